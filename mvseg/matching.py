@@ -1,0 +1,85 @@
+"""Stage 5c: region matching in one call: masks and cameras in, instance ids out."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvseg.affinity import Affinity, region_affinity
+from mvseg.clustering import cluster_affinity
+from mvseg.config import MatchConfig
+from mvseg.epipolar import is_coincident
+from mvseg.errors import InputError
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class Matching:
+    """Which region shows which instance.
+
+    Attributes:
+        instance_ids: (D,) int64; regions of one instance share a number in [0, K); -1 = matched to nothing.
+        match_scores: (D,) float32 in [0, 1]: mean affinity (Eq. 3) of a region to the members of its cluster in other
+            views; 0 for a region matched to nothing or alone in its cluster.
+        num_instances: K.
+    """
+
+    instance_ids: Tensor
+    match_scores: Tensor
+    num_instances: int
+
+
+def match_regions(
+    regions: Regions, cameras: Cameras, config: MatchConfig | None = None, *, progress: bool = False
+) -> Matching:
+    """Give every region an instance id by epipolar region matching (Sec. 3.1).
+
+    Args:
+        regions: D regions in V views.
+        cameras: V >= 2 cameras.
+        config: how; None for the defaults of `MatchConfig`.
+        progress: show progress bars.
+
+    Returns:
+        The matching, on the device of the regions. Without regions it is empty. Warns (UserWarning) of pairs of views
+        at one place, which are skipped, and of a scene without regions.
+
+    Raises:
+        InputError: fewer than two views, or regions and cameras of different numbers of views.
+    """
+    config = config or MatchConfig()
+    if len(cameras) != regions.num_views:
+        raise InputError(f"regions of {regions.num_views} views with {len(cameras)} cameras, expected as many of each")
+    if len(cameras) < 2:
+        raise InputError("matching needs at least two views, got a single one")
+    _warn_of_gaps(regions, cameras)
+    affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
+    clustering = cluster_affinity(
+        affinity,
+        regions.num_per_view,
+        num_instances=config.num_instances,
+        search_range=config.search_range,
+        num_restarts=config.num_restarts,
+        seed=config.seed,
+        progress=progress,
+    )
+    ids = clustering.instance_ids
+    return Matching(ids, mean_affinity(affinity, ids, regions), int(ids.max() + 1) if len(ids) else 0)
+
+
+def mean_affinity(affinity: Affinity, instance_ids: Tensor, regions: Regions) -> Tensor:
+    """(D,) float32: mean affinity of each region to the members of its cluster in other views; 0 where it has none."""
+    same = (instance_ids[:, None] == instance_ids) & (instance_ids >= 0)
+    partners = same & (regions.view_index[:, None] != regions.view_index)
+    return (affinity.to_dense() * partners).sum(1) / partners.sum(1).clamp(min=1)
+
+
+def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
+    if not len(regions):
+        warnings.warn("the masks of all views are empty: there is no instance", stacklevel=3)
+    for i, j in torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist():
+        warnings.warn(f"views {i} and {j} were taken from one place: this pair is skipped", stacklevel=3)

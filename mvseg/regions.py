@@ -1,0 +1,203 @@
+"""Stage 2: the instance masks of all views of a scene, flat, as box crops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from scipy import ndimage
+from torch import Tensor
+
+from mvseg.errors import InputError
+
+IGNORE_LABEL = 65535  # in label maps: pixels that belong to nothing and are judged by nobody
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """D instance masks in V views: the nodes of the paper's graph (Sec. 3.1).
+
+    A mask is kept as the crop of its bounding box, never as a full frame; the crops of all regions stand one after
+    another in one flat tensor. Regions of one view may overlap.
+
+    Attributes:
+        view_index: (D,) int64, the view of each region.
+        boxes: (D, 4) int64, xyxy in pixels, half-open: the crop of region d covers columns x1..x2-1, rows y1..y2-1.
+        crops: (sum of box areas,) bool, the crops, each in row-major order.
+        num_views: V; views without any region count.
+        labels: (D,) int64, the number each mask had where it came from. It means nothing across views.
+
+    Raises:
+        InputError: shapes that disagree, an empty box, a view index outside [0, V).
+    """
+
+    view_index: Tensor
+    boxes: Tensor
+    crops: Tensor
+    num_views: int
+    labels: Tensor
+
+    def __post_init__(self) -> None:
+        num_regions = len(self.view_index)
+        if tuple(self.boxes.shape) != (num_regions, 4) or tuple(self.labels.shape) != (num_regions,):
+            raise InputError(
+                f"{num_regions} regions with boxes {tuple(self.boxes.shape)} and labels {tuple(self.labels.shape)}, "
+                f"expected ({num_regions}, 4) and ({num_regions},)"
+            )
+        if num_regions and int(self.crop_sizes.min()) < 1:
+            raise InputError(f"region {int(self.crop_sizes.min(1)[0].argmin())} has an empty box")
+        if self.crops.dtype != torch.bool or len(self.crops) != int(self.crop_sizes.prod(1).sum()):
+            raise InputError(f"crops hold {len(self.crops)} pixels, expected bool, as many as the boxes cover")
+        if num_regions and not 0 <= int(self.view_index.min()) <= int(self.view_index.max()) < self.num_views:
+            raise InputError(f"a region's view index is not in [0, {self.num_views})")
+
+    def __len__(self) -> int:
+        return len(self.view_index)
+
+    @property
+    def device(self) -> torch.device:
+        return self.boxes.device
+
+    def to(self, device: torch.device | str) -> Regions:
+        view_index, boxes, crops, labels = (
+            field.to(device) for field in (self.view_index, self.boxes, self.crops, self.labels)
+        )
+        return Regions(view_index, boxes, crops, self.num_views, labels)
+
+    @property
+    def crop_sizes(self) -> Tensor:
+        """(D, 2) int64: width and height of each crop."""
+        return self.boxes[:, 2:] - self.boxes[:, :2]
+
+    @property
+    def offsets(self) -> Tensor:
+        """(D + 1,) int64: region d's crop is `crops[offsets[d]:offsets[d + 1]]`."""
+        return torch.nn.functional.pad(self.crop_sizes.prod(1).cumsum(0), (1, 0))
+
+    @property
+    def areas(self) -> Tensor:
+        """(D,) int64: number of pixels of each mask, #_a in Eq. 3."""
+        filled = torch.nn.functional.pad(self.crops.cumsum(0), (1, 0))[self.offsets]
+        return filled[1:] - filled[:-1]
+
+    @property
+    def num_per_view(self) -> Tensor:
+        """(V,) int64: number of regions in each view."""
+        return torch.bincount(self.view_index, minlength=self.num_views)
+
+    def crop(self, index: int) -> Tensor:
+        """(h, w) bool: the crop of one region, a view into `crops`."""
+        start, end = self.offsets[index : index + 2].tolist()
+        width, height = self.crop_sizes[index].tolist()
+        return self.crops[start:end].reshape(height, width)
+
+    def mask(self, index: int, width: int, height: int) -> Tensor:
+        """(height, width) bool: one region as a full frame, for drawing and writing."""
+        frame = torch.zeros(height, width, dtype=torch.bool, device=self.device)
+        x1, y1, x2, y2 = self.boxes[index].tolist()
+        frame[y1:y2, x1:x2] = self.crop(index)
+        return frame
+
+    def select(self, index: Tensor) -> Regions:
+        """The regions at an int64 index or a bool mask, in that order."""
+        keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+        sizes = self.crop_sizes.prod(1)[keep]
+        first = sizes.cumsum(0) - sizes
+        source = torch.arange(int(sizes.sum()), device=self.device)
+        source = source + (self.offsets[:-1][keep] - first).repeat_interleave(sizes)
+        return Regions(
+            self.view_index[keep], self.boxes[keep], self.crops[source], self.num_views, self.labels[keep]
+        )
+
+    def pixels(self, max_per_region: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Centres of the mask pixels.
+
+        Args:
+            max_per_region: masks of more pixels are thinned to a square lattice of at most about this many (at least
+                a quarter as many); None for all pixels.
+
+        Returns:
+            xy (P, 2) float32, pixel centres at half integers; owner (P,) int64, the region of each; weight (P,)
+            float32, how many pixels each one stands for: the weights of a region sum to its area.
+        """
+        flat = self.crops.nonzero()[:, 0]
+        sizes = self.crop_sizes.prod(1)
+        owner = torch.arange(len(self), device=self.device).repeat_interleave(sizes)[flat]
+        local = flat - self.offsets[:-1][owner]
+        width = self.crop_sizes[owner, 0]
+        column = local % width + self.boxes[owner, 0]
+        row = local // width + self.boxes[owner, 1]
+        if max_per_region is not None:
+            step = (self.areas / max_per_region).sqrt().ceil().long().clamp(min=1)[owner]
+            on_lattice = (column % step == 0) & (row % step == 0)
+            # A sliver may miss every lattice point: then it keeps all of its pixels.
+            missed = torch.bincount(owner[on_lattice], minlength=len(self)) == 0
+            keep = on_lattice | missed[owner]
+            owner, column, row = owner[keep], column[keep], row[keep]
+        count = torch.bincount(owner, minlength=len(self)).clamp(min=1)
+        weight = (self.areas / count).float()[owner]
+        return torch.stack((column, row), 1).float() + 0.5, owner, weight
+
+    def label_map(self, view: int, values: Tensor, width: int, height: int) -> Tensor:
+        """Paint the regions of one view into one frame.
+
+        Args:
+            view: view index.
+            values: (D,) int64, what to paint for each region; regions with value 0 are left out.
+            width: of the frame, pixels.
+            height: of the frame, pixels.
+
+        Returns:
+            (height, width) int64, 0 where no region is. Where regions overlap the smaller one is on top.
+        """
+        frame = torch.zeros(height, width, dtype=torch.int64, device=self.device)
+        members = (self.view_index == view).nonzero()[:, 0]
+        members = members[self.areas[members].argsort(descending=True, stable=True)]
+        for index in members[values[members] != 0].tolist():
+            x1, y1, x2, y2 = self.boxes[index].tolist()
+            frame[y1:y2, x1:x2][self.crop(index)] = values[index]
+        return frame
+
+
+def regions_from_label_maps(label_maps: Sequence[np.ndarray]) -> Regions:
+    """Regions from one label map per view.
+
+    Args:
+        label_maps: V integer arrays (H, W), each of its own size; 0 is nothing, 65535 is ignored, every other number is
+            one region of that view.
+
+    Returns:
+        Regions ordered by view, then by number; `labels` holds the numbers.
+    """
+    view_index, boxes, crops, labels = [], [], [], []
+    for view, label_map in enumerate(label_maps):
+        numbers, dense = np.unique(label_map, return_inverse=True)
+        slices = ndimage.find_objects(dense.reshape(label_map.shape) + 1)
+        for rank, (number, place) in enumerate(zip(numbers.tolist(), slices, strict=True)):
+            if number in (0, IGNORE_LABEL) or place is None:
+                continue
+            rows, columns = place
+            view_index.append(view)
+            boxes.append((columns.start, rows.start, columns.stop, rows.stop))
+            crops.append(torch.from_numpy(dense.reshape(label_map.shape)[place] == rank).flatten())
+            labels.append(number)
+    return stack_regions(view_index, boxes, crops, labels, len(label_maps))
+
+
+def stack_regions(
+    view_index: list[int],
+    boxes: list[tuple[int, int, int, int]],
+    crops: list[Tensor],
+    labels: list[int],
+    num_views: int,
+) -> Regions:
+    """Regions from one entry per region: see `Regions`; `crops` are flat bool tensors. All lists may be empty."""
+    return Regions(
+        torch.tensor(view_index, dtype=torch.int64),
+        torch.tensor(boxes, dtype=torch.int64).reshape(-1, 4),
+        torch.cat(crops) if crops else torch.zeros(0, dtype=torch.bool),
+        num_views,
+        torch.tensor(labels, dtype=torch.int64),
+    )

@@ -1,0 +1,169 @@
+"""Stage 1: cameras, views and scenes. This docstring is the convention sheet of the whole project.
+
+Frames     world, cam (one per view), px. Poses are `cam_from_world`: x_cam = R @ x_world + t. The camera looks along
+           +z, +x is right, +y is down (OpenCV, COLMAP). Names carry frames, so that products cancel: `j_from_world`,
+           `px_from_cam`, `world_from_px`.
+Pixels     the centre of the top-left pixel is (0.5, 0.5) (COLMAP); pixel (column c, row r) covers [c, c+1) x [r, r+1).
+           Zero-centred habits (OpenCV, torchvision's masks_to_boxes) are converted where they enter, in `formats/` and
+           `multiview.py`, nowhere else.
+Boxes      xyxy, half-open and continuous: x2 - x1 is the number of pixel columns.
+Lenses     distortion is removed once, on load: `Cameras` are pinholes. `View.lens` keeps the photo's own camera, so
+           that labels can be written in the frame of the photo the user took.
+Axes       V views, D all regions of a scene, N and M regions of two views, K clusters, P points or pixels, B bins of
+           plane angle, H W image.
+Units      world units are the scene's (`Scene.unit`); thresholds are in pixels or fractions, never in world units.
+Types      cameras and plane angles in float64 on entry, image-sized work in float32; indices int64. The device is the
+           device of the inputs.
+Ragged     one flat tensor and an index vector, never padded, never lists of lists.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch import Tensor
+
+from mvseg.errors import InputError
+
+if TYPE_CHECKING:
+    import pycolmap
+
+ROTATION_TOLERANCE = 1e-4  # |R R^T - I|; hand-typed rig files carry about six digits
+
+
+@dataclass(frozen=True, eq=False)
+class Cameras:
+    """V pinhole cameras with known poses.
+
+    Attributes:
+        K: (V, 3, 3) float64, px_from_cam; `K[:, 0, 0]`, `K[:, 1, 1]` are the focal lengths in pixels, > 0.
+        R: (V, 3, 3) float64, rotation of cam_from_world.
+        t: (V, 3) float64, translation of cam_from_world, world units.
+        sizes: (V, 2) int64, image width and height in pixels.
+
+    Raises:
+        InputError: a wrong shape, a number that is not finite, a focal length <= 0, a K that is not upper triangular
+            with last row (0, 0, 1), an R that is not a rotation (reflections included), an image size < 1. The message
+            names the view by its index.
+    """
+
+    K: Tensor
+    R: Tensor
+    t: Tensor
+    sizes: Tensor
+
+    def __post_init__(self) -> None:
+        num_views = len(self.K)
+        for field, shape in (("K", (3, 3)), ("R", (3, 3)), ("t", (3,)), ("sizes", (2,))):
+            value = getattr(self, field)
+            if tuple(value.shape) != (num_views, *shape):
+                raise InputError(f"{field} has shape {tuple(value.shape)}, expected {(num_views, *shape)}")
+            object.__setattr__(self, field, value.to(torch.int64 if field == "sizes" else torch.float64))
+        for index in range(num_views):
+            problem = camera_problem(self.K[index], self.R[index], self.t[index], self.sizes[index])
+            if problem:
+                raise InputError(f"view {index}: {problem}")
+
+    def __len__(self) -> int:
+        return len(self.K)
+
+    def __getitem__(self, index: Any) -> Cameras:
+        """The cameras at a slice, a list or a tensor of view indices."""
+        return Cameras(self.K[index], self.R[index], self.t[index], self.sizes[index])
+
+    @property
+    def device(self) -> torch.device:
+        return self.K.device
+
+    def to(self, device: torch.device | str) -> Cameras:
+        return Cameras(self.K.to(device), self.R.to(device), self.t.to(device), self.sizes.to(device))
+
+    @property
+    def centers(self) -> Tensor:
+        """(V, 3) camera centres in world coordinates, -R^T t."""
+        return -(self.R.mT @ self.t[:, :, None])[:, :, 0]
+
+    @property
+    def world_from_px(self) -> Tensor:
+        """(V, 3, 3): `world_from_px @ (u, v, 1)` is the viewing ray of a pixel in world axes, with depth 1 along +z."""
+        return self.R.mT @ torch.linalg.inv(self.K)
+
+    def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
+        """Project world points into every view.
+
+        Args:
+            points: (P, 3) world coordinates.
+
+        Returns:
+            (V, P, 2) float64 pixel positions and (V, P) depths along +z in world units. Points with depth <= 0 lie
+            behind the camera; their pixel position has no meaning (not finite for depth 0).
+        """
+        cam = points.to(self.K) @ self.R.mT + self.t[:, None, :]
+        px = cam @ self.K.mT
+        return px[..., :2] / px[..., 2:], cam[..., 2]
+
+
+def camera_problem(K: Tensor, R: Tensor, t: Tensor, size: Tensor) -> str | None:
+    """What is wrong with one camera, as the end of a sentence; None for a sound one. Shapes as in `Cameras`."""
+    for name, value in (("K", K), ("R", R), ("t", t)):
+        if not torch.isfinite(value).all():
+            return f"{name} holds a number that is not finite"
+    if size.min() < 1:
+        return f"the image size is {size[0]} x {size[1]}, expected at least 1 x 1"
+    if K[0, 0] <= 0 or K[1, 1] <= 0:
+        return f"the focal length is {K[0, 0]:g}, {K[1, 1]:g}, expected numbers above zero"
+    if K[1, 0] != 0 or K[2].tolist() != [0.0, 0.0, 1.0]:
+        return "K is not upper triangular with last row 0, 0, 1"
+    deviation = (R @ R.T - torch.eye(3).to(R)).abs().max().item()
+    if deviation > ROTATION_TOLERANCE:
+        return f"R is not a rotation (R R^T differs from the identity by {deviation:.2g})"
+    if torch.linalg.det(R) < 0:
+        return "R is a reflection (its determinant is -1), expected a rotation"
+    return None
+
+
+@dataclass(frozen=True)
+class View:
+    """One photo of a scene.
+
+    Attributes:
+        name: unique in its scene; the path of the photo below the folder that all photos share, without suffix. Masks
+            and results of this view are called `<name>.png`.
+        path: where the photo is expected; it may be absent when only masks are used.
+        lens: the photo's own camera (any COLMAP model) when it has distortion, else None.
+    """
+
+    name: str
+    path: Path
+    lens: pycolmap.Camera | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """Photos of one plant from V >= 2 known cameras.
+
+    Attributes:
+        name: the folder's name.
+        views: one `View` per camera.
+        cameras: the undistorted `Cameras`, in the order of the views.
+        unit: name of the world unit ("mm", "m", ...); "" when the cameras do not say.
+        source: the file or folder that the cameras were read from.
+    """
+
+    name: str
+    views: tuple[View, ...]
+    cameras: Cameras
+    unit: str = ""
+    source: Path | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.views) != len(self.cameras):
+            raise InputError(f"{len(self.views)} views with {len(self.cameras)} cameras, expected as many of each")
+        first_with: dict[str, int] = {}
+        for index, view in enumerate(self.views):
+            if view.name in first_with:
+                raise InputError(f"views {first_with[view.name]} and {index} have the same name '{view.name}'")
+            first_with[view.name] = index
