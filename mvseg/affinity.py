@@ -111,9 +111,9 @@ def _directed(lines: Tensor, pixels: Tensor, band_radius: int, half_line: int) -
 def view_pairs(
     samples: list[Samples], cameras: Cameras, *, progress: bool = False
 ) -> Iterator[tuple[int, int, Pencil, Bins]]:
-    """The pairs of views i < j that both hold regions and have a baseline, each with its pencil and bins."""
+    """The pairs of views i < j that both hold pixels and have a baseline, each with its pencil and bins."""
     skip = is_coincident(cameras).tolist()
-    occupied = [view for view, sample in enumerate(samples) if sample.num_regions]
+    occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
     pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
     for i, j in tqdm(pairs, desc="epipolar weights", unit="pair", disable=not progress):
         pencil = epipolar_pencil(cameras, i, j)

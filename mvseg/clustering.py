@@ -18,6 +18,7 @@ from tqdm import tqdm
 from mvseg.affinity import Affinity
 from mvseg.errors import InputError
 
+KS_AT_ONCE = 8
 DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
 
 
@@ -80,39 +81,54 @@ def cluster_affinity(
     tied_W = W[tied][:, tied]
     candidates: dict[int, Tensor] = {}
     criterion: dict[int, float] = {}
-    for k in tqdm(range(low, high + 1), desc="number of instances", unit="k", disable=not progress or low == high):
-        candidates[k] = factorise(tied_W, k, num_restarts=num_restarts, seed=seed).argmax(1)
-        criterion[k] = size_spread(candidates[k], k)
+    with tqdm(total=high - low + 1, desc="number of instances", unit="k", disable=not progress or low == high) as bar:
+        for ks in torch.arange(low, high + 1).split(KS_AT_ONCE):
+            factors = factorise(tied_W, ks.tolist(), num_restarts=num_restarts, seed=seed)
+            for k, H in zip(ks.tolist(), factors, strict=True):
+                candidates[k] = H.argmax(1)
+                criterion[k] = size_spread(candidates[k], k)
+            bar.update(len(ks))
     best = min(criterion, key=lambda k: (criterion[k], k))
     labels[tied] = candidates[best]
     return Clustering(renumber(labels), best, criterion)
 
 
-def factorise(W: Tensor, k: int, *, num_restarts: int = 2, num_iterations: int = 200, seed: int = 0) -> Tensor:
+def factorise(
+    W: Tensor, ks: Sequence[int], *, num_restarts: int = 2, num_iterations: int = 200, seed: int = 0
+) -> list[Tensor]:
     """Symmetric non-negative matrix factorisation W ~ H H^T (Kuang et al. 2012), by multiplicative updates.
+
+    All numbers of columns are factorised together: the columns that a smaller k has too many start at 0, and a
+    multiplicative update keeps them there.
 
     Args:
         W: (D, D) symmetric, >= 0.
-        k: number of columns of H.
-        num_restarts: random starts; the H of the smallest |W - H H^T| is returned.
+        ks: numbers of columns of H; the result for one k does not depend on the others.
+        num_restarts: random starts for each k; the H of the smallest |W - H H^T| is returned.
         num_iterations: updates of each start.
         seed: of the starts; drawn on the CPU, so that every device starts alike.
 
     Returns:
-        (D, k) float32 >= 0; the arg max of a row is the cluster of that node.
+        For each k an H, (D, k) float32 >= 0; the arg max of a row is the cluster of that node.
     """
-    generator = torch.Generator().manual_seed(seed)
-    scale = 2 * (W.mean().clamp(min=torch.finfo(W.dtype).tiny) / k).sqrt()
-    H = torch.rand(num_restarts, len(W), k, generator=generator).to(W) * scale
+    widest = max(ks)
+    scale = 2 * W.mean().clamp(min=torch.finfo(W.dtype).tiny).sqrt()
+    starts = torch.zeros(len(ks), num_restarts, widest, len(W))
+    for row, k in enumerate(ks):
+        generator = torch.Generator().manual_seed(seed + 1_000_003 * k)
+        starts[row, :, :k] = torch.rand(num_restarts, k, len(W), generator=generator) / k**0.5
+    H = starts.flatten(0, 1).to(W) * scale  # transposed, (B, k, D), so that H W is one matrix product
     for _ in range(num_iterations):
-        denominator = H @ (H.mT @ H)
-        H = H * (1 - DAMPING + DAMPING * (W @ H) / denominator.clamp(min=1e-12))
-    loss = torch.linalg.matrix_norm(W - H @ H.mT)
-    return H[loss.argmin()]
+        denominator = (H @ H.mT) @ H
+        H = H * (1 - DAMPING + DAMPING * (H @ W) / denominator.clamp(min=1e-12))
+    # |W - H^T H|^2 without its constant |W|^2
+    loss = (H @ H.mT).square().sum((1, 2)) - 2 * ((H @ W) * H).sum((1, 2))
+    best = loss.reshape(len(ks), num_restarts).argmin(1)
+    return [H[row * num_restarts + int(best[row]), :k].T for row, k in enumerate(ks)]
 
 
 def size_spread(labels: Tensor, k: int) -> float:
-    """Eq. 7: root of the sum (as printed, not the mean) of squared deviations of the k cluster sizes from their mean."""
+    """Eq. 7: root of the sum (as printed, no mean) of squared deviations of the k cluster sizes from their mean."""
     sizes = torch.bincount(labels, minlength=k).double()
     return float((sizes - sizes.mean()).square().sum().sqrt())
 

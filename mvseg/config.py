@@ -38,4 +38,4 @@ class ReconstructConfig:
 
     threshold: float = 0.5
     voxel_size: float | None = None
-    voxel_budget: int = 500_000
+    voxel_budget: int = 250_000

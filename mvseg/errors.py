@@ -1,4 +1,4 @@
-"""The one exception that means: the input is wrong, and this sentence says what, where and what was expected."""
+"""Bad input: the exception that ends a run with one sentence, and the warning that does not end it."""
 
 
 class InputError(ValueError):
@@ -7,3 +7,7 @@ class InputError(ValueError):
     The message is one sentence that names the file, the view or the index, and what was expected. The command line
     prints it and exits with code 2; from Python it is an ordinary `ValueError`.
     """
+
+
+class InputWarning(UserWarning):
+    """The input is odd but usable; the message says what was done about it. Kept in a result's `run.json`."""

@@ -12,7 +12,7 @@ from mvseg.affinity import Affinity, region_affinity
 from mvseg.clustering import cluster_affinity
 from mvseg.config import MatchConfig
 from mvseg.epipolar import is_coincident
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -45,7 +45,7 @@ def match_regions(
         progress: show progress bars.
 
     Returns:
-        The matching, on the device of the regions. Without regions it is empty. Warns (UserWarning) of pairs of views
+        The matching, on the device of the regions. Without regions it is empty. Warns (InputWarning) of pairs of views
         at one place, which are skipped, and of a scene without regions.
 
     Raises:
@@ -80,6 +80,7 @@ def mean_affinity(affinity: Affinity, instance_ids: Tensor, regions: Regions) ->
 
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
     if not len(regions):
-        warnings.warn("the masks of all views are empty: there is no instance", stacklevel=3)
+        warnings.warn("the masks of all views are empty: there is no instance", InputWarning, stacklevel=3)
     for i, j in torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist():
-        warnings.warn(f"views {i} and {j} were taken from one place: this pair is skipped", stacklevel=3)
+        message = f"views {i} and {j} were taken from one place: this pair is skipped"
+        warnings.warn(message, InputWarning, stacklevel=3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -71,12 +72,12 @@ class Regions:
         """(D, 2) int64: width and height of each crop."""
         return self.boxes[:, 2:] - self.boxes[:, :2]
 
-    @property
+    @cached_property
     def offsets(self) -> Tensor:
         """(D + 1,) int64: region d's crop is `crops[offsets[d]:offsets[d + 1]]`."""
         return torch.nn.functional.pad(self.crop_sizes.prod(1).cumsum(0), (1, 0))
 
-    @property
+    @cached_property
     def areas(self) -> Tensor:
         """(D,) int64: number of pixels of each mask, #_a in Eq. 3."""
         filled = torch.nn.functional.pad(self.crops.cumsum(0), (1, 0))[self.offsets]
@@ -107,9 +108,7 @@ class Regions:
         first = sizes.cumsum(0) - sizes
         source = torch.arange(int(sizes.sum()), device=self.device)
         source = source + (self.offsets[:-1][keep] - first).repeat_interleave(sizes)
-        return Regions(
-            self.view_index[keep], self.boxes[keep], self.crops[source], self.num_views, self.labels[keep]
-        )
+        return Regions(self.view_index[keep], self.boxes[keep], self.crops[source], self.num_views, self.labels[keep])
 
     def pixels(self, max_per_region: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Centres of the mask pixels.

@@ -1,0 +1,155 @@
+"""The command `mvseg <verb>`. Every verb takes its options from the command line and from YAML (`--config FILE`)."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+import mvseg
+from mvseg.config import MatchConfig, ReconstructConfig
+from mvseg.errors import InputError, InputWarning
+
+DEMO_SCENE = Path(str(files("mvseg") / "demo_plant"))
+BAD_INPUT = 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    Args:
+        argv: words after the program's name; None for those of the process.
+
+    Returns:
+        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input.
+    """
+    # Idle threads shall sleep: on a shared machine spinning ones make small tensor work ten times slower. Must be set
+    # before torch is loaded, which the verbs do when they start.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    verbs = {"infer": _infer, "match": _match, "eval": _eval}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", InputWarning)
+            args = build_parser().parse_args(list(sys.argv[1:] if argv is None else argv))
+            return verbs[args.verb](args[args.verb])
+    except (InputError, argparse.ArgumentError) as error:
+        return _complain(error)
+
+
+def build_parser() -> ArgumentParser:
+    """The parser of all verbs; its errors are raised, not printed."""
+    parser = ArgumentParser(prog="mvseg", description=mvseg.__doc__, exit_on_error=False, version=mvseg.__version__)
+    verbs = parser.add_subcommands(dest="verb")
+
+    infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
+    infer.add_argument("scene", nargs="?", type=Path, default=DEMO_SCENE, help="scene folder (the shipped one)")
+    _add_options(infer, masks=None)
+    infer.add_class_arguments(ReconstructConfig, "reconstruct")
+    verbs.add_subcommand("infer", infer, help="ids and 3D shapes of one scene")
+
+    match = ArgumentParser(exit_on_error=False, description="Ids only, of any number of scenes.")
+    match.add_argument("scenes", nargs="+", type=Path, help="scene folders")
+    _add_options(match, masks=Path("masks"))
+    verbs.add_subcommand("match", match, help="ids only, of any number of scenes")
+
+    evaluate = ArgumentParser(exit_on_error=False, description="Compare the ids of a result with true labels.")
+    evaluate.add_argument("result", type=Path, help="result folder")
+    evaluate.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids")
+    verbs.add_subcommand("eval", evaluate, help="compare a result with true labels")
+    return parser
+
+
+def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
+    parser.add_argument("--config", action="config", help="YAML file with any of these options")
+    parser.add_argument(
+        "--masks",
+        type=Path | None,
+        default=masks,
+        help="folder of label PNGs or COCO .json, in the scene folder or anywhere; the shipped scene brings its own",
+    )
+    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the result, or the results")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    parser.add_class_arguments(MatchConfig, "match")
+
+
+def _infer(args: Namespace) -> int:
+    masks = args.masks
+    if masks is None:
+        if args.scene != DEMO_SCENE:
+            raise InputError(f"{args.scene}: no masks were given, expected --masks FOLDER (label PNGs) or FILE (COCO)")
+        masks = Path("masks")
+    out = args.out / args.scene.resolve().name if args.out == Path("results") else args.out
+    _run(args.scene, masks, out, args, ReconstructConfig(**vars(args.reconstruct)))
+    return 0
+
+
+def _match(args: Namespace) -> int:
+    names = [scene.resolve().name for scene in args.scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two scenes are called '{name}', expected different names: each gets a folder in --out")
+    code = 0
+    for scene, name in zip(args.scenes, names, strict=True):
+        try:
+            _run(scene, args.masks, args.out / name, args, None)
+        except InputError as error:  # the other scenes still get their results
+            code = _complain(error)
+    return code
+
+
+def _run(scene: Path, masks: Path, out: Path, args: Namespace, reconstruct: ReconstructConfig | None) -> None:
+    """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
+    from mvseg.pipeline import describe_run, run_scene  # keeps --help and wrong options quick
+    from mvseg.result import check_out, save_result
+
+    check_out(out)
+    if (scene / masks).exists():
+        masks = scene / masks
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        result = run_scene(scene, masks, MatchConfig(**vars(args.match)), reconstruct, progress=not args.quiet)
+    remarks = [str(one.message) for one in caught if issubclass(one.category, InputWarning)]
+    for remark in remarks:
+        print(f"mvseg: warning: {remark}", file=sys.stderr)
+    config = {"scene": str(scene), "masks": str(masks), "out": str(out), "match": vars(args.match)}
+    if reconstruct is not None:
+        config["reconstruct"] = dataclasses.asdict(reconstruct)
+    save_result(result, out, describe_run(result, masks, config, remarks), progress=not args.quiet)
+    num_masks, num_views = len(result.regions), len(result.scene.views)
+    print(f"{out}: {result.matching.num_instances} instances from {num_masks} masks in {num_views} views")
+
+
+def _eval(args: Namespace) -> int:
+    from mvseg.metrics import matching_metrics
+    from mvseg.regions import IGNORE_LABEL
+    from mvseg.result import read_instances
+
+    ids, true = read_instances(args.result, args.truth)
+    judged = (true != 0) & (true != IGNORE_LABEL)
+    metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[judged], true[judged]))
+    metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
+    for name, value in metrics.items():
+        print(f"{name:15} {value:.4f}" if isinstance(value, float) else f"{name:15} {value}")
+    try:
+        (args.result / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{args.result}: cannot write metrics.json ({error.strerror})") from None
+    return 0
+
+
+def _complain(error: Exception) -> int:
+    print(f"mvseg: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return BAD_INPUT
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,35 @@
+"""JSON files that people write by hand: read, checked against a pydantic model, every fault one sentence."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TypeVar
+
+from pydantic import BaseModel, FiniteFloat, ValidationError
+
+from mvseg.errors import InputError
+
+Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
+Matrix3 = tuple[Vector3, Vector3, Vector3]
+Model = TypeVar("Model", bound=BaseModel)
+
+
+def read_json(path: Path, model: type[Model]) -> Model:
+    """Read a JSON file as `model`.
+
+    Raises:
+        InputError: the file is missing, is not JSON, or does not fit the model; names the file and the place in it.
+    """
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise InputError(f"{path}: not a whole JSON file ({error})") from None
+    try:
+        return model.model_validate(content)
+    except ValidationError as error:
+        first = error.errors()[0]
+        place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+        raise InputError(f"{path}: {place + ': ' if place else ''}{first['msg']}") from None

@@ -1,0 +1,109 @@
+"""What every reader of cameras hands over, and how it becomes a scene."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import cv2
+import numpy as np
+import pycolmap
+import torch
+
+from mvseg.errors import InputError
+from mvseg.formats.lens import undistort
+from mvseg.scene import Cameras, Scene, View, camera_problem
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """One photo with its camera, as it stands in a camera file.
+
+    Attributes:
+        file: path of the photo relative to the scene folder, "/" between folders.
+        width: pixels.
+        height: pixels.
+        K: (3, 3) float64, without the distortion.
+        R: (3, 3) float64, of cam_from_world.
+        t: (3,) float64, of cam_from_world.
+        lens: the camera with its distortion, None for a pinhole.
+    """
+
+    file: str
+    width: int
+    height: int
+    K: np.ndarray
+    R: np.ndarray
+    t: np.ndarray
+    lens: pycolmap.Camera | None = None
+
+
+def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Path) -> Scene:
+    """The scene of a folder from its photos.
+
+    Raises:
+        InputError: fewer than two views, two views of one name, a file name that leads out of the folder, a camera that
+            is not sound. The message names the camera file, the view's index and its photo.
+    """
+    if not photos:
+        raise InputError(f"{source}: there are no views, expected at least two")
+    if len(photos) < 2:
+        raise InputError(f"{source}: there is a single view, expected at least two")
+    for index, photo in enumerate(photos):
+        problem = _path_problem(photo.file) or camera_problem(
+            torch.as_tensor(photo.K),
+            torch.as_tensor(photo.R),
+            torch.as_tensor(photo.t),
+            torch.tensor([photo.width, photo.height]),
+        )
+        if problem:
+            raise InputError(f"{source}: view {index} ({photo.file}): {problem}")
+    views = tuple(
+        View(name, folder / photo.file, photo.lens)
+        for name, photo in zip(view_names([photo.file for photo in photos]), photos, strict=True)
+    )
+    cameras = Cameras(
+        torch.from_numpy(np.stack([photo.K for photo in photos])),
+        torch.from_numpy(np.stack([photo.R for photo in photos])),
+        torch.from_numpy(np.stack([photo.t for photo in photos])),
+        torch.tensor([[photo.width, photo.height] for photo in photos]),
+    )
+    try:
+        return Scene(folder.resolve().name, views, cameras, unit, source)
+    except InputError as error:
+        raise InputError(f"{source}: {error}") from None
+
+
+def view_names(files: Sequence[str]) -> list[str]:
+    """Names of views: the paths of their photos below the folder that all share, without suffix."""
+    paths = [PurePosixPath(os.path.normpath(file)) for file in files]
+    shared = os.path.commonpath([path.parent for path in paths])
+    return [path.relative_to(shared).with_suffix("").as_posix() for path in paths]
+
+
+def _path_problem(file: str) -> str | None:
+    path = os.path.normpath(file)
+    if not file or os.path.isabs(path) or path.split(os.sep)[0] == "..":
+        return "the file name leads out of the scene folder"
+    return None
+
+
+def read_photo(scene: Scene, view: int) -> np.ndarray:
+    """(H, W, 3) uint8 RGB, the photo of a view with its lens distortion removed.
+
+    Raises:
+        InputError: the photo is missing, cannot be read, or is of another size than its camera says.
+    """
+    path, (width, height) = scene.views[view].path, scene.cameras.sizes[view].tolist()
+    if not path.is_file():
+        raise InputError(f"{path}: the image of view {view} is missing")
+    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None:
+        raise InputError(f"{path}: the image of view {view} cannot be read, expected an image file")
+    if image.shape[:2] != (height, width):
+        size = f"{image.shape[1]} x {image.shape[0]}"
+        raise InputError(f"{path}: the image of view {view} is {size}, its camera says {width} x {height}")
+    K = scene.cameras.K[view].cpu().numpy()
+    return undistort(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), scene.views[view].lens, K)

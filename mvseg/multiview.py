@@ -1,0 +1,227 @@
+"""Stage 7: a torchvision Mask R-CNN that sees all views of a scene at once (Sec. 3.2)."""
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torchvision.models.detection import MaskRCNN
+from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
+from torchvision.models.detection.roi_heads import expand_boxes, expand_masks, paste_mask_in_image
+from torchvision.models.detection.transform import resize_boxes
+
+from mvseg.config import MatchConfig
+from mvseg.errors import InputError
+from mvseg.matching import Matching, match_regions
+from mvseg.nms import EpipolarAssignment, cluster_aware_nms
+from mvseg.regions import Regions, stack_regions
+from mvseg.scene import Cameras
+
+MASK_THRESHOLD = 0.5  # of the mask head's probability, as in torchvision's examples
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """R scored masks of V views, many of them of the same thing.
+
+    Attributes:
+        regions: the R masks as box crops, in the frame of the images.
+        boxes: (R, 4) float32 xyxy in the frame of the images; what NMS compares.
+        scores: (R,) float32.
+        classes: (R,) int64; things of different classes are never matched.
+    """
+
+    regions: Regions
+    boxes: Tensor
+    scores: Tensor
+    classes: Tensor
+
+
+class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
+    """Wraps any torchvision Mask R-CNN; same modules, same state dict, and ids across views when it is told the cameras.
+
+    In train mode, and in eval mode without cameras, it is the detector it wraps. With cameras, in eval mode:
+
+    1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper: 0.7):
+       an excessive set of masks.
+    2. Match first: those that the detector itself would have kept (its own NMS threshold) are matched across views.
+    3. Alternate `num_iterations` times: every mask of the excessive set takes the cluster whose epipolar map it
+       resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each cluster; match the survivors
+       again.
+
+    Departure from the paper: it matches the excessive set itself at first. Its duplicates inflate the number of masks
+    per view, from which the search range of |k| follows, so here the first match takes the detector's own set.
+
+    Args:
+        detector: a torchvision Mask R-CNN (any builder, any backbone, or `MaskRCNN` itself). Its modules are shared,
+            not copied.
+        num_iterations: of assignment and NMS; 0 only matches what the detector finds.
+        proposal_iou: NMS threshold of the excessive set.
+        cluster_iou: NMS threshold inside a cluster.
+        proposals_per_view: size of the excessive set; the best scores stay.
+        match: how regions are matched.
+
+    Raises:
+        InputError: the detector has no mask head.
+    """
+
+    def __init__(
+        self,
+        detector: MaskRCNN,
+        *,
+        num_iterations: int = 2,
+        proposal_iou: float = 0.7,
+        cluster_iou: float = 0.3,
+        proposals_per_view: int = 300,
+        match: MatchConfig | None = None,
+    ) -> None:
+        if not (isinstance(detector, GeneralizedRCNN) and detector.roi_heads.has_mask()):
+            raise InputError(f"{type(detector).__name__} has no mask head, expected a torchvision Mask R-CNN")
+        super().__init__(detector.backbone, detector.rpn, detector.roi_heads, detector.transform)
+        self.assignment = EpipolarAssignment()
+        self.num_iterations = num_iterations
+        self.proposal_iou = proposal_iou
+        self.cluster_iou = cluster_iou
+        self.proposals_per_view = proposals_per_view
+        self.match = match
+        self.train(detector.training)
+
+    def forward(
+        self, images: list[Tensor], targets: list[dict[str, Tensor]] | None = None, cameras: Cameras | None = None
+    ) -> dict[str, Tensor] | list[dict[str, Tensor]]:
+        """Detect, and match across views.
+
+        Args:
+            images: V tensors (3, H, W) in [0, 1], all of one scene when cameras are given; sizes may differ.
+            targets: in train mode, as torchvision's detectors take them.
+            cameras: the V undistorted cameras of the images; ignored in train mode.
+
+        Returns:
+            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`; with
+            cameras also `instance_ids` (int64, the same number for the same instance in every view, -1 = matched to
+            nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
+
+        Raises:
+            InputError: as many cameras as images are expected, of the images' sizes.
+        """
+        if self.training or cameras is None:
+            return super().forward(images, targets)
+        sizes = [[image.shape[-1], image.shape[-2]] for image in images]
+        if sizes != cameras.sizes.tolist():
+            raise InputError(f"images of sizes {sizes} with cameras of sizes {cameras.sizes.tolist()}")
+        with torch.no_grad():
+            cameras = cameras.to(images[0].device)
+            found = [self._propose(image) for image in images]
+            proposals = gather_proposals(found, sizes)
+            keep, matching = self.alternate(proposals, cameras)
+            return self._collect(found, sizes, proposals.regions.view_index, keep, matching)
+
+    def alternate(self, proposals: Proposals, cameras: Cameras) -> tuple[Tensor, Matching]:
+        """Match first, then alternate assignment and NMS (steps 2 and 3 above).
+
+        Args:
+            proposals: the excessive set of all V views.
+            cameras: V cameras on the same device.
+
+        Returns:
+            (S,) int64 indices of the proposals kept, best score first, and their matching.
+        """
+        per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
+        keep = self._suppress(proposals, per_class, self.roi_heads.nms_thresh)
+        matching = self._match(proposals, keep, cameras)
+        for _ in range(self.num_iterations):
+            regions = proposals.regions.select(keep)
+            clusters, _ = self.assignment(proposals.regions, regions, matching.instance_ids, cameras)
+            keep = self._suppress(proposals, torch.cat((per_class, clusters[:, None]), 1), self.cluster_iou)
+            matching = self._match(proposals, keep, cameras)
+        return keep, matching
+
+    def _propose(self, image: Tensor) -> dict[str, Tensor]:
+        """One view's excessive set: torchvision's own heads with a larger NMS threshold; in the transform's frame."""
+        resized, _ = self.transform([image])
+        features = self.backbone(resized.tensors)
+        if isinstance(features, Tensor):
+            features = OrderedDict([("0", features)])
+        boxes, _ = self.rpn(resized, features)
+        lenient = copy.copy(self.roi_heads)  # shares the weights; the detector's own thresholds stay as they are
+        lenient.nms_thresh, lenient.detections_per_img = self.proposal_iou, self.proposals_per_view
+        (found,), _ = lenient(features, boxes, resized.image_sizes)
+        height, width = resized.image_sizes[0]
+        return found | {"frame": torch.tensor([width, height])}
+
+    def _suppress(self, proposals: Proposals, groups: Tensor, iou_threshold: float) -> Tensor:
+        """NMS by group, then the detector's own limit of detections per view."""
+        keep = cluster_aware_nms(proposals.boxes, proposals.scores, groups, iou_threshold)
+        view = proposals.regions.view_index[keep]
+        earlier = (view[:, None] == view).tril(-1).sum(1)
+        return keep[earlier < self.roi_heads.detections_per_img]
+
+    def _match(self, proposals: Proposals, keep: Tensor, cameras: Cameras) -> Matching:
+        """Match the kept proposals class by class; instances of different classes get different ids."""
+        regions, classes = proposals.regions.select(keep), proposals.classes[keep]
+        ids = torch.full_like(classes, -1)
+        scores = torch.zeros_like(proposals.scores[keep])
+        num_instances = 0
+        for one_class in classes.unique().tolist():
+            members = classes == one_class
+            matching = match_regions(regions.select(members), cameras, self.match)
+            ids[members] = torch.where(matching.instance_ids >= 0, matching.instance_ids + num_instances, -1)
+            scores[members] = matching.match_scores
+            num_instances += matching.num_instances
+        return Matching(ids, scores, num_instances)
+
+    def _collect(
+        self,
+        found: list[dict[str, Tensor]],
+        sizes: list[list[int]],
+        view_index: Tensor,
+        keep: Tensor,
+        matching: Matching,
+    ) -> list[dict[str, Tensor]]:
+        """torchvision's result dicts of the kept proposals, with their ids."""
+        results = []
+        start = 0
+        for view, (one, (width, height)) in enumerate(zip(found, sizes, strict=True)):
+            here = view_index[keep] == view
+            index = keep[here] - start
+            kept = {key: one[key][index] for key in ("boxes", "labels", "scores", "masks")}
+            frame_width, frame_height = one["frame"].tolist()
+            (result,) = self.transform.postprocess([kept], [(frame_height, frame_width)], [(height, width)])
+            result |= {"instance_ids": matching.instance_ids[here], "match_scores": matching.match_scores[here]}
+            results.append(result)
+            start += len(one["boxes"])
+        return results
+
+
+def gather_proposals(found: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:
+    """Proposals of all views, moved to the frame of the images; masks become box crops, never full frames.
+
+    Args:
+        found: per view `boxes` (R_v, 4), `scores`, `labels`, `masks` (R_v, 1, S, S) probabilities, and `frame`, the
+            width and height that the boxes refer to.
+        sizes: per view the width and height of the image.
+
+    Returns:
+        The proposals, view after view. The crops hold the very pixels that torchvision pastes, where they exceed 0.5.
+    """
+    boxes, view_index, windows, crops = [], [], [], []
+    for view, (one, (width, height)) in enumerate(zip(found, sizes, strict=True)):
+        frame_width, frame_height = one["frame"].tolist()
+        scaled = resize_boxes(one["boxes"], [frame_height, frame_width], [height, width])
+        masks, scale = expand_masks(one["masks"], padding=1)
+        for mask, pasted in zip(masks[:, 0], expand_boxes(scaled, scale).to(torch.int64), strict=True):
+            x1, y1 = pasted[:2].clamp(min=0).tolist()
+            x2, y2 = min(int(pasted[2]) + 1, width), min(int(pasted[3]) + 1, height)
+            local = pasted - torch.tensor([x1, y1, x1, y1], device=pasted.device)
+            crops.append((paste_mask_in_image(mask, local, y2 - y1, x2 - x1) > MASK_THRESHOLD).flatten())
+            windows.append((x1, y1, x2, y2))
+        boxes.append(scaled)
+        view_index += [view] * len(scaled)
+    device = boxes[0].device
+    numbers = list(range(len(crops)))
+    regions = stack_regions(view_index, windows, [crop.cpu() for crop in crops], numbers, len(sizes)).to(device)
+    scores, classes = (torch.cat([one[key] for one in found]) for key in ("scores", "labels"))
+    return Proposals(regions, torch.cat(boxes), scores, classes)

@@ -1,0 +1,266 @@
+"""Stage 8: back-projection of each cluster into voxels (Eq. 6), and from voxels to points and a mesh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+import trimesh
+from skimage.measure import marching_cubes
+from torch import Tensor
+from tqdm import tqdm
+
+from mvseg.config import ReconstructConfig
+from mvseg.errors import InputError
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+SEARCH_CELLS = 24  # cells per side while the bounding box of an instance is sought
+MAX_VOXELS = 200_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class VoxelGrid:
+    """One instance in 3D.
+
+    Attributes:
+        origin: (3,) float64, world position of the corner of voxel (0, 0, 0); voxel (a, b, c) is centred at
+            origin + voxel_size * (a + 0.5, b + 0.5, c + 0.5).
+        voxel_size: edge length in world units.
+        votes: (X, Y, Z) float32 in [0, 1]: share of the instance's views whose mask contains the centre (I_k, Eq. 6).
+        num_views: views that could vote.
+        threshold: a voxel is occupied when its share exceeds this.
+    """
+
+    origin: Tensor
+    voxel_size: float
+    votes: Tensor
+    num_views: int
+    threshold: float
+
+    @property
+    def occupied(self) -> Tensor:
+        """(X, Y, Z) bool."""
+        return self.votes > self.threshold + 1e-6
+
+    @property
+    def points(self) -> Tensor:
+        """(P, 3) float64: world positions of the centres of the occupied voxels."""
+        return self.origin + self.voxel_size * (self.occupied.nonzero().double() + 0.5)
+
+    @property
+    def volume(self) -> float:
+        """Occupied volume in cubed world units."""
+        return int(self.occupied.sum()) * self.voxel_size**3
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Closed surface of the occupied voxels (marching cubes between the last free and the first occupied share).
+
+        World coordinates, faces outward; an empty mesh when no voxel is occupied.
+        """
+        if not self.occupied.any():
+            return trimesh.Trimesh()
+        votes = np.pad(self.votes.cpu().numpy(), 1)
+        level = (np.floor(self.threshold * self.num_views + 1e-6) + 0.5) / self.num_views
+        vertices, faces, _, _ = marching_cubes(votes, level, gradient_direction="ascent")
+        world = self.origin.cpu().numpy() + self.voxel_size * (vertices - 0.5)
+        return trimesh.Trimesh(world, faces, process=False)
+
+
+def reconstruct_instances(
+    regions: Regions,
+    instance_ids: Tensor,
+    cameras: Cameras,
+    config: ReconstructConfig | None = None,
+    *,
+    progress: bool = False,
+) -> dict[int, VoxelGrid]:
+    """Back-project every instance that is seen in at least two views.
+
+    Args:
+        regions: D regions.
+        instance_ids: (D,) int64, -1 = no instance.
+        cameras: V cameras.
+        config: how; None for the defaults.
+        progress: show a progress bar over the instances.
+
+    Returns:
+        {instance id: grid}. Instances seen in one view only, and those whose masks have no common point in front of the
+        cameras, are left out: they have no bounded shape.
+    """
+    shapes = {}
+    instances = instance_ids[instance_ids >= 0].unique().tolist()
+    for instance in tqdm(instances, desc="back-projection", unit="instance", disable=not progress):
+        grid = back_project(regions.select(instance_ids == instance), cameras, config)
+        if grid is not None:
+            shapes[instance] = grid
+    return shapes
+
+
+def back_project(members: Regions, cameras: Cameras, config: ReconstructConfig | None = None) -> VoxelGrid | None:
+    """The voxels of one instance from all of its masks (Eq. 6), in a bounding box of its own.
+
+    Departures from the paper: several masks of one view (pieces of a split mask) vote as one, their union; a voxel needs
+    *more* than the threshold, so that of two views both must agree. Voxels behind a camera or outside its image get
+    no vote there. The grid is aligned to multiples of the voxel size: grids of one size share their lattice.
+
+    Args:
+        members: the masks of the instance.
+        cameras: V cameras.
+        config: threshold, voxel size (world units) or voxel budget.
+
+    Returns:
+        The grid, or None for an instance seen in fewer than two views or without a common point.
+
+    Raises:
+        InputError: a threshold outside [0, 1), a voxel size or budget that is not positive or asks for more than
+            2e8 voxels.
+    """
+    config = config or ReconstructConfig()
+    if not 0 <= config.threshold < 1:
+        raise InputError(f"the threshold is {config.threshold:g}, expected a number in [0, 1)")
+    if (config.voxel_size is not None and config.voxel_size <= 0) or config.voxel_budget < 1:
+        raise InputError("the voxel size and the voxel budget must be positive")
+    masks = [_ViewMask.union(members, view, cameras) for view in members.view_index.unique().tolist()]
+    if len(masks) < 2:
+        return None
+    box = _bounding_box(masks, config.threshold)
+    if box is None:
+        return None
+    low, high = box
+    size = config.voxel_size or float(((high - low).prod() / config.voxel_budget) ** (1 / 3))
+    first, last = (low / size).floor(), (high / size).ceil()
+    shape = (last - first).long().clamp(min=1)
+    if float((last - first).prod()) > MAX_VOXELS:
+        asked = int((last - first).prod())
+        raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {MAX_VOXELS}")
+    axes = [(first[a] + 0.5 + torch.arange(int(shape[a])).to(low)) * size for a in range(3)]
+    votes = _share_of_masks(masks, axes)
+    return VoxelGrid(first * size, size, votes, len(masks), config.threshold)
+
+
+@dataclass(frozen=True, eq=False)
+class _ViewMask:
+    """The union of an instance's masks in one view."""
+
+    mask: Tensor  # (h, w) bool, a crop
+    corner: tuple[int, int]  # x, y of the crop's top-left pixel
+    px_from_world: Tensor  # (3, 4) float64
+    focal: float
+    center: Tensor  # (3,) camera centre
+    ray: Tensor  # (3,) unit viewing ray through the mask's centroid
+
+    @staticmethod
+    def union(members: Regions, view: int, cameras: Cameras) -> _ViewMask:
+        parts = (members.view_index == view).nonzero()[:, 0].tolist()
+        boxes = members.boxes[parts]
+        x1, y1 = boxes[:, :2].amin(0).tolist()
+        x2, y2 = boxes[:, 2:].amax(0).tolist()
+        mask = torch.zeros(y2 - y1, x2 - x1, dtype=torch.bool, device=members.device)
+        for part, (a, b, c, d) in zip(parts, boxes.tolist(), strict=True):
+            mask[b - y1 : d - y1, a - x1 : c - x1] |= members.crop(part)
+        rows, columns = mask.nonzero().double().mean(0) + 0.5
+        ray = cameras.world_from_px[view] @ torch.stack((columns + x1, rows + y1, torch.ones_like(rows)))
+        ray = ray / torch.linalg.vector_norm(ray)
+        K = cameras.K[view]
+        px_from_world = K @ torch.cat((cameras.R[view], cameras.t[view, :, None]), 1)
+        return _ViewMask(mask, (x1, y1), px_from_world, float(K.diagonal()[:2].max()), cameras.centers[view], ray)
+
+    def contains(self, axes: list[Tensor]) -> Tensor:
+        """(X, Y, Z) bool: L of Eq. 6: is the point in front of the camera, and its pixel in the mask?"""
+        u, v, depth = self._project(axes, torch.float32)
+        height, width = self.mask.shape
+        # One free pixel around the crop receives everything that falls outside.
+        framed = torch.nn.functional.pad(self.mask, (1, 1, 1, 1)).flatten()
+        column = (u + 1).clamp(0, width + 1).long()
+        row = (v + 1).clamp(0, height + 1).long()
+        return framed[row * (width + 2) + column] & (depth > 0)
+
+    def may_meet(self, axes: list[Tensor], reach: float) -> Tensor:
+        """(X, Y, Z) bool: can the mask meet the projection of a ball of radius `reach` about the point?
+
+        The projection is replaced by a square of pixels that contains it, so the answer errs only towards yes.
+        """
+        u, v, depth = self._project(axes, torch.float64)
+        x, y, z = _open_grid([axis - center for axis, center in zip(axes, self.center, strict=True)])
+        # |u' - u| <= f reach sqrt(1 + (X/Z)^2) / (Z - reach), and distance / depth bounds the root.
+        slant = (x**2 + y**2 + z**2).sqrt() / depth.clamp(min=1e-12)
+        margin = reach * self.focal / (depth - reach).clamp(min=1e-12) * slant
+        height, width = self.mask.shape
+        integral = torch.nn.functional.pad(self.mask.int().cumsum(0).cumsum(1), (1, 0, 1, 0)).flatten()
+        x1, y1 = ((c - margin).floor().clamp(0, side).long() for c, side in ((u, width), (v, height)))
+        x2, y2 = (((c + margin).floor() + 1).clamp(0, side).long() for c, side in ((u, width), (v, height)))
+        top, bottom = y1 * (width + 1), y2 * (width + 1)
+        count = integral[bottom + x2] - integral[top + x2] - integral[bottom + x1] + integral[top + x1]
+        return ((count > 0) | (depth <= reach)) & (depth > -reach)
+
+    def _project(self, axes: list[Tensor], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
+        """Column and row relative to the crop, and depth, of each point; computed about the first one, so that float32
+        keeps a thousandth of a pixel however far the world's origin is."""
+        first = torch.stack([axis[0] for axis in axes])
+        offset = (self.px_from_world[:, :3] @ first + self.px_from_world[:, 3]).to(dtype)
+        x, y, z = _open_grid([(axis - axis[0]).to(dtype) for axis in axes])
+        rows = self.px_from_world.to(dtype)
+        u, v, depth = (row[0] * x + row[1] * y + (row[2] * z + start) for row, start in zip(rows, offset, strict=True))
+        scale = 1 / depth.clamp(min=1e-12)
+        return u * scale - self.corner[0], v * scale - self.corner[1], depth
+
+
+def _open_grid(axes: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
+    """Three 1-D axes as (X, 1, 1), (1, Y, 1) and (1, 1, Z)."""
+    return axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :]
+
+
+def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor]) -> Tensor:
+    """(X, Y, Z) float32: I_k (Eq. 6) on a grid, a slab at a time to bound the memory."""
+    slab = max(1, 2_000_000 // (len(axes[1]) * len(axes[2])))
+    parts = []
+    for planes in axes[0].split(slab):
+        part = [planes, axes[1], axes[2]]
+        votes = torch.zeros([len(axis) for axis in part], device=planes.device)
+        for mask in masks:
+            votes += mask.contains(part)
+        parts.append(votes / len(masks))
+    return torch.cat(parts)
+
+
+def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Tensor] | None:
+    """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
+
+    A box about the point nearest to all centroid rays is doubled until no cell at its border can hold such a point, then
+    shrunk to the cells that can, three times. Cells are judged by balls about them, so nothing is lost. None when no
+    cell can. Growth ends at twice the distance of the farthest camera: masks of nearly parallel views may have no
+    bounded common part, and then the box is cut there.
+    """
+    centers, rays = torch.stack([m.center for m in masks]), torch.stack([m.ray for m in masks])
+    across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
+    middle = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
+    distance = torch.linalg.vector_norm(centers - middle, dim=1)
+    sizes = torch.tensor([max(m.mask.shape) / m.focal for m in masks]).to(distance)
+    half = float((sizes * distance).max().clamp(min=1e-9))
+    limit = 2 * float(distance.max()) + half
+    low, high = middle - half, middle + half
+    while half < limit:
+        cells = _possible_cells(masks, low, high, threshold)
+        inner = cells[1:-1, 1:-1, 1:-1]
+        if cells.sum() == inner.sum():
+            break
+        half = min(2 * half, limit)
+        low, high = middle - half, middle + half
+    for _ in range(3):
+        place = _possible_cells(masks, low, high, threshold).nonzero()
+        if not len(place):
+            return None
+        cell = (high - low) / SEARCH_CELLS
+        low, high = low + place.amin(0) * cell, low + (place.amax(0) + 1) * cell
+    return low, high
+
+
+def _possible_cells(masks: list[_ViewMask], low: Tensor, high: Tensor, threshold: float) -> Tensor:
+    """(S, S, S) bool: cells of the box in which some point may exceed the threshold."""
+    cell = (high - low) / SEARCH_CELLS
+    axes = [low[a] + (torch.arange(SEARCH_CELLS).to(low) + 0.5) * cell[a] for a in range(3)]
+    reach = float(torch.linalg.vector_norm(cell)) / 2
+    votes = torch.stack([mask.may_meet(axes, reach) for mask in masks]).sum(0)
+    return votes > threshold * len(masks) + 1e-6

@@ -1,0 +1,209 @@
+"""The result of one scene, and its folder: written whole or not at all, read back for evaluation.
+
+Numbers in files are instance ids plus one, because 0 means "nothing" in a label image: label 3, `leaf_003.ply`, row 3
+of `traits.csv` and `"instance_id": 3` in `instances.json` are one leaf. There, a region matched to nothing has -1.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import tempfile
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from pycocotools import mask as coco_mask
+from torch import Tensor
+from tqdm import tqdm
+
+from mvseg.errors import InputError
+from mvseg.formats.coco import encode_mask, write_coco
+from mvseg.formats.label_png import read_label_png, write_label_png, write_png
+from mvseg.formats.lens import distort
+from mvseg.formats.mesh import write_glb, write_ply
+from mvseg.formats.photos import read_photo
+from mvseg.matching import Matching
+from mvseg.metrics import region_truth
+from mvseg.reconstruction import VoxelGrid
+from mvseg.regions import Regions
+from mvseg.report.overlay import draw_contact_sheet, draw_overlay, instance_color
+from mvseg.scene import Scene
+
+RUN_FILE = "run.json"
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Everything known about one scene.
+
+    Attributes:
+        scene: the scene.
+        regions: D masks, undistorted.
+        matching: their ids.
+        shapes: {instance id: voxels}; None when only ids were asked for.
+        seconds: {stage: wall time}.
+    """
+
+    scene: Scene
+    regions: Regions
+    matching: Matching
+    shapes: dict[int, VoxelGrid] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+
+
+def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False) -> None:
+    """Write a result folder; an earlier result at the same place is replaced.
+
+    The folder appears complete or not at all: it is written beside its place and moved there at the end.
+
+    Args:
+        result: the result.
+        out: the folder.
+        run: what goes to run.json, beside the timings and counts: version, config, inputs, warnings.
+        progress: show a progress bar over the views.
+
+    Raises:
+        InputError: the place cannot be written, holds something that is no result, or a photo is broken.
+    """
+    check_out(out)
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+    except OSError as error:
+        raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
+    try:
+        partial.chmod(0o755)
+        _write_images(result, partial, progress)
+        _write_instances(result, partial)
+        if result.shapes is not None:
+            _write_shapes(result, partial)
+        counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
+        seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
+        text = json.dumps(run | {"counts": counts, "seconds": seconds}, indent=1, default=str)
+        (partial / RUN_FILE).write_text(text + "\n", encoding="utf-8")
+        if out.exists():
+            shutil.rmtree(out)
+        partial.rename(out)
+    except OSError as error:
+        raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def check_out(out: Path) -> None:
+    """Raises InputError when `out` is a file, or a folder that holds something other than an earlier result."""
+    if out.is_dir():
+        if any(out.iterdir()) and not (out / RUN_FILE).is_file():
+            raise InputError(f"{out}: holds files that are no earlier result, expected a new or an empty folder")
+    elif out.exists() or any(parent.is_file() for parent in out.parents):
+        raise InputError(f"{out}: the output folder is not writable (a file is in its place)")
+
+
+def _write_images(result: Result, folder: Path, progress: bool) -> None:
+    scene, ids = result.scene, result.matching.instance_ids
+    overlays = []
+    views = list(enumerate(scene.views))
+    for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
+        width, height = scene.cameras.sizes[index].tolist()
+        labels = result.regions.label_map(index, ids + 1, width, height).cpu().numpy().astype(np.uint16)
+        labels = distort(labels, view.lens, scene.cameras.K[index].cpu().numpy())
+        write_label_png(folder / "labels" / f"{view.name}.png", labels)
+        photo = read_photo(scene, index) if view.path.exists() else np.full((height, width, 3), 40, np.uint8)
+        overlays.append(draw_overlay(photo, result.regions, ids, index))
+        overlay = folder / "overlay" / f"{view.name}.png"
+        overlay.parent.mkdir(parents=True, exist_ok=True)
+        write_png(overlay, overlays[-1])
+    write_png(folder / "contact.png", draw_contact_sheet(overlays, [view.name for view in scene.views]))
+
+
+def _write_instances(result: Result, folder: Path) -> None:
+    """instances.json: every region, in the frame of the photo the user took."""
+    scene, images, annotations = result.scene, [], []
+    ids, scores = result.matching.instance_ids.tolist(), result.matching.match_scores.tolist()
+    labels, views = result.regions.labels.tolist(), result.regions.view_index.tolist()
+    for index, view in enumerate(scene.views):
+        width, height = scene.cameras.sizes[index].tolist()
+        entry = {"id": index + 1, "file_name": view.path.name, "name": view.name, "width": width, "height": height}
+        images.append(entry)
+    for number, index in enumerate(views):
+        width, height = scene.cameras.sizes[index].tolist()
+        mask = result.regions.mask(number, width, height).cpu().numpy().astype(np.uint8)
+        annotations.append(
+            {
+                "image_id": index + 1,
+                "instance_id": ids[number] + 1 if ids[number] >= 0 else -1,
+                "match_score": round(scores[number], 4),
+                "source_label": labels[number],
+                "segmentation": encode_mask(distort(mask, scene.views[index].lens, scene.cameras.K[index].numpy())),
+            }
+        )
+    write_coco(folder / "instances.json", images, annotations)
+
+
+def _write_shapes(result: Result, folder: Path) -> None:
+    """leaves/*.ply, scene.glb and traits.csv."""
+    (folder / "leaves").mkdir()
+    meshes, colors, rows = {}, {}, []
+    ids, views = result.matching.instance_ids, result.regions.view_index
+    for instance in range(result.matching.num_instances):
+        row: dict[str, Any] = {"id": instance + 1, "views": len(views[ids == instance].unique())}
+        grid = (result.shapes or {}).get(instance)
+        if grid is not None and grid.volume > 0:
+            name = f"leaf_{instance + 1:03d}"
+            meshes[name], colors[name] = grid.mesh(), instance_color(instance)
+            write_ply(folder / "leaves" / f"{name}.ply", meshes[name], colors[name])
+            row |= _shape_traits(grid)
+        rows.append(row)
+    write_glb(folder / "scene.glb", meshes, colors)
+    columns = ["id", "views", "volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "unit"]
+    with (folder / "traits.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(row | {"unit": result.scene.unit} for row in rows)
+
+
+def _shape_traits(grid: VoxelGrid) -> dict[str, str]:
+    """Volume in cubed, corners of the bounding box in world units."""
+    points, half = grid.points, grid.voxel_size / 2
+    low, high = points.amin(0) - half, points.amax(0) + half
+    corners = [*zip(("x_min", "y_min", "z_min"), low.tolist(), strict=True)]
+    corners += [*zip(("x_max", "y_max", "z_max"), high.tolist(), strict=True)]
+    return {"volume": f"{grid.volume:.6g}"} | {name: f"{value:.6g}" for name, value in corners}
+
+
+def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
+    """Estimated and true instance ids of the regions of a result.
+
+    Args:
+        folder: a result folder.
+        truth: a folder of label PNGs, one per view, the same number for the same instance in every view.
+
+    Returns:
+        (D,) int64 ids as in instances.json (-1 = matched to nothing) and (D,) int64 true labels: 0 for a region that
+        mostly covers no instance, 65535 for one that is mostly ignored.
+
+    Raises:
+        InputError: the result or the truth is missing or broken.
+    """
+    path = folder / "instances.json"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+        images = {image["id"]: image for image in content["images"]}
+        found = [(images[one["image_id"]], one) for one in content["annotations"]]
+        ids = torch.tensor([int(one["instance_id"]) for _, one in found], dtype=torch.int64)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}), expected a result folder") from None
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: not the instances of a result ({type(error).__name__}: {error})") from None
+    if not truth.is_dir():
+        raise InputError(f"{truth}: no such folder of true labels")
+    labels = {
+        number: read_label_png(truth / f"{image['name']}.png", image["width"], image["height"])
+        for number, image in images.items()
+    }
+    true = [region_truth(labels[image["id"]], coco_mask.decode(one["segmentation"])) for image, one in found]
+    return ids, torch.tensor(true, dtype=torch.int64)
