@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -41,26 +41,27 @@ class Proposals:
 
 
 class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
-    """Wraps any torchvision Mask R-CNN; same modules, same state dict, and ids across views when it is told the cameras.
+    """Wraps any torchvision Mask R-CNN; same modules, same state dict, and ids across views when told the cameras.
 
     In train mode, and in eval mode without cameras, it is the detector it wraps. With cameras, in eval mode:
 
-    1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper: 0.7):
-       an excessive set of masks.
-    2. Match first: those that the detector itself would have kept (its own NMS threshold) are matched across views.
+    1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper:
+       0.7): an excessive set of masks.
+    2. Match first: what plain NMS at `cluster_iou` leaves of it is matched across views, which also tells |k|.
     3. Alternate `num_iterations` times: every mask of the excessive set takes the cluster whose epipolar map it
        resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each cluster; match the survivors
-       again.
+       again, with the same |k|.
 
-    Departure from the paper: it matches the excessive set itself at first. Its duplicates inflate the number of masks
-    per view, from which the search range of |k| follows, so here the first match takes the detector's own set.
+    Departures from the paper: it matches the excessive set itself at first, and estimates |k| anew each time. The
+    duplicates in these sets inflate the number of masks per view, from which the search range of |k| follows; that
+    splits leaves, and the pieces then shelter duplicates from NMS (benchmarks/nms_recall.py).
 
     Args:
         detector: a torchvision Mask R-CNN (any builder, any backbone, or `MaskRCNN` itself). Its modules are shared,
             not copied.
         num_iterations: of assignment and NMS; 0 only matches what the detector finds.
         proposal_iou: NMS threshold of the excessive set.
-        cluster_iou: NMS threshold inside a cluster.
+        cluster_iou: NMS threshold inside a cluster, and of the set that is matched first.
         proposals_per_view: size of the excessive set; the best scores stay.
         match: how regions are matched.
 
@@ -116,28 +117,16 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             cameras = cameras.to(images[0].device)
             found = [self._propose(image) for image in images]
             proposals = gather_proposals(found, sizes)
-            keep, matching = self.alternate(proposals, cameras)
+            keep, matching = match_proposals(
+                proposals,
+                cameras,
+                num_iterations=self.num_iterations,
+                cluster_iou=self.cluster_iou,
+                detections_per_view=self.roi_heads.detections_per_img,
+                assignment=self.assignment,
+                match=self.match,
+            )
             return self._collect(found, sizes, proposals.regions.view_index, keep, matching)
-
-    def alternate(self, proposals: Proposals, cameras: Cameras) -> tuple[Tensor, Matching]:
-        """Match first, then alternate assignment and NMS (steps 2 and 3 above).
-
-        Args:
-            proposals: the excessive set of all V views.
-            cameras: V cameras on the same device.
-
-        Returns:
-            (S,) int64 indices of the proposals kept, best score first, and their matching.
-        """
-        per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
-        keep = self._suppress(proposals, per_class, self.roi_heads.nms_thresh)
-        matching = self._match(proposals, keep, cameras)
-        for _ in range(self.num_iterations):
-            regions = proposals.regions.select(keep)
-            clusters, _ = self.assignment(proposals.regions, regions, matching.instance_ids, cameras)
-            keep = self._suppress(proposals, torch.cat((per_class, clusters[:, None]), 1), self.cluster_iou)
-            matching = self._match(proposals, keep, cameras)
-        return keep, matching
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
         """One view's excessive set: torchvision's own heads with a larger NMS threshold; in the transform's frame."""
@@ -151,27 +140,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         (found,), _ = lenient(features, boxes, resized.image_sizes)
         height, width = resized.image_sizes[0]
         return found | {"frame": torch.tensor([width, height])}
-
-    def _suppress(self, proposals: Proposals, groups: Tensor, iou_threshold: float) -> Tensor:
-        """NMS by group, then the detector's own limit of detections per view."""
-        keep = cluster_aware_nms(proposals.boxes, proposals.scores, groups, iou_threshold)
-        view = proposals.regions.view_index[keep]
-        earlier = (view[:, None] == view).tril(-1).sum(1)
-        return keep[earlier < self.roi_heads.detections_per_img]
-
-    def _match(self, proposals: Proposals, keep: Tensor, cameras: Cameras) -> Matching:
-        """Match the kept proposals class by class; instances of different classes get different ids."""
-        regions, classes = proposals.regions.select(keep), proposals.classes[keep]
-        ids = torch.full_like(classes, -1)
-        scores = torch.zeros_like(proposals.scores[keep])
-        num_instances = 0
-        for one_class in classes.unique().tolist():
-            members = classes == one_class
-            matching = match_regions(regions.select(members), cameras, self.match)
-            ids[members] = torch.where(matching.instance_ids >= 0, matching.instance_ids + num_instances, -1)
-            scores[members] = matching.match_scores
-            num_instances += matching.num_instances
-        return Matching(ids, scores, num_instances)
 
     def _collect(
         self,
@@ -194,6 +162,74 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             results.append(result)
             start += len(one["boxes"])
         return results
+
+
+def match_proposals(
+    proposals: Proposals,
+    cameras: Cameras,
+    *,
+    num_iterations: int = 2,
+    cluster_iou: float = 0.3,
+    detections_per_view: int = 100,
+    assignment: EpipolarAssignment | None = None,
+    match: MatchConfig | None = None,
+) -> tuple[Tensor, Matching]:
+    """Match first, then alternate assignment and NMS (steps 2 and 3 of `MultiViewMaskRCNN`).
+
+    Args:
+        proposals: the excessive set of all V views.
+        cameras: V cameras on the same device.
+        num_iterations: of assignment and NMS.
+        cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
+        detections_per_view: the best scores stay.
+        assignment: None for a default one.
+        match: how regions are matched.
+
+    Returns:
+        (S,) int64 indices of the proposals kept, best score first, and their matching.
+    """
+    assignment = assignment or EpipolarAssignment()
+    per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
+    keep = _suppress(proposals, per_class, cluster_iou, detections_per_view)
+    matching, counts = _match_classes(proposals, keep, cameras, match, {})
+    for _ in range(num_iterations):
+        regions = proposals.regions.select(keep)
+        clusters, _ = assignment(proposals.regions, regions, matching.instance_ids, cameras)
+        groups = torch.cat((per_class, clusters[:, None]), 1)
+        keep = _suppress(proposals, groups, cluster_iou, detections_per_view)
+        matching, _ = _match_classes(proposals, keep, cameras, match, counts)
+    return keep, matching
+
+
+def _suppress(proposals: Proposals, groups: Tensor, iou_threshold: float, detections_per_view: int) -> Tensor:
+    """NMS by group, then the limit of detections per view, as torchvision has it."""
+    keep = cluster_aware_nms(proposals.boxes, proposals.scores, groups, iou_threshold)
+    view = proposals.regions.view_index[keep]
+    earlier = (view[:, None] == view).tril(-1).sum(1)
+    return keep[earlier < detections_per_view]
+
+
+def _match_classes(
+    proposals: Proposals, keep: Tensor, cameras: Cameras, match: MatchConfig | None, counts: dict[int, int]
+) -> tuple[Matching, dict[int, int]]:
+    """Match the kept proposals class by class; instances of different classes get different ids.
+
+    Returns the matching and {class: number of instances}; classes in `counts` get that number instead of a search.
+    """
+    regions, classes = proposals.regions.select(keep), proposals.classes[keep]
+    ids = torch.full_like(classes, -1)
+    scores = torch.zeros_like(proposals.scores[keep])
+    found: dict[int, int] = {}
+    for one_class in classes.unique().tolist():
+        members = classes == one_class
+        config = match or MatchConfig()
+        if counts.get(one_class):
+            config = replace(config, num_instances=counts[one_class])
+        matching = match_regions(regions.select(members), cameras, config)
+        ids[members] = torch.where(matching.instance_ids >= 0, matching.instance_ids + sum(found.values()), -1)
+        scores[members] = matching.match_scores
+        found[one_class] = matching.num_instances
+    return Matching(ids, scores, sum(found.values())), found
 
 
 def gather_proposals(found: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:

@@ -1,4 +1,4 @@
-"""Simulated scenes on disk: cameras around plants, scenes as mvseg reads them, and whole data sets.
+"""Simulated scenes on disk, as mvseg reads them, and whole data sets.
 
 A scene folder holds
 
@@ -17,10 +17,10 @@ from __future__ import annotations
 import csv
 import io
 import json
-import math
 import multiprocessing
 import os
 import shutil
+import threading
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, fields
 from functools import partial
@@ -29,7 +29,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-import torch
 import trimesh
 from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
@@ -37,76 +36,11 @@ from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.scene import Cameras
+from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.plants import FAMILIES, Plant, grow_plant
 from mvseg.simulation.render import build_stage, render_stage
 
 JPEG_QUALITY = 90
-FRAME_FILL = 0.94  # of the half image that the farthest point of the plant may reach
-DISTANCE = 3.5  # of the cameras from the plant's centre, in radii of the plant
-
-
-def arc_cameras(
-    num_views: int,
-    plant: Plant,
-    *,
-    span_deg: float = 200.0,
-    start_deg: float = 0.0,
-    elevations_deg: tuple[float, ...] = (20.0, 50.0),
-    width: int = 480,
-    height: int = 480,
-) -> Cameras:
-    """Cameras on an arc around a plant, all looking at its centre, with one focal length that fills the frame.
-
-    Args:
-        num_views: >= 1, evenly spread over the arc.
-        plant: its leaves and stems are inside every image; pot, soil and ground may not be.
-        span_deg: azimuth from the first to the last camera, above 0; 360 is a full ring without a doubled camera.
-        start_deg: azimuth of the first camera.
-        elevations_deg: above the horizon, taken in turn by the views; above -90 and below 90.
-        width, height: pixels.
-
-    Returns:
-        V = num_views cameras in the plant's world units.
-
-    Raises:
-        InputError: a number out of its range.
-    """
-    if num_views < 1:
-        raise InputError(f"{num_views} views asked for, expected at least 1")
-    if not 0 < span_deg <= 360:
-        raise InputError(f"the arc spans {span_deg:g} degrees, expected more than 0 and at most 360")
-    if not elevations_deg or max(abs(angle) for angle in elevations_deg) >= 90:
-        raise InputError("the elevations must be one or more numbers between -90 and 90 degrees")
-    points = np.concatenate(
-        [leaf.vertices for leaf in plant.leaves]
-        + [part.vertices for part in plant.parts if part.material == "stem"]
-    )
-    center = (points.min(0) + points.max(0)) / 2
-    distance = DISTANCE * float(np.linalg.norm(points - center, axis=1).max())
-    gaps = max(num_views - 1, 1) if span_deg < 360 else num_views
-    azimuths = np.radians(start_deg + span_deg * np.arange(num_views) / gaps)
-    elevations = np.radians(np.resize(elevations_deg, num_views))
-    rotations = np.stack([look_at(a, e) for a, e in zip(azimuths, elevations, strict=True)])
-    translations = np.array([0.0, 0.0, distance]) - rotations @ center
-    cam = np.einsum("vij,pj->vpi", rotations, points) + translations[:, None]
-    slope = np.abs(cam[..., :2] / cam[..., 2:]).max((0, 1))
-    focal = FRAME_FILL * min(width / 2 / slope[0], height / 2 / slope[1])
-    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
-    return Cameras(
-        K=torch.from_numpy(np.repeat(K[None], num_views, 0)),
-        R=torch.from_numpy(rotations),
-        t=torch.from_numpy(translations),
-        sizes=torch.tensor([[width, height]] * num_views),
-    )
-
-
-def look_at(azimuth: float, elevation: float) -> NDArray[np.float64]:
-    """(3, 3) rotation of cam_from_world of an upright camera that looks at the origin from these angles (radians)."""
-    outwards = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
-    )
-    right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
-    return np.stack([right, np.cross(-outwards, right), -outwards])
 
 
 # --- one scene
@@ -319,8 +253,25 @@ def run_all(work: partial[list[Photo]], scenes: list[SceneSpec], num_workers: in
     if num_workers == 1:
         yield from map(work, scenes)
         return
-    with multiprocessing.get_context("spawn").Pool(num_workers, cv2.setNumThreads, (1,)) as pool:
+    with multiprocessing.get_context("spawn").Pool(num_workers, start_worker) as pool:
         yield from pool.imap(work, scenes)
+
+
+def start_worker() -> None:
+    """Prepare a process of the pool: OpenCV on one thread, and an end as soon as the parent is gone.
+
+    A worker that outlives a killed parent would go on with the scenes in its queue and get in the way of the next run.
+    """
+    cv2.setNumThreads(1)
+    threading.Thread(target=end_with_parent, daemon=True).start()
+
+
+def end_with_parent() -> None:
+    """Wait until the parent process is gone, then end this one at once."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def finish_scene(dataset: Path, preset: Preset, scene: SceneSpec) -> list[Photo]:

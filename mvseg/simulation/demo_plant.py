@@ -8,12 +8,13 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from mvseg.simulation.dataset import arc_cameras, write_scene
+from mvseg.simulation.cameras import arc_cameras
+from mvseg.simulation.dataset import write_scene
 from mvseg.simulation.plants import grow_plant
 
 NUM_LEAVES = 12
 NUM_VIEWS = 9
-SEED = 7
+SEED = 6
 
 
 def write_demo_plant(folder: Path) -> None:

@@ -1,0 +1,74 @@
+"""Region proposals as a detector makes them, from true masks: jittered boxes and masks, with duplicates."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvseg.multiview import Proposals
+from mvseg.regions import regions_from_label_maps, stack_regions
+
+
+def simulate_proposals(
+    label_maps: Sequence[np.ndarray], *, seed: int, copies: int = 5, jitter: float = 0.08
+) -> tuple[Proposals, Tensor]:
+    """Several proposals of every visible instance.
+
+    Each copy is the true mask, scaled and shifted so that the edges of its box move by a normal error of `jitter` of
+    the box's side, and eroded or dilated by up to two pixels. Scores fall with the error, and small regions score less,
+    as half-hidden leaves do.
+
+    Args:
+        label_maps: V integer arrays (H, W), 0 = nothing, every other number one instance of the view.
+        seed: of everything that is random.
+        copies: proposals of each instance.
+        jitter: standard deviation of each edge, as a share of the side of the box.
+
+    Returns:
+        The proposals, and (R,) int64, the label each was made from.
+    """
+    rng = np.random.default_rng(seed)
+    truth = regions_from_label_maps(label_maps)
+    view_index: list[int] = []
+    boxes: list[tuple[int, int, int, int]] = []
+    crops: list[Tensor] = []
+    scores, labels = [], []
+    areas = truth.areas.tolist()
+    for index, view in enumerate(truth.view_index.tolist()):
+        height, width = label_maps[view].shape
+        mask = truth.mask(index, width, height).numpy()
+        prominence = min(1.0, (areas[index] / (0.01 * width * height)) ** 0.5)
+        for _ in range(copies):
+            error = rng.normal(0, jitter, 4)
+            moved = _move_mask(mask, truth.boxes[index].numpy(), error, int(rng.integers(-2, 3)))
+            if not moved.any():
+                continue
+            rows, columns = np.nonzero(moved.any(1))[0], np.nonzero(moved.any(0))[0]
+            x1, y1, x2, y2 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+            view_index.append(view)
+            boxes.append((x1, y1, x2, y2))
+            crops.append(torch.from_numpy(moved[y1:y2, x1:x2].copy()).flatten())
+            quality = float(np.exp(-np.square(error).sum() / (4 * jitter**2)))
+            scores.append(0.2 + 0.4 * prominence + 0.3 * quality + 0.1 * rng.random())
+            labels.append(int(truth.labels[index]))
+    regions = stack_regions(view_index, boxes, crops, labels, len(label_maps))
+    classes = torch.ones(len(regions), dtype=torch.int64)
+    return Proposals(regions, regions.boxes.float(), torch.tensor(scores), classes), regions.labels
+
+
+def _move_mask(mask: np.ndarray, box: np.ndarray, error: np.ndarray, grow: int) -> np.ndarray:
+    """(H, W) bool: the mask stretched so that its box's edges move by `error` times the box's sides, then grown."""
+    x1, y1, x2, y2 = box.astype(float)
+    width, height = x2 - x1, y2 - y1
+    left, top, right, bottom = error * np.array([width, height, width, height])
+    scale_x = max(0.2, (width + right - left) / width)
+    scale_y = max(0.2, (height + bottom - top) / height)
+    there_from_here = np.array([[scale_x, 0, x1 + left - scale_x * x1], [0, scale_y, y1 + top - scale_y * y1]])
+    moved = cv2.warpAffine(mask.astype(np.uint8), there_from_here, mask.shape[::-1], flags=cv2.INTER_NEAREST)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(grow) + 1,) * 2)
+    moved = cv2.dilate(moved, kernel) if grow > 0 else cv2.erode(moved, kernel)
+    return np.asarray(moved) > 0

@@ -1,0 +1,53 @@
+"""Fixtures that many tests share: the shipped scene, real plants, and analytic scenes with exact answers."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+import torch
+
+from mvseg.cli import DEMO_SCENE
+from mvseg.formats.folder import load_masks, load_scene
+from mvseg.formats.label_png import read_label_png
+from mvseg.metrics import region_truth
+from mvseg.regions import Regions
+from mvseg.scene import Scene
+
+ROOT = Path(__file__).parent.parent
+torch.set_num_threads(1)  # deterministic sums, and no spinning beside other tests
+
+
+@pytest.fixture(scope="session")
+def demo_scene() -> Scene:
+    return load_scene(DEMO_SCENE)
+
+
+@pytest.fixture(scope="session")
+def demo_regions(demo_scene: Scene) -> Regions:
+    return load_masks(demo_scene, DEMO_SCENE / "masks")
+
+
+@pytest.fixture(scope="session")
+def demo_truth(demo_scene: Scene, demo_regions: Regions) -> torch.Tensor:
+    """(D,) true leaf of each region of the shipped scene."""
+    return true_ids(demo_scene, demo_regions, DEMO_SCENE / "truth")
+
+
+def true_ids(scene: Scene, regions: Regions, truth: Path) -> torch.Tensor:
+    ids = []
+    for index, view in enumerate(regions.view_index.tolist()):
+        width, height = scene.cameras.sizes[view].tolist()
+        labels = read_label_png(truth / f"{scene.views[view].name}.png", width, height)
+        ids.append(region_truth(labels, regions.mask(index, width, height).numpy()))
+    return torch.tensor(ids)
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of real plants, which do not ship with mvseg."""
+    folder = Path(os.environ.get("MVSEG_SHARED_DATA", ROOT.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"the real plants are not here ({folder}); set MVSEG_SHARED_DATA to their folder")
+    return folder

@@ -1,0 +1,142 @@
+"""The executable paper: the slow twin of every fast path, written as the paper says it, with lines drawn by OpenCV."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+
+def fundamental_reference(cameras: Cameras, i: int, j: int) -> np.ndarray:
+    """F_ji with x_j^T F_ji x_i = 0, from the relative pose."""
+    j_from_i = cameras.R[j] @ cameras.R[i].T
+    shift = (cameras.t[j] - j_from_i @ cameras.t[i]).tolist()
+    cross = np.array([[0, -shift[2], shift[1]], [shift[2], 0, -shift[0]], [-shift[1], shift[0], 0]])
+    K_i, K_j = cameras.K[i].numpy(), cameras.K[j].numpy()
+    return np.linalg.inv(K_j).T @ cross @ j_from_i.numpy() @ np.linalg.inv(K_i)
+
+
+def draw_line_reference(line: np.ndarray, width: int, height: int) -> np.ndarray:
+    """(height, width) bool: one epipolar line a u + b v + c = 0, drawn two pixels thick over the whole image."""
+    a, b, c = line
+    canvas = np.zeros((height, width), np.uint8)
+    if abs(b) > abs(a):
+        ends = [(u, -(c + a * u) / b) for u in (0.0, float(width))]
+    else:
+        ends = [(-(c + b * v) / a, v) for v in (0.0, float(height))]
+    if max(abs(x) for end in ends for x in end) > 1e6:  # the line passes far outside the image
+        return canvas > 0
+    first, second = [(round((u - 0.5) * 256), round((v - 0.5) * 256)) for u, v in ends]
+    cv2.line(canvas, first, second, 1, thickness=2, shift=8)
+    return canvas > 0
+
+
+def draw_points_reference(regions: Regions, index: int, num_points: int, generator: np.random.Generator) -> np.ndarray:
+    """(num_points, 2) random pixel centres of one region."""
+    pixels = regions.crop(index).nonzero().numpy()[:, ::-1] + 0.5 + regions.boxes[index, :2].numpy()
+    return pixels[generator.integers(len(pixels), size=num_points)]
+
+
+def affinity_reference(
+    regions: Regions, cameras: Cameras, num_points: int = 200, seed: int = 0, senders: list[int] | None = None
+) -> Tensor:
+    """(D, D) directed weights of Eq. 3: w[n, m] of the band of n and the region m; 0 within a view.
+
+    Every line is drawn two pixels thick, and counted against the full-frame mask of every region.
+    """
+    generator = np.random.default_rng(seed)
+    sizes = cameras.sizes.tolist()
+    masks = [regions.mask(m, *sizes[int(regions.view_index[m])]).numpy() for m in range(len(regions))]
+    weights = torch.zeros(len(regions), len(regions))
+    for n in range(len(regions)) if senders is None else senders:
+        i = int(regions.view_index[n])
+        points = draw_points_reference(regions, n, num_points, generator)
+        homogeneous = np.concatenate([points, np.ones((num_points, 1))], 1)
+        for j in range(len(cameras)):
+            if j == i:
+                continue
+            targets = [m for m in range(len(regions)) if int(regions.view_index[m]) == j]
+            band = np.zeros(sizes[j][::-1], bool)
+            passing = dict.fromkeys(targets, 0)
+            for line in homogeneous @ fundamental_reference(cameras, i, j).T:
+                drawn = draw_line_reference(line, *sizes[j])
+                band |= drawn
+                for m in targets:
+                    passing[m] += int(drawn[masks[m]].any())
+            for m in targets:
+                weights[n, m] = (band & masks[m]).sum() / masks[m].sum() * passing[m] / num_points
+    return weights
+
+
+def epipolar_map_reference(members: Regions, cameras: Cameras, view: int) -> np.ndarray:
+    """(H, W) Eq. 4: the mean of the bands of the members in other views, from all of their pixels."""
+    width, height = cameras.sizes[view].tolist()
+    total, count = np.zeros((height, width)), 0
+    for n in range(len(members)):
+        i = int(members.view_index[n])
+        if i == view:
+            continue
+        pixels = members.crop(n).nonzero().numpy()[:, ::-1] + 0.5 + members.boxes[n, :2].numpy()
+        band = np.zeros((height, width), bool)
+        for line in np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ fundamental_reference(cameras, i, view).T:
+            band |= draw_line_reference(line, width, height)
+        total += band
+        count += 1
+    return total / max(count, 1)
+
+
+def ruzicka_reference(first: np.ndarray, second: np.ndarray) -> float:
+    """Eq. 5 of two maps."""
+    return float(np.minimum(first, second).sum() / max(np.maximum(first, second).sum(), 1e-12))
+
+
+def factorise_reference(W: np.ndarray, H: np.ndarray, num_iterations: int) -> np.ndarray:
+    """SymNMF from a start H (D, k): the multiplicative update, element by element."""
+    for _ in range(num_iterations):
+        above, below = W @ H, H @ (H.T @ H)
+        H = np.array(
+            [
+                [H[n, c] * (0.5 + 0.5 * above[n, c] / max(below[n, c], 1e-12)) for c in range(H.shape[1])]
+                for n in range(H.shape[0])
+            ]
+        )
+    return H
+
+
+def cluster_aware_nms_reference(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float) -> list[int]:
+    """Greedy suppression, one pair at a time; pairs of different groups are left alone."""
+    kept: list[int] = []
+    for candidate in scores.argsort(descending=True, stable=True).tolist():
+        for winner in kept:
+            if (groups[winner] != groups[candidate]).any():
+                continue
+            x1, y1 = torch.maximum(boxes[winner, :2], boxes[candidate, :2]).tolist()
+            x2, y2 = torch.minimum(boxes[winner, 2:], boxes[candidate, 2:]).tolist()
+            common = max(0.0, x2 - x1) * max(0.0, y2 - y1)
+            areas = [float((box[2] - box[0]) * (box[3] - box[1])) for box in (boxes[winner], boxes[candidate])]
+            if common / (sum(areas) - common) > iou_threshold:
+                break
+        else:
+            kept.append(candidate)
+    return kept
+
+
+def back_project_reference(members: Regions, cameras: Cameras, points: Tensor) -> Tensor:
+    """(P,) Eq. 6 at world points: share of the views in which some mask of the instance contains the point."""
+    pixels, depth = cameras.project(points)
+    votes = torch.zeros(len(points))
+    views = members.view_index.unique().tolist()
+    for view in views:
+        width, height = cameras.sizes[view].tolist()
+        seen = torch.zeros(len(points), dtype=torch.bool)
+        for n in (members.view_index == view).nonzero()[:, 0].tolist():
+            mask = members.mask(n, width, height)
+            for p, (u, v) in enumerate(pixels[view].tolist()):
+                if depth[view, p] > 0 and 0 <= u < width and 0 <= v < height:
+                    seen[p] |= mask[int(v), int(u)]
+        votes += seen
+    return votes / len(views)

@@ -1,0 +1,102 @@
+"""Leaf blades: sizes against formulas, and laws of bending, scaling and turning."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from mvseg.simulation.blades import (
+    BLADE_COLUMNS,
+    Blade,
+    Leaf,
+    arc_points,
+    blade_faces,
+    blade_stations,
+    blade_uv,
+    half_widths,
+    measure_leaf,
+    place_blade,
+)
+
+FLAT = Blade(length=70.0, width=40.0, outline=(0.6, 0.9))
+BENT = dataclasses.replace(FLAT, droop=1.2, sweep=-0.3, twist=0.5, roll=0.2, fold=0.3, curl=-0.8)
+
+
+def make_leaf(blade: Blade, azimuth: float = 0.4, elevation: float = 0.0) -> Leaf:
+    vertices = place_blade(blade, np.array([3.0, -2.0, 50.0]), azimuth, elevation)
+    return measure_leaf(1, vertices, blade_faces(blade.rows), blade_uv(blade.rows))
+
+
+def test_flat_blade_has_the_area_of_its_outline() -> None:
+    u, half = blade_stations(FLAT.rows) * FLAT.length, np.concatenate([[0], half_widths(FLAT), [0]])
+    trapezoids = float(np.sum((half[1:] + half[:-1]) * np.diff(u)))
+    leaf = make_leaf(FLAT)
+    assert leaf.area == pytest.approx(trapezoids, rel=1e-12)
+    assert leaf.length == pytest.approx(70, rel=1e-12)
+    assert leaf.width == pytest.approx(40, rel=1e-12)
+
+
+def test_flat_blade_comes_close_to_the_integral_of_its_outline() -> None:
+    a, b = FLAT.outline
+    peak = (a / (a + b)) ** a * (b / (a + b)) ** b
+    beta = math.gamma(a + 1) * math.gamma(b + 1) / math.gamma(a + b + 2)
+    assert make_leaf(FLAT).area == pytest.approx(FLAT.length * FLAT.width * beta / peak, rel=0.01)
+
+
+def test_a_blade_of_constant_width_is_a_rectangle_but_for_its_ends() -> None:
+    blade = Blade(length=50.0, width=10.0, outline=(0.0, 0.0))
+    gap = blade_stations(blade.rows)[1] * 50
+    assert make_leaf(blade).area == pytest.approx(10 * (50 - gap), rel=1e-12)
+
+
+def test_upper_side_of_a_level_blade_looks_up() -> None:
+    leaf = make_leaf(FLAT)
+    corner = leaf.vertices[leaf.faces]
+    normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    assert np.allclose(leaf.vertices[:, 2], 50)
+    assert (normals[:, 2] > 0).all()
+    assert np.allclose(normals[:, :2], 0)
+
+
+@pytest.mark.parametrize("field", ["droop", "sweep", "twist", "roll", "fold", "curl"])
+def test_bending_changes_neither_length_nor_width(field: str) -> None:
+    leaf = make_leaf(dataclasses.replace(FLAT, **{field: 0.7}), elevation=0.5)
+    assert leaf.length == pytest.approx(70, rel=1e-12)
+    assert leaf.width == pytest.approx(40, rel=1e-12)
+
+
+def test_sizes_scale_with_the_blade() -> None:
+    one, two = make_leaf(BENT), make_leaf(dataclasses.replace(BENT, length=140.0, width=80.0))
+    assert two.length == pytest.approx(2 * one.length)
+    assert two.width == pytest.approx(2 * one.width)
+    assert two.area == pytest.approx(4 * one.area)
+
+
+def test_sizes_do_not_depend_on_the_direction() -> None:
+    sizes = [(leaf.length, leaf.width, leaf.area) for leaf in (make_leaf(BENT, a) for a in (0.0, 1.0, 4.0))]
+    assert np.allclose(sizes, sizes[0])
+
+
+def test_uv_follows_the_midrib_and_the_edge() -> None:
+    leaf = make_leaf(FLAT, azimuth=0.0)
+    assert np.allclose(leaf.vertices[:, 0] - 3, 70 * leaf.uv[:, 0])
+    half = np.repeat(half_widths(FLAT), BLADE_COLUMNS)
+    assert np.allclose(leaf.vertices[1:-1, 1] + 2, half * leaf.uv[1:-1, 1])
+
+
+def test_lobes_and_teeth_only_take_from_the_outline() -> None:
+    plain = Blade(length=70.0, width=40.0, outline=(0.5, 0.5), rows=44)
+    lobed = half_widths(dataclasses.replace(plain, lobes=(3, 0.6)))
+    assert lobed.max() == pytest.approx(20)
+    assert lobed.min() > 0
+    is_peak = (lobed[1:-1] > lobed[:-2]) & (lobed[1:-1] > lobed[2:])
+    assert is_peak.sum() >= 3
+
+
+def test_arc_has_the_lengths_of_its_steps() -> None:
+    steps = np.array([1.0, 2.0, 0.5])
+    points = arc_points(np.zeros(3), 0.3, 1.0, steps, 0.8, -0.4)
+    assert np.allclose(np.linalg.norm(np.diff(points, axis=0), axis=1), steps)

@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+from sklearn.metrics import adjusted_rand_score
+
+from mvseg.config import MatchConfig
+from mvseg.errors import InputError, InputWarning
+from mvseg.matching import match_regions
+from mvseg.metrics import matching_metrics
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Scene
+from synthetic import ball_scene, cameras_at, permute_views, render_balls
+
+
+def test_shipped_scene_is_solved(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
+    matching = match_regions(demo_regions, demo_scene.cameras)
+    metrics = matching_metrics(matching.instance_ids, demo_truth)
+    assert (metrics.s_match, metrics.e_k, metrics.ari) == (1.0, 0, 1.0)
+    assert matching.num_instances == 12
+    assert matching.match_scores.min() > 0.3
+    assert matching.match_scores.max() <= 1
+
+
+def test_the_papers_random_points_solve_it_too(
+    demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
+) -> None:
+    matching = match_regions(demo_regions, demo_scene.cameras, MatchConfig(num_points=200, seed=3))
+    assert matching_metrics(matching.instance_ids, demo_truth).ari > 0.95
+
+
+def test_same_seed_same_answer_and_any_order_of_views() -> None:
+    scene = ball_scene(5, 6, seed=2)
+    first, second = (match_regions(scene.regions, scene.cameras) for _ in range(2))
+    assert torch.equal(first.instance_ids, second.instance_ids)
+    turned = permute_views(scene, [3, 1, 5, 4, 0, 2])
+    found = match_regions(turned.regions, turned.cameras)
+    assert adjusted_rand_score(scene.regions.labels, first.instance_ids) == 1
+    assert adjusted_rand_score(turned.regions.labels, found.instance_ids) == 1
+
+
+def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
+    from mvseg.affinity import region_affinity
+
+    scene = ball_scene(5, 4, seed=2)
+    matching = match_regions(scene.regions, scene.cameras)
+    W = region_affinity(scene.regions, scene.cameras).to_dense()
+    for n in range(len(scene.regions)):
+        partners = [
+            m
+            for m in range(len(scene.regions))
+            if matching.instance_ids[m] == matching.instance_ids[n]
+            and scene.regions.view_index[m] != scene.regions.view_index[n]
+        ]
+        expected = sum(float(W[n, m]) for m in partners) / max(len(partners), 1)
+        assert float(matching.match_scores[n]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_single_view_is_refused() -> None:
+    scene = ball_scene(2, 3)
+    one = Regions(
+        *(getattr(scene.regions.select(scene.regions.view_index == 0), f) for f in ("view_index", "boxes", "crops")),
+        1,
+        torch.tensor([1, 2]),
+    )
+    with pytest.raises(InputError, match="single"):
+        match_regions(one, scene.cameras[:1])
+    with pytest.raises(InputError, match="3 views with 2 cameras"):
+        match_regions(scene.regions, scene.cameras[:2])
+
+
+def test_empty_masks_are_data() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [0.0, 10, 0]]))
+    nothing = regions_from_label_maps([torch.zeros(240, 320).numpy().astype(int)] * 2)
+    with pytest.warns(InputWarning, match="empty"):
+        matching = match_regions(nothing, cameras)
+    assert matching.num_instances == 0
+    assert matching.instance_ids.shape == (0,)
+
+
+def test_two_cameras_at_one_place_are_warned_of() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
+    centers, radii = torch.tensor([[0.0, 1, 0], [0.0, -1, 1]]).double(), torch.tensor([0.5, 0.5]).double()
+    regions = regions_from_label_maps(render_balls(cameras, centers, radii))
+    with pytest.warns(InputWarning, match="views 0 and 1 were taken from one place"):
+        matching = match_regions(regions, cameras)
+    assert adjusted_rand_score(regions.labels, matching.instance_ids) == 1
+
+
+def test_all_cameras_at_one_place_match_nothing() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0]]))
+    regions = regions_from_label_maps(
+        render_balls(cameras, torch.tensor([[0.0, 0, 0]]).double(), torch.tensor([0.5]).double())
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        assert match_regions(regions, cameras).instance_ids.tolist() == [-1, -1]

@@ -1,0 +1,181 @@
+"""Eq. 6 against points projected one by one, and against solids of known volume."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.config import ReconstructConfig
+from mvseg.errors import InputError
+from mvseg.reconstruction import back_project, reconstruct_instances
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Cameras
+from reference import back_project_reference
+from synthetic import ball_scene, cameras_at, moved, render_balls
+
+FAR = 1000.0  # cameras so far away that they see in parallel
+
+
+def ball_from(directions: list[list[float]], *, focal: float = 80_000.0) -> tuple[Regions, Cameras]:
+    """A ball of radius 1 at the origin, seen in parallel along the given directions."""
+    cameras = cameras_at(FAR * torch.tensor(directions), focal=focal, width=320, height=320)
+    maps = render_balls(cameras, torch.zeros(1, 3).double(), torch.ones(1).double())
+    return regions_from_label_maps(maps), cameras
+
+
+AXES = [[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0]]
+
+
+@pytest.mark.parametrize(
+    ("num_views", "volume"),
+    [(2, 16 / 3), (3, 8 * (2 - math.sqrt(2)))],  # Steinmetz's solids: what two and three cylinders have in common
+)
+def test_volume_of_what_cylinders_have_in_common(num_views: int, volume: float) -> None:
+    regions, cameras = ball_from(AXES[:num_views])
+    errors = []
+    for size in (0.2, 0.1, 0.05, 0.025):
+        grid = back_project(regions, cameras, ReconstructConfig(threshold=0.9, voxel_size=size))
+        assert grid is not None
+        errors.append(abs(grid.volume - volume) / volume)
+    assert errors[-1] < 0.01
+    assert errors[-1] < errors[0]
+    fine = back_project(regions, cameras, ReconstructConfig(threshold=0.9, voxel_size=0.05))
+    assert fine is not None
+    mesh = fine.mesh()
+    assert mesh.is_watertight
+    assert mesh.volume == pytest.approx(volume, rel=0.03)
+    np.testing.assert_allclose(mesh.bounds, [[-1, -1, -1], [1, 1, 1]], atol=0.06)
+
+
+def test_many_views_carve_the_ball_and_half_of_them_leave_more() -> None:
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(24, 3, generator=generator), dim=1)
+    regions, cameras = ball_from(directions.tolist())
+    ball = 4 / 3 * math.pi
+    strict = back_project(regions, cameras, ReconstructConfig(threshold=0.97, voxel_size=0.04))
+    half = back_project(regions, cameras, ReconstructConfig(threshold=0.5, voxel_size=0.04))
+    assert strict is not None
+    assert half is not None
+    assert strict.volume == pytest.approx(ball, rel=0.12)
+    assert strict.volume > 0.98 * ball  # a hull never loses what all see
+    assert half.volume > 1.3 * strict.volume  # the paper's 0.5 keeps what half of the views see
+
+
+def test_votes_agree_with_points_projected_one_by_one() -> None:
+    scene = ball_scene(3, 5, seed=2, focal=200.0, width=160, height=120)
+    members = scene.regions.select(scene.regions.labels == 2)
+    grid = back_project(members, scene.cameras, ReconstructConfig(voxel_budget=4000))
+    assert grid is not None
+    index = torch.cartesian_prod(*(torch.arange(side) for side in grid.votes.shape))
+    centers = grid.origin + grid.voxel_size * (index + 0.5)
+    expected = back_project_reference(members, scene.cameras, centers).reshape(grid.votes.shape)
+    assert ((grid.votes - expected).abs() > 1e-6).float().mean() < 0.002  # points on the edge of a pixel, in float32
+    assert torch.equal(grid.occupied, grid.votes > 0.5 + 1e-6)
+    torch.testing.assert_close(grid.points, centers[grid.occupied.flatten()])
+
+
+def test_the_box_holds_all_that_exceeds_the_threshold() -> None:
+    """The found box against a search of ten times its volume."""
+    scene = ball_scene(2, 6, seed=1, focal=200.0, width=160, height=120)
+    members = scene.regions.select(scene.regions.labels == 1)
+    grid = back_project(members, scene.cameras, ReconstructConfig(voxel_budget=3000))
+    assert grid is not None
+    generator = torch.Generator().manual_seed(0)
+    low, high = grid.origin, grid.origin + grid.voxel_size * torch.tensor(grid.votes.shape)
+    wide = (low + high) / 2 + (torch.rand(20_000, 3, generator=generator).double() - 0.5) * 2.2 * (high - low)
+    votes = back_project_reference(members, scene.cameras, wide)
+    inside = ((wide >= low) & (wide <= high)).all(1)
+    assert (votes[inside] > 0.5).any()
+    assert not (votes[~inside] > 0.5).any()
+
+
+def test_thin_leaves_are_not_lost_by_the_search() -> None:
+    """A blade of 0.02 thickness beside a box of 2: a tenth of a search cell."""
+    regions, cameras = ball_from(AXES[:2])
+    maps = [np.zeros((320, 320), np.int64) for _ in range(2)]
+    maps[0][159:161, 80:240] = 1
+    maps[1][159:161, 80:240] = 1
+    grid = back_project(regions_from_label_maps(maps), cameras, ReconstructConfig(voxel_size=0.0125))
+    assert grid is not None
+    assert grid.volume == pytest.approx(2 * 2 * 0.025, rel=0.15)
+
+
+def test_a_moved_and_scaled_world_moves_and_scales_the_shape() -> None:
+    scene = ball_scene(2, 5, seed=3)
+    members = scene.regions.select(scene.regions.labels == 1)
+    shift = torch.tensor([1000.0, -2000.0, 300.0]).double()
+    other = moved(scene.cameras, 25.0, torch.eye(3).double(), shift)
+    grids = [back_project(members, cameras) for cameras in (scene.cameras, other)]
+    assert grids[0] is not None
+    assert grids[1] is not None
+    assert grids[1].volume == pytest.approx(25.0**3 * grids[0].volume, rel=0.03)
+    middle = [grid.points.mean(0) for grid in grids if grid is not None]
+    torch.testing.assert_close(middle[1], 25 * middle[0] + shift, atol=0.5, rtol=0)
+
+
+def test_grids_of_one_voxel_size_share_their_lattice() -> None:
+    scene = ball_scene(3, 5, seed=4)
+    shapes = reconstruct_instances(
+        scene.regions, scene.regions.labels - 1, scene.cameras, ReconstructConfig(voxel_size=0.07)
+    )
+    assert sorted(shapes) == [0, 1, 2]
+    for grid in shapes.values():
+        steps = grid.origin / 0.07
+        torch.testing.assert_close(steps, steps.round(), atol=1e-6, rtol=0)
+
+
+def test_pieces_of_a_split_mask_vote_as_one() -> None:
+    regions, cameras = ball_from(AXES)
+    maps = [regions.label_map(view, regions.labels, 320, 320).numpy() for view in range(3)]
+    maps[0][:, 160:] *= 2
+    pieces = regions_from_label_maps(maps)
+    assert len(pieces) == 4
+    whole, joined = (back_project(r, cameras, ReconstructConfig(voxel_size=0.1)) for r in (regions, pieces))
+    assert whole is not None
+    assert joined is not None
+    assert torch.equal(whole.votes, joined.votes)
+
+
+def test_what_has_no_bounded_shape_is_left_out() -> None:
+    regions, cameras = ball_from(AXES)
+    assert back_project(regions.select(torch.tensor([1])), cameras) is None
+    assert reconstruct_instances(regions, torch.tensor([0, -1, -1]), cameras) == {}
+    maps = [np.zeros((320, 320), np.int64) for _ in range(2)]
+    maps[0][0:20, 0:20] = 1  # two masks that look past each other
+    maps[1][300:320, 0:20] = 1
+    assert back_project(regions_from_label_maps(maps), cameras[:2]) is None
+
+
+def test_nearly_parallel_views_are_cut_not_lost() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0.01, 0]]))
+    maps = render_balls(cameras, torch.zeros(1, 3).double(), torch.ones(1).double())
+    grid = back_project(regions_from_label_maps(maps), cameras, ReconstructConfig(voxel_budget=20_000))
+    assert grid is not None
+    assert 0 < grid.volume < 1e5
+
+
+def test_an_empty_grid_has_an_empty_mesh() -> None:
+    regions, cameras = ball_from(AXES)
+    grid = back_project(regions, cameras, ReconstructConfig(voxel_size=8.0))  # one voxel, its centre beside the ball
+    assert grid is not None
+    assert not grid.occupied.any()
+    assert grid.volume == 0
+    assert len(grid.mesh().vertices) == 0
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (ReconstructConfig(threshold=1.0), "threshold"),
+        (ReconstructConfig(voxel_size=0.0), "positive"),
+        (ReconstructConfig(voxel_budget=0), "positive"),
+        (ReconstructConfig(voxel_size=1e-5), "voxels, expected at most"),
+    ],
+)
+def test_impossible_resolutions_are_refused(config: ReconstructConfig, message: str) -> None:
+    regions, cameras = ball_from(AXES[:2])
+    with pytest.raises(InputError, match=message):
+        back_project(regions, cameras, config)

@@ -1,0 +1,95 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError
+from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps
+
+
+def random_maps(seed: int = 0) -> list[np.ndarray]:
+    """Three label maps of different sizes; the second is empty; numbers are sparse and 16 bits wide."""
+    generator = np.random.default_rng(seed)
+    numbers = np.array([0, 0, 3, 700, 65534, IGNORE_LABEL], np.uint16)
+    blocks = [generator.choice(numbers, (6, 8)), np.zeros((5, 5), np.uint16), generator.choice(numbers, (9, 4))]
+    return [np.kron(block, np.ones((4, 3), np.uint16)) for block in blocks]
+
+
+def test_label_maps_make_the_round_trip() -> None:
+    maps = random_maps()
+    regions = regions_from_label_maps(maps)
+    assert regions.num_per_view.tolist() == [3, 0, 3]
+    for view, labels in enumerate(maps):
+        painted = regions.label_map(view, regions.labels, labels.shape[1], labels.shape[0])
+        np.testing.assert_array_equal(painted.numpy(), np.where(labels == IGNORE_LABEL, 0, labels))
+
+
+def test_areas_and_pixels_count_what_the_masks_hold() -> None:
+    maps = random_maps()
+    regions = regions_from_label_maps(maps)
+    xy, owner, weight = regions.pixels()
+    for index in range(len(regions)):
+        mask = maps[int(regions.view_index[index])] == int(regions.labels[index])
+        assert regions.areas[index] == mask.sum()
+        expected = np.argwhere(mask)[:, ::-1] + 0.5
+        np.testing.assert_array_equal(xy[owner == index].numpy(), expected)
+        np.testing.assert_array_equal(regions.mask(index, mask.shape[1], mask.shape[0]).numpy(), mask)
+    assert (weight == 1).all()
+
+
+def test_thinned_pixels_stand_for_the_whole_mask() -> None:
+    maps = [np.zeros((300, 400), np.uint16)]
+    maps[0][10:250, 20:380] = 1
+    maps[0][299, 0:300] = 2  # a sliver that the lattice may miss
+    regions = regions_from_label_maps(maps)
+    xy, owner, weight = regions.pixels(max_per_region=100)
+    counts = torch.bincount(owner)
+    assert 25 <= counts[0] <= 130
+    assert counts[1] >= 1
+    sums = torch.zeros(2).index_add(0, owner, weight)
+    torch.testing.assert_close(sums, regions.areas.float())
+    torch.testing.assert_close(xy[owner == 0].mean(0), torch.tensor([200.0, 130.0]), atol=10, rtol=0)
+
+
+def test_select_keeps_order_and_content() -> None:
+    regions = regions_from_label_maps(random_maps())
+    index = torch.tensor([4, 0, 5])
+    chosen = regions.select(index)
+    for place, source in enumerate(index.tolist()):
+        assert torch.equal(chosen.crop(place), regions.crop(source))
+        assert chosen.labels[place] == regions.labels[source]
+    everything = regions.select(torch.ones(len(regions), dtype=torch.bool))
+    assert torch.equal(everything.crops, regions.crops)
+    assert len(regions.select(torch.zeros(len(regions), dtype=torch.bool))) == 0
+
+
+def test_overlapping_regions_are_painted_small_on_top() -> None:
+    big, small = torch.ones(16, dtype=torch.bool), torch.ones(4, dtype=torch.bool)
+    boxes = torch.tensor([[1, 1, 3, 3], [0, 0, 4, 4]])
+    regions = Regions(torch.tensor([0, 0]), boxes, torch.cat((small, big)), 1, torch.tensor([1, 2]))
+    painted = regions.label_map(0, torch.tensor([7, 9]), 5, 4)
+    assert painted[1:3, 1:3].unique().tolist() == [7]
+    assert (painted == 9).sum() == 12
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"boxes": torch.zeros(2, 4, dtype=torch.int64)}, "empty box"),
+        ({"crops": torch.ones(3, dtype=torch.bool)}, "as many as the boxes cover"),
+        ({"view_index": torch.tensor([0, 5])}, r"not in \[0, 2\)"),
+        ({"labels": torch.tensor([1])}, "labels"),
+    ],
+)
+def test_inconsistent_regions_are_refused(change: dict, message: str) -> None:
+    fields = {
+        "view_index": torch.tensor([0, 1]),
+        "boxes": torch.tensor([[0, 0, 2, 1], [3, 3, 5, 4]]),
+        "crops": torch.ones(4, dtype=torch.bool),
+        "num_views": 2,
+        "labels": torch.tensor([1, 2]),
+    }
+    Regions(**fields)
+    with pytest.raises(InputError, match=message):
+        Regions(**(fields | change))

@@ -1,0 +1,82 @@
+"""The convention sheet, checked against OpenCV."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError
+from mvseg.scene import Cameras, Scene, View
+from synthetic import arc_positions, cameras_at
+
+
+def some_cameras() -> Cameras:
+    return cameras_at(arc_positions(4))
+
+
+def test_project_agrees_with_opencv() -> None:
+    cameras = some_cameras()
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double()
+    px, depth = cameras.project(points)
+    for view in range(4):
+        K = cameras.K[view].numpy().copy()
+        K[:2, 2] -= 0.5  # OpenCV's pixel centres are whole numbers
+        rotation, _ = cv2.Rodrigues(cameras.R[view].numpy())
+        expected, _ = cv2.projectPoints(points.numpy(), rotation, cameras.t[view].numpy(), K, None)
+        np.testing.assert_allclose(px[view].numpy(), expected[:, 0] + 0.5, atol=1e-9)
+        cam = cameras.R[view] @ points.T + cameras.t[view][:, None]
+        torch.testing.assert_close(depth[view], cam[2])
+
+
+def test_center_projects_to_depth_zero_and_rays_return_to_their_pixel() -> None:
+    cameras = some_cameras()
+    for view in range(4):
+        _, depth = cameras.project(cameras.centers)
+        assert depth[view, view].abs() < 1e-12
+        pixel = torch.tensor([17.5, 100.5, 1.0]).double()
+        point = cameras.centers[view] + 3.0 * cameras.world_from_px[view] @ pixel
+        px, depth = cameras.project(point[None])
+        torch.testing.assert_close(px[view, 0], pixel[:2])
+        torch.testing.assert_close(depth[view, 0], torch.tensor(3.0).double())
+
+
+def test_cameras_are_selected_in_the_order_asked_for() -> None:
+    cameras = some_cameras()
+    torch.testing.assert_close(cameras[[2, 0]].centers, cameras.centers[[2, 0]])
+    assert len(cameras[1:3]) == 2
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "message"),
+    [
+        ("K", lambda K: K.index_put((torch.tensor(0), torch.tensor(0)), torch.tensor(0.0).double()), "focal length"),
+        ("K", lambda K: -K, "focal length"),
+        ("K", lambda K: K.T.clone(), "upper triangular"),
+        ("R", lambda R: R * torch.tensor([[1.0], [1.0], [-1.0]]).double(), "reflection"),
+        ("R", lambda R: 1.01 * R, "not a rotation"),
+        ("t", lambda t: t * float("nan"), "not finite"),
+        ("sizes", lambda sizes: 0 * sizes, "image size"),
+    ],
+)
+def test_unsound_camera_is_named(field: str, change, message: str) -> None:
+    cameras = some_cameras()
+    fields = {name: getattr(cameras, name).clone() for name in ("K", "R", "t", "sizes")}
+    fields[field][2] = change(fields[field][2])
+    with pytest.raises(InputError, match=rf"view 2: .*{message}"):
+        Cameras(**fields)
+
+
+def test_wrong_shape_is_named() -> None:
+    cameras = some_cameras()
+    with pytest.raises(InputError, match=r"t has shape \(3, 3\), expected \(4, 3\)"):
+        Cameras(cameras.K, cameras.R, cameras.t[:3], cameras.sizes)
+
+
+def test_two_views_of_one_name_are_an_error() -> None:
+    views = tuple(View(name, Path(name)) for name in ("a", "b", "a", "c"))
+    with pytest.raises(InputError, match="views 0 and 2 have the same name 'a'"):
+        Scene("plant", views, some_cameras())

@@ -1,0 +1,80 @@
+"""Real plants, read from outside the project; skipped where they are missing."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from conftest import true_ids
+from mvseg.config import ReconstructConfig
+from mvseg.formats.folder import load_masks, load_scene
+from mvseg.formats.photos import read_photo
+from mvseg.matching import match_regions
+from mvseg.metrics import matching_metrics
+from mvseg.reconstruction import back_project
+
+pytestmark = pytest.mark.shared_data
+
+
+def test_basil_gets_its_leaves(shared_data: Path) -> None:
+    """Measured: s_match 0.989, e_k 0, ARI 0.975, as a study of the paper's method found before."""
+    folder = shared_data / "basil-0729"
+    scene = load_scene(folder)
+    regions = load_masks(scene, folder / "masks")
+    assert len(regions) == 95
+    metrics = matching_metrics(
+        match_regions(regions, scene.cameras).instance_ids, true_ids(scene, regions, folder / "truth")
+    )
+    assert metrics.s_match > 0.98
+    assert metrics.e_k == 0
+    assert metrics.ari > 0.96
+
+
+def test_maize_is_one_plant_of_its_height(shared_data: Path) -> None:
+    folder = shared_data / "maize-plant1"
+    scene = load_scene(folder)
+    assert scene.unit == "mm"
+    regions = load_masks(scene, folder / "silhouettes")
+    assert len(regions) == 12
+    matching = match_regions(regions, scene.cameras)
+    assert matching.instance_ids.unique().tolist() == [0]
+    grid = back_project(regions, scene.cameras, ReconstructConfig(voxel_budget=400_000))
+    assert grid is not None
+    extent = grid.points.amax(0) - grid.points.amin(0)
+    assert 1100 < float(extent[2]) < 1300
+    assert float(extent[0]) < 1200
+
+
+def test_fern_loads_projects_and_is_undistorted(shared_data: Path) -> None:
+    folder = shared_data / "fern-llff"
+    scene = load_scene(folder)
+    assert len(scene.views) == 20
+    model = pycolmap.Reconstruction(folder / "sparse")
+    points = torch.tensor(np.array([point.xyz for point in model.points3D.values()]))
+    px, _ = scene.cameras.project(points)
+    by_name = {image.name: image for image in model.images.values()}
+    for index in (0, 13):
+        view = scene.views[index]
+        assert view.lens is not None
+        image = by_name[view.path.name]
+        seen = [p for p in image.points2D if p.has_point3D()]
+        order = {number: row for row, number in enumerate(model.points3D)}
+        rows = [order[p.point3D_id] for p in seen]
+        rays = np.concatenate([px[index][rows].numpy(), np.ones((len(rows), 1))], 1)
+        rays = rays @ np.linalg.inv(scene.cameras.K[index].numpy()).T
+        in_photo = np.asarray(view.lens.img_from_cam(rays))
+        error = np.linalg.norm(in_photo - np.array([p.xy for p in seen]), axis=1)
+        assert np.median(error) < 1.0
+        photo = read_photo(scene, index)
+        assert photo.shape == (529, 706, 3)
+    moved = np.abs(px[0].numpy() - np.asarray(scene.views[0].lens.img_from_cam(_rays(scene, px[0])))).max(1)
+    inside = ((px[0] > 0) & (px[0] < torch.tensor([706, 529]))).all(1).numpy()
+    assert 0.5 < moved[inside].max() < 10  # the lens bends by up to some pixels
+
+
+def _rays(scene, px: torch.Tensor) -> np.ndarray:
+    return np.concatenate([px.numpy(), np.ones((len(px), 1))], 1) @ np.linalg.inv(scene.cameras.K[0].numpy()).T
