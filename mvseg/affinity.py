@@ -2,24 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
-from mvseg.epipolar import (
-    Bins,
-    Pencil,
-    Samples,
-    bin_histogram,
-    choose_bins,
-    dilate,
-    epipolar_pencil,
-    is_coincident,
-    view_samples,
-)
+from mvseg.epipolar import BinnedPair, Bins, Samples, bin_histogram, binned_pairs, dilate, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -64,41 +52,35 @@ def region_affinity(
         The graph. A region in a view alone, or whose bands meet nothing, has no edge.
     """
     samples, members = view_samples(regions)
-    senders = samples if num_points is None else _draw_points(samples, num_points, seed)
+    senders = None if num_points is None else _draw_points(samples, num_points, seed)
     edges, weights = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)], []
-    for i, j, pencil, bins in view_pairs(samples, cameras, progress=progress):
-        both = pairwise_affinity(pencil, bins, (samples[i], samples[j]), (senders[i], senders[j]))
-        mean = both[0].add(both[1].T) / 2
+    for pair in binned_pairs(samples, cameras, progress=progress):
+        i, j = pair.i, pair.j
+        lines = pair.counts if senders is None else _line_counts(pair, senders[i], senders[j])
+        forth, back = pairwise_affinity(pair.bins, pair.counts, lines)
+        mean = (forth + back.T) / 2
         place = mean.nonzero()
-        pair = torch.stack((members[i][place[:, 0]], members[j][place[:, 1]]), 1)
-        edges.append(pair.sort(1).values)
+        edges.append(torch.stack((members[i][place[:, 0]], members[j][place[:, 1]]), 1).sort(1).values)
         weights.append(mean[place[:, 0], place[:, 1]])
     empty = torch.zeros(0, device=regions.device)
     return Affinity(torch.cat(edges), torch.cat([empty, *weights]), len(regions))
 
 
-def pairwise_affinity(
-    pencil: Pencil, bins: Bins, targets: tuple[Samples, Samples], senders: tuple[Samples, Samples]
-) -> tuple[Tensor, Tensor]:
+def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
     """Both directions of Eq. 3 for the regions of two views.
 
     w(n -> m) is the fraction of m's pixels inside the band of n, times the fraction of n's lines that pass through m.
 
     Args:
-        pencil: of the two views.
-        bins: of the angles of both views' pixels.
-        targets: all pixels of the N regions of view i and of the M regions of view j.
-        senders: the pixels of the same regions that send out lines.
+        bins: B half-planes of the two views' pencil.
+        pixels: (N, B) and (M, B) float32, pixels of the regions of view i and of view j in each bin.
+        lines: (N, B) and (M, B) float32, lines that the same regions send out in each bin.
 
     Returns:
         w(i -> j) (N, M) and w(j -> i) (M, N), float32 in [0, 1].
     """
-    pixels = [bin_histogram(pencil, bins, side, targets[side]) for side in (0, 1)]
-    lines = [pixels[s] if senders[s] is targets[s] else bin_histogram(pencil, bins, s, senders[s]) for s in (0, 1)]
-    return (
-        _directed(lines[0], pixels[1], bins.band_radius(0), bins.half_line[1]),
-        _directed(lines[1], pixels[0], bins.band_radius(1), bins.half_line[0]),
-    )
+    forth = _directed(lines[0], pixels[1], bins.band_radius(0), bins.half_line[1])
+    return forth, _directed(lines[1], pixels[0], bins.band_radius(1), bins.half_line[0])
 
 
 def _directed(lines: Tensor, pixels: Tensor, band_radius: int, half_line: int) -> Tensor:
@@ -108,16 +90,10 @@ def _directed(lines: Tensor, pixels: Tensor, band_radius: int, half_line: int) -
     return covered * passing
 
 
-def view_pairs(
-    samples: list[Samples], cameras: Cameras, *, progress: bool = False
-) -> Iterator[tuple[int, int, Pencil, Bins]]:
-    """The pairs of views i < j that both hold pixels and have a baseline, each with its pencil and bins."""
-    skip = is_coincident(cameras).tolist()
-    occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
-    pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
-    for i, j in tqdm(pairs, desc="epipolar weights", unit="pair", disable=not progress):
-        pencil = epipolar_pencil(cameras, i, j)
-        yield i, j, pencil, choose_bins(pencil, (samples[i], samples[j]))
+def _line_counts(pair: BinnedPair, first: Samples, second: Samples) -> tuple[Tensor, Tensor]:
+    """(N, B) and (M, B): how many of the drawn points lie in each bin."""
+    angles = [pair.pencil.angles(side, sample.xy) for side, sample in enumerate((first, second))]
+    return bin_histogram(pair.bins, angles[0], first), bin_histogram(pair.bins, angles[1], second)
 
 
 def _draw_points(samples: list[Samples], num_points: int, seed: int) -> list[Samples]:

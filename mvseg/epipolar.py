@@ -11,11 +11,13 @@ behind one of the cameras; where both epipoles lie outside the images the two ar
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from math import ceil
 
 import torch
 from torch import Tensor
+from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.regions import Regions
@@ -23,6 +25,7 @@ from mvseg.scene import Cameras
 
 BINS_PER_PIXEL = 2  # a bin is half a pixel wide, so that a line of two pixels is resolved
 MIN_BINS, MAX_BINS = 64, 8192
+LINE_PX = 2.0  # thickness of an epipolar line (Sec. 3.1)
 COINCIDENT = 1e-6  # baselines shorter than this fraction of the longest one have no epipolar geometry
 
 
@@ -53,16 +56,9 @@ def view_samples(regions: Regions, max_per_region: int | None = None) -> tuple[l
     Returns:
         V `Samples`, and V int64 tensors with the indices in `regions` that the owners of a view stand for.
     """
-    xy, owner, weight = regions.pixels(max_per_region)
     members = [(regions.view_index == view).nonzero()[:, 0] for view in range(regions.num_views)]
-    rank = torch.empty(len(regions), dtype=torch.int64, device=regions.device)
-    for nodes in members:
-        rank[nodes] = torch.arange(len(nodes), device=regions.device)
-    view_of_pixel = regions.view_index[owner]
-    order = view_of_pixel.argsort(stable=True)
-    ends = torch.bincount(view_of_pixel, minlength=regions.num_views).tolist()
-    parts = zip(xy[order].split(ends), rank[owner[order]].split(ends), weight[order].split(ends), members, strict=True)
-    return [Samples(p, o, w, len(nodes)) for p, o, w, nodes in parts], members
+    samples = [Samples(*regions.select(nodes).pixels(max_per_region), len(nodes)) for nodes in members]
+    return samples, members
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,14 +94,18 @@ class Pencil:
         where it diverges, count as one pixel away from it.
         """
         x, y = self._plane(side, xy)
-        gradient = self.plane_from_px[side, :, :2].to(x)
-        across = torch.linalg.vector_norm(x[:, None] * gradient[1] - y[:, None] * gradient[0], dim=1)
-        reach = torch.maximum(x.abs() + y.abs(), gradient.abs().sum())
+        (x_u, x_v, _), (y_u, y_v, _) = self.plane_from_px[side].tolist()
+        across = torch.hypot(x * y_u - y * x_u, x * y_v - y * x_v)
+        reach = (x.abs() + y.abs()).clamp(min=abs(x_u) + abs(x_v) + abs(y_u) + abs(y_v))
         return float((across / reach**2).mean())
 
     def _plane(self, side: int, xy: Tensor) -> tuple[Tensor, Tensor]:
-        rows = self.plane_from_px[side].to(xy)
-        x, y = (xy @ rows[:, :2].T + rows[:, 2]).unbind(1)
+        u, v = xy.unbind(1)
+        first, second = self.plane_from_px[
+            side
+        ].tolist()  # numbers: a product of (P, 2) with (2, 2) is ten times slower
+        x = u * first[0] + v * first[1] + first[2]
+        y = u * second[0] + v * second[1] + second[2]
         return x, y
 
 
@@ -159,8 +159,8 @@ class Bins:
     half_pixel: tuple[int, int]
 
     def index(self, angles: Tensor) -> Tensor:
-        """(P,) int64 bin of each angle; angles outside the binning give a number outside [0, B)."""
-        return ((angles - self.low) * self.per_unit).floor().long()
+        """(P,) int32 bin of each angle; -1 below the binning and B above it."""
+        return ((angles - self.low) * self.per_unit).floor().clamp(-1, self.num_bins).int()
 
     def band_radius(self, source: int) -> int:
         """Bins that a band of image `source` (0 or 1) reaches beyond its pixels' centres, seen in the other image.
@@ -171,33 +171,69 @@ class Bins:
         return max(self.half_line[1 - source], self.half_pixel[source])
 
 
-def choose_bins(pencil: Pencil, samples: tuple[Samples, Samples], line_px: float = 2.0) -> Bins:
-    """Bins of half a pixel over the angles of both views' samples; lines are `line_px` pixels thick (paper: 2).
+def choose_bins(pencil: Pencil, xy: tuple[Tensor, Tensor], angles: tuple[Tensor, Tensor]) -> Bins:
+    """Bins of half a pixel over the angles of both views' pixels; lines are two pixels thick, as in the paper.
 
-    A line is a wedge of the pencil, so its thickness in pixels varies with the distance to the epipole; `line_px` is
-    met on average over the samples of each image. Both samples must hold at least one pixel.
+    A line is a wedge of the pencil, so its thickness in pixels varies with the distance to the epipole; two pixels are
+    met on average over the pixels of each image. Both views must hold at least one pixel.
+
+    Args:
+        pencil: of views i and j.
+        xy: (P, 2) and (Q, 2) pixels of views i and j.
+        angles: (P,) and (Q,), their angles.
     """
-    angles = torch.cat([pencil.angles(side, samples[side].xy) for side in (0, 1)])
-    low, high = angles.min().item(), angles.max().item()
-    pitches = [pencil.pitch(side, samples[side].xy) for side in (0, 1)]
+    ends = torch.stack([torch.stack(torch.aminmax(part)) for part in angles]).tolist()
+    low, high = min(end[0] for end in ends), max(end[1] for end in ends)
+    pitches = [pencil.pitch(side, xy[side]) for side in (0, 1)]
     per_unit = BINS_PER_PIXEL / max(min(pitches), 1e-12)
     num_bins = int(min(max((high - low) * per_unit, MIN_BINS), MAX_BINS))
     per_unit = num_bins / max(high - low, 1e-12) * (1 - 1e-6)
-    half_line = [max(1, min(num_bins, round(line_px / 2 * pitch * per_unit))) for pitch in pitches]
+    half_line = [max(1, min(num_bins, round(LINE_PX / 2 * pitch * per_unit))) for pitch in pitches]
     half_pixel = [max(1, min(num_bins, ceil(pitch / 2 * per_unit))) for pitch in pitches]
     return Bins(low, per_unit, num_bins, (half_line[0], half_line[1]), (half_pixel[0], half_pixel[1]))
 
 
-def bin_histogram(pencil: Pencil, bins: Bins, side: int, samples: Samples) -> Tensor:
+def bin_histogram(bins: Bins, angles: Tensor, samples: Samples) -> Tensor:
     """(N, B) float32: how many mask pixels of each region lie in each bin of half-planes.
 
     Pixels whose half-plane lies outside the bins are left out.
     """
-    index = bins.index(pencil.angles(side, samples.xy))
-    inside = (index >= 0) & (index < bins.num_bins)
-    flat = (samples.owner * bins.num_bins + index)[inside]
-    counts = torch.bincount(flat, weights=samples.weight[inside], minlength=samples.num_regions * bins.num_bins)
-    return counts.reshape(samples.num_regions, bins.num_bins).float()
+    padded = bins.num_bins + 2  # a bin on either side takes what lies outside
+    flat = samples.owner * padded + (bins.index(angles) + 1)
+    counts = torch.bincount(flat, weights=samples.weight, minlength=samples.num_regions * padded)
+    return counts.reshape(samples.num_regions, padded)[:, 1:-1].float()
+
+
+@dataclass(frozen=True, eq=False)
+class BinnedPair:
+    """Two views with a baseline, and their regions as histograms over the half-planes of their pencil.
+
+    Attributes:
+        i: the first view.
+        j: the second view.
+        pencil: of i and j.
+        bins: common to both.
+        counts: (N, B) and (M, B) float32, pixels of each region of i and of j in each bin.
+    """
+
+    i: int
+    j: int
+    pencil: Pencil
+    bins: Bins
+    counts: tuple[Tensor, Tensor]
+
+
+def binned_pairs(samples: Sequence[Samples], cameras: Cameras, *, progress: bool = False) -> Iterator[BinnedPair]:
+    """All pairs of views i < j that both hold pixels and have a baseline."""
+    skip = is_coincident(cameras).tolist()
+    occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
+    pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
+    for i, j in tqdm(pairs, desc="epipolar weights", unit="pair", disable=not progress):
+        pencil = epipolar_pencil(cameras, i, j)
+        angles = pencil.angles(0, samples[i].xy), pencil.angles(1, samples[j].xy)
+        bins = choose_bins(pencil, (samples[i].xy, samples[j].xy), angles)
+        counts = bin_histogram(bins, angles[0], samples[i]), bin_histogram(bins, angles[1], samples[j])
+        yield BinnedPair(i, j, pencil, bins, counts)
 
 
 def dilate(occupied: Tensor, radius: int) -> Tensor:
@@ -223,15 +259,15 @@ def epipolar_bands(regions: Regions, cameras: Cameras, view: int, xy: Tensor) ->
     bands = torch.zeros(len(regions), len(xy), dtype=torch.bool, device=regions.device)
     if not len(xy):
         return bands
-    target = Samples(xy, torch.zeros(len(xy), dtype=torch.int64, device=xy.device), torch.ones_like(xy[:, 0]), 1)
     skip = is_coincident(cameras)[view]
     for other, (source, members) in enumerate(zip(*view_samples(regions), strict=True)):
         if skip[other] or not len(members):
             continue
         pencil = epipolar_pencil(cameras, other, view)
-        bins = choose_bins(pencil, (source, target))
-        occupied = dilate(bin_histogram(pencil, bins, 0, source) > 0, bins.band_radius(0))
-        bands[members] = occupied[:, bins.index(pencil.angles(1, xy)).clamp(0, bins.num_bins - 1)] > 0
+        angles = pencil.angles(0, source.xy), pencil.angles(1, xy)
+        bins = choose_bins(pencil, (source.xy, xy), angles)
+        occupied = dilate(bin_histogram(bins, angles[0], source) > 0, bins.band_radius(0))
+        bands[members] = occupied[:, bins.index(angles[1]).clamp(0, bins.num_bins - 1)] > 0
     return bands
 
 

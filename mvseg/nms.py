@@ -6,8 +6,7 @@ import torch
 import torchvision
 from torch import Tensor, nn
 
-from mvseg.affinity import view_pairs
-from mvseg.epipolar import Bins, Pencil, Samples, bin_histogram, dilate, view_samples
+from mvseg.epipolar import Samples, bin_histogram, binned_pairs, dilate, view_samples
 from mvseg.errors import InputError
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -80,32 +79,25 @@ def ruzicka_similarity(
     on_image = torch.zeros(len(cameras), num_clusters, device=regions.device)  # sum of bands over the image
     count = torch.zeros(len(cameras), num_clusters, device=regions.device)  # #_c of Eq. 4
     joint = [_concatenate(source, target) for source, target in zip(sources, targets, strict=True)]
-    for i, j, pencil, bins in view_pairs(joint, cameras):
-        for source, target, side in ((i, j, 0), (j, i, 1)):
-            if not len(sources[source].xy):
-                continue
+    for pair in binned_pairs(joint, cameras):
+        for source, target, side in ((pair.i, pair.j, 0), (pair.j, pair.i, 1)):
             clusters = cluster_of[source_members[source]]
-            bands = _cluster_bands(pencil, bins, side, sources[source], clusters, num_clusters)
+            sent = pair.counts[side][: len(clusters)] > 0
+            bands = torch.zeros(num_clusters, pair.bins.num_bins, device=regions.device)
+            bands.index_add_(0, clusters, dilate(sent, pair.bins.band_radius(side)))
             count[target] += torch.bincount(clusters, minlength=num_clusters)
-            on_image[target] += (bin_histogram(pencil, bins, 1 - side, images[target]) @ bands.T)[0]
-            if len(targets[target].xy):
-                on_mask[target_members[target]] += bin_histogram(pencil, bins, 1 - side, targets[target]) @ bands.T
+            received = pair.counts[1 - side][sources[target].num_regions :]
+            on_mask[target_members[target]] += received @ bands.T
+            image = bin_histogram(pair.bins, pair.pencil.angles(1 - side, images[target].xy), images[target])
+            on_image[target] += (image @ bands.T)[0]
     count = count.clamp(min=1)
     smallest = on_mask / count[proposals.view_index]
     largest = (on_image / count)[proposals.view_index] + proposals.areas[:, None] - smallest
     return smallest / largest.clamp(min=1e-12)
 
 
-def _cluster_bands(
-    pencil: Pencil, bins: Bins, side: int, source: Samples, clusters: Tensor, num_clusters: int
-) -> Tensor:
-    """(K, B) float32: how many bands of each cluster's members in one view cover each bin."""
-    bands = dilate(bin_histogram(pencil, bins, side, source) > 0, bins.band_radius(side))
-    return torch.zeros(num_clusters, bins.num_bins, device=bands.device).index_add_(0, clusters, bands)
-
-
 def _concatenate(first: Samples, second: Samples) -> Samples:
-    """Both sets of pixels as the pixels of their regions, for choosing bins."""
+    """The regions of both sets, first and then second, in one."""
     return Samples(
         torch.cat((first.xy, second.xy)),
         torch.cat((first.owner, second.owner + first.num_regions)),

@@ -101,9 +101,9 @@ def reconstruct_instances(
 def back_project(members: Regions, cameras: Cameras, config: ReconstructConfig | None = None) -> VoxelGrid | None:
     """The voxels of one instance from all of its masks (Eq. 6), in a bounding box of its own.
 
-    Departures from the paper: several masks of one view (pieces of a split mask) vote as one, their union; a voxel needs
-    *more* than the threshold, so that of two views both must agree. Voxels behind a camera or outside its image get
-    no vote there. The grid is aligned to multiples of the voxel size: grids of one size share their lattice.
+    Departures from the paper: several masks of one view (pieces of a split mask) vote as one, their union; a voxel
+    needs *more* than the threshold, so that of two views both must agree. Voxels behind a camera or outside its image
+    get no vote there. The grid is aligned to multiples of the voxel size: grids of one size share their lattice.
 
     Args:
         members: the masks of the instance.
@@ -228,8 +228,8 @@ def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor]) -> Tensor:
 def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Tensor] | None:
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
-    A box about the point nearest to all centroid rays is doubled until no cell at its border can hold such a point, then
-    shrunk to the cells that can, three times. Cells are judged by balls about them, so nothing is lost. None when no
+    A box about the point nearest to all centroid rays is doubled until no cell at its border can hold such a point,
+    then shrunk to the cells that can, three times. Cells are judged by balls about them, so nothing is lost. None when no
     cell can. Growth ends at twice the distance of the farthest camera: masks of nearly parallel views may have no
     bounded common part, and then the box is cut there.
     """

@@ -80,8 +80,8 @@ class Regions:
     @cached_property
     def areas(self) -> Tensor:
         """(D,) int64: number of pixels of each mask, #_a in Eq. 3."""
-        filled = torch.nn.functional.pad(self.crops.cumsum(0), (1, 0))[self.offsets]
-        return filled[1:] - filled[:-1]
+        parts = self.crops.split(self.crop_sizes.prod(1).tolist())
+        return torch.stack([part.sum() for part in parts]) if parts else torch.zeros_like(self.view_index)
 
     @property
     def num_per_view(self) -> Tensor:
@@ -104,11 +104,9 @@ class Regions:
     def select(self, index: Tensor) -> Regions:
         """The regions at an int64 index or a bool mask, in that order."""
         keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        sizes = self.crop_sizes.prod(1)[keep]
-        first = sizes.cumsum(0) - sizes
-        source = torch.arange(int(sizes.sum()), device=self.device)
-        source = source + (self.offsets[:-1][keep] - first).repeat_interleave(sizes)
-        return Regions(self.view_index[keep], self.boxes[keep], self.crops[source], self.num_views, self.labels[keep])
+        parts = self.crops.split(self.crop_sizes.prod(1).tolist())
+        crops = torch.cat([parts[number] for number in keep.tolist()]) if len(keep) else self.crops[:0]
+        return Regions(self.view_index[keep], self.boxes[keep], crops, self.num_views, self.labels[keep])
 
     def pixels(self, max_per_region: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Centres of the mask pixels.
@@ -122,8 +120,7 @@ class Regions:
             float32, how many pixels each one stands for: the weights of a region sum to its area.
         """
         flat = self.crops.nonzero()[:, 0]
-        sizes = self.crop_sizes.prod(1)
-        owner = torch.arange(len(self), device=self.device).repeat_interleave(sizes)[flat]
+        owner = torch.searchsorted(self.offsets[1:], flat, right=True)
         local = flat - self.offsets[:-1][owner]
         width = self.crop_sizes[owner, 0]
         column = local % width + self.boxes[owner, 0]

@@ -130,10 +130,13 @@ def test_histograms_hold_every_pixel_once() -> None:
     scene = ball_scene(6, 3)
     samples, members = view_samples(scene.regions)
     pencil = epipolar_pencil(scene.cameras, 0, 2)
-    bins = choose_bins(pencil, (samples[0], samples[2]))
+    angles = pencil.angles(0, samples[0].xy), pencil.angles(1, samples[2].xy)
+    bins = choose_bins(pencil, (samples[0].xy, samples[2].xy), angles)
     for side, view in ((0, 0), (1, 2)):
-        counts = bin_histogram(pencil, bins, side, samples[view])
+        counts = bin_histogram(bins, angles[side], samples[view])
         torch.testing.assert_close(counts.sum(1), scene.regions.areas[members[view]].float())
+        elsewhere = bin_histogram(bins, angles[side] + 10, samples[view])
+        assert elsewhere.sum() == 0
 
 
 @pytest.mark.parametrize("name", RIGS)
