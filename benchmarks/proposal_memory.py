@@ -1,0 +1,74 @@
+"""Peak memory and time of the NMS loop on 28 views x 300 proposals of 1280 x 960: `python benchmarks/proposal_memory.py`
+
+Masks as the mask head gives them (28 x 28 probabilities and boxes), pasted as crops, matched, assigned and suppressed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import time
+
+import torch
+
+from mvseg.config import MatchConfig
+from mvseg.multiview import gather_proposals, match_proposals
+from mvseg.simulation.cameras import arc_cameras
+from mvseg.simulation.plants import grow_plant
+
+
+def mask_head_output(plant, cameras, view: int, count: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
+    """`count` jittered boxes around the projections of the leaves, with elliptic masks."""
+    width, height = cameras.sizes[view].tolist()
+    boxes = []
+    for leaf in plant.leaves:
+        px = cameras[view : view + 1].project(torch.from_numpy(leaf.vertices))[0][0]
+        boxes.append(torch.cat((px.amin(0), px.amax(0))))
+    chosen = torch.stack(boxes)[torch.arange(count) % len(boxes)].float()
+    sides = (chosen[:, 2:] - chosen[:, :2]).repeat(1, 2)
+    chosen = chosen + 0.15 * sides * torch.randn(count, 4, generator=generator)
+    chosen = torch.cat((torch.minimum(chosen[:, :2], chosen[:, 2:] - 4), chosen[:, 2:]), 1)
+    chosen = chosen.clamp(min=torch.zeros(4), max=torch.tensor([width, height, width, height]).float())
+    grid = torch.linspace(-1, 1, 28)
+    ellipse = ((grid[:, None] ** 2 + grid**2) < 1).float().expand(count, 1, 28, 28)
+    scores = torch.rand(count, generator=generator)
+    labels = torch.ones(count, dtype=torch.int64)
+    return {
+        "boxes": chosen,
+        "masks": ellipse,
+        "scores": scores,
+        "labels": labels,
+        "frame": torch.tensor([width, height]),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--views", type=int, default=28)
+    parser.add_argument("--proposals", type=int, default=300)
+    args = parser.parse_args()
+    generator = torch.Generator().manual_seed(0)
+    plant = grow_plant("ovate", 28, seed=3)
+    cameras = arc_cameras(args.views, plant, width=1280, height=960)
+    found = [mask_head_output(plant, cameras, view, args.proposals, generator) for view in range(args.views)]
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    start = time.perf_counter()
+    proposals = gather_proposals(found, cameras.sizes.tolist())
+    gathered = time.perf_counter()
+    keep, matching = match_proposals(proposals, cameras, num_iterations=2, match=MatchConfig(num_instances=28))
+    report = {
+        "proposals": len(proposals.boxes),
+        "mean_crop_px": int(proposals.regions.crop_sizes.prod(1).float().mean()),
+        "kept": len(keep),
+        "instances": matching.num_instances,
+        "gather_s": round(gathered - start, 1),
+        "loop_s": round(time.perf_counter() - gathered, 1),
+        "peak_memory_GB": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20, 2),
+        "memory_before_GB": round(before / 2**20, 2),
+    }
+    print(json.dumps(report, indent=1))
+
+
+if __name__ == "__main__":
+    main()

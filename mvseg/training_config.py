@@ -1,0 +1,150 @@
+"""What a training run can be told. The fields are the keys of configs/train/*.yaml and of the command line.
+
+Imports nothing heavy, so that the command line can show its help quickly.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from mvseg.errors import InputError
+
+Orientation = Literal["any", "upright", "fixed"]
+
+# may differ between the start of a run and its continuation: they do not change what is computed (the names of the
+# samples are compared on their own, so the data may have moved)
+FREE_ON_RESUME = {"photos", "labels", "val_photos", "val_labels", "skip_broken", "output", "resume", "device",
+                  "num_workers", "checkpoint_every", "log_every"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """How a detector is trained.
+
+    Attributes:
+        photos: folder of the training photos.
+        labels: folder of label PNGs with the stems of the photos (0 background, 65535 ignored), or a COCO JSON file.
+        output: folder for everything the run writes; made when missing.
+        val_photos: folder of the validation photos, together with val_labels.
+        val_labels: labels of the validation photos.
+        hold_out_every: without val_photos: hold every n-th photo (sorted by name, from the first) out of the training
+            for validation; 0 for no validation. Views of one plant belong on one side: use val_photos for scenes.
+        skip_broken: train without broken samples (they are counted and listed in broken_samples.txt) instead of
+            stopping.
+        arch: resnet18_fpn, mobilenet_v3_large_fpn, maskrcnn_resnet50_fpn, maskrcnn_resnet50_fpn_v2.
+        weights: a name torchvision has for this arch (COCO_V1; IMAGENET1K_V1 for the small ones: downloaded), a
+            .safetensors file or checkpoint, or null for random weights.
+        image_size: S: training samples are S x S pixels; photos are detected with their longer side scaled to S.
+        orientation: augmentation: any (flips and right-angle turns: photos from above), upright (left-right flips:
+            plants from the side), fixed (none).
+        scale_range: the photo's longer side becomes a random factor from this range times image_size.
+        color_jitter: strength of random brightness, contrast and saturation, in [0, 1].
+        blur_probability: share of the samples that are blurred.
+        epochs: passes over the training samples; each ends with an evaluation.
+        batch_size: samples per optimisation step, over all processes.
+        images_per_forward: samples per forward pass of one process, what its memory allows; divides batch_size. The
+            losses are normalised over these samples, so it is part of the recipe; the number of processes is not.
+        optimizer: adamw, or sgd (momentum 0.9).
+        lr: peak learning rate for a batch of 16; scaled linearly with batch_size for sgd, with its root for adamw.
+        weight_decay: of everything except biases and norms.
+        schedule: cosine (to 1 % of the peak), or multistep (a tenth after 60 % and after 85 % of the steps).
+        warmup_steps: steps of linear warm-up, at most a tenth of the run.
+        clip_norm: gradients with a larger norm are scaled down to it; 0 for never.
+        ema_decay: evaluate and export an exponential moving average of the weights with this decay (at step t at most
+            (1 + t) / (10 + t)); 0 for none.
+        precision: bf16 (autocast), fp32, or auto: bf16 on GPUs that have it, else fp32. Evaluation is always fp32.
+        device: cpu, cuda, or auto.
+        num_workers: processes that read and augment, per training process; 0 reads in the training process itself.
+        seed: of the weights, the order, the augmentation and the samplers of the losses.
+        checkpoint_every: steps between checkpoints; every epoch ends with one, too.
+        log_every: steps between records of the losses in log.jsonl and TensorBoard.
+        resume: go on from the checkpoint in output, if there is one.
+    """
+
+    photos: Path
+    labels: Path
+    output: Path
+    val_photos: Path | None = None
+    val_labels: Path | None = None
+    hold_out_every: int = 0
+    skip_broken: bool = False
+    arch: str = "resnet18_fpn"
+    weights: str | None = None
+    image_size: int = 512
+    orientation: Orientation = "any"
+    scale_range: tuple[float, float] = (0.6, 1.6)
+    color_jitter: float = 0.3
+    blur_probability: float = 0.2
+    epochs: int = 20
+    batch_size: int = 4
+    images_per_forward: int = 2
+    optimizer: Literal["adamw", "sgd"] = "adamw"
+    lr: float = 1e-3
+    weight_decay: float = 1e-4
+    schedule: Literal["cosine", "multistep"] = "cosine"
+    warmup_steps: int = 200
+    clip_norm: float = 10.0
+    ema_decay: float = 0.0
+    precision: Literal["auto", "bf16", "fp32"] = "auto"
+    device: str = "auto"
+    num_workers: int = 2
+    seed: int = 0
+    checkpoint_every: int = 200
+    log_every: int = 10
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        """Check what does not need the disk.
+
+        Raises:
+            InputError: a number outside its range; the message names the field.
+        """
+        at_least = {"epochs": 1, "batch_size": 1, "images_per_forward": 1, "image_size": 32, "checkpoint_every": 1,
+                    "log_every": 1, "hold_out_every": 0, "warmup_steps": 0, "num_workers": 0, "seed": 0, "lr": 0.0,
+                    "weight_decay": 0.0, "clip_norm": 0.0}  # fmt: skip
+        for name, bound in at_least.items():
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= bound):
+                raise InputError(f"{name} is {value}, expected at least {bound}")
+        for name in ("color_jitter", "blur_probability", "ema_decay"):
+            value = getattr(self, name)
+            if not 0 <= value <= 1:
+                raise InputError(f"{name} is {value}, expected a number from 0 to 1")
+        if not 0 < self.scale_range[0] <= self.scale_range[1] < math.inf:
+            raise InputError(f"scale_range is {self.scale_range}, expected two factors above 0, the smaller one first")
+        if self.batch_size % self.images_per_forward:
+            raise InputError(
+                f"batch_size {self.batch_size} is not a multiple of images_per_forward {self.images_per_forward}"
+            )
+        if self.hold_out_every == 1:
+            raise InputError("hold_out_every is 1, which leaves nothing to train on; expected 0 or at least 2")
+        if (self.val_photos is None) != (self.val_labels is None):
+            raise InputError("val_photos and val_labels belong together, expected both or neither")
+        if self.val_photos is not None and self.hold_out_every:
+            raise InputError("hold_out_every and val_photos are both set, expected one way to validate")
+
+    @property
+    def num_chunks(self) -> int:
+        """Forward passes per step, over all processes."""
+        return self.batch_size // self.images_per_forward
+
+
+def config_values(config: TrainConfig) -> dict[str, Any]:
+    """The config as plain values, as YAML and checkpoints hold it: paths as strings, tuples as lists."""
+
+    def plain(value: Any) -> Any:
+        return str(value) if isinstance(value, Path) else list(value) if isinstance(value, tuple) else value
+
+    return {name: plain(value) for name, value in asdict(config).items()}
+
+
+def config_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
+    """The first field that keeps a run from going on with another config, "name (before, now after)", or None."""
+    for name in now:
+        if name not in FREE_ON_RESUME and before.get(name) != now[name]:
+            return f"{name} ({before.get(name)}, now {now[name]})"
+    return None

@@ -1,0 +1,90 @@
+"""The processes that train together: one alone, or those that torchrun started."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import torch
+import torch.distributed as dist
+from torch import Tensor
+
+from mvseg.errors import InputError
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Processes:
+    """This process among those that train together.
+
+    Attributes:
+        rank: 0 for the first process, which writes the files.
+        count: number of processes.
+        device: where this process computes.
+    """
+
+    rank: int
+    count: int
+    device: torch.device
+
+    @property
+    def is_first(self) -> bool:
+        return self.rank == 0
+
+    def ask_first(self, question: Callable[[], T]) -> T:
+        """What the first process gets from `question`, in every process; so with an InputError that it raises."""
+        answer: list[Any] = [None]
+        if self.is_first:
+            try:
+                answer = [question()]
+            except InputError as error:
+                answer = [error]
+        if self.count > 1:
+            dist.broadcast_object_list(answer)
+        if isinstance(answer[0], InputError):
+            raise answer[0]
+        return answer[0]
+
+    def gather(self, items: list[T]) -> list[T]:
+        """The lists of all processes in one."""
+        if self.count == 1:
+            return items
+        lists: list[Any] = [None] * self.count
+        dist.all_gather_object(lists, items)
+        return [item for part in lists for item in part]
+
+    def add_up(self, values: dict[str, Tensor]) -> dict[str, float]:
+        """The sums over all processes of scalars that every process has."""
+        stacked = torch.stack(list(values.values()))
+        if self.count > 1:
+            dist.all_reduce(stacked)
+        return dict(zip(values, stacked.tolist(), strict=True))
+
+
+@contextmanager
+def join_processes(device: str) -> Iterator[Processes]:
+    """Join the other processes that torchrun started (gloo on CPUs, nccl on GPUs); alone without torchrun.
+
+    Args:
+        device: "cpu", "cuda" or "auto" (a GPU when there is one); with GPUs, each process of a machine takes its own.
+
+    Raises:
+        InputError: a device that is none of these, or that this machine does not have.
+    """
+    rank, count, local_rank = (int(os.environ.get(key, 0)) for key in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
+    kind = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
+    if kind not in ("cpu", "cuda") or (kind == "cuda" and local_rank >= torch.cuda.device_count()):
+        raise InputError(f"device '{device}' (process {local_rank}) is not there, expected cpu, cuda or auto")
+    place = torch.device("cpu") if kind == "cpu" else torch.device("cuda", local_rank)
+    if place.type == "cuda":
+        torch.cuda.set_device(place)
+    if count <= 1:
+        yield Processes(0, 1, place)
+        return
+    dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
+    yield Processes(rank, count, place)
+    dist.destroy_process_group()  # not after an exception: it would wait for processes that wait for this one
