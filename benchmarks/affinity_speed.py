@@ -1,7 +1,7 @@
 """Affinity by plane angles against affinity by drawn lines, side by side: `python benchmarks/affinity_speed.py`
 
 A simulated plant of 16 leaves in 10 views of 640 x 480. The drawn twin (tests/reference.py: 200 points per region,
-OpenCV lines of two pixels, each counted against every region's mask) is timed on some regions and scaled to all of them.
+OpenCV lines of two pixels, each counted against every region's mask) is timed on some regions and scaled to all.
 `--agreement` instead compares both on the whole shipped scene, over four samplings; that takes a quarter of an hour.
 """
 

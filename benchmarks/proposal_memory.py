@@ -1,4 +1,4 @@
-"""Peak memory and time of the NMS loop on 28 views x 300 proposals of 1280 x 960: `python benchmarks/proposal_memory.py`
+"""Memory and time of the NMS loop on 28 views x 300 proposals, 1280 x 960: `python benchmarks/proposal_memory.py`
 
 Masks as the mask head gives them (28 x 28 probabilities and boxes), pasted as crops, matched, assigned and suppressed.
 """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import logging
 import os
 import sys
 import warnings
@@ -18,8 +19,10 @@ from jsonargparse import ArgumentParser, Namespace
 import mvseg
 from mvseg.config import MatchConfig, ReconstructConfig
 from mvseg.errors import InputError, InputWarning
+from mvseg.training_config import TrainConfig
 
 DEMO_SCENE = Path(str(files("mvseg") / "demo_plant"))
+DEFAULT_OUT = Path("results")
 BAD_INPUT = 2
 
 
@@ -35,7 +38,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # Idle threads shall sleep: on a shared machine spinning ones make small tensor work ten times slower. Must be set
     # before torch is loaded, which the verbs do when they start.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    verbs = {"infer": _infer, "match": _match, "eval": _eval}
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what a broken image means is said once, by us
+    verbs = {"infer": _infer, "match": _match, "eval": _eval, "train": _train, "simulate": _simulate}
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
@@ -65,6 +69,18 @@ def build_parser() -> ArgumentParser:
     evaluate.add_argument("result", type=Path, help="result folder")
     evaluate.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids")
     verbs.add_subcommand("eval", evaluate, help="compare a result with true labels")
+
+    train = ArgumentParser(exit_on_error=False, description="Fine-tune a Mask R-CNN; see configs/train/.")
+    train.add_argument("--config", action="config", help="YAML file with any of these options")
+    train.add_class_arguments(TrainConfig)
+    verbs.add_subcommand("train", train, help="fine-tune a Mask R-CNN")
+
+    simulate = ArgumentParser(exit_on_error=False, description="Render plants with known answers.")
+    simulate.add_argument("preset", help="paper-eval or train")
+    simulate.add_argument("--out", type=Path, required=True, help="folder for the scenes; finished ones are kept")
+    simulate.add_argument("--seed", type=int, default=0)
+    simulate.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")
+    verbs.add_subcommand("simulate", simulate, help="render plants with known answers")
     return parser
 
 
@@ -76,7 +92,7 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
         default=masks,
         help="folder of label PNGs or COCO .json, in the scene folder or anywhere; the shipped scene brings its own",
     )
-    parser.add_argument("--out", type=Path, default=Path("results"), help="folder for the result, or the results")
+    parser.add_argument("--out", type=Path | None, help="folder for the result, or the results (under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     parser.add_class_arguments(MatchConfig, "match")
 
@@ -87,7 +103,7 @@ def _infer(args: Namespace) -> int:
         if args.scene != DEMO_SCENE:
             raise InputError(f"{args.scene}: no masks were given, expected --masks FOLDER (label PNGs) or FILE (COCO)")
         masks = Path("masks")
-    out = args.out / args.scene.resolve().name if args.out == Path("results") else args.out
+    out = args.out or DEFAULT_OUT / args.scene.resolve().name
     _run(args.scene, masks, out, args, ReconstructConfig(**vars(args.reconstruct)))
     return 0
 
@@ -97,10 +113,10 @@ def _match(args: Namespace) -> int:
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two scenes are called '{name}', expected different names: each gets a folder in --out")
-    code = 0
+    code, out = 0, args.out or DEFAULT_OUT
     for scene, name in zip(args.scenes, names, strict=True):
         try:
-            _run(scene, args.masks, args.out / name, args, None)
+            _run(scene, args.masks, out / name, args, None)
         except InputError as error:  # the other scenes still get their results
             code = _complain(error)
     return code
@@ -118,6 +134,8 @@ def _run(scene: Path, masks: Path, out: Path, args: Namespace, reconstruct: Reco
         warnings.simplefilter("always", InputWarning)
         result = run_scene(scene, masks, MatchConfig(**vars(args.match)), reconstruct, progress=not args.quiet)
     remarks = [str(one.message) for one in caught if issubclass(one.category, InputWarning)]
+    for other in (one for one in caught if not issubclass(one.category, InputWarning)):
+        warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
     for remark in remarks:
         print(f"mvseg: warning: {remark}", file=sys.stderr)
     config = {"scene": str(scene), "masks": str(masks), "out": str(out), "match": vars(args.match)}
@@ -143,6 +161,22 @@ def _eval(args: Namespace) -> int:
         (args.result / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
         raise InputError(f"{args.result}: cannot write metrics.json ({error.strerror})") from None
+    return 0
+
+
+def _train(args: Namespace) -> int:
+    from mvseg.training import train
+
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    values = {field.name: args[field.name] for field in dataclasses.fields(TrainConfig)}
+    train(TrainConfig(**values))
+    return 0
+
+
+def _simulate(args: Namespace) -> int:
+    from mvseg.simulation.dataset import write_dataset
+
+    write_dataset(args.preset, args.out, seed=args.seed, num_workers=args.num_workers)
     return 0
 
 

@@ -229,8 +229,8 @@ def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Ten
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
     A box about the point nearest to all centroid rays is doubled until no cell at its border can hold such a point,
-    then shrunk to the cells that can, three times. Cells are judged by balls about them, so nothing is lost. None when no
-    cell can. Growth ends at twice the distance of the farthest camera: masks of nearly parallel views may have no
+    then shrunk to the cells that can, three times. Cells are judged by balls about them, so nothing is lost. None when
+    no cell can. Growth ends at twice the distance of the farthest camera: masks of nearly parallel views may have no
     bounded common part, and then the box is cut there.
     """
     centers, rays = torch.stack([m.center for m in masks]), torch.stack([m.ray for m in masks])

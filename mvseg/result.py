@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import os
 import shutil
 import tempfile
 from dataclasses import dataclass, field
@@ -16,13 +17,15 @@ from typing import Any
 
 import numpy as np
 import torch
-from pycocotools import mask as coco_mask
+from pydantic import BaseModel
 from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.formats.coco import encode_mask, write_coco
-from mvseg.formats.label_png import read_label_png, write_label_png, write_png
+from mvseg.formats.coco import Rle, decode_rle, encode_mask, write_coco
+from mvseg.formats.image_file import write_png
+from mvseg.formats.json_file import Pixels, read_json
+from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.mesh import write_glb, write_ply
 from mvseg.formats.photos import read_photo
@@ -58,7 +61,8 @@ class Result:
 def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False) -> None:
     """Write a result folder; an earlier result at the same place is replaced.
 
-    The folder appears complete or not at all: it is written beside its place and moved there at the end.
+    The folder appears complete or not at all: it is written beside its place and moved there at the end; until then an
+    earlier result stays. The overlays are drawn on the photos, or on grey when the scene has none at all.
 
     Args:
         result: the result.
@@ -67,12 +71,13 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         progress: show a progress bar over the views.
 
     Raises:
-        InputError: the place cannot be written, holds something that is no result, or a photo is broken.
+        InputError: the place cannot be written, holds something that is no result, or a photo is broken or,
+            when others are there, missing.
     """
     check_out(out)
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
-        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
+        partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.resolve().parent))
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
     try:
@@ -85,9 +90,7 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
         text = json.dumps(run | {"counts": counts, "seconds": seconds}, indent=1, default=str)
         (partial / RUN_FILE).write_text(text + "\n", encoding="utf-8")
-        if out.exists():
-            shutil.rmtree(out)
-        partial.rename(out)
+        _move(partial, out.resolve())
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
     finally:
@@ -95,24 +98,43 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
 
 
 def check_out(out: Path) -> None:
-    """Raises InputError when `out` is a file, or a folder that holds something other than an earlier result."""
+    """Raises InputError when `out` is a file, lies where nothing can be written, or is a folder that holds something
+    other than an earlier result."""
+    place = out.resolve()
     if out.is_dir():
-        if any(out.iterdir()) and not (out / RUN_FILE).is_file():
+        if not os.access(place, os.R_OK) or (any(place.iterdir()) and not (place / RUN_FILE).is_file()):
             raise InputError(f"{out}: holds files that are no earlier result, expected a new or an empty folder")
-    elif out.exists() or any(parent.is_file() for parent in out.parents):
+    elif out.exists() or any(parent.is_file() for parent in place.parents):
         raise InputError(f"{out}: the output folder is not writable (a file is in its place)")
+    nearest = next((parent for parent in place.parents if parent.exists()), place)
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(f"{out}: the output folder is not writable (no right to write in {nearest})")
+
+
+def _move(folder: Path, place: Path) -> None:
+    """Move a folder to a place that may be taken; what was there is deleted after that, or stays if it fails."""
+    earlier = folder.with_name(f"{folder.name}.earlier")
+    if place.exists():
+        place.rename(earlier)
+    try:
+        folder.rename(place)
+    except OSError:
+        if earlier.exists():
+            earlier.rename(place)
+        raise
+    shutil.rmtree(earlier, ignore_errors=True)
 
 
 def _write_images(result: Result, folder: Path, progress: bool) -> None:
     scene, ids = result.scene, result.matching.instance_ids
-    overlays = []
+    overlays, has_photos = [], any(view.path.exists() for view in scene.views)
     views = list(enumerate(scene.views))
     for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
         width, height = scene.cameras.sizes[index].tolist()
         labels = result.regions.label_map(index, ids + 1, width, height).cpu().numpy().astype(np.uint16)
         labels = distort(labels, view.lens, scene.cameras.K[index].cpu().numpy())
         write_label_png(folder / "labels" / f"{view.name}.png", labels)
-        photo = read_photo(scene, index) if view.path.exists() else np.full((height, width, 3), 40, np.uint8)
+        photo = read_photo(scene, index) if has_photos else np.full((height, width, 3), 40, np.uint8)
         overlays.append(draw_overlay(photo, result.regions, ids, index))
         overlay = folder / "overlay" / f"{view.name}.png"
         overlay.parent.mkdir(parents=True, exist_ok=True)
@@ -127,8 +149,8 @@ def _write_instances(result: Result, folder: Path) -> None:
     labels, views = result.regions.labels.tolist(), result.regions.view_index.tolist()
     for index, view in enumerate(scene.views):
         width, height = scene.cameras.sizes[index].tolist()
-        entry = {"id": index + 1, "file_name": view.path.name, "name": view.name, "width": width, "height": height}
-        images.append(entry)
+        file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
+        images.append({"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height})
     for number, index in enumerate(views):
         width, height = scene.cameras.sizes[index].tolist()
         mask = result.regions.mask(number, width, height).cpu().numpy().astype(np.uint8)
@@ -175,6 +197,24 @@ def _shape_traits(grid: VoxelGrid) -> dict[str, str]:
     return {"volume": f"{grid.volume:.6g}"} | {name: f"{value:.6g}" for name, value in corners}
 
 
+class _Image(BaseModel):
+    id: int
+    name: str
+    width: Pixels
+    height: Pixels
+
+
+class _Instance(BaseModel):
+    image_id: int
+    instance_id: int
+    segmentation: Rle
+
+
+class _Instances(BaseModel):
+    images: list[_Image]
+    annotations: list[_Instance]
+
+
 def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
     """Estimated and true instance ids of the regions of a result.
 
@@ -190,20 +230,25 @@ def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
         InputError: the result or the truth is missing or broken.
     """
     path = folder / "instances.json"
-    try:
-        content = json.loads(path.read_text(encoding="utf-8"))
-        images = {image["id"]: image for image in content["images"]}
-        found = [(images[one["image_id"]], one) for one in content["annotations"]]
-        ids = torch.tensor([int(one["instance_id"]) for _, one in found], dtype=torch.int64)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}), expected a result folder") from None
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, ValueError) as error:
-        raise InputError(f"{path}: not the instances of a result ({type(error).__name__}: {error})") from None
+    if not path.is_file():
+        raise InputError(f"{path}: is missing, expected a result folder")
     if not truth.is_dir():
         raise InputError(f"{truth}: no such folder of true labels")
+    content = read_json(path, _Instances)
+    images = {image.id: image for image in content.images}
     labels = {
-        number: read_label_png(truth / f"{image['name']}.png", image["width"], image["height"])
+        number: read_label_png(truth / f"{image.name}.png", image.width, image.height)
         for number, image in images.items()
     }
-    true = [region_truth(labels[image["id"]], coco_mask.decode(one["segmentation"])) for image, one in found]
-    return ids, torch.tensor(true, dtype=torch.int64)
+    true = []
+    for index, one in enumerate(content.annotations):
+        if one.image_id not in images:
+            raise InputError(f"{path}: annotations[{index}]: there is no image {one.image_id}")
+        image = images[one.image_id]
+        try:
+            mask = decode_rle(one.segmentation.counts, image.width, image.height)
+        except InputError as error:
+            raise InputError(f"{path}: annotations[{index}]: {error}") from None
+        true.append(region_truth(labels[image.id], mask))
+    ids = [one.instance_id for one in content.annotations]
+    return torch.tensor(ids, dtype=torch.int64), torch.tensor(true, dtype=torch.int64)

@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from tiny_training import write_photos
 from torch import Tensor
 
 from mvseg.augmentation import MEAN_COLOR, Augmentation, AugmentedSamples, augment, make_target, mix_seed, order_epoch
 from mvseg.training_data import LabelledPhoto, list_samples
+from tiny_training import write_photos
 
 PLAIN = Augmentation(64, "fixed", (1.0, 1.0), 0.0, 0.0)
 

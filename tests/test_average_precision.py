@@ -7,11 +7,11 @@ from typing import Any
 
 import pytest
 import torch
-from tiny_training import build_tiny, write_photos
 from torch import Tensor
 
 from mvseg.average_precision import annotate_detections, annotate_truth, average_precision, detect, detect_and_label
 from mvseg.training_data import LabelledPhoto, list_samples
+from tiny_training import build_tiny, write_photos
 
 
 def square(x: int, y: int, size: int = 8) -> Tensor:

@@ -94,7 +94,7 @@ def test_the_box_holds_all_that_exceeds_the_threshold() -> None:
 
 def test_thin_leaves_are_not_lost_by_the_search() -> None:
     """A blade of 0.02 thickness beside a box of 2: a tenth of a search cell."""
-    regions, cameras = ball_from(AXES[:2])
+    _, cameras = ball_from(AXES[:2])
     maps = [np.zeros((320, 320), np.int64) for _ in range(2)]
     maps[0][159:161, 80:240] = 1
     maps[1][159:161, 80:240] = 1

@@ -18,13 +18,13 @@ import numpy as np
 import pytest
 import torch
 import yaml  # type: ignore[import-untyped]
-from tiny_training import build_tiny, load_weights, make_config, parse_config, write_photos
 
 import mvseg.training
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.errors import InputError
 from mvseg.training import TrainConfig, best_epoch, train
 from mvseg.training_processes import Processes
+from tiny_training import build_tiny, load_weights, make_config, parse_config, write_photos
 
 TESTS = Path(__file__).parent
 

@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 import torch
-from tiny_training import build_tiny, make_config, parse_config
 
 from mvseg.detectors.mask_rcnn import list_architectures
 from mvseg.errors import InputError
 from mvseg.training_config import TrainConfig
 from mvseg.training_files import append_record, cut_log, write_whole
 from mvseg.training_state import TrainingState, apply_gradients, build_optimizer, learning_rate
+from tiny_training import build_tiny, make_config, parse_config
 
 # --- configs
 

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TypeVar
+from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, FiniteFloat, ValidationError
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from mvseg.errors import InputError
+from mvseg.formats.image_file import MAX_SIDE
 
 Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
+Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE)]
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -22,10 +24,10 @@ def read_json(path: Path, model: type[Model]) -> Model:
         InputError: the file is missing, is not JSON, or does not fit the model; names the file and the place in it.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))  # Windows editors put a mark in front
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, numbers of thousands of digits
         raise InputError(f"{path}: not a whole JSON file ({error})") from None
     try:
         return model.model_validate(content)

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from mvseg.errors import InputError
+from mvseg.formats.image_file import read_image, write_png
 
 
 def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
@@ -19,9 +20,9 @@ def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise InputError(f"{path}: the mask file is missing")
-    labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    labels = read_image(path, cv2.IMREAD_UNCHANGED)
     if labels is None:
-        raise InputError(f"{path}: cannot be read, expected a label PNG")
+        raise InputError(f"{path}: cannot be read, expected a whole label PNG")
     if labels.ndim != 2:
         raise InputError(f"{path}: has {labels.shape[2]} colour channels, expected a label PNG with a single channel")
     if labels.dtype not in (np.uint8, np.uint16):
@@ -36,14 +37,3 @@ def write_label_png(path: Path, labels: np.ndarray) -> None:
     """Write an integer label map (H, W) with values in [0, 65535] as a 16-bit PNG; its folder is made."""
     path.parent.mkdir(parents=True, exist_ok=True)
     write_png(path, labels.astype(np.uint16))
-
-
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write (H, W) uint8 or uint16, or (H, W, 3) uint8 RGB.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
-    _, encoded = cv2.imencode(".png", pixels)
-    path.write_bytes(encoded.tobytes())

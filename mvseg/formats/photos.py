@@ -13,6 +13,7 @@ import pycolmap
 import torch
 
 from mvseg.errors import InputError
+from mvseg.formats.image_file import MAX_SIDE, read_image
 from mvseg.formats.lens import undistort
 from mvseg.scene import Cameras, Scene, View, camera_problem
 
@@ -52,12 +53,7 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
     if len(photos) < 2:
         raise InputError(f"{source}: there is a single view, expected at least two")
     for index, photo in enumerate(photos):
-        problem = _path_problem(photo.file) or camera_problem(
-            torch.as_tensor(photo.K),
-            torch.as_tensor(photo.R),
-            torch.as_tensor(photo.t),
-            torch.tensor([photo.width, photo.height]),
-        )
+        problem = _problem(photo)
         if problem:
             raise InputError(f"{source}: view {index} ({photo.file}): {problem}")
     views = tuple(
@@ -83,11 +79,17 @@ def view_names(files: Sequence[str]) -> list[str]:
     return [path.relative_to(shared).with_suffix("").as_posix() for path in paths]
 
 
-def _path_problem(file: str) -> str | None:
-    path = os.path.normpath(file)
-    if not file or os.path.isabs(path) or path.split(os.sep)[0] == "..":
+def _problem(photo: Photo) -> str | None:
+    """What is wrong with a photo's path or camera, as the end of a sentence; None for a sound one."""
+    path = os.path.normpath(photo.file)
+    if os.path.isabs(path) or path.split(os.sep)[0] == "..":
         return "the file name leads out of the scene folder"
-    return None
+    if path == "." or "\0" in path:
+        return "this is no name of a file"
+    if max(photo.width, photo.height) > MAX_SIDE:
+        return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_SIDE} pixels a side"
+    size = torch.tensor([photo.width, photo.height])
+    return camera_problem(torch.as_tensor(photo.K), torch.as_tensor(photo.R), torch.as_tensor(photo.t), size)
 
 
 def read_photo(scene: Scene, view: int) -> np.ndarray:
@@ -99,9 +101,9 @@ def read_photo(scene: Scene, view: int) -> np.ndarray:
     path, (width, height) = scene.views[view].path, scene.cameras.sizes[view].tolist()
     if not path.is_file():
         raise InputError(f"{path}: the image of view {view} is missing")
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    image = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None:
-        raise InputError(f"{path}: the image of view {view} cannot be read, expected an image file")
+        raise InputError(f"{path}: the image of view {view} cannot be read, expected a whole image file")
     if image.shape[:2] != (height, width):
         size = f"{image.shape[1]} x {image.shape[0]}"
         raise InputError(f"{path}: the image of view {view} is {size}, its camera says {width} x {height}")

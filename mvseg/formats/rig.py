@@ -16,10 +16,10 @@ from typing import Literal
 
 import numpy as np
 import pycolmap
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
+from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.json_file import Matrix3, Vector3, read_json
+from mvseg.formats.json_file import Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.photos import Photo, build_scene
 from mvseg.scene import Scene
 
@@ -29,8 +29,8 @@ RIG_FORMAT = "mvseg-rig/1"
 class _RigView(BaseModel):
     model_config = ConfigDict(extra="allow")
     file: str
-    width: int = Field(ge=1)
-    height: int = Field(ge=1)
+    width: Pixels
+    height: Pixels
     K: Matrix3
     R: Matrix3
     t: Vector3
@@ -61,12 +61,12 @@ def read_rig(path: Path) -> Scene:
 
 def _photo(path: Path, index: int, view: _RigView) -> Photo:
     K, lens = np.array(view.K), None
-    if view.distortion is not None and any(view.distortion):
-        if len(view.distortion) not in (4, 5, 8):
-            raise InputError(
-                f"{path}: view {index} ({view.file}): distortion has {len(view.distortion)} numbers, "
-                "expected k1, k2, p1, p2, k3"
-            )
+    if view.distortion and len(view.distortion) not in (4, 5, 8):
+        raise InputError(
+            f"{path}: view {index} ({view.file}): distortion has {len(view.distortion)} numbers, "
+            "expected k1, k2, p1, p2, k3"
+        )
+    if view.distortion and any(view.distortion):
         if K[0, 1] != 0:
             raise InputError(f"{path}: view {index} ({view.file}): K has skew together with distortion, expected none")
         lens = opencv_lens(view.width, view.height, K, view.distortion)

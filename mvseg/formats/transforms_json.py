@@ -6,10 +6,10 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from pydantic import BaseModel, Field, FiniteFloat
+from pydantic import BaseModel, FiniteFloat
 
 from mvseg.errors import InputError
-from mvseg.formats.json_file import read_json
+from mvseg.formats.json_file import Pixels, read_json
 from mvseg.formats.photos import Photo, build_scene
 from mvseg.formats.rig import opencv_lens
 from mvseg.scene import Scene
@@ -20,8 +20,8 @@ Row4 = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
 
 class _Intrinsics(BaseModel):
     camera_model: str | None = None
-    w: int | None = Field(None, ge=1)
-    h: int | None = Field(None, ge=1)
+    w: Pixels | None = None
+    h: Pixels | None = None
     fl_x: FiniteFloat | None = None
     fl_y: FiniteFloat | None = None
     cx: FiniteFloat | None = None
@@ -70,9 +70,11 @@ def _photo(folder: Path, frame: _Frame, intrinsics: dict) -> Photo:
     fy = intrinsics.get("fl_y", fx)
     K = np.array([[fx, 0, intrinsics["cx"]], [0, fy, intrinsics["cy"]], [0, 0, 1.0]])
     world_from_cam = np.array(frame.transform_matrix)
+    if world_from_cam[3:].tolist() not in ([], [[0.0, 0.0, 0.0, 1.0]]):
+        raise InputError("the last row of transform_matrix is not 0, 0, 0, 1")
     R = (world_from_cam[:3, :3] @ OPENGL_FROM_OPENCV).T
     file = frame.file_path
-    if not Path(file).suffix:  # nerfstudio allows leaving ".png" away
+    if not (folder / file).is_file():  # nerfstudio allows leaving ".png" away
         file = next((file + end for end in (".png", ".jpg", ".jpeg") if (folder / (file + end)).is_file()), file)
     lens = _lens(intrinsics, width, height, K)
     return Photo(file, width, height, K, R, -R @ world_from_cam[:3, 3], lens)

@@ -71,7 +71,7 @@ def draw_contact_sheet(overlays: Sequence[np.ndarray], names: Sequence[str]) -> 
     columns = max(columns, min(len(overlays), 4))
     tiles = []
     for overlay, name in zip(overlays, names, strict=True):
-        height = round(TILE_WIDTH * overlay.shape[0] / overlay.shape[1])
+        height = max(1, round(TILE_WIDTH * overlay.shape[0] / overlay.shape[1]))
         tile = cv2.resize(overlay, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
         tile = cv2.copyMakeBorder(tile, 26, 4, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
         cv2.putText(tile, name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)

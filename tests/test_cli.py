@@ -1,0 +1,467 @@
+"""The command line: what a person types, sees and gets; bad input above all."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import struct
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+import trimesh
+
+import mvseg
+from mvseg.cli import DEMO_SCENE, main
+from mvseg.formats.label_png import read_label_png
+from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
+
+ROOT = Path(__file__).parent.parent
+NAN, INF = float("nan"), float("inf")
+Break = Callable[[Path], None]
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Path:
+    return write_scene(tmp_path / "plant")
+
+
+def complaint(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line on stderr, without its prefix."""
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("mvseg: error: ")
+    assert "Traceback" not in captured.err
+    return captured.err.removeprefix("mvseg: error: ").rstrip("\n")
+
+
+# --- The shipped scene ----------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The result of `mvseg infer` without arguments."""
+    folder = tmp_path_factory.mktemp("demo")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        assert main(["infer", "--quiet"]) == 0
+    return folder / "results" / "demo_plant"
+
+
+def test_demo_finds_every_leaf(demo: Path) -> None:
+    names = {path.relative_to(demo).as_posix() for path in demo.rglob("*") if path.is_file()}
+    views = [f"{view:03d}.png" for view in range(9)]
+    assert names == {
+        *(f"labels/{name}" for name in views),
+        *(f"overlay/{name}" for name in views),
+        *(f"leaves/leaf_{leaf:03d}.ply" for leaf in range(1, 13)),
+        *("contact.png", "instances.json", "run.json", "scene.glb", "traits.csv"),
+    }
+    leaf_of_label: dict[int, set[int]] = {}
+    for name in views:
+        labels = read_label_png(demo / "labels" / name, 640, 480)
+        truth = read_label_png(DEMO_SCENE / "truth" / name, 640, 480)
+        np.testing.assert_array_equal(labels > 0, truth > 0)
+        for label in np.unique(labels)[1:].tolist():
+            leaf_of_label.setdefault(label, set()).update(np.unique(truth[labels == label]).tolist())
+    assert sorted(leaf_of_label) == list(range(1, 13))
+    assert sorted(leaf for leaves in leaf_of_label.values() for leaf in leaves) == list(range(1, 13))
+
+
+def test_demo_shapes_hold_the_true_leaves(demo: Path) -> None:
+    labels, truth = (read_label_png(path / "000.png", 640, 480) for path in (demo / "labels", DEMO_SCENE / "truth"))
+    for label in np.unique(labels)[1:].tolist():
+        leaf = int(truth[labels == label][0])
+        shape = trimesh.load_mesh(demo / "leaves" / f"leaf_{label:03d}.ply")
+        true = trimesh.load_mesh(DEMO_SCENE / "truth" / "leaves" / f"leaf_{leaf:03d}.ply")
+        size = np.linalg.norm(true.extents)
+        assert np.abs(shape.bounds.mean(0) - true.bounds.mean(0)).max() < 0.2 * size
+    scene = trimesh.load_scene(demo / "scene.glb")
+    assert set(scene.graph.nodes_geometry) == {f"leaf_{leaf:03d}" for leaf in range(1, 13)}
+
+
+def test_demo_evaluates_to_one(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["eval", str(demo), "--truth", str(DEMO_SCENE / "truth")]) == 0
+    printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
+    metrics = json.loads((demo / "metrics.json").read_text())
+    assert printed.keys() == metrics.keys()
+    assert (metrics["s_match"], metrics["e_k"], metrics["ari"]) == (1, 0, 1)
+    assert (metrics["num_regions"], metrics["num_estimated"], metrics["num_true"]) == (108, 12, 12)
+    assert (metrics["no_instance"], metrics["ignored"]) == (0, 0)
+    assert printed["s_match"] == "1.0000"
+
+
+# --- Options --------------------------------------------------------------------------------------
+
+
+def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    config = tmp_path / "run.yaml"
+    config.write_text(
+        "masks: masks\nquiet: true\nmatch:\n  num_instances: 3\n  seed: 4\n"
+        "reconstruct: {voxel_size: 1.5, threshold: 0.4}\n"
+    )
+    arguments = ["infer", str(plant), "--config", str(config), "--match.seed", "9", "--out", str(tmp_path / "out")]
+    assert main(arguments) == 0
+    captured = capsys.readouterr()
+    assert captured.out == f"{tmp_path / 'out'}: 3 instances from 12 masks in 4 views\n"
+    assert captured.err == ""
+    run = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert run["config"] == {
+        "scene": str(plant),
+        "masks": str(plant / "masks"),
+        "out": str(tmp_path / "out"),
+        "match": {"num_points": None, "num_instances": 3, "search_range": None, "num_restarts": 2, "seed": 9},
+        "reconstruct": {"threshold": 0.4, "voxel_size": 1.5, "voxel_budget": 250_000},
+    }
+    assert run["mvseg"] == mvseg.__version__
+    assert run["inputs"].keys() == {str(plant / "cameras.json"), str(plant / "masks")}
+    assert run["warnings"] == []
+
+
+def test_progress_bars_unless_quiet(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["match", str(plant), "--out", str(tmp_path / "out")]) == 0
+    assert "pictures: 100%" in capsys.readouterr().err
+    assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+
+
+def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
+    (plant / "masks").rename(tmp_path / "elsewhere")
+    arguments = ["match", str(plant), "--masks", str(tmp_path / "elsewhere"), "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(arguments) == 0
+    assert (tmp_path / "out" / "plant" / "labels" / "003.png").is_file()
+
+
+@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["infer", "--help"], ["match", "--help"]])
+def test_help_and_version(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as stop:
+        main(arguments)
+    assert stop.value.code == 0
+    assert capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("config", "arguments", "message"),
+    [
+        ("match: {num_pionts: 3}", [], "match.num_pionts"),
+        ("colour: red", [], "colour"),
+        ("reconstruct: {threshold: high}", [], "reconstruct.threshold"),
+        ("match: {num_points: [3", [], "config"),
+        ("", ["--match.num_pionts", "3"], "--match.num_pionts"),
+        ("", ["--match.num_points", "many"], "match.num_points"),
+        ("", ["--config", "absent.yaml"], "absent.yaml"),
+        ("", ["surplus"], "surplus"),
+    ],
+)
+def test_wrong_options(
+    config: str,
+    arguments: list[str],
+    message: str,
+    plant: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "run.yaml").write_text(config)
+    first = ["--config", str(tmp_path / "run.yaml")] if config else []
+    common = [str(plant), "--masks", "masks", "--out", str(tmp_path / "out")]
+    assert main(["infer", *common, *first, *arguments]) == 2
+    assert message in complaint(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("arguments", [[], ["guess"], ["match"], ["eval"], ["eval", "results"]])
+def test_incomplete_commands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(arguments) == 2
+    assert complaint(capsys)
+
+
+# --- Several scenes -------------------------------------------------------------------------------
+
+
+def test_match_takes_several_scenes(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    other = write_scene(tmp_path / "other", 3)
+    out = tmp_path / "out"
+    assert main(["match", str(plant), str(other), "--out", str(out), "--quiet"]) == 0
+    assert capsys.readouterr().out.splitlines() == [
+        f"{out / 'plant'}: 3 instances from 12 masks in 4 views",
+        f"{out / 'other'}: 3 instances from 9 masks in 3 views",
+    ]
+    assert sorted(path.name for path in out.iterdir()) == ["other", "plant"]
+    assert not (out / "plant" / "scene.glb").exists()
+    assert json.loads((out / "other" / "run.json").read_text())["scene"] == "other"
+
+
+def test_a_broken_scene_does_not_stop_the_others(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    broken = write_scene(tmp_path / "broken")
+    (broken / "masks" / "001.png").unlink()
+    assert main(["match", str(broken), str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    captured = capsys.readouterr()
+    assert captured.err == f"mvseg: error: {broken}/masks/001.png: the mask file is missing (view 1)\n"
+    assert captured.out.startswith(f"{tmp_path}/out/plant: 3 instances")
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["plant"]
+
+
+def test_scenes_of_one_name_are_refused(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(plant, tmp_path / "more" / "plant")
+    assert main(["match", str(plant), str(tmp_path / "more" / "plant"), "--out", str(tmp_path / "out")]) == 2
+    assert "two scenes are called 'plant'" in complaint(capsys)
+    assert not (tmp_path / "out").exists()
+
+
+# --- Not errors -----------------------------------------------------------------------------------
+
+
+def test_masks_only(tmp_path: Path) -> None:
+    plant = write_scene(tmp_path / "plant", images=False)
+    assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert len(list((tmp_path / "out" / "overlay").iterdir())) == 4
+
+
+@pytest.mark.parametrize("verb", ["infer", "match"])
+def test_two_cameras_at_one_place(verb: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    same = json.loads((plant / "cameras.json").read_text())["views"][0]
+    edit_rig(plant, 1, R=same["R"], t=same["t"])
+    for kind in ("images", "masks"):
+        shutil.copy(plant / kind / "000.png", plant / kind / "001.png")
+    assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    warning = "views 0 and 1 were taken from one place: this pair is skipped"
+    assert capsys.readouterr().err == f"mvseg: warning: {warning}\n"
+    (run,) = (tmp_path / "out").rglob("run.json")
+    assert json.loads(run.read_text())["warnings"] == [warning]
+
+
+@pytest.mark.parametrize("verb", ["infer", "match"])
+def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for path in (plant / "masks").iterdir():
+        write_image(path, np.zeros((HEIGHT, WIDTH), np.uint16))
+    assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    captured = capsys.readouterr()
+    assert captured.err == "mvseg: warning: the masks of all views are empty: there is no instance\n"
+    assert captured.out.endswith(": 0 instances from 0 masks in 4 views\n")
+    out = tmp_path / "out" if verb == "infer" else tmp_path / "out" / "plant"
+    content = json.loads((out / "instances.json").read_text())
+    assert len(content["images"]) == 4
+    assert content["annotations"] == []
+    assert not read_label_png(out / "labels" / "002.png", WIDTH, HEIGHT).any()
+    assert json.loads((out / "run.json").read_text())["counts"] == {"regions": 0, "instances": 0}
+    if verb == "infer":
+        assert list(csv.DictReader((out / "traits.csv").read_text().splitlines())) == []
+        assert (out / "traits.csv").read_text().startswith("id,views,volume,")
+        assert not trimesh.load_scene(out / "scene.glb").geometry
+        assert list((out / "leaves").iterdir()) == []
+    assert main(["eval", str(out), "--truth", str(plant / "masks")]) == 0
+
+
+# --- Bad input ------------------------------------------------------------------------------------
+
+
+def rig(view: int | None = None, **changes: Any) -> Break:
+    return lambda folder: edit_rig(folder, view, **changes)
+
+
+def remove(name: str) -> Break:
+    return lambda folder: (folder / name).unlink()
+
+
+def write_text(name: str, text: str) -> Break:
+    return lambda folder: (folder / name).write_text(text) and None
+
+
+def cut(name: str, share: float) -> Break:
+    return lambda folder: cut_file(folder / name, share)
+
+
+def picture(name: str, *shape: int, dtype: type = np.uint8) -> Break:
+    return lambda folder: write_image(folder / name, np.zeros(shape, dtype))
+
+
+def as_jpeg(share: float) -> Break:
+    """Photo 2 as a JPEG of which only a part is there."""
+
+    def change(folder: Path) -> None:
+        edit_rig(folder, 2, file="images/002.jpg")
+        noise = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        write_image(folder / "images" / "002.jpg", noise)
+        cut_file(folder / "images" / "002.jpg", share)
+
+    return change
+
+
+def colmap(name: str = "", length: float = 1.0, *, replace: tuple[bytes, bytes] | None = None) -> Break:
+    """The cameras as a binary COLMAP model, one of its files cut or changed."""
+
+    def change(folder: Path) -> None:
+        model = pycolmap.Reconstruction()
+        params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
+        camera = pycolmap.Camera(model="PINHOLE", width=WIDTH, height=HEIGHT, params=params, camera_id=1)
+        model.add_camera_with_trivial_rig(camera)
+        for view in range(4):
+            R, t = arc_pose(view, 4)
+            image = pycolmap.Image(f"{view:03d}.png", pycolmap.Point2DList(), 1, view + 1)
+            model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(R), t))
+        (folder / "sparse").mkdir()
+        model.write_binary(folder / "sparse")
+        (folder / "cameras.json").unlink()
+        if name:
+            cut_file(folder / "sparse" / name, length)
+        if replace:
+            path = folder / "sparse" / "cameras.bin"
+            path.write_bytes(path.read_bytes().replace(*replace))
+
+    return change
+
+
+def transforms(**changes: Any) -> Break:
+    def change(folder: Path) -> None:
+        (folder / "cameras.json").unlink()
+        frames = [{"file_path": f"images/{v:03d}.png", "transform_matrix": np.eye(4).tolist()} for v in range(4)]
+        content = {"w": WIDTH, "h": HEIGHT, "fl_x": 150, "cx": 64, "cy": 48, "frames": frames}
+        (folder / "transforms.json").write_text(json.dumps(content | changes))
+
+    return change
+
+
+def coco(text: str) -> Break:
+    """Masks as a COCO file; the test passes `--masks masks.json`."""
+    return write_text("masks.json", text)
+
+
+IMAGES = [{"id": v, "file_name": f"{v:03d}.png", "width": WIDTH, "height": HEIGHT} for v in range(4)]
+BAD_RLE = {"id": 7, "image_id": 2, "segmentation": {"size": [HEIGHT, WIDTH], "counts": "zz"}}
+BAD_INPUT: dict[str, tuple[Break, str]] = {
+    "missing image": (remove("images/002.png"), "images/002.png: the image of view 2 is missing"),
+    "image of another size": (picture("images/002.png", 96, 127, 3), "images/002.png: the image of view 2 is 127 x 96"),
+    "image cut": (cut("images/002.png", 0.7), "images/002.png: the image of view 2 cannot be read"),
+    "image empty": (cut("images/002.png", 0), "images/002.png: the image of view 2 cannot be read"),
+    "JPEG cut": (as_jpeg(0.6), "images/002.jpg: the image of view 2 cannot be read"),
+    "JPEG cut at its end": (as_jpeg(0.999), "images/002.jpg: the image of view 2 cannot be read"),
+    "image is text": (write_text("images/002.png", "hello"), "images/002.png: the image of view 2 cannot be read"),
+    "camera model in transforms.json": (
+        transforms(camera_model="CUBIST"),
+        "transforms.json: frame 0 (images/000.png): the camera model 'CUBIST' is not known",
+    ),
+    "camera model in COLMAP": (
+        colmap(replace=(struct.pack("<ii", 1, 1), struct.pack("<ii", 1, 77))),
+        "sparse/cameras.bin: camera model number 77 is not known",
+    ),
+    "no rotation": (rig(1, R=np.diag([1, 1, 1.2]).tolist()), "view 1 (images/001.png): R is not a rotation"),
+    "reflection": (rig(1, R=np.diag([1, 1, -1]).tolist()), "view 1 (images/001.png): R is a reflection"),
+    "zero focal length": (
+        rig(3, K=[[0, 0, 64], [0, 150, 48], [0, 0, 1]]),
+        "view 3 (images/003.png): the focal length is 0",
+    ),
+    "zero focal length in COLMAP": (
+        colmap(replace=(struct.pack("<2d", 150, 150), struct.pack("<2d", 0, 150))),
+        "sparse: view 0 (images/000.png): the focal length is 0",
+    ),
+    "NaN in a pose": (rig(1, t=[0, NAN, 50]), "cameras.json: views[1].t[1]: Input should be a finite number"),
+    "infinity in a pose": (rig(1, t=[0, INF, 50]), "cameras.json: views[1].t[1]: Input should be a finite number"),
+    "two views of one name": (rig(3, file="images/001.jpg"), "cameras.json: views 1 and 3 have the same name '001'"),
+    "name that leads out": (rig(2, file="../002.png"), "view 2 (../002.png): the file name leads out of the scene"),
+    "absolute name": (rig(2, file="/etc/passwd"), "view 2 (/etc/passwd): the file name leads out of the scene"),
+    "name of a folder": (rig(2, file="images/.."), "view 2 (images/..): this is no name of a file"),
+    "missing mask": (remove("masks/001.png"), "masks/001.png: the mask file is missing (view 1)"),
+    "mask of another size": (picture("masks/001.png", 95, 128), "masks/001.png: the mask is 128 x 95, its camera says"),
+    "mask with colours": (picture("masks/001.png", 96, 128, 3), "masks/001.png: has 3 colour channels"),
+    "mask cut": (cut("masks/001.png", 0.6), "masks/001.png: cannot be read, expected a whole label PNG (view 1)"),
+    "mask empty": (cut("masks/001.png", 0), "masks/001.png: cannot be read, expected a whole label PNG (view 1)"),
+    "COCO cut": (coco(json.dumps({"images": IMAGES, "annotations": []})[:50]), "masks.json: not a whole JSON file"),
+    "COCO without a view": (
+        coco(json.dumps({"images": IMAGES[:3], "annotations": []})),
+        "masks.json: view 3 (003) has no entry",
+    ),
+    "COCO of another size": (
+        coco(json.dumps({"images": [IMAGES[0] | {"width": 5}, *IMAGES[1:]], "annotations": []})),
+        "masks.json: image 000.png is 5 x 96",
+    ),
+    "COCO mask broken": (
+        coco(json.dumps({"images": IMAGES, "annotations": [BAD_RLE]})),
+        "masks.json: annotation 7: its run lengths do not add up",
+    ),
+    "COCO of another form": (coco("[1, 2]"), "masks.json: Input should be a valid dictionary"),
+    "single view": (rig(views=rig_content()["views"][:1]), "cameras.json: there is a single view"),
+    "rig without views": (rig(views=[]), "cameras.json: there are no views"),
+    "rig of another format": (rig(format="mvseg-rig/9"), "cameras.json: format: Input should be 'mvseg-rig/1'"),
+    "rig cut": (cut("cameras.json", 0.5), "cameras.json: not a whole JSON file"),
+    "rig empty": (cut("cameras.json", 0), "cameras.json: not a whole JSON file"),
+    "transforms.json without frames": (transforms(frames=[]), "transforms.json: there are no views"),
+    "no cameras": (remove("cameras.json"), "plant: no cameras, expected cameras.json"),
+    **{
+        f"{name} cut at {share}": (colmap(name, share), f"sparse/{name}: not a whole COLMAP file")
+        for name in ("cameras.bin", "images.bin", "points3D.bin")
+        for share in (0, 0.2, 0.9)
+    },
+}
+
+
+@pytest.mark.parametrize("name", BAD_INPUT)
+def test_bad_input(name: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    change, message = BAD_INPUT[name]
+    change(plant)
+    masks = "masks.json" if (plant / "masks.json").exists() else "masks"
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["infer", str(plant), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert message in complaint(capsys)
+    assert sorted(tmp_path.rglob("*")) == before  # no result, and nothing half of one
+
+
+def test_the_same_scene_whole_is_fine(plant: Path, tmp_path: Path) -> None:
+    """The builders of the table above are sound when nothing is broken."""
+    shutil.copytree(plant, tmp_path / "colmap")
+    colmap()(tmp_path / "colmap")
+    coco(json.dumps({"images": IMAGES, "annotations": []}))(plant)
+    for scene, masks in ((plant, "masks"), (tmp_path / "colmap", "masks"), (plant, "masks.json")):
+        assert main(["infer", str(scene), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    transforms()(plant)
+    assert main(["match", str(plant), "--out", str(tmp_path / "other"), "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("place", ["file", "file/below", "full"])
+def test_output_that_cannot_be_written(
+    place: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").touch()
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.tex").touch()
+    before = sorted(tmp_path.rglob("*"))
+    assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / place), "--quiet"]) == 2
+    reason = "holds files that are no earlier result" if place == "full" else "the output folder is not writable"
+    assert f"{tmp_path / place}: {reason}" in complaint(capsys)
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_scene_or_masks_that_are_not_there(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = ["--out", str(tmp_path / "out")]
+    assert main(["infer", str(tmp_path / "absent"), "--masks", "masks", *out]) == 2
+    assert complaint(capsys) == f"{tmp_path / 'absent'}: no such scene folder"
+    assert main(["infer", str(plant), "--masks", "absent", *out]) == 2
+    assert complaint(capsys).startswith("absent: no such masks")
+    assert main(["infer", str(plant), *out]) == 2
+    assert complaint(capsys).startswith(f"{plant}: no masks were given, expected --masks")
+    assert main(["eval", str(plant), "--truth", str(plant / "truth")]) == 2
+    assert complaint(capsys) == f"{plant / 'instances.json'}: is missing, expected a result folder"
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", ["JPEG cut", "images.bin cut at 0.2", "mask cut"])
+def test_bad_input_in_a_process_of_its_own(name: str, plant: Path, tmp_path: Path) -> None:
+    """Libraries that write to stderr by themselves would show here."""
+    change, message = BAD_INPUT[name]
+    change(plant)
+    command = [sys.executable, str(ROOT / "infer.py"), str(plant), "--masks", "masks", "--out", "out", "--quiet"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr.startswith("mvseg: error: ")
+    assert done.stderr.count("\n") == 1
+    assert message in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["plant"]

@@ -1,0 +1,221 @@
+"""COCO masks against pycocotools, there and back, and every way to get them wrong."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+
+from mvseg.errors import InputError
+from mvseg.formats.coco import decode_rle, encode_mask, read_coco, write_coco
+from mvseg.scene import Cameras, Scene, View
+
+pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in pycocotools
+WIDTH, HEIGHT = 60, 40
+POLYGON = [5.0, 5.0, 50.0, 8.0, 40.0, 35.0, 12.0, 30.0]
+OTHER = [2.0, 30.0, 10.0, 30.0, 10.0, 38.0]
+
+
+def make_scene(*files: str) -> Scene:
+    eye = torch.eye(3).expand(len(files), 3, 3)
+    cameras = Cameras(eye, eye, torch.zeros(len(files), 3), torch.tensor([[WIDTH, HEIGHT]] * len(files)))
+    names = [file.removeprefix("images/").rsplit(".", 1)[0] for file in files]
+    return Scene("plant", tuple(map(View, names, [Path("plant") / file for file in files])), cameras)
+
+
+@pytest.fixture
+def scene() -> Scene:
+    return make_scene("images/a.jpg", "images/b.jpg")
+
+
+def random_mask(seed: int, height: int = HEIGHT, width: int = WIDTH) -> np.ndarray:
+    noise = np.random.default_rng(seed).normal(size=(height, width))
+    return cv2.GaussianBlur(noise, (0, 0), 2) > 0.05
+
+
+def uncompressed(mask: np.ndarray) -> dict[str, Any]:
+    """COCO's uncompressed RLE, counted here pixel by pixel down the columns."""
+    counts, value = [0], False
+    for pixel in mask.T.ravel().tolist():
+        if pixel != value:
+            counts.append(0)
+            value = pixel
+        counts[-1] += 1
+    return {"size": list(mask.shape), "counts": counts}
+
+
+def write(folder: Path, annotations: list[dict[str, Any]], files: tuple[str, ...] = ("a.jpg", "b.jpg")) -> Path:
+    images = [
+        {"id": 10 + index, "file_name": file, "width": WIDTH, "height": HEIGHT} for index, file in enumerate(files)
+    ]
+    whole = [{"id": 1 + index, "image_id": 10, "category_id": 1} | one for index, one in enumerate(annotations)]
+    path = folder / "masks.json"
+    path.write_text(json.dumps({"images": images, "annotations": whole, "categories": []}))
+    return path
+
+
+def read_one(folder: Path, scene: Scene, segmentation: Any) -> np.ndarray:
+    ((_, mask),), _ = read_coco(write(folder, [{"segmentation": segmentation}]), scene)
+    return mask
+
+
+@pytest.mark.parametrize(
+    "mask", [random_mask(0), random_mask(1, 1, 300), np.zeros((5, 7), bool), np.ones((5, 7), bool)]
+)
+def test_run_lengths_decode_as_in_pycocotools(mask: np.ndarray) -> None:
+    height, width = mask.shape
+    rle = encode_mask(mask)
+    np.testing.assert_array_equal(coco_mask.decode(rle), mask)
+    np.testing.assert_array_equal(decode_rle(rle["counts"], width, height), mask)
+    np.testing.assert_array_equal(decode_rle(uncompressed(mask)["counts"], width, height), mask)
+    oracle = coco_mask.decode(coco_mask.frPyObjects(uncompressed(mask), height, width))
+    np.testing.assert_array_equal(oracle, mask)
+
+
+def test_long_runs_decode() -> None:
+    mask = np.zeros((3000, 2000), bool)
+    mask[100:2900, 700:1900] = True
+    np.testing.assert_array_equal(decode_rle(encode_mask(mask)["counts"], 2000, 3000), mask)
+
+
+def test_all_three_encodings_give_one_mask(scene: Scene, tmp_path: Path) -> None:
+    polygons = [POLYGON, OTHER]
+    expected = coco_mask.decode(coco_mask.merge(coco_mask.frPyObjects(polygons, HEIGHT, WIDTH))).astype(bool)
+    assert expected.sum() > 500
+    for segmentation in (polygons, encode_mask(expected), uncompressed(expected)):
+        mask = read_one(tmp_path, scene, segmentation)
+        assert mask.dtype == bool
+        np.testing.assert_array_equal(mask, expected)
+
+
+def test_annotations_go_to_their_views_and_crowds_are_left_out(scene: Scene, tmp_path: Path) -> None:
+    rles = [encode_mask(random_mask(seed)) for seed in range(4)]
+    annotations: list[dict[str, Any]] = [
+        {"segmentation": rles[0], "image_id": 11},
+        {"segmentation": rles[1], "image_id": 10},
+        {"segmentation": rles[2], "image_id": 11, "iscrowd": 1},
+        {"segmentation": rles[3], "image_id": 12},
+    ]
+    first, second = read_coco(write(tmp_path, annotations, ("a.jpg", "b.jpg", "elsewhere.jpg")), scene)
+    assert [number for number, _ in first] == [2]
+    assert [number for number, _ in second] == [1]
+    np.testing.assert_array_equal(second[0][1], random_mask(0))
+
+
+def test_a_view_without_annotations_is_empty(scene: Scene, tmp_path: Path) -> None:
+    assert read_coco(write(tmp_path, []), scene) == [[], []]
+
+
+@pytest.mark.parametrize(
+    "form", ["{}.jpg", "./{}.jpg", "images/{}.jpg", "images\\{}.jpg", "{}", "{}.png", "plant/images/{}.jpg"]
+)
+def test_images_are_found_by_name(form: str, scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": [POLYGON]}], (form.format("a"), form.format("b")))
+    assert [len(view) for view in read_coco(path, scene)] == [1, 0]
+
+
+def test_views_in_subfolders(tmp_path: Path) -> None:
+    scene = make_scene("images/left/1.jpg", "images/right/1.jpg")
+    path = write(tmp_path, [{"segmentation": [POLYGON], "image_id": 11}], ("left/1.jpg", "right/1.jpg"))
+    assert [len(view) for view in read_coco(path, scene)] == [0, 1]
+    path = write(tmp_path, [], ("1.jpg", "right/1.jpg"))
+    with pytest.raises(InputError, match=r"image 1.jpg could be view 0 \(left/1\) or 1 \(right/1\), expected its path"):
+        read_coco(path, scene)
+
+
+BAD: list[tuple[Any, str]] = [
+    ({"size": [HEIGHT, WIDTH], "counts": encode_mask(random_mask(0))["counts"][:-9]}, "do not add up to 60 x 40"),
+    ({"size": [HEIGHT, WIDTH], "counts": ""}, "do not add up to 60 x 40"),
+    ({"size": [HEIGHT, WIDTH], "counts": "zzzzzzzz"}, "do not add up to 60 x 40"),
+    ({"size": [HEIGHT, WIDTH], "counts": "ü~"}, "do not add up to 60 x 40"),
+    ({"size": [HEIGHT, WIDTH], "counts": [100, 100]}, "do not add up to 60 x 40"),
+    ({"size": [HEIGHT, WIDTH], "counts": [0, WIDTH * HEIGHT + 1]}, "do not add up to 60 x 40"),
+    ({"size": [WIDTH, HEIGHT], "counts": [0, WIDTH * HEIGHT]}, "its mask is 40 x 60, its camera says 60 x 40"),
+    ({"size": [10**9, 10**9], "counts": "PPYo1"}, "its mask is 1000000000 x 1000000000"),
+    ([], "expected polygons"),
+    ([[]], "expected polygons"),
+    ([[1.0, 2.0, 3.0, 4.0]], "expected polygons"),
+    ([POLYGON, [1.0, 2.0, 3.0, 4.0]], "expected polygons"),
+    ([[*POLYGON, 3.0]], "expected polygons"),
+    ([[1.0, 2.0, 1e12, 4.0, 5.0, 6.0]], "leads far out of the image"),
+]
+
+
+@pytest.mark.parametrize(("segmentation", "message"), BAD)
+def test_broken_masks_are_named(segmentation: Any, message: str, scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": [POLYGON]}, {"segmentation": segmentation}])
+    with pytest.raises(InputError, match=rf"masks.json: annotation 2: .*{message}"):
+        read_coco(path, scene)
+
+
+@pytest.mark.parametrize(
+    "segmentation",
+    [
+        {"size": [HEIGHT, WIDTH], "counts": [-5, WIDTH * HEIGHT + 5]},
+        {"size": [HEIGHT, WIDTH], "counts": ["a"]},
+        {"counts": [WIDTH * HEIGHT]},
+        {"size": [HEIGHT, WIDTH]},
+        [[1.0, 2.0, float("nan"), 4.0, 5.0, 6.0]],
+        "circle",
+        None,
+    ],
+)
+def test_masks_of_another_form_are_named(segmentation: Any, scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": [POLYGON]}, {"segmentation": segmentation}])
+    with pytest.raises(InputError, match=r"masks.json: annotations\[1\]\.segmentation"):
+        read_coco(path, scene)
+
+
+def test_missing_image_entry(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"masks.json: view 1 \(b\) has no entry among the images"):
+        read_coco(write(tmp_path, [], ("a.jpg",)), scene)
+
+
+def test_other_image_size(scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [])
+    path.write_text(path.read_text().replace(f'"width": {WIDTH}', '"width": 61'))
+    with pytest.raises(InputError, match=r"masks.json: image a.jpg is 61 x 40, its camera says 60 x 40"):
+        read_coco(path, scene)
+
+
+@pytest.mark.parametrize("length", [0, 1, 100, 200])
+def test_cut_short(length: int, scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": [POLYGON]}])
+    path.write_text(path.read_text()[:length])
+    with pytest.raises(InputError, match=r"masks.json: not a whole JSON file"):
+        read_coco(path, scene)
+
+
+def test_written_file_reads_back_here_and_in_pycocotools(
+    scene: Scene, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    masks = [random_mask(seed) for seed in range(3)]
+    images = [
+        {"id": i + 1, "file_name": f"{name}.jpg", "width": WIDTH, "height": HEIGHT} for i, name in enumerate("ab")
+    ]
+    annotations = [
+        {"image_id": 1 + number % 2, "instance_id": number, "segmentation": encode_mask(mask)}
+        for number, mask in enumerate(masks)
+    ]
+    write_coco(tmp_path / "out.json", images, annotations)
+    first, second = read_coco(tmp_path / "out.json", scene)
+    np.testing.assert_array_equal([mask for _, mask in first], [masks[0], masks[2]])
+    np.testing.assert_array_equal(second[0][1], masks[1])
+    coco = COCO(tmp_path / "out.json")
+    capsys.readouterr()  # pycocotools prints its progress
+    for number, one in enumerate(coco.loadAnns(coco.getAnnIds())):
+        np.testing.assert_array_equal(coco.annToMask(one), masks[number])
+        rows, columns = masks[number].nonzero()
+        assert one["area"] == masks[number].sum()
+        left, top, width, height = one["bbox"]
+        assert (left, left + width, top, top + height) == (
+            columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+        )  # fmt: skip
+        assert (one["instance_id"], one["category_id"], one["iscrowd"]) == (number, 1, 0)

@@ -1,0 +1,65 @@
+"""Label PNGs: what was written comes back, and nothing else passes for labels."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mvseg.errors import InputError
+from mvseg.formats.label_png import read_label_png, write_label_png
+from scene_folders import cut_file, write_image
+
+
+def test_round_trip_over_all_16_bits(tmp_path: Path) -> None:
+    labels = np.arange(65536, dtype=np.int64).reshape(128, 512)
+    path = tmp_path / "new" / "folder" / "labels.png"
+    write_label_png(path, labels)
+    back = read_label_png(path, 512, 128)
+    assert back.dtype == np.uint16
+    np.testing.assert_array_equal(back, labels)
+    np.testing.assert_array_equal(cv2.imread(str(path), cv2.IMREAD_UNCHANGED), labels)
+
+
+def test_8_bit_labels_are_taken_as_they_are(tmp_path: Path) -> None:
+    labels = np.array([[0, 1, 2], [200, 254, 255]], np.uint8)
+    write_image(tmp_path / "labels.png", labels)
+    np.testing.assert_array_equal(read_label_png(tmp_path / "labels.png", 3, 2), labels)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.zeros((4, 6, 3), np.uint8), "has 3 colour channels, expected a label PNG with a single channel"),
+        (np.zeros((4, 5), np.uint16), "the mask is 5 x 4, its camera says 6 x 4"),
+        (np.zeros((6, 4), np.uint16), "the mask is 4 x 6, its camera says 6 x 4"),
+    ],
+)
+def test_other_images_are_refused(image: np.ndarray, message: str, tmp_path: Path) -> None:
+    write_image(tmp_path / "labels.png", image)
+    with pytest.raises(InputError, match=rf"labels.png: {message}"):
+        read_label_png(tmp_path / "labels.png", 6, 4)
+
+
+def test_transparency_and_floats_are_refused(tmp_path: Path) -> None:
+    assert cv2.imwrite(str(tmp_path / "alpha.png"), np.zeros((4, 6, 4), np.uint8))
+    with pytest.raises(InputError, match=r"alpha.png: has 4 colour channels"):
+        read_label_png(tmp_path / "alpha.png", 6, 4)
+    assert cv2.imwrite(str(tmp_path / "float.tif"), np.zeros((4, 6), np.float32))
+    with pytest.raises(InputError, match=r"float.tif: holds float32 numbers, expected 8 or 16 bits"):
+        read_label_png(tmp_path / "float.tif", 6, 4)
+
+
+def test_missing(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"labels.png: the mask file is missing"):
+        read_label_png(tmp_path / "labels.png", 6, 4)
+
+
+@pytest.mark.parametrize("share", [0, 0.3, 0.7, 0.99])
+def test_cut_short(share: float, tmp_path: Path) -> None:
+    write_label_png(tmp_path / "labels.png", np.arange(2400).reshape(40, 60))
+    cut_file(tmp_path / "labels.png", share)
+    with pytest.raises(InputError, match=r"labels.png: cannot be read, expected a whole label PNG"):
+        read_label_png(tmp_path / "labels.png", 60, 40)
