@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.config import ReconstructConfig
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -111,7 +112,8 @@ def back_project(members: Regions, cameras: Cameras, config: ReconstructConfig |
         config: threshold, voxel size (world units) or voxel budget.
 
     Returns:
-        The grid, or None for an instance seen in fewer than two views or without a common point.
+        The grid, or None for an instance seen in fewer than two views or without a common point. Warns (InputWarning)
+        when the common part has no bounds, as with views that are nearly parallel, and had to be cut off.
 
     Raises:
         InputError: a threshold outside [0, 1), a voxel size or budget that is not positive or asks for more than
@@ -241,10 +243,10 @@ def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Ten
     half = float((sizes * distance).max().clamp(min=1e-9))
     limit = 2 * float(distance.max()) + half
     low, high = middle - half, middle + half
-    while half < limit:
-        cells = _possible_cells(masks, low, high, threshold)
-        inner = cells[1:-1, 1:-1, 1:-1]
-        if cells.sum() == inner.sum():
+    while _reaches_border(_possible_cells(masks, low, high, threshold)):
+        if half >= limit:
+            message = f"the {len(masks)} masks of an instance have no bounded common part (the views are too alike)"
+            warnings.warn(f"{message}: its shape is cut off", InputWarning, stacklevel=4)
             break
         half = min(2 * half, limit)
         low, high = middle - half, middle + half
@@ -255,6 +257,10 @@ def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Ten
         cell = (high - low) / SEARCH_CELLS
         low, high = low + place.amin(0) * cell, low + (place.amax(0) + 1) * cell
     return low, high
+
+
+def _reaches_border(cells: Tensor) -> bool:
+    return bool(cells.sum() > cells[1:-1, 1:-1, 1:-1].sum())
 
 
 def _possible_cells(masks: list[_ViewMask], low: Tensor, high: Tensor, threshold: float) -> Tensor:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvseg.config import ReconstructConfig
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction import back_project, reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -152,7 +152,8 @@ def test_what_has_no_bounded_shape_is_left_out() -> None:
 def test_nearly_parallel_views_are_cut_not_lost() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0.01, 0]]))
     maps = render_balls(cameras, torch.zeros(1, 3).double(), torch.ones(1).double())
-    grid = back_project(regions_from_label_maps(maps), cameras, ReconstructConfig(voxel_budget=20_000))
+    with pytest.warns(InputWarning, match="cut off"):
+        grid = back_project(regions_from_label_maps(maps), cameras, ReconstructConfig(voxel_budget=20_000))
     assert grid is not None
     assert 0 < grid.volume < 1e5
 
