@@ -17,7 +17,8 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-SEARCH_CELLS = 24  # cells per side while the bounding box of an instance is sought
+SEARCH_CELLS = 24  # cells along the bounding box of an instance when the search for it ends
+MAX_CELLS = 100_000  # or when it holds this many
 MAX_VOXELS = 200_000_000
 
 
@@ -150,6 +151,7 @@ class _ViewMask:
     corner: tuple[int, int]  # x, y of the crop's top-left pixel
     px_from_world: Tensor  # (3, 4) float64
     focal: float
+    slant: float  # largest distance from the camera per unit of depth, over the rays of the crop
     center: Tensor  # (3,) camera centre
     ray: Tensor  # (3,) unit viewing ray through the mask's centroid
 
@@ -167,51 +169,51 @@ class _ViewMask:
         ray = ray / torch.linalg.vector_norm(ray)
         K = cameras.K[view]
         px_from_world = K @ torch.cat((cameras.R[view], cameras.t[view, :, None]), 1)
-        return _ViewMask(mask, (x1, y1), px_from_world, float(K.diagonal()[:2].max()), cameras.centers[view], ray)
+        corners = torch.tensor([[u, v, 1.0] for u in (x1, x2) for v in (y1, y2)]).to(K)
+        slant = float(torch.linalg.vector_norm(corners @ torch.linalg.inv(K).T, dim=1).max())
+        focal = float(K.diagonal()[:2].max())
+        return _ViewMask(mask, (x1, y1), px_from_world, focal, slant, cameras.centers[view], ray)
 
     def contains(self, axes: list[Tensor]) -> Tensor:
-        """(X, Y, Z) bool: L of Eq. 6: is the point in front of the camera, and its pixel in the mask?"""
-        u, v, depth = self._project(axes, torch.float32)
+        """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask?
+
+        Computed about the first point, so that float32 keeps a thousandth of a pixel however far the world's origin is.
+        """
+        first = torch.stack([axis[0] for axis in axes])
+        offset = (self.px_from_world[:, :3] @ first + self.px_from_world[:, 3]).float()
+        x, y, z = ((axis - axis[0]).float() for axis in axes)
+        x, y, z = x[:, None, None], y[None, :, None], z[None, None, :]
+        rows = self.px_from_world.float()
+        u, v, depth = (row[0] * x + row[1] * y + (row[2] * z + start) for row, start in zip(rows, offset, strict=True))
+        scale = 1 / depth.clamp(min=1e-12)
         height, width = self.mask.shape
         # One free pixel around the crop receives everything that falls outside.
         framed = torch.nn.functional.pad(self.mask, (1, 1, 1, 1)).flatten()
-        column = (u + 1).clamp(0, width + 1).long()
-        row = (v + 1).clamp(0, height + 1).long()
+        column = (u * scale - (self.corner[0] - 1)).clamp(0, width + 1).long()
+        row = (v * scale - (self.corner[1] - 1)).clamp(0, height + 1).long()
         return framed[row * (width + 2) + column] & (depth > 0)
 
-    def may_meet(self, axes: list[Tensor], reach: float) -> Tensor:
-        """(X, Y, Z) bool: can the mask meet the projection of a ball of radius `reach` about the point?
+    def may_meet(self, points: Tensor, reach: float) -> Tensor:
+        """(P,) bool: can the mask meet the projection of a ball of radius `reach` about each (P, 3) point?
 
         The projection is replaced by a square of pixels that contains it, so the answer errs only towards yes.
         """
-        u, v, depth = self._project(axes, torch.float64)
-        x, y, z = _open_grid([axis - center for axis, center in zip(axes, self.center, strict=True)])
+        u, v, depth = (points @ self.px_from_world[:, :3].T + self.px_from_world[:, 3]).unbind(1)
+        distance = torch.linalg.vector_norm(points - self.center, dim=1)
+        scale = 1 / depth.clamp(min=1e-12)
+        u, v = u * scale - self.corner[0], v * scale - self.corner[1]
         # |u' - u| <= f reach sqrt(1 + (X/Z)^2) / (Z - reach), and distance / depth bounds the root.
-        slant = (x**2 + y**2 + z**2).sqrt() / depth.clamp(min=1e-12)
-        margin = reach * self.focal / (depth - reach).clamp(min=1e-12) * slant
+        margin = reach * self.focal / (depth - reach).clamp(min=1e-12) * distance * scale
         height, width = self.mask.shape
         integral = torch.nn.functional.pad(self.mask.int().cumsum(0).cumsum(1), (1, 0, 1, 0)).flatten()
         x1, y1 = ((c - margin).floor().clamp(0, side).long() for c, side in ((u, width), (v, height)))
         x2, y2 = (((c + margin).floor() + 1).clamp(0, side).long() for c, side in ((u, width), (v, height)))
         top, bottom = y1 * (width + 1), y2 * (width + 1)
         count = integral[bottom + x2] - integral[top + x2] - integral[bottom + x1] + integral[top + x1]
-        return ((count > 0) | (depth <= reach)) & (depth > -reach)
-
-    def _project(self, axes: list[Tensor], dtype: torch.dtype) -> tuple[Tensor, Tensor, Tensor]:
-        """Column and row relative to the crop, and depth, of each point; computed about the first one, so that float32
-        keeps a thousandth of a pixel however far the world's origin is."""
-        first = torch.stack([axis[0] for axis in axes])
-        offset = (self.px_from_world[:, :3] @ first + self.px_from_world[:, 3]).to(dtype)
-        x, y, z = _open_grid([(axis - axis[0]).to(dtype) for axis in axes])
-        rows = self.px_from_world.to(dtype)
-        u, v, depth = (row[0] * x + row[1] * y + (row[2] * z + start) for row, start in zip(rows, offset, strict=True))
-        scale = 1 / depth.clamp(min=1e-12)
-        return u * scale - self.corner[0], v * scale - self.corner[1], depth
-
-
-def _open_grid(axes: list[Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """Three 1-D axes as (X, 1, 1), (1, Y, 1) and (1, 1, Z)."""
-    return axes[0][:, None, None], axes[1][None, :, None], axes[2][None, None, :]
+        # A ball that reaches behind the camera has no bounded projection. A mask point in it has a depth below
+        # 2 reach, thus lies within 2 reach * slant of the camera, and the ball's centre within reach of that.
+        beside = (depth > -reach) & (distance <= reach * (1 + 2 * self.slant))
+        return torch.where(depth > reach, count > 0, beside)
 
 
 def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor]) -> Tensor:
@@ -230,43 +232,29 @@ def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor]) -> Tensor:
 def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Tensor] | None:
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
-    A box about the point nearest to all centroid rays is doubled until no cell at its border can hold such a point,
-    then shrunk to the cells that can, three times. Cells are judged by balls about them, so nothing is lost. None when
-    no cell can. Growth ends at twice the distance of the farthest camera: masks of nearly parallel views may have no
-    bounded common part, and then the box is cut there.
+    A cube about the point nearest to all centroid rays, twice as far as the farthest camera, is halved again and again;
+    cells in which no point can exceed the threshold are dropped, until the box of the rest is `SEARCH_CELLS` cells
+    long and hardly shrinks any more. Cells are judged by balls about them, so nothing is lost, however thin. None when no cell is left. Masks of
+    nearly parallel views may have no bounded common part: it is cut off at the cube.
     """
     centers, rays = torch.stack([m.center for m in masks]), torch.stack([m.ray for m in masks])
     across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
     middle = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
-    distance = torch.linalg.vector_norm(centers - middle, dim=1)
-    sizes = torch.tensor([max(m.mask.shape) / m.focal for m in masks]).to(distance)
-    half = float((sizes * distance).max().clamp(min=1e-9))
-    limit = 2 * float(distance.max()) + half
-    low, high = middle - half, middle + half
-    while _reaches_border(_possible_cells(masks, low, high, threshold)):
-        if half >= limit:
-            message = f"the {len(masks)} masks of an instance have no bounded common part (the views are too alike)"
-            warnings.warn(f"{message}: its shape is cut off", InputWarning, stacklevel=4)
-            break
-        half = min(2 * half, limit)
-        low, high = middle - half, middle + half
-    for _ in range(3):
-        place = _possible_cells(masks, low, high, threshold).nonzero()
-        if not len(place):
+    half = 2 * float(torch.linalg.vector_norm(centers - middle, dim=1).max().clamp(min=1e-9))
+    root_low, root_high = middle - half, middle + half
+    cells, split = middle[None], torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3).to(middle)
+    low, high, shrinks = root_low, root_high, True
+    while (shrinks or (high - low).max() < 2 * half * SEARCH_CELLS) and len(cells) < MAX_CELLS:
+        before = (high - low).prod()
+        cells = (cells[:, None] + half * split).flatten(0, 1)
+        half /= 2
+        votes = torch.stack([mask.may_meet(cells, half * 3**0.5) for mask in masks]).sum(0)
+        cells = cells[votes > threshold * len(masks) + 1e-6]
+        if not len(cells):
             return None
-        cell = (high - low) / SEARCH_CELLS
-        low, high = low + place.amin(0) * cell, low + (place.amax(0) + 1) * cell
+        low, high = cells.amin(0) - half, cells.amax(0) + half
+        shrinks = bool((high - low).prod() < 0.8 * before)
+    if (low - half < root_low).any() or (high + half > root_high).any():
+        message = f"the {len(masks)} masks of an instance have no bounded common part (the views are too alike)"
+        warnings.warn(f"{message}: its shape is cut off", InputWarning, stacklevel=4)
     return low, high
-
-
-def _reaches_border(cells: Tensor) -> bool:
-    return bool(cells.sum() > cells[1:-1, 1:-1, 1:-1].sum())
-
-
-def _possible_cells(masks: list[_ViewMask], low: Tensor, high: Tensor, threshold: float) -> Tensor:
-    """(S, S, S) bool: cells of the box in which some point may exceed the threshold."""
-    cell = (high - low) / SEARCH_CELLS
-    axes = [low[a] + (torch.arange(SEARCH_CELLS).to(low) + 0.5) * cell[a] for a in range(3)]
-    reach = float(torch.linalg.vector_norm(cell)) / 2
-    votes = torch.stack([mask.may_meet(axes, reach) for mask in masks]).sum(0)
-    return votes > threshold * len(masks) + 1e-6
