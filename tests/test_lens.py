@@ -68,7 +68,10 @@ def test_projection_agrees_with_opencv(coefficients: list[float]) -> None:
 def test_inverse_agrees_with_opencv(coefficients: list[float]) -> None:
     criteria = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 200, 1e-12)
     arguments = ((pixels() - 0.5)[:, None], OPENCV_K, np.array(coefficients))
-    expected = cv2.undistortPoints(*arguments, P=OPENCV_K, criteria=criteria)[:, 0]
+    if hasattr(cv2, "undistortPointsIter"):  # until OpenCV 5
+        expected = cv2.undistortPointsIter(*arguments, None, OPENCV_K, criteria)[:, 0]
+    else:
+        expected = cv2.undistortPoints(*arguments, P=OPENCV_K, criteria=criteria)[:, 0]
     np.testing.assert_allclose(pinhole_from_photo(lens_of(coefficients), K, pixels()) - 0.5, expected, atol=1e-5)
 
 
