@@ -190,3 +190,11 @@ def test_at_most_so_many_detections_per_view() -> None:
     scene, proposals, _ = crowded_scene()
     keep, _ = match_proposals(proposals, scene.cameras, num_iterations=1, detections_per_view=5)
     assert proposals.regions.select(keep).num_per_view.max() == 5
+
+
+def test_nothing_found_is_an_empty_answer() -> None:
+    detector = tiny_detector()
+    detector.roi_heads.score_thresh = 0.999
+    found = MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
+    assert [len(one["instance_ids"]) for one in found] == [0, 0, 0]
+    assert found[0]["masks"].shape == (0, 1, 120, 160)
