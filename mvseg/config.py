@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from mvseg.errors import InputError
+
 
 @dataclass(frozen=True)
 class MatchConfig:
@@ -12,8 +14,8 @@ class MatchConfig:
     Attributes:
         num_points: random pixels per region that send out epipolar lines (the paper: 200); null takes all pixels.
         num_instances: number of instances, when it is known.
-        search_range: smallest and largest number of instances to try; null for [m, 2 m], m the largest number of
-            masks in any view. See mvseg/clustering.py for why it decides everything.
+        search_range: smallest and largest number of instances to try, as in [5, 9]; null for [m, 2 m], m the largest
+            number of masks in any view. Where the search starts decides much: equal parts always look good.
         num_restarts: random starts of each factorisation.
         seed: of the random pixels and starts.
     """
@@ -23,6 +25,17 @@ class MatchConfig:
     search_range: tuple[int, int] | None = None
     num_restarts: int = 2
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("num_points", "num_instances", "num_restarts"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"match.{name} is {value}, expected at least 1")
+        if self.search_range is not None and not 1 <= self.search_range[0] <= self.search_range[1]:
+            low, high = self.search_range
+            raise InputError(f"match.search_range is [{low}, {high}], expected 1 <= smallest <= largest")
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"match.seed is {self.seed}, expected a number from 0 to 2^32 - 1")
 
 
 @dataclass(frozen=True)
@@ -39,3 +52,11 @@ class ReconstructConfig:
     threshold: float = 0.5
     voxel_size: float | None = None
     voxel_budget: int = 250_000
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.threshold < 1:
+            raise InputError(f"reconstruct.threshold is {self.threshold:g}, expected a number in [0, 1)")
+        if self.voxel_size is not None and not 0 < self.voxel_size < float("inf"):
+            raise InputError(f"reconstruct.voxel_size is {self.voxel_size:g}, expected a positive number")
+        if self.voxel_budget < 1:
+            raise InputError(f"reconstruct.voxel_budget is {self.voxel_budget}, expected at least 1")

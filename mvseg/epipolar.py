@@ -111,7 +111,9 @@ class Pencil:
 
 def is_coincident(cameras: Cameras) -> Tensor:
     """(V, V) bool: the pair has no baseline (shorter than 1e-6 of the scene's longest), so no epipolar geometry."""
-    distance = torch.cdist(cameras.centers, cameras.centers)
+    centers = cameras.centers
+    # Differences, not torch.cdist: that one cancels for many cameras far from the world's origin.
+    distance = torch.linalg.vector_norm(centers[:, None] - centers, dim=2)
     return distance <= COINCIDENT * distance.max()
 
 
@@ -259,6 +261,7 @@ def epipolar_bands(regions: Regions, cameras: Cameras, view: int, xy: Tensor) ->
     bands = torch.zeros(len(regions), len(xy), dtype=torch.bool, device=regions.device)
     if not len(xy):
         return bands
+    cameras = cameras.to(regions.device)
     skip = is_coincident(cameras)[view]
     for other, (source, members) in enumerate(zip(*view_samples(regions), strict=True)):
         if skip[other] or not len(members):
@@ -283,5 +286,5 @@ def epipolar_map(regions: Regions, cameras: Cameras, view: int, xy: Tensor) -> T
     Returns:
         (P,) float32 in [0, 1]; zeros when no member lies in another view.
     """
-    projectable = ~is_coincident(cameras)[view][regions.view_index]
+    projectable = ~is_coincident(cameras.to(regions.device))[view][regions.view_index]
     return epipolar_bands(regions, cameras, view, xy).sum(0) / projectable.sum().clamp(min=1)

@@ -56,6 +56,7 @@ def match_regions(
         raise InputError(f"regions of {regions.num_views} views with {len(cameras)} cameras, expected as many of each")
     if len(cameras) < 2:
         raise InputError("matching needs at least two views, got a single one")
+    cameras = cameras.to(regions.device)
     _warn_of_gaps(regions, cameras)
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
     clustering = cluster_affinity(

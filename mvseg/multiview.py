@@ -48,9 +48,10 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper:
        0.7): an excessive set of masks.
     2. Match first: what plain NMS at `cluster_iou` leaves of it is matched across views, which also tells |k|.
+       Things of different classes are never matched.
     3. Alternate `num_iterations` times: every mask of the excessive set takes the cluster whose epipolar map it
        resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each cluster; match the survivors
-       again, with the same |k|.
+       again, with the same |k|. Masks that resemble no map form one more group.
 
     Departures from the paper: it matches the excessive set itself at first, and estimates |k| anew each time. The
     duplicates in these sets inflate the number of masks per view, from which the search range of |k| follows; that
@@ -63,7 +64,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         proposal_iou: NMS threshold of the excessive set.
         cluster_iou: NMS threshold inside a cluster, and of the set that is matched first.
         proposals_per_view: size of the excessive set; the best scores stay.
-        match: how regions are matched.
+        match: how regions are matched; a given number of instances holds for each class.
 
     Raises:
         InputError: the detector has no mask head.
@@ -91,7 +92,11 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         self.train(detector.training)
 
     def forward(
-        self, images: list[Tensor], targets: list[dict[str, Tensor]] | None = None, cameras: Cameras | None = None
+        self,
+        images: list[Tensor],
+        targets: list[dict[str, Tensor]] | None = None,
+        *,
+        cameras: Cameras | None = None,
     ) -> dict[str, Tensor] | list[dict[str, Tensor]]:
         """Detect, and match across views.
 
@@ -106,16 +111,17 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
 
         Raises:
-            InputError: as many cameras as images are expected, of the images' sizes.
+            InputError: two or more images are expected, as many cameras, and the cameras' sizes.
         """
         if self.training or cameras is None:
             return super().forward(images, targets)
         sizes = [[image.shape[-1], image.shape[-2]] for image in images]
-        if sizes != cameras.sizes.tolist():
-            raise InputError(f"images of sizes {sizes} with cameras of sizes {cameras.sizes.tolist()}")
+        _check_cameras(cameras, sizes)
         with torch.no_grad():
-            cameras = cameras.to(images[0].device)
             found = [self._propose(image) for image in images]
+        # Under autocast the heads may work in half precision; counts of pixels may not.
+        with torch.no_grad(), torch.autocast(images[0].device.type, enabled=False):
+            cameras = cameras.to(images[0].device)
             proposals = gather_proposals(found, sizes)
             keep, matching = match_proposals(
                 proposals,
@@ -139,7 +145,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         lenient.nms_thresh, lenient.detections_per_img = self.proposal_iou, self.proposals_per_view
         (found,), _ = lenient(features, boxes, resized.image_sizes)
         height, width = resized.image_sizes[0]
-        return found | {"frame": torch.tensor([width, height])}
+        exact = {key: found[key].float() for key in ("boxes", "scores", "masks")}
+        return found | exact | {"frame": torch.tensor([width, height])}
 
     def _collect(
         self,
@@ -162,6 +169,16 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             results.append(result)
             start += len(one["boxes"])
         return results
+
+
+def _check_cameras(cameras: Cameras, sizes: list[list[int]]) -> None:
+    if not isinstance(cameras, Cameras):
+        raise InputError(f"cameras is a {type(cameras).__name__}, expected Cameras (of a scene: scene.cameras)")
+    if len(sizes) < 2 or len(sizes) != len(cameras):
+        raise InputError(f"{len(sizes)} images with {len(cameras)} cameras, expected as many, two or more")
+    for view, (found, told) in enumerate(zip(sizes, cameras.sizes.tolist(), strict=True)):
+        if found != told:
+            raise InputError(f"image {view} is {found[0]} x {found[1]}, its camera says {told[0]} x {told[1]}")
 
 
 def match_proposals(

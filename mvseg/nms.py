@@ -69,6 +69,9 @@ def ruzicka_similarity(
         (R, K) float32 in [0, 1]; 0 where a cluster has no member in another view: its own view's members have no band
         there, and do not count in Eq. 4 (the paper does not say).
     """
+    if instance_ids.shape != regions.view_index.shape:
+        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+    cameras = cameras.to(regions.device)
     num_clusters = int(instance_ids.max()) + 1 if len(instance_ids) else 0
     clustered = regions.select(instance_ids >= 0)
     cluster_of = instance_ids[instance_ids >= 0]

@@ -88,15 +88,24 @@ def reconstruct_instances(
         progress: show a progress bar over the instances.
 
     Returns:
-        {instance id: grid}. Instances seen in one view only, and those whose masks have no common point in front of the
-        cameras, are left out: they have no bounded shape.
+        {instance id: grid}. Instances seen in one view only are left out: they have no bounded shape. So are, with an
+        InputWarning (which counts instances from 1, as files do), those in which no point has enough votes.
+
+    Raises:
+        InputError: as many ids as regions are expected; see also `back_project`.
     """
+    if instance_ids.shape != regions.view_index.shape:
+        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
     shapes = {}
     instances = instance_ids[instance_ids >= 0].unique().tolist()
     for instance in tqdm(instances, desc="back-projection", unit="instance", disable=not progress):
-        grid = back_project(regions.select(instance_ids == instance), cameras, config)
+        members = regions.select(instance_ids == instance)
+        grid = back_project(members, cameras, config)
         if grid is not None:
             shapes[instance] = grid
+        elif len(members.view_index.unique()) > 1:
+            message = f"instance {instance + 1} has no shape: its {len(members)} masks have no point in common"
+            warnings.warn(message, InputWarning, stacklevel=2)
     return shapes
 
 
@@ -117,15 +126,12 @@ def back_project(members: Regions, cameras: Cameras, config: ReconstructConfig |
         when the common part has no bounds, as with views that are nearly parallel, and had to be cut off.
 
     Raises:
-        InputError: a threshold outside [0, 1), a voxel size or budget that is not positive or asks for more than
-            2e8 voxels.
+        InputError: a voxel size that asks for more than 2e8 voxels.
     """
     config = config or ReconstructConfig()
-    if not 0 <= config.threshold < 1:
-        raise InputError(f"the threshold is {config.threshold:g}, expected a number in [0, 1)")
-    if (config.voxel_size is not None and config.voxel_size <= 0) or config.voxel_budget < 1:
-        raise InputError("the voxel size and the voxel budget must be positive")
-    masks = [_ViewMask.union(members, view, cameras) for view in members.view_index.unique().tolist()]
+    cameras = cameras.to(members.device)
+    views = members.view_index[members.areas > 0].unique().tolist()
+    masks = [_ViewMask.union(members, view, cameras) for view in views]
     if len(masks) < 2:
         return None
     box = _bounding_box(masks, config.threshold)

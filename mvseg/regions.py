@@ -103,6 +103,8 @@ class Regions:
 
     def select(self, index: Tensor) -> Regions:
         """The regions at an int64 index or a bool mask, in that order."""
+        if index.dtype == torch.bool and len(index) != len(self):
+            raise InputError(f"a mask of {len(index)} for {len(self)} regions, expected as many")
         keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
         parts = self.crops.split(self.crop_sizes.prod(1).tolist())
         crops = torch.cat([parts[number] for number in keep.tolist()]) if len(keep) else self.crops[:0]

@@ -160,7 +160,7 @@ def _write_instances(result: Result, folder: Path) -> None:
                 "instance_id": ids[number] + 1 if ids[number] >= 0 else -1,
                 "match_score": round(scores[number], 4),
                 "source_label": labels[number],
-                "segmentation": encode_mask(distort(mask, scene.views[index].lens, scene.cameras.K[index].numpy())),
+                "segmentation": encode_mask(distort(mask, scene.views[index].lens, scene.cameras.K[index].cpu().numpy())),
             }
         )
     write_coco(folder / "instances.json", images, annotations)

@@ -71,7 +71,9 @@ class Cameras:
         return len(self.K)
 
     def __getitem__(self, index: Any) -> Cameras:
-        """The cameras at a slice, a list or a tensor of view indices."""
+        """The cameras at a slice, a list or a tensor of view indices; of one view: `cameras[[0]]`."""
+        if isinstance(index, int):
+            raise InputError(f"cameras[{index}] asks for a single camera, expected a list: cameras[[{index}]]")
         return Cameras(self.K[index], self.R[index], self.t[index], self.sizes[index])
 
     @property
@@ -143,7 +145,7 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Photos of one plant from V >= 2 known cameras.
+    """Photos of one plant from V known cameras (two or more, when read from a folder).
 
     Attributes:
         name: the folder's name.

@@ -117,6 +117,12 @@ def test_views_of_one_place_have_no_pencil() -> None:
         epipolar_pencil(cameras, 0, 1)
 
 
+def test_many_cameras_far_from_the_origin_keep_their_baselines() -> None:
+    shift = torch.tensor([5e5, 5e6, 0.0]).double()
+    cameras = moved(cameras_at(arc_positions(28, distance=0.35)), 1.0, torch.eye(3).double(), shift)
+    assert torch.equal(is_coincident(cameras), torch.eye(28, dtype=torch.bool))
+
+
 def test_dilate_agrees_with_a_loop() -> None:
     occupied = torch.rand(4, 60, generator=torch.Generator().manual_seed(0)) < 0.08
     for radius in (1, 3, 70):

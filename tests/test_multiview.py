@@ -119,10 +119,14 @@ def test_the_detectors_own_thresholds_stay_as_they_were() -> None:
 
 def test_wrong_arguments_are_named() -> None:
     wrapped = MultiViewMaskRCNN(tiny_detector())
-    with pytest.raises(InputError, match="images of sizes"):
+    with pytest.raises(InputError, match="2 images with 3 cameras"):
         wrapped(some_images(2), cameras=small_cameras(3))
-    with pytest.raises(InputError, match="images of sizes"):
+    with pytest.raises(InputError, match="image 0 is 150 x 120, its camera says 160 x 120"):
         wrapped(some_images(3, width=150), cameras=small_cameras(3))
+    with pytest.raises(InputError, match="expected as many, two or more"):
+        wrapped(some_images(1), cameras=small_cameras(2)[:1])
+    with pytest.raises(InputError, match=r"expected Cameras \(of a scene"):
+        wrapped(some_images(3), cameras="cameras.json")
     boxes_only = fasterrcnn_mobilenet_v3_large_320_fpn(weights=None, weights_backbone=None)
     with pytest.raises(InputError, match="no mask head"):
         MultiViewMaskRCNN(boxes_only)
@@ -198,3 +202,11 @@ def test_nothing_found_is_an_empty_answer() -> None:
     found = MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
     assert [len(one["instance_ids"]) for one in found] == [0, 0, 0]
     assert found[0]["masks"].shape == (0, 1, 120, 160)
+
+
+def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
+    wrapped = MultiViewMaskRCNN(tiny_detector())
+    with torch.autocast("cpu", torch.bfloat16):
+        found = wrapped(some_images(), cameras=small_cameras())
+    assert found[0]["match_scores"].dtype == torch.float32
+    assert max(int(one["instance_ids"].max()) for one in found) >= 0

@@ -14,7 +14,7 @@ from mvseg.reconstruction import back_project, reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from reference import back_project_reference
-from synthetic import ball_scene, cameras_at, moved, render_balls
+from synthetic import arc_positions, ball_scene, cameras_at, moved, render_balls
 
 FAR = 1000.0  # cameras so far away that they see in parallel
 
@@ -146,7 +146,9 @@ def test_what_has_no_bounded_shape_is_left_out() -> None:
     maps = [np.zeros((320, 320), np.int64) for _ in range(2)]
     maps[0][0:20, 0:20] = 1  # two masks that look past each other
     maps[1][300:320, 0:20] = 1
-    assert back_project(regions_from_label_maps(maps), cameras[:2]) is None
+    apart = regions_from_label_maps(maps)
+    with pytest.warns(InputWarning, match="instance 1 has no shape"):
+        assert reconstruct_instances(apart, torch.tensor([0, 0]), cameras[:2]) == {}
 
 
 def test_nearly_parallel_views_are_cut_not_lost() -> None:
@@ -170,13 +172,37 @@ def test_an_empty_grid_has_an_empty_mesh() -> None:
 @pytest.mark.parametrize(
     ("config", "message"),
     [
-        (ReconstructConfig(threshold=1.0), "threshold"),
-        (ReconstructConfig(voxel_size=0.0), "positive"),
-        (ReconstructConfig(voxel_budget=0), "positive"),
-        (ReconstructConfig(voxel_size=1e-5), "voxels, expected at most"),
+        ({"threshold": 1.0}, "threshold is 1, expected"),
+        ({"voxel_size": 0.0}, "voxel_size is 0, expected"),
+        ({"voxel_size": float("nan")}, "voxel_size is nan, expected"),
+        ({"voxel_budget": 0}, "voxel_budget is 0, expected"),
+        ({"voxel_size": 1e-5}, "voxels, expected at most"),
     ],
 )
-def test_impossible_resolutions_are_refused(config: ReconstructConfig, message: str) -> None:
+def test_impossible_resolutions_are_refused(config: dict[str, float], message: str) -> None:
     regions, cameras = ball_from(AXES[:2])
     with pytest.raises(InputError, match=message):
-        back_project(regions, cameras, config)
+        back_project(regions, cameras, ReconstructConfig(**config))
+
+
+def test_a_minority_of_wrong_masks_does_not_cost_the_shape() -> None:
+    """Two of eight masks belong to a ball far away, so that the rays' nearest point is off the first ball."""
+    cameras = cameras_at(arc_positions(8, distance=400.0), focal=400.0)
+    centers, radii = torch.tensor([[-30.0, 0, 0], [30.0, 0, 0]]).double(), torch.tensor([1.5, 1.5]).double()
+    regions = regions_from_label_maps(render_balls(cameras, centers, radii))
+    mixed = torch.where(regions.view_index < 6, 1, 2)
+    grid = back_project(regions.select(regions.labels == mixed), cameras)
+    assert grid is not None
+    torch.testing.assert_close(grid.points.mean(0), centers[0], atol=0.5, rtol=0)
+
+
+def test_masks_without_a_pixel_do_not_vote_and_ids_must_fit() -> None:
+    regions, cameras = ball_from(AXES)
+    nothing = torch.zeros_like(regions.crop(2)).flatten()
+    crops = torch.cat((regions.crop(0).flatten(), regions.crop(1).flatten(), nothing))
+    emptied = Regions(regions.view_index, regions.boxes, crops, 3, regions.labels)
+    grid = back_project(emptied, cameras, ReconstructConfig(voxel_size=0.1))
+    assert grid is not None
+    assert grid.num_views == 2
+    with pytest.raises(InputError, match="2 instance ids for 3 regions"):
+        reconstruct_instances(regions, torch.tensor([0, 0]), cameras)

@@ -66,13 +66,13 @@ def _read_view(scene: Scene, view: int, folder: Path) -> np.ndarray:
         labels = read_label_png(folder / f"{scene.views[view].name}.png", width, height)
     except InputError as error:
         raise InputError(f"{error} (view {view})") from None
-    return undistort(labels, scene.views[view].lens, scene.cameras.K[view].numpy())
+    return undistort(labels, scene.views[view].lens, scene.cameras.K[view].cpu().numpy())
 
 
 def _regions_from_coco(scene: Scene, path: Path) -> Regions:
     parts = []
     for view, masks in enumerate(read_coco(path, scene)):
-        lens, K = scene.views[view].lens, scene.cameras.K[view].numpy()
+        lens, K = scene.views[view].lens, scene.cameras.K[view].cpu().numpy()
         for label, mask in masks:
             crop = regions_from_label_maps([undistort(mask.astype(np.uint8), lens, K)])
             if len(crop):
