@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mvseg.errors import InputWarning as InputWarning
     from mvseg.formats.folder import load_masks as load_masks
     from mvseg.formats.folder import load_scene as load_scene
+    from mvseg.formats.photos import load_photos as load_photos
     from mvseg.matching import Matching as Matching
     from mvseg.matching import match_regions as match_regions
     from mvseg.metrics import matching_metrics as matching_metrics
@@ -43,6 +44,7 @@ _HOME = {
     "scene": ("Cameras", "Scene"),
     "regions": ("Regions", "regions_from_label_maps"),
     "formats.folder": ("load_masks", "load_scene"),
+    "formats.photos": ("load_photos",),
     "epipolar": ("epipolar_map",),
     "affinity": ("Affinity", "region_affinity"),
     "clustering": ("cluster_affinity",),

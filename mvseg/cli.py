@@ -24,6 +24,7 @@ from mvseg.training_config import TrainConfig
 DEMO_SCENE = Path(str(files("mvseg") / "demo_plant"))
 DEFAULT_OUT = Path("results")
 BAD_INPUT = 2
+ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -51,7 +52,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def build_parser() -> ArgumentParser:
     """The parser of all verbs; its errors are raised, not printed."""
-    parser = ArgumentParser(prog="mvseg", description=mvseg.__doc__, exit_on_error=False, version=mvseg.__version__)
+    parser = ArgumentParser(
+        prog="mvseg", description=ABOUT, exit_on_error=False, version=mvseg.__version__
+    )
     verbs = parser.add_subcommands(dest="verb")
 
     infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
@@ -128,8 +131,7 @@ def _run(scene: Path, masks: Path, out: Path, args: Namespace, reconstruct: Reco
     from mvseg.result import check_out, save_result
 
     check_out(out)
-    if (scene / masks).exists():
-        masks = scene / masks
+    masks = _find_masks(scene, masks)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         result = run_scene(scene, masks, MatchConfig(**vars(args.match)), reconstruct, progress=not args.quiet)
@@ -144,6 +146,14 @@ def _run(scene: Path, masks: Path, out: Path, args: Namespace, reconstruct: Reco
     save_result(result, out, describe_run(result, masks, config, remarks), progress=not args.quiet)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     print(f"{out}: {result.matching.num_instances} instances from {num_masks} masks in {num_views} views")
+
+
+def _find_masks(scene: Path, masks: Path) -> Path:
+    """A relative path may start at the scene folder or where the command runs, as long as only one of them is there."""
+    inside = scene / masks
+    if inside.exists() and masks.exists() and not inside.samefile(masks):
+        raise InputError(f"both {inside} and {masks.resolve()} are there, expected --masks with the whole path of one")
+    return inside if inside.exists() else masks
 
 
 def _eval(args: Namespace) -> int:

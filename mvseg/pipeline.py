@@ -15,6 +15,7 @@ import torch
 import mvseg
 from mvseg.config import MatchConfig, ReconstructConfig
 from mvseg.formats.folder import load_masks, load_scene
+from mvseg.formats.photos import check_photos
 from mvseg.matching import match_regions
 from mvseg.reconstruction import reconstruct_instances
 from mvseg.result import Result
@@ -46,6 +47,7 @@ def run_scene(
     seconds: dict[str, float] = {}
     with _timed(seconds, "load"):
         scene = load_scene(folder)
+        check_photos(scene)
         regions = load_masks(scene, masks)
     with _timed(seconds, "match"):
         matching = match_regions(regions, scene.cameras, match, progress=progress)

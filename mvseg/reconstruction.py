@@ -240,8 +240,8 @@ def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Ten
 
     A cube about the point nearest to all centroid rays, twice as far as the farthest camera, is halved again and again;
     cells in which no point can exceed the threshold are dropped, until the box of the rest is `SEARCH_CELLS` cells
-    long and hardly shrinks any more. Cells are judged by balls about them, so nothing is lost, however thin. None when no cell is left. Masks of
-    nearly parallel views may have no bounded common part: it is cut off at the cube.
+    long and hardly shrinks any more. Cells are judged by balls about them, so nothing is lost, however thin. None when
+    no cell is left. Masks of nearly parallel views may have no bounded common part: it is cut off at the cube.
     """
     centers, rays = torch.stack([m.center for m in masks]), torch.stack([m.ray for m in masks])
     across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]

@@ -151,6 +151,7 @@ def _write_instances(result: Result, folder: Path) -> None:
         width, height = scene.cameras.sizes[index].tolist()
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
         images.append({"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height})
+    K = scene.cameras.K.cpu().numpy()
     for number, index in enumerate(views):
         width, height = scene.cameras.sizes[index].tolist()
         mask = result.regions.mask(number, width, height).cpu().numpy().astype(np.uint8)
@@ -160,7 +161,7 @@ def _write_instances(result: Result, folder: Path) -> None:
                 "instance_id": ids[number] + 1 if ids[number] >= 0 else -1,
                 "match_score": round(scores[number], 4),
                 "source_label": labels[number],
-                "segmentation": encode_mask(distort(mask, scene.views[index].lens, scene.cameras.K[index].cpu().numpy())),
+                "segmentation": encode_mask(distort(mask, scene.views[index].lens, K[index])),
             }
         )
     write_coco(folder / "instances.json", images, annotations)

@@ -465,3 +465,28 @@ def test_bad_input_in_a_process_of_its_own(name: str, plant: Path, tmp_path: Pat
     assert done.stderr.count("\n") == 1
     assert message in done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["plant"]
+
+
+def test_masks_are_looked_for_in_two_places(
+    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(plant / "masks", tmp_path / "annotations")
+    assert main(["match", str(plant), "--masks", "annotations", "--out", "one", "--quiet"]) == 0
+    shutil.copytree(plant / "masks", plant / "annotations")
+    capsys.readouterr()
+    assert main(["match", str(plant), "--masks", "annotations", "--out", "two", "--quiet"]) == 2
+    assert "expected --masks with the whole path of one" in capsys.readouterr().err
+    assert main(["match", str(plant), "--masks", str(tmp_path / "annotations"), "--out", "two", "--quiet"]) == 0
+
+
+@pytest.mark.parametrize("option", ["num_points=0", "num_points=-5", "num_restarts=0", "seed=-1", "search_range=[5,3]"])
+def test_options_out_of_range(plant: Path, tmp_path: Path, option: str, capsys: pytest.CaptureFixture[str]) -> None:
+    name, value = option.split("=")
+    arguments = ["match", str(plant), "--out", str(tmp_path / "out"), "--quiet", f"--match.{name}", value]
+    assert main(arguments) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("mvseg: error: ")
+    assert error.count("\n") == 1
+    assert f"match.{name} is" in error
+    assert not (tmp_path / "out").exists()

@@ -9,7 +9,7 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.formats.folder import load_scene
-from mvseg.formats.photos import Photo, build_scene, read_photo, view_names
+from mvseg.formats.photos import Photo, build_scene, check_photos, load_photos, read_photo, view_names
 from mvseg.scene import Scene
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, write_image, write_scene
 
@@ -117,3 +117,18 @@ class TestReadPhoto:
         picture.rename(scene.views[1].path)
         with pytest.raises(InputError, match=r"001\.png: the image of view 1 cannot be read, expected a whole image"):
             read_photo(scene, 1)
+
+
+def test_photos_for_a_detector_and_photos_that_are_missing(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    scene = load_scene(folder)
+    photos = load_photos(scene)
+    assert [tuple(photo.shape) for photo in photos] == [(3, 96, 128)] * 4
+    np.testing.assert_allclose(photos[2].permute(1, 2, 0).numpy() * 255, read_photo(scene, 2), atol=1e-4)
+    check_photos(scene)
+    (folder / "images" / "001.png").unlink()
+    with pytest.raises(InputError, match=r"001\.png: the image of view 1 is missing"):
+        check_photos(scene)
+    for path in (folder / "images").iterdir():
+        path.unlink()
+    check_photos(scene)

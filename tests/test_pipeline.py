@@ -72,7 +72,7 @@ def test_wrong_input_is_an_input_error(plant: Path, tmp_path: Path) -> None:
         run_scene(tmp_path / "absent", plant / "masks")
     with pytest.raises(InputError, match="absent: no such masks"):
         run_scene(plant, plant / "absent")
-    with pytest.raises(ValueError, match="voxel size"):  # an InputError is a ValueError
+    with pytest.raises(ValueError, match="voxel_size"):  # an InputError is a ValueError
         run_scene(plant, plant / "masks", reconstruct=ReconstructConfig(voxel_size=-1.0))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,7 @@ import numpy as np
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, FiniteFloat, NonNegativeInt
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.json_file import read_json
 from mvseg.scene import Scene
 
@@ -56,6 +57,11 @@ def read_coco(path: Path, scene: Scene) -> list[list[tuple[int, np.ndarray]]]:
     """
     coco = read_json(path, _Coco)
     masks: list[list[tuple[int, np.ndarray]]] = []
+    numbers = {image.id for image in coco.images}
+    lost = [one.id for one in coco.annotations if one.image_id not in numbers]
+    if lost:
+        message = f"{path}: {len(lost)} annotations are of no image in the file, the first is annotation {lost[0]}"
+        warnings.warn(message, InputWarning, stacklevel=4)
     view_of = [_find_view(path, image.file_name, scene) for image in coco.images]
     for index, view in enumerate(scene.views):
         entries = [image for image, one in zip(coco.images, view_of, strict=True) if one == index]

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import mmap
 import struct
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import Photo, build_scene
 from mvseg.scene import Scene
+
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 
 
 def is_colmap_model(folder: Path) -> bool:
@@ -56,7 +59,16 @@ def read_colmap(model: Path, folder: Path) -> Scene:
                 None if lens.is_perspective_pinhole() and lens.is_undistorted() else lens,
             )
         )
-    return build_scene(folder, photos, unit="", source=model)
+    scene = build_scene(folder, photos, unit="", source=model)
+    known = {photo.file.removeprefix("images/") for photo in photos}
+    here = [path.relative_to(folder / "images").as_posix() for path in sorted((folder / "images").rglob("*.*"))]
+    without = [name for name in here if name not in known and name.lower().endswith(PHOTO_SUFFIXES)]
+    if without:
+        message = (
+            f"{len(without)} photos in images/ have no pose in the model and are left out, the first is {without[0]}"
+        )
+        warnings.warn(f"{model}: {message}", InputWarning, stacklevel=3)
+    return scene
 
 
 def _check_whole(model: Path) -> None:

@@ -92,6 +92,25 @@ def _problem(photo: Photo) -> str | None:
     return camera_problem(torch.as_tensor(photo.K), torch.as_tensor(photo.R), torch.as_tensor(photo.t), size)
 
 
+def check_photos(scene: Scene) -> None:
+    """Raises InputError when some photos of the scene are there and others are missing. None at all is fine: masks
+    are enough for matching and for shapes."""
+    present = [view.path.is_file() for view in scene.views]
+    if any(present) and not all(present):
+        missing = present.index(False)
+        raise InputError(f"{scene.views[missing].path}: the image of view {missing} is missing")
+
+
+def load_photos(scene: Scene) -> list[torch.Tensor]:
+    """V tensors (3, H, W) float32 in [0, 1], RGB, undistorted: what torchvision's detectors take.
+
+    Raises:
+        InputError: see `read_photo`.
+    """
+    photos = [read_photo(scene, view) for view in range(len(scene.views))]
+    return [torch.from_numpy(photo).permute(2, 0, 1).float() / 255 for photo in photos]
+
+
 def read_photo(scene: Scene, view: int) -> np.ndarray:
     """(H, W, 3) uint8 RGB, the photo of a view with its lens distortion removed.
 
