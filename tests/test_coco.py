@@ -13,7 +13,7 @@ import torch
 from pycocotools import mask as coco_mask
 from pycocotools.coco import COCO
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.coco import decode_rle, encode_mask, read_coco, write_coco
 from mvseg.scene import Cameras, Scene, View
 
@@ -219,3 +219,11 @@ def test_written_file_reads_back_here_and_in_pycocotools(
             columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
         )  # fmt: skip
         assert (one["instance_id"], one["category_id"], one["iscrowd"]) == (number, 1, 0)
+
+
+def test_annotations_of_no_image_are_counted(scene: Scene, tmp_path: Path) -> None:
+    segmentation = uncompressed(random_mask(0))
+    path = write(tmp_path, [{"segmentation": segmentation}, {"segmentation": segmentation, "image_id": 99}])
+    with pytest.warns(InputWarning, match="1 annotations are of no image in the file, the first is annotation 2"):
+        masks = read_coco(path, scene)
+    assert [len(view) for view in masks] == [1, 0]

@@ -12,7 +12,7 @@ import pycolmap
 import pytest
 import torch
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.colmap import is_colmap_model, read_colmap
 from mvseg.formats.folder import load_scene
 from mvseg.formats.lens import photo_from_pinhole
@@ -230,3 +230,12 @@ def test_a_real_model_reprojects_its_own_points(shared_data: Path) -> None:
             found = photo_from_pinhole(lens, scene.cameras.K[view].numpy(), found)
         errors = np.linalg.norm(found - np.stack([point.xy for point in seen]), axis=1)
         assert np.median(errors) < 1.0
+
+
+def test_photos_without_a_pose_are_warned_of(small: Path, tmp_path: Path) -> None:
+    model = copy_model(small, tmp_path / "plant")
+    (tmp_path / "plant" / "images").mkdir(exist_ok=True)
+    (tmp_path / "plant" / "images" / "stranger.jpg").write_bytes(b"")
+    with pytest.warns(InputWarning, match=r"1 photos in images/ have no pose .* the first is stranger\.jpg"):
+        scene = read_colmap(model, tmp_path / "plant")
+    assert "stranger" not in [view.name for view in scene.views]
