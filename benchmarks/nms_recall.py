@@ -13,6 +13,7 @@ import json
 import torch
 import torchvision
 
+from mvseg.config import MatchConfig
 from mvseg.multiview import Proposals, match_proposals
 from mvseg.nms import cluster_aware_nms
 from mvseg.regions import Regions, regions_from_label_maps
@@ -54,6 +55,7 @@ def main() -> None:
     parser.add_argument("--plants", type=int, default=6)
     parser.add_argument("--leaves", type=int, default=24)
     parser.add_argument("--views", type=int, default=8)
+    parser.add_argument("--method", default="auto", help="of matching: symnmf, one-per-view, nview or auto")
     args = parser.parse_args()
     totals: dict[str, list[int]] = {}
     for seed in range(args.plants):
@@ -80,7 +82,9 @@ def main() -> None:
             for iou in (0.3, 0.5, 0.7)
         }
         for iterations in (1, 2, 3):
-            keep, _ = match_proposals(proposals, cameras, num_iterations=iterations)
+            keep, _ = match_proposals(
+                proposals, cameras, num_iterations=iterations, match=MatchConfig(method=args.method)
+            )
             runs[f"cluster-aware, {iterations} iterations"] = keep
         for name, keep in runs.items():
             found = found_leaves(proposals, keep, truth, size)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from mvseg.errors import InputError
 
@@ -12,14 +13,19 @@ class MatchConfig:
     """How regions are matched across views.
 
     Attributes:
+        method: nview (what all views must agree on; the strongest), one-per-view (the epipolar weights, no two regions
+            of a view in one cluster; the quickest), symnmf (the paper's), or auto: nview, but symnmf when the number of
+            instances or a range for it is given.
         num_points: random pixels per region that send out epipolar lines (the paper: 200); null takes all pixels.
-        num_instances: number of instances, when it is known.
+        num_instances: number of instances, when it is known; symnmf only, the others find it by themselves.
         search_range: smallest and largest number of instances to try, as in [5, 9]; null for [m, 2 m], m the largest
-            number of masks in any view. Where the search starts decides much: equal parts always look good.
-        num_restarts: random starts of each factorisation.
+            number of masks in any view. Where the search starts decides much: equal parts always look good. symnmf
+            only.
+        num_restarts: random starts of each factorisation of symnmf.
         seed: of the random pixels and starts.
     """
 
+    method: Literal["auto", "nview", "one-per-view", "symnmf"] = "auto"
     num_points: int | None = None
     num_instances: int | None = None
     search_range: tuple[int, int] | None = None
@@ -31,6 +37,8 @@ class MatchConfig:
             value = getattr(self, name)
             if value is not None and value < 1:
                 raise InputError(f"match.{name} is {value}, expected at least 1")
+        if self.method in ("nview", "one-per-view") and (self.num_instances or self.search_range):
+            raise InputError(f"match.num_instances and match.search_range are for symnmf, not for {self.method}")
         if self.search_range is not None and not 1 <= self.search_range[0] <= self.search_range[1]:
             low, high = self.search_range
             raise InputError(f"match.search_range is [{low}, {high}], expected 1 <= smallest <= largest")

@@ -13,6 +13,8 @@ from mvseg.clustering import cluster_affinity
 from mvseg.config import MatchConfig
 from mvseg.epipolar import is_coincident
 from mvseg.errors import InputError, InputWarning
+from mvseg.nview import match_nview
+from mvseg.one_per_view import one_per_view_clusters
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -23,20 +25,27 @@ class Matching:
 
     Attributes:
         instance_ids: (D,) int64; regions of one instance share a number in [0, K); -1 = matched to nothing.
-        match_scores: (D,) float32 in [0, 1]: mean affinity (Eq. 3) of a region to the members of its cluster in other
-            views; 0 for a region matched to nothing or alone in its cluster.
+        match_scores: (D,) float32 in [0, 1]. Where "nview" was asked for: the chance that the id is right, as fitted on
+            simulated plants. Else the mean affinity (Eq. 3) of a region to the members of its cluster in other views.
+            0 for a region matched to nothing or alone in its cluster.
         num_instances: K.
+        method: what matched: "nview", "one-per-view" (also what nview falls back to when the views do not agree on
+            anything, or are two) or "symnmf".
     """
 
     instance_ids: Tensor
     match_scores: Tensor
     num_instances: int
+    method: str
 
 
 def match_regions(
     regions: Regions, cameras: Cameras, config: MatchConfig | None = None, *, progress: bool = False
 ) -> Matching:
     """Give every region an instance id by epipolar region matching (Sec. 3.1).
+
+    The weights are the paper's; the clustering is the paper's with `method` "symnmf", and a stronger one by default
+    (see `MatchConfig.method`), which also leaves regions unmatched (-1) that belong to nothing.
 
     Args:
         regions: D regions in V views.
@@ -59,17 +68,32 @@ def match_regions(
     cameras = cameras.to(regions.device)
     _warn_of_gaps(regions, cameras)
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
-    clustering = cluster_affinity(
-        affinity,
-        regions.num_per_view,
-        num_instances=config.num_instances,
-        search_range=config.search_range,
-        num_restarts=config.num_restarts,
-        seed=config.seed,
-        progress=progress,
-    )
-    ids = clustering.instance_ids
-    return Matching(ids, mean_affinity(affinity, ids, regions), int(ids.max() + 1) if len(ids) else 0)
+    method = choose_method(config)
+    if method == "nview":
+        found = match_nview(regions, cameras, affinity)
+        ids, scores, method = found.instance_ids, found.match_scores, found.method
+    elif method == "one-per-view":
+        ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
+        scores = mean_affinity(affinity, ids, regions)
+    else:
+        ids = cluster_affinity(
+            affinity,
+            regions.num_per_view,
+            num_instances=config.num_instances,
+            search_range=config.search_range,
+            num_restarts=config.num_restarts,
+            seed=config.seed,
+            progress=progress,
+        ).instance_ids
+        scores = mean_affinity(affinity, ids, regions)
+    return Matching(ids, scores, int(ids.max()) + 1 if len(ids) else 0, method)
+
+
+def choose_method(config: MatchConfig) -> str:
+    """What "auto" stands for: "symnmf" when the number of instances or a range for it is given, else "nview"."""
+    if config.method != "auto":
+        return config.method
+    return "symnmf" if config.num_instances or config.search_range else "nview"
 
 
 def mean_affinity(affinity: Affinity, instance_ids: Tensor, regions: Regions) -> Tensor:

@@ -15,7 +15,7 @@ from torchvision.models.detection.transform import resize_boxes
 
 from mvseg.config import MatchConfig
 from mvseg.errors import InputError
-from mvseg.matching import Matching, match_regions
+from mvseg.matching import Matching, choose_method, match_regions
 from mvseg.nms import EpipolarAssignment, cluster_aware_nms
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
@@ -240,13 +240,13 @@ def _match_classes(
     for one_class in classes.unique().tolist():
         members = classes == one_class
         config = match or MatchConfig()
-        if counts.get(one_class):
+        if counts.get(one_class) and choose_method(config) == "symnmf":
             config = replace(config, num_instances=counts[one_class])
         matching = match_regions(regions.select(members), cameras, config)
         ids[members] = torch.where(matching.instance_ids >= 0, matching.instance_ids + sum(found.values()), -1)
         scores[members] = matching.match_scores
         found[one_class] = matching.num_instances
-    return Matching(ids, scores, sum(found.values())), found
+    return Matching(ids, scores, sum(found.values()), choose_method(match or MatchConfig())), found
 
 
 def gather_proposals(found: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:

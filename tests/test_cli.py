@@ -117,7 +117,14 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "scene": str(plant),
         "masks": str(plant / "masks"),
         "out": str(tmp_path / "out"),
-        "match": {"num_points": None, "num_instances": 3, "search_range": None, "num_restarts": 2, "seed": 9},
+        "match": {
+            "method": "auto",
+            "num_points": None,
+            "num_instances": 3,
+            "search_range": None,
+            "num_restarts": 2,
+            "seed": 9,
+        },
         "reconstruct": {"threshold": 0.4, "voxel_size": 1.5, "voxel_budget": 250_000},
     }
     assert run["mvseg"] == mvseg.__version__

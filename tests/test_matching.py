@@ -15,8 +15,12 @@ from mvseg.scene import Scene
 from synthetic import ball_scene, cameras_at, permute_views, render_balls
 
 
-def test_shipped_scene_is_solved(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
-    matching = match_regions(demo_regions, demo_scene.cameras)
+@pytest.mark.parametrize("method", ["auto", "nview", "one-per-view", "symnmf"])
+def test_shipped_scene_is_solved(
+    method: str, demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
+) -> None:
+    matching = match_regions(demo_regions, demo_scene.cameras, MatchConfig(method=method))
+    assert matching.method == ("nview" if method == "auto" else method)
     metrics = matching_metrics(matching.instance_ids, demo_truth)
     assert (metrics.s_match, metrics.e_k, metrics.ari) == (1.0, 0, 1.0)
     assert matching.num_instances == 12
@@ -27,7 +31,7 @@ def test_shipped_scene_is_solved(demo_scene: Scene, demo_regions: Regions, demo_
 def test_the_papers_random_points_solve_it_too(
     demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
 ) -> None:
-    matching = match_regions(demo_regions, demo_scene.cameras, MatchConfig(num_points=200, seed=3))
+    matching = match_regions(demo_regions, demo_scene.cameras, MatchConfig(method="symnmf", num_points=200, seed=3))
     assert matching_metrics(matching.instance_ids, demo_truth).ari > 0.95
 
 
@@ -45,7 +49,7 @@ def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
     from mvseg.affinity import region_affinity
 
     scene = ball_scene(5, 4, seed=2)
-    matching = match_regions(scene.regions, scene.cameras)
+    matching = match_regions(scene.regions, scene.cameras, MatchConfig(method="symnmf"))
     W = region_affinity(scene.regions, scene.cameras).to_dense()
     for n in range(len(scene.regions)):
         partners = [
@@ -56,6 +60,14 @@ def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
         ]
         expected = sum(float(W[n, m]) for m in partners) / max(len(partners), 1)
         assert float(matching.match_scores[n]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_given_number_of_instances_is_for_symnmf() -> None:
+    scene = ball_scene(5, 4, seed=2)
+    assert match_regions(scene.regions, scene.cameras, MatchConfig(num_instances=4)).method == "symnmf"
+    assert match_regions(scene.regions, scene.cameras, MatchConfig(search_range=(4, 6))).method == "symnmf"
+    with pytest.raises(InputError, match="are for symnmf, not for nview"):
+        MatchConfig(method="nview", num_instances=4)
 
 
 def test_a_single_view_is_refused() -> None:

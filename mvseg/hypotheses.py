@@ -1,0 +1,200 @@
+"""Stage 5c: how well clusters of regions explain what all views show.
+
+A cluster explains a pixel of a region when some point of the pixel's ray shows members of the cluster in the other
+views: the rows of `rows.py`, so that neither a volume nor a surface is needed. A region's own view never counts for it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mvseg.rows import EMPTY, RowTable
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Costs:
+    """What a view counts that does not show the cluster, when one that does counts 1; and the other gains.
+
+    Attributes:
+        missing: cost of no region there, although the cluster has one in this view.
+        absent: cost of no region there when the cluster has none in this view (its mask may be missed).
+        hidden: cost of the region of another cluster there; also the most that a pixel without any good row costs.
+        landing: gain of a region on which all best rows of a cluster land.
+        weight: gain of each region of a cluster whose epipolar weight exceeds 0.5 by 1, over V - 1; few views have
+            little else to go by, and there it is larger by `weight_few` / (V - 1).
+        weight_few: see `weight`.
+        alone: gain of a region in no cluster.
+        piece_landing: least landing on a left-over region that joins a cluster whose place is taken.
+        piece_score: least score of such a region, as a share of the score of the region that holds the place.
+    """
+
+    missing: float = 0.7
+    absent: float = 0.3
+    hidden: float = 0.15
+    landing: float = 0.5
+    weight: float = 2.0
+    weight_few: float = 2.0
+    alone: float = 0.0
+    piece_landing: float = 0.05
+    piece_score: float = 0.5
+
+    def pair_factor(self, num_views: int) -> float:
+        """What an epipolar weight of 1.5 in place of 0.5 gains."""
+        others = max(num_views - 1, 1)
+        return (self.weight + self.weight_few / others) / others
+
+
+@dataclass(frozen=True, eq=False)
+class Bounds:
+    """Where the views stand in a `RowTable`: (V + 1,) starts of their regions, pixels and rows."""
+
+    regions: Ints
+    pixels: Ints
+    rows: Ints
+
+    def of(self, view: int) -> tuple[slice, slice, slice]:
+        """Regions, pixels and rows of one view."""
+        return (
+            slice(int(self.regions[view]), int(self.regions[view + 1])),
+            slice(int(self.pixels[view]), int(self.pixels[view + 1])),
+            slice(int(self.rows[view]), int(self.rows[view + 1])),
+        )
+
+
+def view_bounds(table: RowTable) -> Bounds:
+    """The bounds of all views of a table."""
+    numbers = np.arange(table.num_views + 1)
+    pixels = np.searchsorted(table.view_index[table.pixel_region], numbers)
+    return Bounds(np.searchsorted(table.view_index, numbers), pixels, np.searchsorted(table.pixel, pixels))
+
+
+def score_matrix(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs) -> Floats:
+    """Leave-one-out scores of the regions of one view in all clusters, S(n, c).
+
+    A row scores (views that show c - hidden * views that show others - missing or absent * views that show nothing)
+    / (views that the point lies in); a pixel scores as its best row, but not below -hidden; a region as the mean of its
+    pixels.
+
+    Args:
+        table: rows of D regions.
+        ids: (D,) cluster of each region in [0, K); K for the regions of the view itself, whatever they are.
+        view: the view.
+        bounds: of the table.
+        costs: of views that do not show the cluster.
+
+    Returns:
+        (N, K) float32 in [-hidden, 1].
+    """
+    _, pixels, rows = bounds.of(view)
+    num_clusters = int(ids.max(initial=0))
+    labels = torch.from_numpy(table.labels[rows].astype(np.int64))
+    cluster = torch.from_numpy(np.append(ids, [num_clusters, num_clusters]))[labels]
+    shown = torch.zeros(len(labels), num_clusters + 1)
+    shown.scatter_add_(1, cluster, torch.ones(1).expand(cluster.shape))
+    is_empty = (labels == EMPTY).float()
+    num_labels = (labels >= 0).sum(1, keepdim=True).float()
+    num_inside = num_labels + is_empty.sum(1, keepdim=True)
+    empty_cost = torch.from_numpy(_empty_costs(table, ids, num_clusters, costs))
+    score = torch.addmm(costs.hidden * num_labels, is_empty, empty_cost.T)
+    score = ((1 + costs.hidden) * shown[:, :num_clusters]).sub_(score).div_(num_inside)
+    best = np.full((pixels.stop - pixels.start, num_clusters), -costs.hidden, np.float32)
+    start = run_starts(table.pixel[rows])
+    if len(start):
+        place = table.pixel[rows][start] - pixels.start
+        best[place] = np.maximum(np.maximum.reduceat(score.numpy(), start, 0), -costs.hidden)
+    start = run_starts(table.pixel_region[pixels])
+    return np.add.reduceat(best, start, 0) / np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
+
+
+def _empty_costs(table: RowTable, ids: Ints, num_clusters: int, costs: Costs) -> Floats:
+    """(K, V) float32: what a view without a region costs each cluster."""
+    has_mask = np.zeros((num_clusters + 1, table.num_views), bool)
+    has_mask[ids, table.view_index] = True
+    return np.where(has_mask[:num_clusters], costs.missing, costs.absent).astype(np.float32)
+
+
+def run_starts(values: NDArray[np.integer]) -> Ints:
+    """(R,) int64: where the runs of equal values start."""
+    return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else np.zeros(0, np.int64)
+
+
+def landing_matrix(table: RowTable, ids: Ints, costs: Costs) -> Floats:
+    """Where the clusters expect to be seen in each view, R(c, n).
+
+    Args:
+        table: rows of D regions.
+        ids: (D,) cluster of each region in [0, K).
+        costs: of views that do not show the cluster.
+
+    Returns:
+        (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best row shows n. The best
+        row is chosen without n's view; pixels whose best row scores below 0 do not count, and equal rows share.
+    """
+    num_clusters = int(ids.max(initial=-1)) + 1
+    labels, region = table.labels, table.pixel_region[table.pixel]
+    own = ids[region]
+    gain, is_inside = own_row_gains(table, ids, costs)
+    total, count = gain.sum(1), is_inside.sum(1)
+    start = run_starts(table.pixel)
+    run = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(total))))
+    found = np.zeros((num_clusters, len(ids)), np.float32)
+    for view in np.unique(table.view_index).tolist() if len(start) else ():
+        score = (total - gain[:, view]) / np.maximum(count - is_inside[:, view], 1)
+        best = np.maximum.reduceat(score, start)
+        use = np.flatnonzero((score >= best[run] - 1e-6) & (best[run] >= 0) & (table.view_index[region] != view))
+        share = 1 / np.bincount(run[use], minlength=len(start))[run[use]]
+        pixels = np.bincount(own[use], share, num_clusters)
+        hit = labels[use, view] >= 0
+        flat = own[use][hit] * len(ids) + labels[use, view][hit]
+        landed = np.bincount(flat, share[hit], num_clusters * len(ids)).reshape(found.shape)
+        found += landed / np.maximum(pixels, 1e-9)[:, None]
+    return found
+
+
+def own_row_gains(table: RowTable, ids: Ints, costs: Costs) -> tuple[Floats, NDArray[np.bool_]]:
+    """(I, V) float32, what each view of each row adds to the score of the region in its own cluster; and (I, V) bool,
+    whether the point lies in that view. The sum of the gains over the number of these views is the score of the row.
+
+    `ids` (D,) is the cluster of each region in [0, K).
+    """
+    labels, own = table.labels, ids[table.pixel_region[table.pixel]]
+    empty = _empty_costs(table, ids, int(ids.max(initial=-1)) + 1, costs)[own]
+    gain = np.where(labels == EMPTY, -empty, np.float32(-costs.hidden))
+    gain[labels < EMPTY] = 0
+    gain[np.append(ids, [-1, -1])[labels] == own[:, None]] = 1
+    return gain, labels >= EMPTY
+
+
+def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
+    """(D,) score of each region in its own cluster, its own view left out: see `nview.score_matrix`."""
+    gain, is_inside = own_row_gains(table, ids, costs)
+    score = gain.sum(1) / np.maximum(is_inside.sum(1), 1)
+    best = np.full(len(table.pixel_region), -costs.hidden)
+    start = run_starts(table.pixel)
+    if len(start):
+        best[table.pixel[start]] = np.maximum(np.maximum.reduceat(score, start), -costs.hidden)
+    counts = np.bincount(table.pixel_region, minlength=len(ids))
+    return np.bincount(table.pixel_region, best, len(ids)) / np.maximum(counts, 1)
+
+
+def partition_value(table: RowTable, evidence: Floats, ids: Ints, costs: Costs) -> float:
+    """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all pairs
+    that are put together.
+
+    Args:
+        table: rows of D regions.
+        evidence: (D, D) symmetric, for (> 0) or against (< 0) each pair.
+        ids: (D,) cluster of each region in [0, K).
+        costs: of views that do not show the cluster.
+    """
+    is_alone = np.bincount(ids)[ids] < 2
+    together = (ids[:, None] == ids) & (table.view_index[:, None] != table.view_index)
+    pairs = costs.pair_factor(table.num_views) * float((evidence * together).sum()) / 2
+    return float(own_scores(table, ids, costs)[~is_alone].sum()) + pairs

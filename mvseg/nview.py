@@ -1,0 +1,342 @@
+"""Stage 5d: matching that all views must agree on.
+
+Pairs of views cannot tell leaves apart that share their epipolar lines; a third view can. A start comes from a soft
+multi-view stereo on region labels: how likely two regions are one instance, and which row of a ray is the right one,
+explain each other (expectation maximisation) before there is any cluster. Then one assignment problem per view, as in
+`one_per_view.py`, is decided by how well the clusters explain the regions in all views (`hypotheses.py`), and by the
+epipolar weights. Regions that are left over may join a cluster whose place in their view is taken, if it expects to be
+seen there too: the pieces of an instance that the segmenter split, or that a stem in front of it divides.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mvseg.affinity import Affinity
+from mvseg.clustering import renumber
+from mvseg.confidence import Support, match_scores
+from mvseg.hypotheses import (
+    Bounds,
+    Costs,
+    landing_matrix,
+    own_scores,
+    partition_value,
+    run_starts,
+    score_matrix,
+    view_bounds,
+)
+from mvseg.one_per_view import (
+    assign_one_to_one,
+    dense_ids,
+    drop_singletons,
+    join_alone,
+    link_average,
+    one_per_view_clusters,
+    view_order,
+)
+from mvseg.regions import Regions
+from mvseg.rows import EMPTY, PLENTY, RowTable, row_table
+from mvseg.scene import Cameras
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.int64]
+
+SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the rows of a pixel, one per iteration
+EARLY = 2  # iterations after which the affinity is a start of its own
+STARTS = ((-1, 0.3), (EARLY - 1, 0.1))  # iteration whose affinity is clustered, and where agglomeration stops
+EMPTY_COST = 0.7  # of a row in which all views show no region
+EM_PIXELS = 20  # at most so many per region
+AS_GOOD = 0.99  # share of the best value that pairwise clusters must reach
+SECOND_CHANCE = 0.4  # mean epipolar weight with which regions that are left alone join after all
+MANY_VIEWS = 8  # more than these need no second start
+WIDENINGS = (1, 2, 4, 8)  # pixels of reprojection error that are tried
+EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean scores above which the poses are sound, below which the rows are of no use
+# Log-odds that two regions show one instance against their epipolar weight, on degraded masks of development plants.
+WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
+LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
+PRIOR, SPAN = 2.5, 6.0  # added to the log-odds; what divides them
+
+
+@dataclass(frozen=True, eq=False)
+class NViewMatching:
+    """Which region shows which instance, and how sure that is.
+
+    Attributes:
+        instance_ids: (D,) int64 in [0, K), clusters numbered by their first region; -1 = matched to nothing.
+        match_scores: (D,) float32 in [0, 1], the chance that the id is right; 0 for -1.
+        num_views_seen: (K,) int64, in how many views each instance has a region.
+        explained: mean score of the matched regions in their clusters, 1 = every pixel is seen in all other views.
+        residual_px: reprojection error that the label maps were widened by, pixels.
+        method: "nview", or "one-per-view" where the rows do not explain the regions (poses too far off, two views).
+    """
+
+    instance_ids: Tensor
+    match_scores: Tensor
+    num_views_seen: Tensor
+    explained: float
+    residual_px: int
+    method: str
+
+
+def match_nview(regions: Regions, cameras: Cameras, affinity: Affinity) -> NViewMatching:
+    """Match the regions of V >= 2 views by what all views show.
+
+    Args:
+        regions: D regions in V views, in any order.
+        cameras: V cameras.
+        affinity: the epipolar weights of the regions.
+
+    Returns:
+        The matching, on the device of the regions. It does not depend on the order of views and regions, unless two
+        choices are worth exactly the same, and there is no randomness in it. Without regions or edges all are -1.
+    """
+    order = regions.view_index.argsort(stable=True)
+    ordered = regions.select(order)
+    W = affinity.to_dense()[order][:, order].cpu().double().numpy()
+    pairwise = one_per_view_clusters(affinity, regions.view_index, len(cameras))[order].cpu().numpy()
+    costs = view_costs(len(cameras))
+    table, residual_px = _table_of_poses(ordered, cameras, pairwise, costs)
+    ids = search(table, W, costs, dense_ids(_alone_apart(pairwise)))
+    method, explained = "nview", _explained(table, ids, costs)
+    if explained < UNEXPLAINED or len(cameras) == 2:
+        ids, method = dense_ids(_alone_apart(pairwise)), "one-per-view"
+        explained = _explained(table, ids, costs)
+    scores = match_scores(support(table, W, ids, costs))
+    back = order.argsort()
+    final = renumber(drop_singletons(ids)[back.cpu()])
+    seen = torch.zeros(int(final.max()) + 1 if len(final) else 0, len(cameras))
+    seen[final[final >= 0], regions.view_index.cpu()[final >= 0]] = 1
+    confidence = torch.from_numpy(scores).float()[back.cpu()] * (final >= 0)
+    return NViewMatching(
+        final.to(regions.device),
+        confidence.to(regions.device),
+        seen.sum(1).long().to(regions.device),
+        explained,
+        residual_px,
+        method,
+    )
+
+
+def view_costs(num_views: int) -> Costs:
+    """The costs for a number of views: of three views, two do not suffice to tell a piece from a neighbour."""
+    return Costs() if num_views > 3 else replace(Costs(), piece_landing=0.1, piece_score=0.8)
+
+
+def _table_of_poses(regions: Regions, cameras: Cameras, ids: Ints, costs: Costs) -> tuple[RowTable, int]:
+    """The row table, its label maps widened by about the reprojection error, and that error in pixels.
+
+    The error is the least widening with which the rows explain pairwise clusters nearly as well as with any.
+    """
+    table = row_table(regions, cameras, widen_px=WIDENINGS[0])
+    apart = dense_ids(_alone_apart(ids))
+    explained = [_explained(table, apart, costs)]
+    if explained[0] >= EXPLAINED:
+        return table, WIDENINGS[0]
+    tables = [table] + [row_table(regions, cameras, widen_px=width) for width in WIDENINGS[1:]]
+    explained = [_explained(wide, apart, costs) for wide in tables]
+    best = int(np.argmax(np.array(explained) >= max(explained) - 0.05))
+    return tables[best], WIDENINGS[best]
+
+
+def _alone_apart(ids: Ints) -> Ints:
+    """Ids in which each unmatched region (-1) has a number of its own."""
+    return np.where(ids < 0, int(ids.max(initial=-1)) + 1 + np.arange(len(ids)), ids)
+
+
+def _explained(table: RowTable, ids: Ints, costs: Costs) -> float:
+    """Mean score of the regions that are not alone in their cluster; 0 without any."""
+    together = np.bincount(ids, minlength=1)[ids] > 1
+    return float(own_scores(table, ids, costs)[together].mean()) if together.any() else 0.0
+
+
+def search(table: RowTable, W: Floats, costs: Costs, pairwise: Ints) -> Ints:
+    """The best partition that refinement finds from one start, or, with few views, two.
+
+    Clusters from the weights alone are kept when they are worth nearly as much: then the masks are sound, and the
+    weights know better what becomes of slivers that few views show.
+
+    Args:
+        table: rows of D regions.
+        W: (D, D) symmetric epipolar weights.
+        costs: of views that do not show a cluster.
+        pairwise: (D,) int64, clusters from the weights alone, in [0, K).
+
+    Returns:
+        (D,) int64 cluster of each region in [0, K), regions alone included.
+    """
+    history = em_affinities(table)
+    evidence = weight_evidence(W)
+    found = []
+    for iteration, stop in STARTS[: 1 if table.num_views > MANY_VIEWS else None]:
+        ids = link_average(history[iteration], table.view_index, table.num_views, stop)
+        ids = refine(table, W, ids, costs)
+        found.append(refine(table, W, ids, costs, join_pieces=True))
+    values = [partition_value(table, evidence, ids, costs) for ids in (pairwise, *found)]
+    if values[0] >= AS_GOOD * max(values):
+        return pairwise
+    best = found[int(np.argmax(values[1:]))]
+    return join_alone(W, table.view_index, table.num_views, best, SECOND_CHANCE)
+
+
+def weight_evidence(W: Floats) -> Floats:
+    """(D, D) for (> 0) or against (< 0) each pair of regions being one instance, from its epipolar weight."""
+    return (np.interp(W, WEIGHTS, LOG_ODDS) + PRIOR) / SPAN
+
+
+def em_affinities(table: RowTable) -> list[Floats]:
+    """How likely two regions are one instance, from the rows alone.
+
+    E step: the rows of a pixel share one unit of belief by a soft maximum of their mean affinity between all regions
+    that they name (the pixel's own included), less EMPTY_COST for views that show nothing. M step: the affinity of
+    region n to m is the belief in rows with m, averaged over the pixels of n, and made symmetric.
+
+    Args:
+        table: rows of D regions.
+
+    Returns:
+        After each iteration (D, D) float64 in [0, 1], symmetric, 0 for regions of one view.
+    """
+    num, owner_of = len(table.view_index), table.pixel_region
+    most = round(EM_PIXELS * min(1, PLENTY / table.num_views))
+    counts = np.bincount(owner_of, minlength=num)
+    rank = np.arange(len(owner_of)) - np.searchsorted(owner_of, owner_of)
+    is_used = rank % np.maximum(1, -(-counts // most))[owner_of] == 0
+    rows = is_used[table.pixel]
+    pixel, owner = table.pixel[rows], torch.from_numpy(owner_of[table.pixel[rows]])
+    labels = torch.from_numpy(table.labels[rows].astype(np.int64))
+    num_empty, num_inside = (labels == EMPTY).sum(1), (labels >= EMPTY).sum(1)
+    labels = torch.where(labels < 0, num, labels).T.contiguous()  # column `num` collects what is no region
+    pixels = torch.from_numpy(np.maximum(np.bincount(owner_of[is_used], minlength=num), 1))[:, None]
+    start = run_starts(pixel)
+    run = torch.from_numpy(np.repeat(np.arange(len(start)), np.diff(np.append(start, len(pixel)))))
+    cell = owner * (num + 1) + labels
+    if not len(start):
+        return [np.zeros((num, num))] * len(SHARPNESS)
+    seen = torch.unique(run * (num + 1) + labels)
+    first = owner[torch.from_numpy(start)][seen // (num + 1)] * (num + 1) + seen % (num + 1)
+    A = torch.bincount(first, minlength=num * (num + 1)).reshape(num, num + 1)[:, :num] / pixels
+    history = []
+    for beta in SHARPNESS:
+        flat = torch.nn.functional.pad((A + A.T).float() / 2, (0, 1, 0, 1)).flatten()
+        score = flat[cell].sum(0)
+        for view, base in enumerate(labels * (num + 1)):
+            for other in range(view + 1, len(labels)):
+                score += flat[base + labels[other]]
+        score = 2 * score / (num_inside * (num_inside + 1)) - EMPTY_COST * num_empty / num_inside
+        best = torch.from_numpy(np.maximum.reduceat(score.numpy(), start))
+        belief = torch.exp(beta * (score - best[run])).double()
+        belief /= torch.bincount(run, belief)[run]
+        mass = torch.bincount(cell.flatten(), belief.expand(cell.shape).flatten(), minlength=num * (num + 1))
+        A = mass.reshape(num, num + 1)[:, :num] / pixels
+        history.append(((A + A.T) / 2).double().numpy())
+    return history
+
+
+def refine(
+    table: RowTable, W: Floats, ids: Ints, costs: Costs, *, num_sweeps: int = 3, join_pieces: bool = False
+) -> Ints:
+    """Re-assign the regions of one view after another to the clusters of the others.
+
+    Args:
+        table: rows of D regions.
+        W: (D, D) symmetric epipolar weights.
+        ids: (D,) clusters to start from.
+        costs: of views that do not show a cluster.
+        num_sweeps: at most so many times through all views; fewer when nothing changes.
+        join_pieces: left-over regions may join a cluster whose place in their view is taken.
+
+    Returns:
+        (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
+    """
+    bounds, ids, evidence = view_bounds(table), dense_ids(ids), weight_evidence(W)
+    order = view_order(W, table.view_index, table.num_views)
+    for _ in range(num_sweeps):
+        before = dense_ids(ids)
+        ids, landing = before.copy(), landing_matrix(table, before, costs)
+        for view in order.tolist():
+            here = bounds.of(view)[0]
+            if here.start == here.stop:
+                continue
+            gains = view_gains(table, evidence, ids, landing, view, bounds, costs)
+            chosen = assign_one_to_one(gains.total, costs.alone)
+            if join_pieces:
+                chosen = _join_pieces(chosen, gains, costs)
+            fresh = ids.max() + 1 + np.arange(len(chosen))
+            ids[here] = np.append(gains.clusters, fresh)[chosen]
+        if (dense_ids(ids) == before).all():
+            break
+    return dense_ids(ids)
+
+
+@dataclass(frozen=True, eq=False)
+class ViewGains:
+    """What the N regions of one view gain from the K clusters that the other views form.
+
+    Attributes:
+        clusters: (K,) int64, their ids.
+        score: (N, K), S(n, c).
+        landing: (N, K), share of the best rows of c that land on n.
+        total: (N, K), both and the epipolar evidence.
+    """
+
+    clusters: Ints
+    score: Floats
+    landing: Floats
+    total: Floats
+
+
+def view_gains(
+    table: RowTable, evidence: Floats, ids: Ints, landing: Floats, view: int, bounds: Bounds, costs: Costs
+) -> ViewGains:
+    """The gains of one view. `landing` may know fewer clusters than `ids` has: the others expect to land nowhere."""
+    here = bounds.of(view)[0]
+    is_other = table.view_index != view
+    clusters, inverse = np.unique(ids[is_other], return_inverse=True)
+    compact = np.full(len(ids), len(clusters))
+    compact[is_other] = inverse
+    score = score_matrix(table, compact, view, bounds, costs)
+    expected = np.zeros_like(score)
+    known = clusters < len(landing)
+    expected[:, known] = landing[clusters[known], here].T
+    members = np.zeros((len(ids), len(clusters) + 1))
+    members[np.arange(len(ids)), compact] = 1
+    pairs = costs.pair_factor(table.num_views) * (evidence[here] @ members[:, :-1])
+    return ViewGains(clusters, score, expected, score + costs.landing * expected + pairs)
+
+
+def _join_pieces(chosen: Ints, gains: ViewGains, costs: Costs) -> Ints:
+    """Put left-over regions into taken clusters that expect to be seen on them and explain them well."""
+    is_in = chosen < len(gains.clusters)
+    holder = np.full(len(gains.clusters), np.inf)
+    holder[chosen[is_in]] = gains.score[is_in, chosen[is_in]]
+    fits = (gains.landing >= costs.piece_landing) & (gains.score >= costs.piece_score * holder) & (gains.score > 0)
+    value = np.where(fits, gains.score + costs.landing * gains.landing, -np.inf)
+    joins = ~is_in & fits.any(1)
+    chosen = chosen.copy()
+    if joins.any():
+        chosen[joins] = value[joins].argmax(1)
+    return chosen
+
+
+def support(table: RowTable, W: Floats, ids: Ints, costs: Costs) -> Support:
+    """What speaks for the id of each region: see `Support`. Regions alone in their cluster have no support."""
+    bounds, evidence, landing = view_bounds(table), weight_evidence(W), landing_matrix(table, ids, costs)
+    score, own, rival, landed = (np.zeros(len(ids)) for _ in range(4))
+    for view in np.unique(table.view_index).tolist():
+        here = bounds.of(view)[0]
+        gains = view_gains(table, evidence, ids, landing, view, bounds, costs)
+        is_own = ids[here][:, None] == gains.clusters
+        score[here] = (gains.score * is_own).sum(1)
+        own[here] = (gains.total * is_own).sum(1)
+        rival[here] = np.where(is_own, costs.alone, gains.total).max(1, initial=costs.alone)
+        landed[here] = (gains.landing * is_own).sum(1)
+    together = (ids[:, None] == ids) & (table.view_index[:, None] != table.view_index)
+    num_partners = together.sum(1)
+    mean_weight = (W * together).sum(1) / np.maximum(num_partners, 1)
+    num_pieces = ((ids[:, None] == ids) & (table.view_index[:, None] == table.view_index)).sum(1)
+    return Support(score, own - rival, landed, mean_weight, num_partners, num_pieces, table.num_views)
