@@ -12,7 +12,6 @@ import time
 
 import torch
 
-from mvseg.config import MatchConfig
 from mvseg.multiview import gather_proposals, match_proposals
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.plants import grow_plant
@@ -56,7 +55,7 @@ def main() -> None:
     start = time.perf_counter()
     proposals = gather_proposals(found, cameras.sizes.tolist())
     gathered = time.perf_counter()
-    keep, matching = match_proposals(proposals, cameras, num_iterations=2, match=MatchConfig(num_instances=28))
+    keep, matching = match_proposals(proposals, cameras)
     report = {
         "proposals": len(proposals.boxes),
         "mean_crop_px": int(proposals.regions.crop_sizes.prod(1).float().mean()),

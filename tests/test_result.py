@@ -187,7 +187,7 @@ class TestVariants:
     def test_unmatched_regions(self, result: Result, tmp_path: Path) -> None:
         ids = result.matching.instance_ids.clone()
         ids[ids == 1] = -1
-        matching = Matching(ids, result.matching.match_scores, 3)
+        matching = Matching(ids, result.matching.match_scores, 3, "nview")
         save_result(Result(result.scene, result.regions, matching), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         assert [one["instance_id"] for one in annotations].count(-1) == 4
