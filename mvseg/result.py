@@ -135,7 +135,7 @@ def _write_images(result: Result, folder: Path, progress: bool) -> None:
         labels = distort(labels, view.lens, scene.cameras.K[index].cpu().numpy())
         write_label_png(folder / "labels" / f"{view.name}.png", labels)
         photo = read_photo(scene, index) if has_photos else np.full((height, width, 3), 40, np.uint8)
-        overlays.append(draw_overlay(photo, result.regions, ids, index))
+        overlays.append(draw_overlay(photo, result.regions, ids, index, result.matching.match_scores))
         overlay = folder / "overlay" / f"{view.name}.png"
         overlay.parent.mkdir(parents=True, exist_ok=True)
         write_png(overlay, overlays[-1])

@@ -102,3 +102,12 @@ def test_contact_sheet_of_odd_sizes() -> None:
     assert sheet.shape == (1920 + 30, 3 * (TILE_WIDTH + 4), 3)
     blue, green, red = cv2.split(sheet[1000:, TILE_WIDTH + 10 :])
     assert min(blue.min(), green.min(), red.min()) == 255  # filled up with white
+
+
+def test_unsure_matches_are_marked(regions: Regions) -> None:
+    ids = torch.tensor([0, 1, 0, 1])
+    plain = draw_overlay(GREY, regions, ids, 0)
+    sure = draw_overlay(GREY, regions, ids, 0, torch.tensor([0.5, 0.9, 0.9, 0.9]))
+    unsure = draw_overlay(GREY, regions, ids, 0, torch.tensor([0.4, 0.9, 0.9, 0.9]))
+    np.testing.assert_array_equal(sure, plain)
+    assert (unsure != plain).any()

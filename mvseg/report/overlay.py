@@ -15,6 +15,7 @@ from mvseg.regions import Regions
 MAX_SIDE = 1600  # pixels of an overlay's longer side
 TILE_WIDTH = 480
 UNMATCHED = (150, 150, 150)
+UNSURE = 0.5  # match scores below this are marked
 
 
 def instance_color(instance: int) -> tuple[int, int, int]:
@@ -27,7 +28,9 @@ def instance_color(instance: int) -> tuple[int, int, int]:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def draw_overlay(photo: np.ndarray, regions: Regions, instance_ids: Tensor, view: int) -> np.ndarray:
+def draw_overlay(
+    photo: np.ndarray, regions: Regions, instance_ids: Tensor, view: int, match_scores: Tensor | None = None
+) -> np.ndarray:
     """Tint the regions of one view in the colours of their instances, with outline and number.
 
     Args:
@@ -36,6 +39,7 @@ def draw_overlay(photo: np.ndarray, regions: Regions, instance_ids: Tensor, view
         instance_ids: (D,) int64, -1 = matched to nothing (grey, no number). Numbers are drawn as in the result's
             files: id + 1.
         view: index of the view.
+        match_scores: (D,) in [0, 1]; a number with a score below 0.5 gets a question mark.
 
     Returns:
         uint8 RGB, scaled down so that the longer side has at most 1600 pixels.
@@ -59,7 +63,8 @@ def draw_overlay(photo: np.ndarray, regions: Regions, instance_ids: Tensor, view
             # The number goes to the thickest place of the mask, which is always inside it.
             depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
             row, column = np.unravel_index(depth.argmax(), depth.shape)
-            labels.append((str(instance + 1), (int(column), int(row))))
+            doubt = "?" if match_scores is not None and match_scores[index] < UNSURE else ""
+            labels.append((f"{instance + 1}{doubt}", (int(column), int(row))))
     for text, center in labels:
         _write(painted, text, center, max(size) / 1100)
     return painted
