@@ -88,7 +88,8 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
             _write_shapes(result, partial)
         counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
         seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
-        text = json.dumps(run | {"counts": counts, "seconds": seconds}, indent=1, default=str)
+        found = {"matched_by": result.matching.method, "counts": counts, "seconds": seconds}
+        text = json.dumps(run | found, indent=1, default=str)
         (partial / RUN_FILE).write_text(text + "\n", encoding="utf-8")
         _move(partial, out.resolve())
     except OSError as error:
