@@ -1,4 +1,4 @@
-"""Stage 5c: region matching in one call: masks and cameras in, instance ids out."""
+"""Stage 5f: region matching in one call: masks and cameras in, instance ids out."""
 
 from __future__ import annotations
 

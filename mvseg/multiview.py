@@ -47,15 +47,16 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
     1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper:
        0.7): an excessive set of masks.
-    2. Match first: what plain NMS at `cluster_iou` leaves of it is matched across views, which also tells |k|.
-       Things of different classes are never matched.
+    2. Match first: what plain NMS at `cluster_iou` leaves of it is matched across views. Things of different classes
+       are never matched.
     3. Alternate `num_iterations` times: every mask of the excessive set takes the cluster whose epipolar map it
        resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each cluster; match the survivors
-       again, with the same |k|. Masks that resemble no map form one more group.
+       again. Masks that resemble no map form one more group.
 
-    Departures from the paper: it matches the excessive set itself at first, and estimates |k| anew each time. The
-    duplicates in these sets inflate the number of masks per view, from which the search range of |k| follows; that
-    splits leaves, and the pieces then shelter duplicates from NMS (benchmarks/nms_recall.py).
+    Departures from the paper: it matches the excessive set itself at first, and estimates |k| anew each time; here,
+    where `match` names "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the number of
+    masks per view, from which the search range of |k| follows; that splits leaves, and the pieces then shelter
+    duplicates from NMS. The other methods of matching need no |k|.
 
     Args:
         detector: a torchvision Mask R-CNN (any builder, any backbone, or `MaskRCNN` itself). Its modules are shared,
@@ -231,7 +232,8 @@ def _match_classes(
 ) -> tuple[Matching, dict[int, int]]:
     """Match the kept proposals class by class; instances of different classes get different ids.
 
-    Returns the matching and {class: number of instances}; classes in `counts` get that number instead of a search.
+    Returns the matching and {class: number of instances}; with "symnmf", classes in `counts` get that number instead
+    of a search.
     """
     regions, classes = proposals.regions.select(keep), proposals.classes[keep]
     ids = torch.full_like(classes, -1)
