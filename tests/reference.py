@@ -140,3 +140,67 @@ def back_project_reference(members: Regions, cameras: Cameras, points: Tensor) -
                     seen[p] |= mask[int(v), int(u)]
         votes += seen
     return votes / len(views)
+
+
+def ray_distance_reference(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> Tensor:
+    """(N, M) distance of rays (origins, unit directions), one pair at a time: the least squares meeting point."""
+    distance = torch.full((len(first[0]), len(second[0])), torch.inf, dtype=torch.float64)
+    for n in range(len(first[0])):
+        for m in range(len(second[0])):
+            shift = (second[0][m] - first[0][n]).numpy()
+            both = np.stack((first[1][n].numpy(), -second[1][m].numpy()), 1)
+            along = np.linalg.lstsq(both, shift, rcond=None)[0]
+            if (along > 0).all():
+                distance[n, m] = float(np.linalg.norm(both @ along - shift))
+    return distance
+
+
+def match_keypoints_reference(first: np.ndarray, second: np.ndarray, ratio: float) -> set[tuple[int, int]]:
+    """Mutual nearest neighbours of descriptors (P, C) that pass the ratio test both ways; bits by Hamming distance."""
+    norm = 1 if max(first.max(), second.max()) <= 1 else 2
+    table = np.array([[np.linalg.norm(a - b, ord=norm) for b in second] for a in first])
+    matches = set()
+    for n, row in enumerate(table):
+        m = int(row.argmin())
+        column = table[:, m]
+        if int(column.argmin()) == n and all(np.sort(x)[0] < ratio * np.sort(x)[1] for x in (row, column)):
+            matches.add((n, m))
+    return matches
+
+
+def region_points_reference(regions: Regions, cameras: Cameras, points: Tensor) -> Tensor:
+    """(D, 3) centroid of the nearest 10 % of the points that project into each region, one point at a time."""
+    pixels, depth = cameras.project(points)
+    anchors = torch.full((len(regions), 3), torch.nan, dtype=torch.float64)
+    for n in range(len(regions)):
+        view = int(regions.view_index[n])
+        width, height = cameras.sizes[view].tolist()
+        mask = regions.mask(n, width, height)
+        inside = []
+        for p, (u, v) in enumerate(pixels[view].tolist()):
+            if depth[view, p] > 0 and 0 <= u < width and 0 <= v < height and mask[int(v), int(u)]:
+                inside.append((float(torch.linalg.vector_norm(points[p] - cameras.centers[view])), p))
+        nearest = [p for _, p in sorted(inside)[: int(np.ceil(len(inside) / 10))]]
+        if nearest:
+            anchors[n] = points[nearest].mean(0)
+    return anchors
+
+
+def consistent_depth_reference(
+    depths: list[np.ndarray], cameras: Cameras, view: int, others: list[int], error: float
+) -> np.ndarray:
+    """(H, W): depths of a view that the depth map of another view confirms, one pixel at a time; else 0."""
+    kept = np.zeros_like(depths[view])
+    for v, u in np.ndindex(*kept.shape):
+        own = depths[view][v, u]
+        if np.isnan(own):
+            continue
+        ray = cameras.world_from_px[view] @ torch.tensor([u + 0.5, v + 0.5, 1.0], dtype=torch.float64)
+        pixels, expected = cameras.project((cameras.centers[view] + float(own) * ray)[None])
+        for j in others:
+            (x, y), depth = pixels[j, 0].tolist(), float(expected[j, 0])
+            width, height = cameras.sizes[j].tolist()
+            is_inside = depth > 0 and 0 <= x < width and 0 <= y < height
+            if is_inside and abs(depths[j][int(y), int(x)] - depth) <= error * depth:
+                kept[v, u] = own
+    return kept

@@ -37,6 +37,7 @@ ORDER = [
     "multiview",
     "detectors",
     "reconstruction",
+    "baselines",
     "metrics",
     "report",
     "result",

@@ -1,0 +1,95 @@
+"""Point-based matching (Sec. 4.2): epipolar lines of centroids instead of epipolar bands of regions."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mvseg.affinity import Affinity
+from mvseg.baselines.ties import check_views, cluster_ties, tie_graph
+from mvseg.config import MatchConfig
+from mvseg.epipolar import is_coincident
+from mvseg.matching import Matching
+from mvseg.regions import Regions
+from mvseg.scene import Cameras, Scene
+
+PARALLEL = 1e-12  # squared sine of the angle of two rays below which they have no nearest points
+
+
+def match_points(regions: Regions, scene: Scene, config: MatchConfig | None = None) -> Matching:
+    """Match regions by the rays through their centroids (Sec. 4.2, "Point-based matching").
+
+    Args:
+        regions: D regions in V views.
+        scene: V >= 2 cameras; the photos are not looked at.
+        config: see `cluster_ties`; None for the defaults.
+
+    Returns:
+        The matching, method "points".
+
+    Raises:
+        InputError: fewer than two views, or regions and cameras of different numbers of views.
+    """
+    check_views(regions, scene)
+    return cluster_ties(nearest_ray_graph(regions, scene.cameras.to(regions.device)), regions, config, "points")
+
+
+def nearest_ray_graph(regions: Regions, cameras: Cameras) -> Affinity:
+    """Ties each region to the region of each other view whose ray passes nearest in 3D.
+
+    The epipolar line of a centroid is the image of its viewing ray, thus the "nearest epipolar lines in 3D space" of
+    the paper are the nearest rays. The distance is the plain one in world units, as printed: no ray is too far to be
+    the nearest, so every region is tied to one of every other view that has any. Views at one place are not tied (all
+    their rays meet), nor are regions whose rays come nearest behind a camera.
+
+    Args:
+        regions: D regions; the first wins where two are exactly as near.
+        cameras: V cameras, on the device of the regions.
+    """
+    centers, rays = centroid_rays(regions, cameras)
+    skip = is_coincident(cameras)
+    members = [(regions.view_index == view).nonzero()[:, 0] for view in range(len(cameras))]
+    ties = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)]
+    for i, own in enumerate(members):
+        for j, other in enumerate(members):
+            if skip[i, j] or not len(own) or not len(other):
+                continue
+            distance = pairwise_ray_distance((centers[own], rays[own]), (centers[other], rays[other]))
+            nearest, place = distance.min(1)
+            ties.append(torch.stack((own, other[place]), 1)[nearest.isfinite()])
+    return tie_graph(torch.cat(ties), len(regions))
+
+
+def centroid_rays(regions: Regions, cameras: Cameras) -> tuple[Tensor, Tensor]:
+    """The viewing rays through the centroids of D masks: their origins (D, 3) and unit directions (D, 3), float64,
+    world frame. A mask without pixels has no ray (NaN)."""
+    xy, owner, _ = regions.pixels()
+    total = torch.zeros(len(regions), 2, dtype=torch.float64, device=regions.device).index_add_(0, owner, xy.double())
+    centroids = total / regions.areas[:, None]
+    homogeneous = torch.nn.functional.pad(centroids, (0, 1), value=1.0)
+    rays = (cameras.world_from_px[regions.view_index] @ homogeneous[:, :, None])[:, :, 0]
+    return cameras.centers[regions.view_index], rays / torch.linalg.vector_norm(rays, dim=1, keepdim=True)
+
+
+def pairwise_ray_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> Tensor:
+    """Distance of the rays of two views where they come nearest.
+
+    Args:
+        first: origins (N, 3) and unit directions (N, 3) of the rays of one view.
+        second: (M, 3) and (M, 3) of the other.
+
+    Returns:
+        (N, M), world units; of parallel rays the distance of their lines; infinite where the nearest points lie behind
+        an origin, or a ray is NaN.
+    """
+    shift = second[0] - first[0][:, None]
+    u, v = first[1][:, None].expand_as(shift), second[1].expand_as(shift)
+    cosine, along_u, along_v = (u * v).sum(2), (shift * u).sum(2), (shift * v).sum(2)
+    sine_sq = torch.linalg.cross(u, v).square().sum(2)  # of tiny angles 1 - cosine^2 would be noise
+    is_parallel = sine_sq <= PARALLEL
+    scale = 1 / sine_sq.clamp(min=PARALLEL)
+    s, t = (along_u - cosine * along_v) * scale, (cosine * along_u - along_v) * scale  # how far along each ray
+    across = shift - along_u[..., None] * u
+    gap = torch.where(is_parallel[..., None], across, s[..., None] * u - shift - t[..., None] * v)
+    is_ahead = is_parallel & (cosine > 0) | ~is_parallel & (s > 0) & (t > 0)
+    return torch.where(is_ahead, torch.linalg.vector_norm(gap, dim=2), torch.inf)

@@ -1,0 +1,32 @@
+"""Semantic segmentation in 3D (Sec. 4.3): back-projection of the union of all masks, without any matching."""
+
+from __future__ import annotations
+
+from mvseg.config import ReconstructConfig
+from mvseg.errors import InputError
+from mvseg.reconstruction import VoxelGrid, back_project
+from mvseg.regions import Regions
+from mvseg.scene import Scene
+
+
+def reconstruct_semantic(regions: Regions, scene: Scene, config: ReconstructConfig | None = None) -> VoxelGrid | None:
+    """The voxels of all leaves as one thing: "we unified the silhouettes of all leaves" (Sec. 4.3).
+
+    A voxel is occupied when more than the threshold's share of the views that show any leaf have a mask there. Give a
+    voxel size to compare with instances: the voxel budget here is that of the whole plant.
+
+    Args:
+        regions: D regions; ids are not needed.
+        scene: V cameras.
+        config: threshold, voxel size (world units) or voxel budget; None for the defaults.
+
+    Returns:
+        The grid, None when fewer than two views show anything or no point has enough votes.
+
+    Raises:
+        InputError: regions and cameras of different numbers of views; see also `back_project`.
+    """
+    if len(scene.cameras) != regions.num_views:
+        message = f"regions of {regions.num_views} views with {len(scene.cameras)} cameras"
+        raise InputError(f"{message}, expected as many of each")
+    return back_project(regions, scene.cameras, config)

@@ -1,0 +1,46 @@
+"""An easy scene for matchers that look at photos: a few large, strongly textured leaves from closely spaced views."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Scene, View
+from mvseg.simulation.cameras import arc_cameras
+from mvseg.simulation.plants import grow_plant
+from mvseg.simulation.render import build_stage, render_stage
+
+
+@dataclass(frozen=True, eq=False)
+class LeafyScene:
+    """A scene with its photos on disk, the true masks (`regions.labels` are the true ids), depths and leaf vertices."""
+
+    scene: Scene
+    regions: Regions
+    depths: list[np.ndarray]
+    vertices: Tensor
+
+
+def write_leafy_scene(folder: Path, *, num_leaves: int = 4, num_views: int = 10, size: int = 320) -> LeafyScene:
+    """Views 5 degrees apart in azimuth, at one height; `folder` must be there."""
+    plant = grow_plant("ovate", num_leaves, 18)  # hardly a leaf in front of another
+    cameras = arc_cameras(num_views, plant, span_deg=45, elevations_deg=(40,), width=size, height=size)
+    stage = build_stage(plant, seed=12)
+    stage = replace(stage, look=replace(stage.look, spots=2.0, quilting=0.15, gloss=0.0, noise=0.004))
+    views, labels, depths = [], [], []
+    for view in range(num_views):
+        K, R, t = (part[view].numpy() for part in (cameras.K, cameras.R, cameras.t))
+        shot = render_stage(stage, K, R, t, size, size)
+        views.append(View(f"{view:03d}", folder / f"{view:03d}.png"))
+        assert cv2.imwrite(str(views[-1].path), shot.rgb[..., ::-1])
+        labels.append(shot.ids)
+        depths.append(shot.depth)
+    vertices = np.concatenate([leaf.vertices for leaf in plant.leaves])
+    scene = Scene("leafy", tuple(views), cameras)
+    return LeafyScene(scene, regions_from_label_maps(labels), depths, torch.from_numpy(vertices).double())
