@@ -3,13 +3,15 @@
 The 16 cells of the evaluation, {4, 8, 16, 32} leaves x {3, 5, 10, 20} views, on simulated plants: those of the preset
 "paper-eval" (480 x 480, cameras on a 200 degree arc, exact poses). "true" masks are the visible parts of at least 30
 pixels, "degraded" ones have the faults of a segmenter. Label maps are rendered once and kept in the cache folder. The
-split "dev" is for choosing parameters, "test" for looking at once, at the end.
+split "dev" is for choosing parameters, "test" for looking at once, at the end. `--ablate` leaves out one part of the
+N-view matcher after another.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import multiprocessing
 import os
 import time
@@ -25,6 +27,7 @@ from embreex.rtcore_scene import EmbreeScene
 
 from mvseg.affinity import Affinity, region_affinity
 from mvseg.clustering import cluster_affinity
+from mvseg.hypotheses import Costs
 from mvseg.metrics import matching_metrics
 from mvseg.nview import match_nview
 from mvseg.one_per_view import one_per_view_clusters
@@ -47,11 +50,21 @@ def one_per_view_ids(regions: Regions, cameras: Cameras, affinity: Affinity) -> 
     return one_per_view_clusters(affinity, regions.view_index, len(cameras))
 
 
-def nview_ids(regions: Regions, cameras: Cameras, affinity: Affinity) -> torch.Tensor:
-    return match_nview(regions, cameras, affinity).instance_ids
+def nview_ids(regions: Regions, cameras: Cameras, affinity: Affinity, *, costs: Costs | None = None) -> torch.Tensor:
+    return match_nview(regions, cameras, affinity, costs=costs).instance_ids
 
 
 METHODS: dict[str, Method] = {"symnmf": symnmf_ids, "one-per-view": one_per_view_ids, "nview": nview_ids}
+ABLATIONS = {
+    "no weights": Costs(weight=0, weight_few=0),
+    "no landing": Costs(landing=0, merged_swap=math.inf),
+    "missed=absent": Costs(absent=Costs.missing),
+    "hidden is free": Costs(hidden=0),
+    "pieces alone": Costs(piece_landing=math.inf),
+    "few views kept": Costs(few_landing=math.inf),
+    "no swap": Costs(merged_swap=math.inf),
+}
+METHODS |= {name: partial(nview_ids, costs=costs) for name, costs in ABLATIONS.items()}
 
 
 def visible_ids(plant: Plant, cameras: Cameras) -> Maps:
@@ -141,7 +154,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, required=True, help="folder for label maps and records")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["symnmf", "one-per-view", "nview"])
+    parser.add_argument("--ablate", action="store_true", help="nview whole, and without one of its parts at a time")
     parser.add_argument("--masks", nargs="+", choices=("true", "degraded"), default=("true", "degraded"))
     parser.add_argument("--leaves", nargs="+", type=int, default=(4, 8, 16, 32))
     parser.add_argument("--views", nargs="+", type=int, default=(3, 5, 10, 20))
@@ -155,7 +169,8 @@ def main() -> None:
         if spec.split == args.split and spec.num_leaves in args.leaves and spec.num_views in args.views
         if int(spec.folder.split("-")[1].split("_")[0]) < args.plants
     ]
-    work = partial(run_scene, cache=args.cache, methods=args.methods, masks=args.masks)
+    methods = ["one-per-view", "nview", *ABLATIONS] if args.ablate else args.methods
+    work = partial(run_scene, cache=args.cache, methods=methods, masks=args.masks)
     with multiprocessing.get_context("spawn").Pool(args.workers) as pool:
         records = [record for found in pool.imap(work, scenes) for record in found]
     if args.json:

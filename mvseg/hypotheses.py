@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvseg.rows import EMPTY, RowTable
+from mvseg.rows import EMPTY, RowTable, run_starts
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -20,7 +20,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Costs:
-    """What a view counts that does not show the cluster, when one that does counts 1; and the other gains.
+    """What a view counts that does not show the cluster, when one that does counts 1; the other gains, and thresholds.
 
     Attributes:
         missing: cost of no region there, although the cluster has one in this view.
@@ -33,6 +33,11 @@ class Costs:
         alone: gain of a region in no cluster.
         piece_landing: least landing on a left-over region that joins a cluster whose place is taken.
         piece_score: least score of such a region, as a share of the score of the region that holds the place.
+        few: share of the views; clusters that no more of them show are doubted.
+        few_landing: least landing of a cluster on a region of such a one that it takes over.
+        merged_landing: least landing of a cluster on a region that it may share with another cluster.
+        merged_share: least share of the pixels of such a region that it alone explains.
+        merged_swap: by how much more it must speak for the region than the other cluster to become its first one.
     """
 
     missing: float = 0.7
@@ -44,6 +49,11 @@ class Costs:
     alone: float = 0.0
     piece_landing: float = 0.05
     piece_score: float = 0.5
+    few: float = 0.25
+    few_landing: float = 0.02
+    merged_landing: float = 0.25
+    merged_share: float = 0.2
+    merged_swap: float = 0.15
 
     def pair_factor(self, num_views: int) -> float:
         """What an epipolar weight of 1.5 in place of 0.5 gains."""
@@ -75,8 +85,48 @@ def view_bounds(table: RowTable) -> Bounds:
     return Bounds(np.searchsorted(table.view_index, numbers), pixels, np.searchsorted(table.pixel, pixels))
 
 
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What was found out about clusters so far. It depends on nothing but their members, so that a cluster that stays
+    as it is need not be looked at again.
+
+    Attributes:
+        scores: by view and members in other views (their indices as bytes): (N,) float32, the scores of the view's
+            regions.
+        landings: by members: (D,) float32, where the cluster expects to be seen.
+    """
+
+    scores: dict[tuple[int, bytes], Floats]
+    landings: dict[bytes, Floats]
+
+
+def nothing_known() -> Known:
+    """To start from, for one table and its costs."""
+    return Known({}, {})
+
+
+def members_of(ids: Ints, num_clusters: int) -> list[Ints]:
+    """The members of clusters 0 .. K - 1 in rising order; `ids` (D,) is K for regions that are in none."""
+    order = np.argsort(ids, kind="stable")
+    return np.split(order, np.searchsorted(ids[order], np.arange(1, num_clusters + 1)))[:num_clusters]
+
+
+def known_scores(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs, known: Known) -> Floats:
+    """What `score_matrix` returns, by looking only at clusters that are not known yet; they are added to `known`."""
+    num_clusters = int(ids.max(initial=0))
+    keys = [(view, members.tobytes()) for members in members_of(ids, num_clusters)]
+    new = np.array([k for k, key in enumerate(keys) if key not in known.scores], np.int64)
+    if len(new):
+        place = np.full(num_clusters + 1, len(new))
+        place[new] = np.arange(len(new))
+        fresh = score_matrix(table, place[ids], view, bounds, costs)
+        known.scores.update({keys[k]: fresh[:, i] for i, k in enumerate(new.tolist())})
+    here = bounds.of(view)[0]
+    return np.stack([known.scores[key] for key in keys], 1) if keys else np.zeros((here.stop - here.start, 0))
+
+
 def score_matrix(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs) -> Floats:
-    """Leave-one-out scores of the regions of one view in all clusters, S(n, c).
+    """Leave-one-out scores of the regions of one view in some clusters, S(n, c).
 
     A row scores (views that show c - hidden * views that show others - missing or absent * views that show nothing)
     / (views that the point lies in); a pixel scores as its best row, but not below -hidden; a region as the mean of its
@@ -84,7 +134,8 @@ def score_matrix(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: C
 
     Args:
         table: rows of D regions.
-        ids: (D,) cluster of each region in [0, K); K for the regions of the view itself, whatever they are.
+        ids: (D,) cluster of each region in [0, K); K for regions of no cluster that is asked for, and for the regions
+            of the view itself, whatever they are.
         view: the view.
         bounds: of the table.
         costs: of views that do not show the cluster.
@@ -92,25 +143,30 @@ def score_matrix(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: C
     Returns:
         (N, K) float32 in [-hidden, 1].
     """
+    best = pixel_scores(table, ids, view, bounds, costs)
+    start = run_starts(table.pixel_region[bounds.of(view)[1]])
+    return np.add.reduceat(best, start, 0) / np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
+
+
+def pixel_scores(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs) -> Floats:
+    """(P, K) float32: the same for each of the view's pixels, see `score_matrix`."""
     _, pixels, rows = bounds.of(view)
     num_clusters = int(ids.max(initial=0))
-    labels = torch.from_numpy(table.labels[rows].astype(np.int64))
+    labels = torch.from_numpy(table.labels[rows].T.astype(np.int64))
     cluster = torch.from_numpy(np.append(ids, [num_clusters, num_clusters]))[labels]
-    shown = torch.zeros(len(labels), num_clusters + 1)
-    shown.scatter_add_(1, cluster, torch.ones(1).expand(cluster.shape))
+    shown = torch.zeros(num_clusters + 1, labels.shape[1])  # rows run fastest: they are what is maximised over
+    shown.scatter_add_(0, cluster, torch.ones(1).expand(cluster.shape))
     is_empty = (labels == EMPTY).float()
-    num_labels = (labels >= 0).sum(1, keepdim=True).float()
-    num_inside = num_labels + is_empty.sum(1, keepdim=True)
-    empty_cost = torch.from_numpy(_empty_costs(table, ids, num_clusters, costs))
-    score = torch.addmm(costs.hidden * num_labels, is_empty, empty_cost.T)
-    score = ((1 + costs.hidden) * shown[:, :num_clusters]).sub_(score).div_(num_inside)
+    num_labels = (labels >= 0).sum(0).float()
+    num_inside = num_labels + is_empty.sum(0)
+    cost = torch.from_numpy(_empty_costs(table, ids, num_clusters, costs)) @ is_empty
+    score = shown[:num_clusters].mul_(1 + costs.hidden).sub_(cost).sub_(costs.hidden * num_labels).div_(num_inside)
     best = np.full((pixels.stop - pixels.start, num_clusters), -costs.hidden, np.float32)
     start = run_starts(table.pixel[rows])
     if len(start):
         place = table.pixel[rows][start] - pixels.start
-        best[place] = np.maximum(np.maximum.reduceat(score.numpy(), start, 0), -costs.hidden)
-    start = run_starts(table.pixel_region[pixels])
-    return np.add.reduceat(best, start, 0) / np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
+        best[place] = np.maximum(np.maximum.reduceat(score.numpy(), start, 1), -costs.hidden).T
+    return best
 
 
 def _empty_costs(table: RowTable, ids: Ints, num_clusters: int, costs: Costs) -> Floats:
@@ -120,56 +176,70 @@ def _empty_costs(table: RowTable, ids: Ints, num_clusters: int, costs: Costs) ->
     return np.where(has_mask[:num_clusters], costs.missing, costs.absent).astype(np.float32)
 
 
-def run_starts(values: NDArray[np.integer]) -> Ints:
-    """(R,) int64: where the runs of equal values start."""
-    return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else np.zeros(0, np.int64)
+def known_landings(table: RowTable, ids: Ints, costs: Costs, known: Known) -> Floats:
+    """What `landing_matrix` returns, by looking only at clusters that are not known yet; they are added to `known`."""
+    keys = [members.tobytes() for members in members_of(ids, int(ids.max(initial=-1)) + 1)]
+    new = np.array([k for k, key in enumerate(keys) if key not in known.landings], np.int64)
+    if len(new):
+        fresh = landing_matrix(table, ids, costs, new)
+        known.landings.update({keys[k]: fresh[i] for i, k in enumerate(new.tolist())})
+    return np.stack([known.landings[key] for key in keys]) if keys else np.zeros((0, len(ids)), np.float32)
 
 
-def landing_matrix(table: RowTable, ids: Ints, costs: Costs) -> Floats:
-    """Where the clusters expect to be seen in each view, R(c, n).
+def landing_matrix(table: RowTable, ids: Ints, costs: Costs, clusters: Ints | None = None) -> Floats:
+    """Where clusters expect to be seen in each view, R(c, n).
 
     Args:
         table: rows of D regions.
         ids: (D,) cluster of each region in [0, K).
         costs: of views that do not show the cluster.
+        clusters: (C,) the clusters that are asked for; None for all K.
 
     Returns:
-        (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best row shows n. The best
+        (C, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best row shows n. The best
         row is chosen without n's view; pixels whose best row scores below 0 do not count, and equal rows share.
     """
     num_clusters = int(ids.max(initial=-1)) + 1
-    labels, region = table.labels, table.pixel_region[table.pixel]
-    own = ids[region]
-    gain, is_inside = own_row_gains(table, ids, costs)
+    clusters = np.arange(num_clusters) if clusters is None else clusters
+    place = np.full(num_clusters, -1)
+    place[clusters] = np.arange(len(clusters))
+    region = table.pixel_region[table.pixel]
+    rows = np.flatnonzero(place[ids[region]] >= 0)
+    labels, region, pixel = table.labels[rows], region[rows], table.pixel[rows]
+    own = place[ids[region]]
+    gain, is_inside = own_row_gains(table, ids, costs, rows)
     total, count = gain.sum(1), is_inside.sum(1)
-    start = run_starts(table.pixel)
+    start = run_starts(pixel)
     run = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(total))))
-    found = np.zeros((num_clusters, len(ids)), np.float32)
+    found = np.zeros((len(clusters), len(ids)), np.float32)
     for view in np.unique(table.view_index).tolist() if len(start) else ():
         score = (total - gain[:, view]) / np.maximum(count - is_inside[:, view], 1)
         best = np.maximum.reduceat(score, start)
         use = np.flatnonzero((score >= best[run] - 1e-6) & (best[run] >= 0) & (table.view_index[region] != view))
         share = 1 / np.bincount(run[use], minlength=len(start))[run[use]]
-        pixels = np.bincount(own[use], share, num_clusters)
+        pixels = np.bincount(own[use], share, len(clusters))
         hit = labels[use, view] >= 0
         flat = own[use][hit] * len(ids) + labels[use, view][hit]
-        landed = np.bincount(flat, share[hit], num_clusters * len(ids)).reshape(found.shape)
+        landed = np.bincount(flat, share[hit], len(clusters) * len(ids)).reshape(found.shape)
         found += landed / np.maximum(pixels, 1e-9)[:, None]
     return found
 
 
-def own_row_gains(table: RowTable, ids: Ints, costs: Costs) -> tuple[Floats, NDArray[np.bool_]]:
+def own_row_gains(
+    table: RowTable, ids: Ints, costs: Costs, rows: Ints | slice = slice(None)
+) -> tuple[Floats, NDArray[np.bool_]]:
     """(I, V) float32, what each view of each row adds to the score of the region in its own cluster; and (I, V) bool,
     whether the point lies in that view. The sum of the gains over the number of these views is the score of the row.
 
-    `ids` (D,) is the cluster of each region in [0, K).
+    `ids` (D,) is the cluster of each region in [0, K); `rows` (I,) are the rows that are asked for, all by default.
     """
-    labels, own = table.labels, ids[table.pixel_region[table.pixel]]
-    empty = _empty_costs(table, ids, int(ids.max(initial=-1)) + 1, costs)[own]
-    gain = np.where(labels == EMPTY, -empty, np.float32(-costs.hidden))
-    gain[labels < EMPTY] = 0
+    labels, own = table.labels[rows], ids[table.pixel_region[table.pixel[rows]]]
+    empty = _empty_costs(table, ids, int(ids.max(initial=-1)) + 1, costs)
+    gain = np.full(labels.shape, -costs.hidden, np.float32)
     gain[np.append(ids, [-1, -1])[labels] == own[:, None]] = 1
-    return gain, labels >= EMPTY
+    gain = np.where(labels == EMPTY, -empty[own], gain)
+    is_inside = labels >= EMPTY
+    return gain * is_inside, is_inside
 
 
 def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
@@ -182,6 +252,60 @@ def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
         best[table.pixel[start]] = np.maximum(np.maximum.reduceat(score, start), -costs.hidden)
     counts = np.bincount(table.pixel_region, minlength=len(ids))
     return np.bincount(table.pixel_region, best, len(ids)) / np.maximum(counts, 1)
+
+
+def merged_regions(table: RowTable, W: Floats, ids: Ints, costs: Costs, known: Known) -> tuple[Ints, Ints]:
+    """Masks that cover two instances: two clusters explain disjoint parts of them.
+
+    A cluster that has no region in a view, but lands on one that belongs to another cluster, may share it. A pixel is
+    explained by a cluster when it scores at least half of what the cluster's regions score in the median. The cluster
+    for which more speaks comes first: landing, mean epipolar weight, and share of the pixels that it alone explains.
+
+    Args:
+        table: rows of D regions.
+        W: (D, D) symmetric epipolar weights.
+        ids: (D,) cluster of each region in [0, K).
+        costs: thresholds, and costs of views that do not show a cluster.
+        known: what is found about clusters is added.
+
+    Returns:
+        (D,) the ids, changed for merged masks whose second cluster comes first; (M, 3) int64 region, first and second
+        cluster.
+    """
+    bounds, views = view_bounds(table), table.view_index
+    landing, own = known_landings(table, ids, costs, known), own_scores(table, ids, costs)
+    clusters = members_of(ids, len(landing))
+    usual = np.array([np.median(own[members]) for members in clusters])
+    is_real = np.array([len(np.unique(views[members])) >= max(2, costs.few * table.num_views) for members in clusters])
+    changed, found = ids.copy(), []
+    for view in np.unique(views).tolist():
+        regions, pixels, _ = bounds.of(view)
+        here = np.arange(regions.start, regions.stop)
+        is_second = (landing[:, here] >= costs.merged_landing) & is_real[:, None] & is_real[ids[here]]
+        is_second[ids[here]] = False
+        shared = here[is_second.any(0)]
+        if not len(shared):
+            continue
+        asked = np.union1d(np.flatnonzero(is_second.any(1)), ids[shared])
+        column = np.full(len(clusters), len(asked))
+        column[asked] = np.arange(len(asked))
+        scores = pixel_scores(table, np.where(views == view, len(asked), column[ids]), view, bounds, costs)
+        is_explained = scores >= 0.5 * usual[asked]
+        num_others = np.maximum(np.bincount(ids[views != view], minlength=len(clusters)), 1)
+        for region in shared.tolist():
+            pair = np.append(ids[region], np.flatnonzero(is_second[:, region - regions.start]))
+            part = is_explained[table.pixel_region[pixels] == region][:, column[pair]]
+            first_only, only = (part[:, :1] & ~part).mean(0), (part & ~part[:, :1]).mean(0)
+            weight = np.bincount(ids[views != view], W[region][views != view], len(clusters)) / num_others
+            speaks = landing[pair, region] + weight[pair]
+            margin = (speaks + only - first_only - speaks[0])[1:]
+            best = 1 + int(margin.argmax())
+            second, share = pair[best], only[best]
+            if margin[best - 1] > costs.merged_swap:
+                changed[region], second, share = pair[best], pair[0], first_only[best]
+            if share >= costs.merged_share:
+                found.append((region, changed[region], second))
+    return changed, np.array(found, np.int64).reshape(-1, 3)
 
 
 def partition_value(table: RowTable, evidence: Floats, ids: Ints, costs: Costs) -> float:

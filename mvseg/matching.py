@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
@@ -31,12 +31,20 @@ class Matching:
         num_instances: K.
         method: what matched: "nview", "one-per-view" (also what nview falls back to when the views do not agree on
             anything, or are two) or "symnmf".
+        support: (K,) int64, in how many views each instance has a region whose match score is at least 0.5; None where
+            the match scores are no chances.
+        merged: (M, 3) int64, masks that seem to cover two instances: region, its instance, the other instance. Nothing
+            is changed in the masks. Only "nview" looks for them.
+        residual_px: about how far, in pixels, the reprojections of matched regions are off; None where not estimated.
     """
 
     instance_ids: Tensor
     match_scores: Tensor
     num_instances: int
     method: str
+    support: Tensor | None = None
+    merged: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.int64))
+    residual_px: int | None = None
 
 
 def match_regions(
@@ -71,8 +79,16 @@ def match_regions(
     method = choose_method(config)
     if method == "nview":
         found = match_nview(regions, cameras, affinity)
-        ids, scores, method = found.instance_ids, found.match_scores, found.method
-    elif method == "one-per-view":
+        return Matching(
+            found.instance_ids,
+            found.match_scores,
+            len(found.support),
+            found.method,
+            found.support,
+            found.merged,
+            found.residual_px,
+        )
+    if method == "one-per-view":
         ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
         scores = mean_affinity(affinity, ids, regions)
     else:

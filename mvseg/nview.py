@@ -23,11 +23,13 @@ from mvseg.confidence import Support, match_scores
 from mvseg.hypotheses import (
     Bounds,
     Costs,
-    landing_matrix,
+    Known,
+    known_landings,
+    known_scores,
+    merged_regions,
+    nothing_known,
     own_scores,
     partition_value,
-    run_starts,
-    score_matrix,
     view_bounds,
 )
 from mvseg.one_per_view import (
@@ -40,19 +42,17 @@ from mvseg.one_per_view import (
     view_order,
 )
 from mvseg.regions import Regions
-from mvseg.rows import EMPTY, PLENTY, RowTable, row_table
+from mvseg.rows import RowTable, em_affinities, row_table
 from mvseg.scene import Cameras
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
-SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the rows of a pixel, one per iteration
-EARLY = 2  # iterations after which the affinity is a start of its own
+EARLY = 2  # iterations of `em_affinities` after which the affinity is a start of its own
 STARTS = ((-1, 0.3), (EARLY - 1, 0.1))  # iteration whose affinity is clustered, and where agglomeration stops
-EMPTY_COST = 0.7  # of a row in which all views show no region
-EM_PIXELS = 20  # at most so many per region
 AS_GOOD = 0.99  # share of the best value that pairwise clusters must reach
 SECOND_CHANCE = 0.4  # mean epipolar weight with which regions that are left alone join after all
+CONFIDENT = 0.5  # match score from which a region counts for its instance's support
 MANY_VIEWS = 8  # more than these need no second start
 WIDENINGS = (1, 2, 4, 8)  # pixels of reprojection error that are tried
 EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean scores above which the poses are sound, below which the rows are of no use
@@ -69,7 +69,9 @@ class NViewMatching:
     Attributes:
         instance_ids: (D,) int64 in [0, K), clusters numbered by their first region; -1 = matched to nothing.
         match_scores: (D,) float32 in [0, 1], the chance that the id is right; 0 for -1.
-        num_views_seen: (K,) int64, in how many views each instance has a region.
+        support: (K,) int64, in how many views each instance has a region whose match score is at least 0.5.
+        merged: (M, 3) int64, masks that seem to cover two instances: region, its instance, the second one. The region
+            has the id of the first; `hypotheses.merged_regions` says how they are found.
         explained: mean score of the matched regions in their clusters, 1 = every pixel is seen in all other views.
         residual_px: reprojection error that the label maps were widened by, pixels.
         method: "nview", or "one-per-view" where the rows do not explain the regions (poses too far off, two views).
@@ -77,19 +79,21 @@ class NViewMatching:
 
     instance_ids: Tensor
     match_scores: Tensor
-    num_views_seen: Tensor
+    support: Tensor
+    merged: Tensor
     explained: float
     residual_px: int
     method: str
 
 
-def match_nview(regions: Regions, cameras: Cameras, affinity: Affinity) -> NViewMatching:
+def match_nview(regions: Regions, cameras: Cameras, affinity: Affinity, *, costs: Costs | None = None) -> NViewMatching:
     """Match the regions of V >= 2 views by what all views show.
 
     Args:
         regions: D regions in V views, in any order.
         cameras: V cameras.
         affinity: the epipolar weights of the regions.
+        costs: None for the default ones.
 
     Returns:
         The matching, on the device of the regions. It does not depend on the order of views and regions, unless two
@@ -99,32 +103,46 @@ def match_nview(regions: Regions, cameras: Cameras, affinity: Affinity) -> NView
     ordered = regions.select(order)
     W = affinity.to_dense()[order][:, order].cpu().double().numpy()
     pairwise = one_per_view_clusters(affinity, regions.view_index, len(cameras))[order].cpu().numpy()
-    costs = view_costs(len(cameras))
+    costs = view_costs(len(cameras), costs or Costs())
     table, residual_px = _table_of_poses(ordered, cameras, pairwise, costs)
-    ids = search(table, W, costs, dense_ids(_alone_apart(pairwise)))
+    known = nothing_known()
+    ids = search(table, W, costs, dense_ids(_alone_apart(pairwise)), known)
     method, explained = "nview", _explained(table, ids, costs)
     if explained < UNEXPLAINED or len(cameras) == 2:
         ids, method = dense_ids(_alone_apart(pairwise)), "one-per-view"
         explained = _explained(table, ids, costs)
-    scores = match_scores(support(table, W, ids, costs))
-    back = order.argsort()
-    final = renumber(drop_singletons(ids)[back.cpu()])
-    seen = torch.zeros(int(final.max()) + 1 if len(final) else 0, len(cameras))
-    seen[final[final >= 0], regions.view_index.cpu()[final >= 0]] = 1
-    confidence = torch.from_numpy(scores).float()[back.cpu()] * (final >= 0)
+    ids, found = merged_regions(table, W, ids, costs, known)
+    merged = torch.from_numpy(found)
+    scores = torch.from_numpy(match_scores(support(table, W, ids, costs, known))).float()
+    back = order.argsort().cpu()
+    final = renumber(drop_singletons(ids)[back])
+    confidence = scores[back] * (final >= 0)
+    number = final[order.cpu()[np.unique(ids, return_index=True)[1]]]  # of each cluster
+    merged = torch.cat((order.cpu()[merged[:, :1]], number[merged[:, 1:]]), 1)
     return NViewMatching(
         final.to(regions.device),
         confidence.to(regions.device),
-        seen.sum(1).long().to(regions.device),
+        _count_views(final, regions.view_index.cpu(), confidence).to(regions.device),
+        merged[(merged >= 0).all(1)].to(regions.device),
         explained,
         residual_px,
         method,
     )
 
 
-def view_costs(num_views: int) -> Costs:
+def _count_views(ids: Tensor, view_index: Tensor, scores: Tensor) -> Tensor:
+    """(K,) int64: in how many views a region of each instance scores at least CONFIDENT."""
+    seen = torch.zeros(int(ids.max()) + 1 if len(ids) else 0, int(view_index.max()) + 1 if len(ids) else 0)
+    sure = (ids >= 0) & (scores >= CONFIDENT)
+    seen[ids[sure], view_index[sure]] = 1
+    return seen.sum(1).long()
+
+
+def view_costs(num_views: int, costs: Costs) -> Costs:
     """The costs for a number of views: of three views, two do not suffice to tell a piece from a neighbour."""
-    return Costs() if num_views > 3 else replace(Costs(), piece_landing=0.1, piece_score=0.8)
+    if num_views > 3:
+        return costs
+    return replace(costs, piece_landing=max(costs.piece_landing, 0.1), piece_score=max(costs.piece_score, 0.8))
 
 
 def _table_of_poses(regions: Regions, cameras: Cameras, ids: Ints, costs: Costs) -> tuple[RowTable, int]:
@@ -154,7 +172,7 @@ def _explained(table: RowTable, ids: Ints, costs: Costs) -> float:
     return float(own_scores(table, ids, costs)[together].mean()) if together.any() else 0.0
 
 
-def search(table: RowTable, W: Floats, costs: Costs, pairwise: Ints) -> Ints:
+def search(table: RowTable, W: Floats, costs: Costs, pairwise: Ints, known: Known | None = None) -> Ints:
     """The best partition that refinement finds from one start, or, with few views, two.
 
     Clusters from the weights alone are kept when they are worth nearly as much: then the masks are sound, and the
@@ -165,22 +183,25 @@ def search(table: RowTable, W: Floats, costs: Costs, pairwise: Ints) -> Ints:
         W: (D, D) symmetric epipolar weights.
         costs: of views that do not show a cluster.
         pairwise: (D,) int64, clusters from the weights alone, in [0, K).
+        known: scores and landings of the same table and costs; what is found is added.
 
     Returns:
         (D,) int64 cluster of each region in [0, K), regions alone included.
     """
+    known = known or nothing_known()
     history = em_affinities(table)
     evidence = weight_evidence(W)
     found = []
     for iteration, stop in STARTS[: 1 if table.num_views > MANY_VIEWS else None]:
         ids = link_average(history[iteration], table.view_index, table.num_views, stop)
-        ids = refine(table, W, ids, costs)
-        found.append(refine(table, W, ids, costs, join_pieces=True))
+        ids = refine(table, W, ids, costs, known=known)
+        found.append(refine(table, W, ids, costs, join_pieces=True, known=known))
     values = [partition_value(table, evidence, ids, costs) for ids in (pairwise, *found)]
-    if values[0] >= AS_GOOD * max(values):
-        return pairwise
-    best = found[int(np.argmax(values[1:]))]
-    return join_alone(W, table.view_index, table.num_views, best, SECOND_CHANCE)
+    best = pairwise
+    if values[0] < AS_GOOD * max(values):
+        best = found[int(np.argmax(values[1:]))]
+        best = join_alone(W, table.view_index, table.num_views, best, SECOND_CHANCE)
+    return join_few(table, W, best, costs, known)
 
 
 def weight_evidence(W: Floats) -> Floats:
@@ -188,57 +209,15 @@ def weight_evidence(W: Floats) -> Floats:
     return (np.interp(W, WEIGHTS, LOG_ODDS) + PRIOR) / SPAN
 
 
-def em_affinities(table: RowTable) -> list[Floats]:
-    """How likely two regions are one instance, from the rows alone.
-
-    E step: the rows of a pixel share one unit of belief by a soft maximum of their mean affinity between all regions
-    that they name (the pixel's own included), less EMPTY_COST for views that show nothing. M step: the affinity of
-    region n to m is the belief in rows with m, averaged over the pixels of n, and made symmetric.
-
-    Args:
-        table: rows of D regions.
-
-    Returns:
-        After each iteration (D, D) float64 in [0, 1], symmetric, 0 for regions of one view.
-    """
-    num, owner_of = len(table.view_index), table.pixel_region
-    most = round(EM_PIXELS * min(1, PLENTY / table.num_views))
-    counts = np.bincount(owner_of, minlength=num)
-    rank = np.arange(len(owner_of)) - np.searchsorted(owner_of, owner_of)
-    is_used = rank % np.maximum(1, -(-counts // most))[owner_of] == 0
-    rows = is_used[table.pixel]
-    pixel, owner = table.pixel[rows], torch.from_numpy(owner_of[table.pixel[rows]])
-    labels = torch.from_numpy(table.labels[rows].astype(np.int64))
-    num_empty, num_inside = (labels == EMPTY).sum(1), (labels >= EMPTY).sum(1)
-    labels = torch.where(labels < 0, num, labels).T.contiguous()  # column `num` collects what is no region
-    pixels = torch.from_numpy(np.maximum(np.bincount(owner_of[is_used], minlength=num), 1))[:, None]
-    start = run_starts(pixel)
-    run = torch.from_numpy(np.repeat(np.arange(len(start)), np.diff(np.append(start, len(pixel)))))
-    cell = owner * (num + 1) + labels
-    if not len(start):
-        return [np.zeros((num, num))] * len(SHARPNESS)
-    seen = torch.unique(run * (num + 1) + labels)
-    first = owner[torch.from_numpy(start)][seen // (num + 1)] * (num + 1) + seen % (num + 1)
-    A = torch.bincount(first, minlength=num * (num + 1)).reshape(num, num + 1)[:, :num] / pixels
-    history = []
-    for beta in SHARPNESS:
-        flat = torch.nn.functional.pad((A + A.T).float() / 2, (0, 1, 0, 1)).flatten()
-        score = flat[cell].sum(0)
-        for view, base in enumerate(labels * (num + 1)):
-            for other in range(view + 1, len(labels)):
-                score += flat[base + labels[other]]
-        score = 2 * score / (num_inside * (num_inside + 1)) - EMPTY_COST * num_empty / num_inside
-        best = torch.from_numpy(np.maximum.reduceat(score.numpy(), start))
-        belief = torch.exp(beta * (score - best[run])).double()
-        belief /= torch.bincount(run, belief)[run]
-        mass = torch.bincount(cell.flatten(), belief.expand(cell.shape).flatten(), minlength=num * (num + 1))
-        A = mass.reshape(num, num + 1)[:, :num] / pixels
-        history.append(((A + A.T) / 2).double().numpy())
-    return history
-
-
 def refine(
-    table: RowTable, W: Floats, ids: Ints, costs: Costs, *, num_sweeps: int = 3, join_pieces: bool = False
+    table: RowTable,
+    W: Floats,
+    ids: Ints,
+    costs: Costs,
+    *,
+    num_sweeps: int = 3,
+    join_pieces: bool = False,
+    known: Known | None = None,
 ) -> Ints:
     """Re-assign the regions of one view after another to the clusters of the others.
 
@@ -249,20 +228,22 @@ def refine(
         costs: of views that do not show a cluster.
         num_sweeps: at most so many times through all views; fewer when nothing changes.
         join_pieces: left-over regions may join a cluster whose place in their view is taken.
+        known: scores and landings of the same table and costs; what is found is added.
 
     Returns:
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
     bounds, ids, evidence = view_bounds(table), dense_ids(ids), weight_evidence(W)
+    known = known or nothing_known()
     order = view_order(W, table.view_index, table.num_views)
     for _ in range(num_sweeps):
         before = dense_ids(ids)
-        ids, landing = before.copy(), landing_matrix(table, before, costs)
+        ids, landing = before.copy(), known_landings(table, before, costs, known)
         for view in order.tolist():
             here = bounds.of(view)[0]
             if here.start == here.stop:
                 continue
-            gains = view_gains(table, evidence, ids, landing, view, bounds, costs)
+            gains = view_gains(table, evidence, ids, landing, view, bounds, costs, known)
             chosen = assign_one_to_one(gains.total, costs.alone)
             if join_pieces:
                 chosen = _join_pieces(chosen, gains, costs)
@@ -291,7 +272,14 @@ class ViewGains:
 
 
 def view_gains(
-    table: RowTable, evidence: Floats, ids: Ints, landing: Floats, view: int, bounds: Bounds, costs: Costs
+    table: RowTable,
+    evidence: Floats,
+    ids: Ints,
+    landing: Floats,
+    view: int,
+    bounds: Bounds,
+    costs: Costs,
+    known: Known,
 ) -> ViewGains:
     """The gains of one view. `landing` may know fewer clusters than `ids` has: the others expect to land nowhere."""
     here = bounds.of(view)[0]
@@ -299,14 +287,50 @@ def view_gains(
     clusters, inverse = np.unique(ids[is_other], return_inverse=True)
     compact = np.full(len(ids), len(clusters))
     compact[is_other] = inverse
-    score = score_matrix(table, compact, view, bounds, costs)
+    score = known_scores(table, compact, view, bounds, costs, known)
     expected = np.zeros_like(score)
-    known = clusters < len(landing)
-    expected[:, known] = landing[clusters[known], here].T
+    has_landing = clusters < len(landing)
+    expected[:, has_landing] = landing[clusters[has_landing], here].T
     members = np.zeros((len(ids), len(clusters) + 1))
     members[np.arange(len(ids)), compact] = 1
     pairs = costs.pair_factor(table.num_views) * (evidence[here] @ members[:, :-1])
     return ViewGains(clusters, score, expected, score + costs.landing * expected + pairs)
+
+
+def join_few(table: RowTable, W: Floats, ids: Ints, costs: Costs, known: Known) -> Ints:
+    """Dissolve clusters that few views show into those that expect to be seen where they are.
+
+    Pieces of split masks, and masks that are merged with something else, find each other across views and make up
+    clusters that stand for nothing. A region of such a cluster joins the larger one that expects most to be seen on
+    it and explains some of it, whether its place is taken or not; if there is one. With three views no cluster is
+    seen often enough to be doubted.
+
+    Args:
+        table: rows of D regions.
+        W: (D, D) symmetric epipolar weights.
+        ids: (D,) cluster of each region in [0, K).
+        costs: of views that do not show a cluster.
+        known: what is found about clusters is added.
+
+    Returns:
+        (D,) int64 cluster of each region in [0, K), numbered by their first region.
+    """
+    ids, bounds, evidence = dense_ids(ids), view_bounds(table), weight_evidence(W)
+    num_clusters, views = int(ids.max(initial=-1)) + 1, table.view_index
+    is_shown = np.zeros((num_clusters, table.num_views), bool)
+    is_shown[ids, views] = True
+    is_few = is_shown.sum(1) <= max(1, costs.few * table.num_views)
+    if table.num_views < 4 or not is_few.any():
+        return ids
+    landing, joined = known_landings(table, ids, costs, known), ids.copy()
+    for view in np.unique(views[is_few[ids]]).tolist():
+        here = bounds.of(view)[0]
+        gains = view_gains(table, evidence, ids, landing, view, bounds, costs, known)
+        fits = ~is_few[gains.clusters] & (gains.landing >= costs.few_landing) & (gains.score > 0)
+        moves = is_few[ids[here]] & fits.any(1)
+        if moves.any():
+            joined[here][moves] = gains.clusters[np.where(fits, gains.landing, -1)[moves].argmax(1)]
+    return dense_ids(joined)
 
 
 def _join_pieces(chosen: Ints, gains: ViewGains, costs: Costs) -> Ints:
@@ -323,13 +347,13 @@ def _join_pieces(chosen: Ints, gains: ViewGains, costs: Costs) -> Ints:
     return chosen
 
 
-def support(table: RowTable, W: Floats, ids: Ints, costs: Costs) -> Support:
+def support(table: RowTable, W: Floats, ids: Ints, costs: Costs, known: Known) -> Support:
     """What speaks for the id of each region: see `Support`. Regions alone in their cluster have no support."""
-    bounds, evidence, landing = view_bounds(table), weight_evidence(W), landing_matrix(table, ids, costs)
+    bounds, evidence, landing = view_bounds(table), weight_evidence(W), known_landings(table, ids, costs, known)
     score, own, rival, landed = (np.zeros(len(ids)) for _ in range(4))
     for view in np.unique(table.view_index).tolist():
         here = bounds.of(view)[0]
-        gains = view_gains(table, evidence, ids, landing, view, bounds, costs)
+        gains = view_gains(table, evidence, ids, landing, view, bounds, costs, known)
         is_own = ids[here][:, None] == gains.clusters
         score[here] = (gains.score * is_own).sum(1)
         own[here] = (gains.total * is_own).sum(1)

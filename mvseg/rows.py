@@ -2,7 +2,8 @@
 
 Every hypothesis about a pixel's depth makes one statement per view: there the point shows this region, or no region, or
 it is outside of the image. Such a tuple is a row. Most depths make the same statement as their neighbours, so that few
-distinct rows are left per pixel and per region; everything later works on those.
+distinct rows are left per pixel and per region; everything later works on those. Rows alone already tell, without any
+cluster, how likely two regions are one instance (`em_affinities`).
 """
 
 from __future__ import annotations
@@ -18,12 +19,15 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 EMPTY, OUTSIDE = -1, -2  # labels of a row: no region there; outside of the image, behind the camera, or the own view
-PIXELS = 40  # at most so many per region cast a ray, and
+PIXELS = 24  # at most so many per region cast a ray, and
 PLENTY = 10  # with more views than this, fewer: there is more to be seen along each ray
-DEPTHS = 128  # along a ray
+DEPTHS = 96  # along a ray
 NEAREST = 0.05  # no depth below this fraction of the longest baseline
 MAX_EMPTY = 0.5  # share of the other views that may show no region
 DOMINANCE_PASSES = 3
+SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the rows of a pixel, one per iteration
+EMPTY_COST = 0.7  # of a row in which all views show no region
+EM_PIXELS = 12  # at most so many per region
 CHUNK = 512  # rays at a time: their samples fit into the cache
 
 Floats = NDArray[np.float32]
@@ -237,3 +241,57 @@ def _join_equal(pixel: Tensor, labels: Tensor, inverse: Tensor) -> tuple[Tensor,
         keep[:-1] &= ~(more & ~less)
         pixel, labels, inverse = pixel[keep], labels[keep], inverse[keep]
     return pixel, labels, inverse
+
+
+def run_starts(values: NDArray[np.integer]) -> Ints:
+    """(R,) int64: where the runs of equal values start."""
+    return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else np.zeros(0, np.int64)
+
+
+def em_affinities(table: RowTable) -> list[NDArray[np.floating]]:
+    """How likely two regions are one instance, from the rows alone.
+
+    E step: the rows of a pixel share one unit of belief by a soft maximum of their mean affinity between all regions
+    that they name (the pixel's own included), less EMPTY_COST for views that show nothing. M step: the affinity of
+    region n to m is the belief in rows with m, averaged over the pixels of n, and made symmetric.
+
+    Args:
+        table: rows of D regions.
+
+    Returns:
+        After each iteration (D, D) float64 in [0, 1], symmetric, 0 for regions of one view.
+    """
+    num, owner_of = len(table.view_index), table.pixel_region
+    most = round(EM_PIXELS * min(1, PLENTY / table.num_views))
+    counts = np.bincount(owner_of, minlength=num)
+    rank = np.arange(len(owner_of)) - np.searchsorted(owner_of, owner_of)
+    is_used = rank % np.maximum(1, -(-counts // most))[owner_of] == 0
+    rows = is_used[table.pixel]
+    pixel, owner = table.pixel[rows], torch.from_numpy(owner_of[table.pixel[rows]])
+    labels = torch.from_numpy(table.labels[rows].astype(np.int64))
+    num_empty, num_inside = (labels == EMPTY).sum(1), (labels >= EMPTY).sum(1)
+    labels = torch.where(labels < 0, num, labels).T.contiguous()  # column `num` collects what is no region
+    pixels = torch.from_numpy(np.maximum(np.bincount(owner_of[is_used], minlength=num), 1))[:, None]
+    start = run_starts(pixel)
+    run = torch.from_numpy(np.repeat(np.arange(len(start)), np.diff(np.append(start, len(pixel)))))
+    cell = owner * (num + 1) + labels
+    if not len(start):
+        return [np.zeros((num, num))] * len(SHARPNESS)
+    seen = torch.unique(run * (num + 1) + labels)
+    first = owner[torch.from_numpy(start)][seen // (num + 1)] * (num + 1) + seen % (num + 1)
+    A = torch.bincount(first, minlength=num * (num + 1)).reshape(num, num + 1)[:, :num] / pixels
+    history = []
+    for beta in SHARPNESS:
+        flat = torch.nn.functional.pad((A + A.T).float() / 2, (0, 1, 0, 1)).flatten()
+        score = flat[cell].sum(0)
+        for view, base in enumerate(labels * (num + 1)):
+            for other in range(view + 1, len(labels)):
+                score += flat[base + labels[other]]
+        score = 2 * score / (num_inside * (num_inside + 1)) - EMPTY_COST * num_empty / num_inside
+        best = torch.from_numpy(np.maximum.reduceat(score.numpy(), start))
+        belief = torch.exp(beta * (score - best[run])).double()
+        belief /= torch.bincount(run, belief)[run]
+        mass = torch.bincount(cell.flatten(), belief.expand(cell.shape).flatten(), minlength=num * (num + 1))
+        A = mass.reshape(num, num + 1)[:, :num] / pixels
+        history.append(((A + A.T) / 2).double().numpy())
+    return history

@@ -26,6 +26,15 @@ def test_shipped_scene_is_solved(
     assert matching.num_instances == 12
     assert matching.match_scores.min() > 0.3
     assert matching.match_scores.max() <= 1
+    assert matching.merged.shape == (0, 3)
+    if method in ("auto", "nview"):
+        assert matching.support is not None
+        assert matching.support.shape == (12,)
+        assert matching.support.min() >= 2
+        assert matching.residual_px == 1
+    else:
+        assert matching.support is None
+        assert matching.residual_px is None
 
 
 def test_the_papers_random_points_solve_it_too(

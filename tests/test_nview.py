@@ -9,11 +9,21 @@ import torch
 from sklearn.metrics import adjusted_rand_score
 
 from mvseg.affinity import region_affinity
-from mvseg.hypotheses import Costs, landing_matrix, own_scores, partition_value, score_matrix, view_bounds
-from mvseg.nview import NViewMatching, em_affinities, match_nview, refine, search
+from mvseg.hypotheses import (
+    Costs,
+    known_landings,
+    known_scores,
+    landing_matrix,
+    nothing_known,
+    own_scores,
+    partition_value,
+    score_matrix,
+    view_bounds,
+)
+from mvseg.nview import NViewMatching, match_nview, refine, search
 from mvseg.one_per_view import dense_ids
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.rows import EMPTY, OUTSIDE, RowTable, row_table, sample_pixels
+from mvseg.rows import EMPTY, OUTSIDE, RowTable, em_affinities, row_table, sample_pixels
 from mvseg.scene import Cameras, Scene
 from synthetic import (
     BallScene,
@@ -125,6 +135,22 @@ def test_landing_agrees_with_the_definition(table: RowTable) -> None:
     )
 
 
+def test_what_is_known_of_clusters_is_what_looking_again_would_find(table: RowTable) -> None:
+    """Columns are kept while the members of a cluster stay; then some regions change their cluster."""
+    known, bounds, ids = nothing_known(), view_bounds(table), some_ids(table, 3)
+    for step in range(3):
+        ids = dense_ids(np.where(np.arange(len(ids)) % 7 == step, np.roll(ids, 1), ids))
+        np.testing.assert_allclose(
+            known_landings(table, ids, COSTS, known), landing_matrix(table, ids, COSTS), atol=1e-6
+        )
+        for view in range(table.num_views):
+            rest = np.where(table.view_index == view, ids.max() + 1, ids)
+            rest[rest <= ids.max()] = np.unique(rest[rest <= ids.max()], return_inverse=True)[1]
+            rest[table.view_index == view] = rest[table.view_index != view].max() + 1
+            found = known_scores(table, rest, view, bounds, COSTS, known)
+            np.testing.assert_allclose(found, score_matrix(table, rest, view, bounds, COSTS), atol=1e-6)
+
+
 def test_rows_are_what_points_on_the_ray_show(balls: BallScene, table: RowTable) -> None:
     """Every row is shown, label by label, by the label maps at the projections of its mean depth, or next to them."""
     rng = np.random.default_rng(0)
@@ -170,8 +196,10 @@ def test_balls_are_solved_and_scored(balls: BallScene) -> None:
     assert found.match_scores.min() >= 0
     assert found.match_scores.max() <= 1
     assert found.match_scores.median() > 0.9
-    seen = [len(set(balls.regions.view_index[found.instance_ids == k].tolist())) for k in range(7)]
-    assert found.num_views_seen.tolist() == seen
+    sure = found.match_scores >= 0.5
+    seen = [len(set(balls.regions.view_index[sure & (found.instance_ids == k)].tolist())) for k in range(7)]
+    assert found.support.tolist() == seen
+    assert found.merged.shape == (0, 3)
 
 
 def test_shipped_scene_is_solved(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
@@ -233,6 +261,49 @@ def test_pieces_of_a_split_mask_are_joined() -> None:
     regions = regions_from_label_maps([*scene.label_maps[:2], labels, *scene.label_maps[3:]])
     truth = torch.where(regions.labels == 90, whole, regions.labels)
     assert same_partition(solve(regions, scene.cameras).instance_ids, truth)
+
+
+def test_pieces_do_not_make_up_an_instance() -> None:
+    """One ball is cut in two in most views: the parts on one side are seen by too few views to stand for something."""
+    scene = ball_scene(6, 10, seed=2)
+    maps = [labels.copy() for labels in scene.label_maps]
+    for view in (1, 5):
+        rows, columns = np.nonzero(maps[view] == 2)
+        maps[view][rows[columns > columns.mean()], columns[columns > columns.mean()]] = 90
+    regions = regions_from_label_maps(maps)
+    assert int((regions.labels == 90).sum()) == 2
+    truth = torch.where(regions.labels == 90, 2, regions.labels)
+    found = solve(regions, scene.cameras)
+    assert same_partition(found.instance_ids, truth)
+    assert len(found.support) == 6
+
+
+def test_a_mask_that_covers_two_instances_is_found() -> None:
+    scene = ball_scene(6, 8, seed=3)
+    numbers, view = touching_balls(scene)
+    labels = scene.label_maps[view].copy()
+    labels[labels == numbers[1]] = numbers[0]
+    regions = regions_from_label_maps([*scene.label_maps[:view], labels, *scene.label_maps[view + 1 :]])
+    (region,) = ((regions.view_index == view) & (regions.labels == numbers[0])).nonzero()[:, 0].tolist()
+    rest = torch.arange(len(regions)) != region
+    found = solve(regions, scene.cameras)
+    assert same_partition(found.instance_ids[rest], regions.labels[rest])
+    assert len(found.support) == 6
+    instances = [int(found.instance_ids[rest][regions.labels[rest] == number][0]) for number in numbers]
+    assert found.merged[:, 0].tolist() == [region]
+    assert sorted(found.merged[0, 1:].tolist()) == sorted(instances)
+    assert found.merged[0, 1] == found.instance_ids[region]
+
+
+def touching_balls(scene: BallScene) -> tuple[tuple[int, int], int]:
+    """The numbers of two balls that touch each other in a view and show as much as possible there; and that view."""
+    best = (0, (0, 0), 0)
+    for view, labels in enumerate(scene.label_maps):
+        sizes = np.bincount(labels.ravel())
+        ends = np.stack([labels[:, 1:].ravel(), labels[:, :-1].ravel()], 1)
+        for a, b in np.unique(ends[(ends[:, 0] != ends[:, 1]) & (ends.min(1) > 0)], axis=0).tolist():
+            best = max(best, (int(min(sizes[a], sizes[b])), (a, b), view))
+    return best[1], best[2]
 
 
 def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
@@ -311,7 +382,7 @@ def test_two_views_fall_back_on_the_pairs() -> None:
 def test_nothing_to_match() -> None:
     cameras = cameras_at(arc_positions(3))
     found = solve(regions_from_label_maps([np.zeros((240, 320), int)] * 3), cameras)
-    assert found.instance_ids.shape == found.match_scores.shape == found.num_views_seen.shape == (0,)
+    assert found.instance_ids.shape == found.match_scores.shape == found.support.shape == (0,)
     one = render_balls(cameras[[0]], torch.zeros(1, 3), torch.ones(1))[0]
     found = solve(regions_from_label_maps([one, np.zeros_like(one), np.zeros_like(one)]), cameras)
     assert found.instance_ids.tolist() == [-1]
