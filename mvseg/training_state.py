@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import nn
+from torch import Tensor, nn
 from torchvision.models.detection import MaskRCNN
 
 from mvseg.detectors.mask_rcnn import build_detector
+from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.training_config import TrainConfig, config_difference, config_values
 from mvseg.training_data import SampleList
@@ -60,8 +61,10 @@ def start_state(
         raise InputError(f"{config.output} holds the checkpoint of an earlier run, set resume or choose another output")
     torch.manual_seed(config.seed)
     if model is None:
-        model = build_detector(config.arch, len(samples.categories) + 1, config.weights)
+        weights = config.weights and str(find_weights(config.weights) or config.weights)
+        model = build_detector(config.arch, len(samples.categories) + 1, weights)
     model.transform.min_size, model.transform.max_size = (config.image_size,), config.image_size
+    model.rpn.head.register_forward_hook(leave_autocast)
     model = model.to(device).train()
     averaged = copy.deepcopy(model).eval() if config.ema_decay else None
     state = TrainingState(model, build_optimizer(config, model), averaged)
@@ -71,6 +74,15 @@ def start_state(
     elif config.resume:
         logger.info("%s has no checkpoint yet: starting from the beginning", config.output)
     return state
+
+
+def leave_autocast(head: nn.Module, inputs: Any, outputs: tuple[list[Tensor], ...]) -> tuple[list[Tensor], ...]:
+    """Forward hook of an RPN's head: float32 from here on.
+
+    Under autocast torchvision would decode proposals, and round true boxes, in bfloat16, whose numbers above 256 are
+    even: boxes one pixel wide collapse, and their regression loss is not a number.
+    """
+    return tuple([level.float() for level in levels] for levels in outputs)
 
 
 def restore_state(state: TrainingState, saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:

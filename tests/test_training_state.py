@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
 from pathlib import Path
@@ -13,9 +14,10 @@ import torch
 from mvseg.detectors.mask_rcnn import list_architectures
 from mvseg.errors import InputError
 from mvseg.training_config import TrainConfig
+from mvseg.training_data import list_samples
 from mvseg.training_files import append_record, cut_log, write_whole
-from mvseg.training_state import TrainingState, apply_gradients, build_optimizer, learning_rate
-from tiny_training import build_tiny, make_config, parse_config
+from mvseg.training_state import TrainingState, apply_gradients, build_optimizer, learning_rate, start_state
+from tiny_training import build_tiny, make_config, parse_config, write_photos
 
 # --- configs
 
@@ -122,3 +124,22 @@ def test_a_log_is_cut_where_the_run_goes_on(tmp_path: Path) -> None:
     cut_log(log, 2)
     assert log.read_text() == '{"step": 1}\n{"step": 2}\n'
     cut_log(tmp_path / "none.jsonl", 2)
+
+
+def test_bfloat16_does_not_collapse_narrow_boxes_far_from_the_origin(tmp_path: Path) -> None:
+    photos, labels = write_photos(tmp_path / "data", 2)
+    config = make_config(tmp_path / "data", tmp_path / "out", image_size=320)
+    model = build_tiny().float()
+    target = {
+        "boxes": torch.tensor([[303.0, 100.0, 304.0, 140.0]]),
+        "labels": torch.ones(1, dtype=torch.int64),
+        "masks": torch.zeros(1, 320, 320, dtype=torch.uint8),
+    }
+    target["masks"][0, 100:140, 303] = 1
+    model.transform.min_size, model.transform.max_size = (320,), 320
+    plain = copy.deepcopy(model).train()
+    hooked = start_state(config, list_samples(photos, labels), torch.device("cpu"), model).model
+    with torch.autocast("cpu", torch.bfloat16):
+        broken, sound = (network([torch.zeros(3, 320, 320)], [target]) for network in (plain, hooked))
+    assert not torch.isfinite(broken["loss_box_reg"])  # what torchvision alone makes of it
+    assert all(torch.isfinite(loss) for loss in sound.values())
