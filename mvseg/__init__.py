@@ -17,8 +17,10 @@ if TYPE_CHECKING:
     from mvseg.affinity import Affinity as Affinity
     from mvseg.affinity import region_affinity as region_affinity
     from mvseg.clustering import cluster_affinity as cluster_affinity
+    from mvseg.config import DetectConfig as DetectConfig
     from mvseg.config import MatchConfig as MatchConfig
     from mvseg.config import ReconstructConfig as ReconstructConfig
+    from mvseg.detectors.zoo import load_detector as load_detector
     from mvseg.epipolar import epipolar_map as epipolar_map
     from mvseg.errors import InputError as InputError
     from mvseg.errors import InputWarning as InputWarning
@@ -51,10 +53,11 @@ _HOME = {
     "matching": ("Matching", "match_regions"),
     "nms": ("EpipolarAssignment", "cluster_aware_nms"),
     "multiview": ("MultiViewMaskRCNN",),
+    "detectors.zoo": ("load_detector",),
     "reconstruction": ("reconstruct_instances",),
     "metrics": ("matching_metrics", "shape_distance"),
     "pipeline": ("run_scene",),
-    "config": ("MatchConfig", "ReconstructConfig"),
+    "config": ("DetectConfig", "MatchConfig", "ReconstructConfig"),
     "errors": ("InputError", "InputWarning"),
 }
 __all__ = ["__version__", *(name for names in _HOME.values() for name in names)]

@@ -17,7 +17,7 @@ from typing import Any
 from jsonargparse import ArgumentParser, Namespace
 
 import mvseg
-from mvseg.config import MatchConfig, ReconstructConfig
+from mvseg.config import DetectConfig, MatchConfig, ReconstructConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.training_config import TrainConfig
 
@@ -40,7 +40,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # before torch is loaded, which the verbs do when they start.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what a broken image means is said once, by us
-    verbs = {"infer": _infer, "match": _match, "eval": _eval, "train": _train, "simulate": _simulate}
+    verbs = {"infer": _infer, "match": _match, "eval": _eval, "train": _train, "simulate": _simulate,
+             "models": _models}  # fmt: skip
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
@@ -48,18 +49,20 @@ def main(argv: Sequence[str] | None = None) -> int:
             return verbs[args.verb](args[args.verb])
     except (InputError, argparse.ArgumentError) as error:
         return _complain(error)
+    except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
 
 
 def build_parser() -> ArgumentParser:
     """The parser of all verbs; its errors are raised, not printed."""
-    parser = ArgumentParser(
-        prog="mvseg", description=ABOUT, exit_on_error=False, version=mvseg.__version__
-    )
+    parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=mvseg.__version__)
     verbs = parser.add_subcommands(dest="verb")
 
     infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
     infer.add_argument("scene", nargs="?", type=Path, default=DEMO_SCENE, help="scene folder (the shipped one)")
     _add_options(infer, masks=None)
+    infer.add_class_arguments(DetectConfig, "detect")
     infer.add_class_arguments(ReconstructConfig, "reconstruct")
     verbs.add_subcommand("infer", infer, help="ids and 3D shapes of one scene")
 
@@ -84,6 +87,12 @@ def build_parser() -> ArgumentParser:
     simulate.add_argument("--seed", type=int, default=0)
     simulate.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")
     verbs.add_subcommand("simulate", simulate, help="render plants with known answers")
+
+    models = ArgumentParser(exit_on_error=False, description="List the shipped detectors, or pack one of your own.")
+    models.add_argument("--pack", type=Path | None, help="output folder of a finished training run")
+    models.add_argument("--into", type=Path | None, help="folder for the packed detector, with --pack")
+    models.add_argument("--image_size", type=int | None, help="longer side that photos are scaled to, with --pack")
+    verbs.add_subcommand("models", models, help="the detectors that ship with mvseg")
     return parser
 
 
@@ -93,7 +102,7 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
         "--masks",
         type=Path | None,
         default=masks,
-        help="folder of label PNGs or COCO .json, in the scene folder or anywhere; the shipped scene brings its own",
+        help="folder of label PNGs or COCO .json, in the scene folder or anywhere; infer finds leaves itself without",
     )
     parser.add_argument("--out", type=Path | None, help="folder for the result, or the results (under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -101,13 +110,8 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
 
 
 def _infer(args: Namespace) -> int:
-    masks = args.masks
-    if masks is None:
-        if args.scene != DEMO_SCENE:
-            raise InputError(f"{args.scene}: no masks were given, expected --masks FOLDER (label PNGs) or FILE (COCO)")
-        masks = Path("masks")
     out = args.out or DEFAULT_OUT / args.scene.resolve().name
-    _run(args.scene, masks, out, args, ReconstructConfig(**vars(args.reconstruct)))
+    _run(args.scene, args.masks, out, args, ReconstructConfig(**vars(args.reconstruct)))
     return 0
 
 
@@ -125,24 +129,26 @@ def _match(args: Namespace) -> int:
     return code
 
 
-def _run(scene: Path, masks: Path, out: Path, args: Namespace, reconstruct: ReconstructConfig | None) -> None:
+def _run(scene: Path, masks: Path | None, out: Path, args: Namespace, reconstruct: ReconstructConfig | None) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
     from mvseg.pipeline import describe_run, run_scene  # keeps --help and wrong options quick
     from mvseg.result import check_out, save_result
 
     check_out(out)
-    masks = _find_masks(scene, masks)
+    masks = None if masks is None else _find_masks(scene, masks)
+    detect = DetectConfig(**vars(args.detect)) if masks is None else None
+    match = MatchConfig(**vars(args.match))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        result = run_scene(scene, masks, MatchConfig(**vars(args.match)), reconstruct, progress=not args.quiet)
+        result = run_scene(scene, masks, match, reconstruct, detect=detect, progress=not args.quiet)
     remarks = [str(one.message) for one in caught if issubclass(one.category, InputWarning)]
     for other in (one for one in caught if not issubclass(one.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
     for remark in remarks:
         print(f"mvseg: warning: {remark}", file=sys.stderr)
-    config = {"scene": str(scene), "masks": str(masks), "out": str(out), "match": vars(args.match)}
-    if reconstruct is not None:
-        config["reconstruct"] = dataclasses.asdict(reconstruct)
+    config: dict[str, Any] = {"scene": str(scene), "masks": masks and str(masks), "out": str(out)}
+    stages = {"detect": detect, "match": match, "reconstruct": reconstruct}
+    config |= {name: dataclasses.asdict(stage) for name, stage in stages.items() if stage is not None}
     save_result(result, out, describe_run(result, masks, config, remarks), progress=not args.quiet)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     print(f"{out}: {result.matching.num_instances} instances from {num_masks} masks in {num_views} views")
@@ -177,9 +183,26 @@ def _eval(args: Namespace) -> int:
 def _train(args: Namespace) -> int:
     from mvseg.training import train
 
-    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    is_first = os.environ.get("RANK", "0") == "0"  # under torchrun one process speaks
+    logging.basicConfig(level=logging.INFO if is_first else logging.WARNING, format="%(message)s")
     values = {field.name: args[field.name] for field in dataclasses.fields(TrainConfig)}
     train(TrainConfig(**values))
+    return 0
+
+
+def _models(args: Namespace) -> int:
+    from mvseg.detectors.zoo import list_detectors, pack_detector
+
+    if (args.pack is None) != (args.into is None):
+        raise InputError("--pack and --into belong together, expected both or neither")
+    if args.pack is not None:
+        pack_detector(args.pack, args.into, args.image_size)
+        return 0
+    for entry in list_detectors():
+        scores = entry.metrics.get("test") or entry.metrics["validation"]
+        size = entry.weights.stat().st_size / 1e6
+        shown = f"mask AP {scores['mask_AP']:.3f}, AP50 {scores['mask_AP50']:.3f} on simulated plants"
+        print(f"{entry.name:15} {size:.0f} MB, {shown}; {entry.weights.parent / 'card.md'}")
     return 0
 
 

@@ -47,23 +47,54 @@ class MatchConfig:
 
 
 @dataclass(frozen=True)
+class DetectConfig:
+    """How leaves are found in the photos when no masks are given.
+
+    Attributes:
+        weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
+        min_score: detections that are less sure are dropped; in [0, 1].
+        image_size: longer side, in pixels, that photos are scaled to; null for what the weights say.
+        num_iterations: of assignment to epipolar maps and NMS; 0 only matches what plain NMS leaves.
+    """
+
+    weights: str = "leaf-slim"
+    min_score: float = 0.5
+    image_size: int | None = None
+    num_iterations: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_score <= 1:
+            raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
+        if self.image_size is not None and self.image_size < 32:
+            raise InputError(f"detect.image_size is {self.image_size}, expected at least 32")
+        if self.num_iterations < 0:
+            raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")
+
+
+@dataclass(frozen=True)
 class ReconstructConfig:
     """How instances become voxels.
 
     Attributes:
         threshold: a voxel belongs to an instance when more than this share of the instance's masks contains it (the
             paper: 0.5); in [0, 1).
+        seen_share: against matter around thin instances: of the instance's views whose pixel shows the instance or
+            no instance at all, more than this share must show the instance. A view in which another instance may stand
+            in front of the voxel does not count. In [0, 1); 0 is the paper's rule, 0.9 is good for leaves.
         voxel_size: edge of a voxel in the scene's unit; null to derive it from the budget.
         voxel_budget: voxels in an instance's bounding box when no size is given.
     """
 
     threshold: float = 0.5
+    seen_share: float = 0.0
     voxel_size: float | None = None
     voxel_budget: int = 250_000
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold < 1:
             raise InputError(f"reconstruct.threshold is {self.threshold:g}, expected a number in [0, 1)")
+        if not 0 <= self.seen_share < 1:
+            raise InputError(f"reconstruct.seen_share is {self.seen_share:g}, expected a number in [0, 1)")
         if self.voxel_size is not None and not 0 < self.voxel_size < float("inf"):
             raise InputError(f"reconstruct.voxel_size is {self.voxel_size:g}, expected a positive number")
         if self.voxel_budget < 1:

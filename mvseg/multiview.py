@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections import OrderedDict
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import torch
@@ -38,6 +39,10 @@ class Proposals:
     boxes: Tensor
     scores: Tensor
     classes: Tensor
+
+    def select(self, index: Tensor) -> Proposals:
+        """The proposals at an int64 index, in that order."""
+        return Proposals(self.regions.select(index), self.boxes[index], self.scores[index], self.classes[index])
 
 
 class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
@@ -122,18 +127,49 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             found = [self._propose(image) for image in images]
         # Under autocast the heads may work in half precision; counts of pixels may not.
         with torch.no_grad(), torch.autocast(images[0].device.type, enabled=False):
-            cameras = cameras.to(images[0].device)
             proposals = gather_proposals(found, sizes)
-            keep, matching = match_proposals(
-                proposals,
-                cameras,
-                num_iterations=self.num_iterations,
-                cluster_iou=self.cluster_iou,
-                detections_per_view=self.roi_heads.detections_per_img,
-                assignment=self.assignment,
-                match=self.match,
-            )
+            keep, matching = self._match(proposals, cameras.to(images[0].device))
             return self._collect(found, sizes, proposals.regions.view_index, keep, matching)
+
+    @torch.no_grad()
+    def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> tuple[Proposals, Matching]:
+        """As `forward` with cameras, for large scenes: one image in memory at a time, masks as crops.
+
+        Args:
+            images: V tensors (3, H, W) in [0, 1] on the detector's device, e.g. from a generator.
+            cameras: their V undistorted cameras.
+
+        Returns:
+            The D detections that are kept, on the CPU, ordered by view and by falling score, and their matching.
+
+        Raises:
+            InputError: as `forward`.
+        """
+        found, sizes = [], []
+        for image in images:
+            found.append({key: value.cpu() for key, value in self._propose(image).items()})
+            sizes.append([image.shape[-1], image.shape[-2]])
+        _check_cameras(cameras, sizes)
+        proposals = gather_proposals(found, sizes)
+        keep, matching = self._match(proposals, cameras.to("cpu"))
+        order = proposals.regions.view_index[keep].argsort(stable=True)
+        kept = proposals.select(keep[order])
+        ids, scores = matching.instance_ids[order], matching.match_scores[order]
+        return kept, replace(matching, instance_ids=ids, match_scores=scores)
+
+    def _match(self, proposals: Proposals, cameras: Cameras) -> tuple[Tensor, Matching]:
+        """Indices of the proposals to keep, without those whose mask is empty, and their matching."""
+        solid = (proposals.regions.areas > 0).nonzero()[:, 0]
+        keep, matching = match_proposals(
+            proposals.select(solid),
+            cameras,
+            num_iterations=self.num_iterations,
+            cluster_iou=self.cluster_iou,
+            detections_per_view=self.roi_heads.detections_per_img,
+            assignment=self.assignment,
+            match=self.match,
+        )
+        return solid[keep], matching
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
         """One view's excessive set: torchvision's own heads with a larger NMS threshold; in the transform's frame."""

@@ -11,31 +11,38 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from tqdm import tqdm
 
 import mvseg
-from mvseg.config import MatchConfig, ReconstructConfig
+from mvseg.config import DetectConfig, MatchConfig, ReconstructConfig
+from mvseg.detectors.zoo import find_weights, load_detector
+from mvseg.errors import InputError
 from mvseg.formats.folder import load_masks, load_scene
-from mvseg.formats.photos import check_photos
-from mvseg.matching import match_regions
+from mvseg.formats.photos import check_photos, read_photo
+from mvseg.matching import Matching, match_regions
+from mvseg.multiview import MultiViewMaskRCNN, Proposals
 from mvseg.reconstruction import reconstruct_instances
 from mvseg.result import Result
+from mvseg.scene import Scene
 
 
 def run_scene(
     folder: Path,
-    masks: Path,
+    masks: Path | None,
     match: MatchConfig | None = None,
     reconstruct: ReconstructConfig | None = None,
     *,
+    detect: DetectConfig | None = None,
     progress: bool = False,
 ) -> Result:
-    """From a scene folder and masks to instances, with ids in every view and, if asked for, in 3D.
+    """From a scene folder, with or without masks, to instances, with ids in every view and, if asked for, in 3D.
 
     Args:
         folder: the scene, see `load_scene`.
-        masks: label PNGs or COCO JSON, see `load_masks`.
+        masks: label PNGs or COCO JSON, see `load_masks`; None: a detector finds them in the photos.
         match: how regions are matched; None for the defaults.
         reconstruct: how instances become voxels; None for ids only.
+        detect: how instances are found without masks; None for the defaults.
         progress: show progress bars.
 
     Returns:
@@ -48,16 +55,43 @@ def run_scene(
     with _timed(seconds, "load"):
         scene = load_scene(folder)
         check_photos(scene)
-        regions = load_masks(scene, masks)
-    with _timed(seconds, "match"):
-        matching = match_regions(regions, scene.cameras, match, progress=progress)
+        regions = load_masks(scene, masks) if masks is not None else None
+    if masks is None and not scene.views[0].path.is_file():
+        raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them")
+    scores = None
+    if regions is None:
+        with _timed(seconds, "detect"):
+            found, matching = detect_regions(scene, detect or DetectConfig(), match, progress=progress)
+            regions, scores = found.regions, found.scores
+    else:
+        with _timed(seconds, "match"):
+            matching = match_regions(regions, scene.cameras, match, progress=progress)
     shapes = None
     if reconstruct is not None:
         with _timed(seconds, "reconstruct"):
             shapes = reconstruct_instances(
                 regions, matching.instance_ids, scene.cameras, reconstruct, progress=progress
             )
-    return Result(scene, regions, matching, shapes, seconds)
+    return Result(scene, regions, matching, shapes, seconds, scores)
+
+
+def detect_regions(
+    scene: Scene, detect: DetectConfig, match: MatchConfig | None, *, progress: bool = False
+) -> tuple[Proposals, Matching]:
+    """Find and match the instances in the photos of a scene, see `MultiViewMaskRCNN.find_regions`.
+
+    Runs on the first GPU, if there is one. Torch's number of threads and generators stay as they are.
+
+    Raises:
+        InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
+    """
+    detector = load_detector(detect.weights, image_size=detect.image_size)
+    detector.roi_heads.score_thresh = detect.min_score
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = MultiViewMaskRCNN(detector, num_iterations=detect.num_iterations, match=match).to(device)
+    views = tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress)
+    photos = (torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1).float() / 255 for view in views)
+    return model.find_regions(photos, scene.cameras)
 
 
 @contextmanager
@@ -67,10 +101,15 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = time.perf_counter() - start
 
 
-def describe_run(result: Result, masks: Path, config: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
-    """What run.json says of where a result comes from: version, inputs with their SHA-256, config, warnings."""
-    source = result.scene.source
-    inputs = {str(path): _hash_files(path) for path in (source, masks) if path is not None}
+def describe_run(result: Result, masks: Path | None, config: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
+    """What run.json says of where a result comes from: version, inputs with their SHA-256, config, warnings.
+
+    `masks` is None for a result of a detector, whose weights `config["detect"]` names.
+    """
+    if masks is None:
+        weights = config["detect"]["weights"]
+        masks = find_weights(weights) or Path(weights)
+    inputs = {str(path): _hash_files(path) for path in (result.scene.source, masks) if path is not None}
     return {
         "mvseg": mvseg.__version__,
         "torch": torch.__version__,

@@ -49,6 +49,7 @@ class Result:
         matching: their ids.
         shapes: {instance id: voxels}; None when only ids were asked for.
         seconds: {stage: wall time}.
+        scores: (D,) float32, how sure a detector was of each mask; None when the masks were given.
     """
 
     scene: Scene
@@ -56,6 +57,7 @@ class Result:
     matching: Matching
     shapes: dict[int, VoxelGrid] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
+    scores: Tensor | None = None
 
 
 def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False) -> None:
@@ -88,8 +90,8 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
             _write_shapes(result, partial)
         counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
         seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
-        found = {"matched_by": result.matching.method, "counts": counts, "seconds": seconds}
-        text = json.dumps(run | found, indent=1, default=str)
+        how = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
+        text = json.dumps(run | how | {"counts": counts, "seconds": seconds}, indent=1, default=str)
         (partial / RUN_FILE).write_text(text + "\n", encoding="utf-8")
         _move(partial, out.resolve())
     except OSError as error:
@@ -148,11 +150,19 @@ def _write_instances(result: Result, folder: Path) -> None:
     scene, images, annotations = result.scene, [], []
     ids, scores = result.matching.instance_ids.tolist(), result.matching.match_scores.tolist()
     labels, views = result.regions.labels.tolist(), result.regions.view_index.tolist()
+    others = {region: instance for region, _, instance in result.matching.merged.tolist()}
     for index, view in enumerate(scene.views):
         width, height = scene.cameras.sizes[index].tolist()
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
         images.append({"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height})
     K = scene.cameras.K.cpu().numpy()
+
+    def extras(number: int) -> dict[str, float]:
+        also = {"other_instance_id": others[number] + 1} if number in others else {}
+        if result.scores is None:
+            return also | {"source_label": labels[number]}
+        return also | {"score": round(float(result.scores[number]), 4)}
+
     for number, index in enumerate(views):
         width, height = scene.cameras.sizes[index].tolist()
         mask = result.regions.mask(number, width, height).cpu().numpy().astype(np.uint8)
@@ -161,7 +171,7 @@ def _write_instances(result: Result, folder: Path) -> None:
                 "image_id": index + 1,
                 "instance_id": ids[number] + 1 if ids[number] >= 0 else -1,
                 "match_score": round(scores[number], 4),
-                "source_label": labels[number],
+                **extras(number),
                 "segmentation": encode_mask(distort(mask, scene.views[index].lens, K[index])),
             }
         )
@@ -175,6 +185,8 @@ def _write_shapes(result: Result, folder: Path) -> None:
     ids, views = result.matching.instance_ids, result.regions.view_index
     for instance in range(result.matching.num_instances):
         row: dict[str, Any] = {"id": instance + 1, "views": len(views[ids == instance].unique())}
+        if result.matching.support is not None:
+            row["sure_views"] = int(result.matching.support[instance])
         grid = (result.shapes or {}).get(instance)
         if grid is not None and grid.volume > 0:
             name = f"leaf_{instance + 1:03d}"
@@ -183,7 +195,7 @@ def _write_shapes(result: Result, folder: Path) -> None:
             row |= _shape_traits(grid)
         rows.append(row)
     write_glb(folder / "scene.glb", meshes, colors)
-    columns = ["id", "views", "volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "unit"]
+    columns = ["id", "views", "sure_views", "volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "unit"]
     with (folder / "traits.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()

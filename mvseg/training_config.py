@@ -37,7 +37,7 @@ class TrainConfig:
             stopping.
         arch: resnet18_fpn, mobilenet_v3_large_fpn, maskrcnn_resnet50_fpn, maskrcnn_resnet50_fpn_v2.
         weights: a name torchvision has for this arch (COCO_V1; IMAGENET1K_V1 for the small ones: downloaded), a
-            .safetensors file or checkpoint, or null for random weights.
+            .safetensors file or checkpoint, a shipped detector (`mvseg models`), or null for random weights.
         image_size: S: training samples are S x S pixels; photos are detected with their longer side scaled to S.
         orientation: augmentation: any (flips and right-angle turns: photos from above), upright (left-right flips:
             plants from the side), fixed (none).

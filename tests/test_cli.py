@@ -47,11 +47,11 @@ def complaint(capsys: pytest.CaptureFixture[str]) -> str:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The result of `mvseg infer` without arguments."""
+    """The result of `mvseg infer --masks masks`: the shipped scene with its true masks."""
     folder = tmp_path_factory.mktemp("demo")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        assert main(["infer", "--quiet"]) == 0
+        assert main(["infer", "--quiet", "--masks", "masks"]) == 0
     return folder / "results" / "demo_plant"
 
 
@@ -96,6 +96,25 @@ def test_demo_evaluates_to_one(demo: Path, capsys: pytest.CaptureFixture[str]) -
     assert (metrics["num_regions"], metrics["num_estimated"], metrics["num_true"]) == (108, 12, 12)
     assert (metrics["no_instance"], metrics["ignored"]) == (0, 0)
     assert printed["s_match"] == "1.0000"
+
+
+def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(["infer", "--quiet", "--out", str(out)]) == 0
+    found = json.loads((out / "instances.json").read_text())["annotations"]
+    assert all(0.5 <= one["score"] <= 1 and "source_label" not in one for one in found)
+    run = json.loads((out / "run.json").read_text())
+    assert run["config"]["masks"] is None
+    assert run["config"]["detect"]["weights"] == "leaf-slim"
+    assert any(path.endswith("weights.safetensors") for path in run["inputs"])
+    assert run["counts"]["regions"] == len(found)
+    capsys.readouterr()
+    assert main(["eval", str(out), "--truth", str(DEMO_SCENE / "truth")]) == 0
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics["num_regions"] >= 60  # of 108 visible leaves
+    assert metrics["ari"] >= 0.8
+    assert metrics["e_k"] <= 4
+    assert metrics["no_instance"] <= 12
 
 
 # --- Options --------------------------------------------------------------------------------------
@@ -262,7 +281,7 @@ def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: py
     assert json.loads((out / "run.json").read_text())["counts"] == {"regions": 0, "instances": 0}
     if verb == "infer":
         assert list(csv.DictReader((out / "traits.csv").read_text().splitlines())) == []
-        assert (out / "traits.csv").read_text().startswith("id,views,volume,")
+        assert (out / "traits.csv").read_text().startswith("id,views,sure_views,volume,")
         assert not trimesh.load_scene(out / "scene.glb").geometry
         assert list((out / "leaves").iterdir()) == []
     assert main(["eval", str(out), "--truth", str(plant / "masks")]) == 0
@@ -452,8 +471,9 @@ def test_scene_or_masks_that_are_not_there(plant: Path, tmp_path: Path, capsys: 
     assert complaint(capsys) == f"{tmp_path / 'absent'}: no such scene folder"
     assert main(["infer", str(plant), "--masks", "absent", *out]) == 2
     assert complaint(capsys).startswith("absent: no such masks")
+    shutil.rmtree(plant / "images")
     assert main(["infer", str(plant), *out]) == 2
-    assert complaint(capsys).startswith(f"{plant}: no masks were given, expected --masks")
+    assert complaint(capsys) == f"{plant}: there are neither photos nor masks (--masks), expected one of them"
     assert main(["eval", str(plant), "--truth", str(plant / "truth")]) == 2
     assert complaint(capsys) == f"{plant / 'instances.json'}: is missing, expected a result folder"
     assert not (tmp_path / "out").exists()

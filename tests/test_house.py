@@ -114,7 +114,7 @@ def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     top = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert top == {"mvseg"}
-    assert {"mvseg/demo_plant/cameras.json", "mvseg/py.typed", "mvseg/zoo/README.md"} <= set(names)
+    assert {"mvseg/demo_plant/cameras.json", "mvseg/py.typed", "mvseg/zoo/leaf-slim/weights.safetensors"} <= set(names)
 
 
 def test_shipped_scene_is_small() -> None:

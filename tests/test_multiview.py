@@ -210,3 +210,22 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
         found = wrapped(some_images(), cameras=small_cameras())
     assert found[0]["match_scores"].dtype == torch.float32
     assert max(int(one["instance_ids"].max()) for one in found) >= 0
+
+
+def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(), small_cameras()
+    proposals, matching = wrapped.find_regions(iter(images), cameras)
+    results = wrapped(images, cameras=cameras)
+    views = proposals.regions.view_index
+    assert torch.equal(views, views.sort().values)
+    assert (proposals.regions.areas > 0).all()
+    for view, result in enumerate(results):
+        here = views == view
+        assert torch.equal(proposals.scores[here], result["scores"])
+        assert torch.equal(matching.instance_ids[here], result["instance_ids"])
+        assert torch.equal(matching.match_scores[here], result["match_scores"])
+        assert (result["scores"].diff() <= 0).all()
+        for number, mask in zip(here.nonzero()[:, 0].tolist(), result["masks"][:, 0], strict=True):
+            assert torch.equal(proposals.regions.mask(number, 160, 120), mask > 0.5)
+    with pytest.raises(InputError, match="2 images with 3 cameras"):
+        wrapped.find_regions(iter(images[:2]), cameras)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -100,6 +101,16 @@ class TestContent:
     def test_names_of_all_files(self, saved: Path) -> None:
         assert files_below(saved) == IDS_FILES | SHAPE_FILES
         assert list(saved.parent.iterdir()) == [saved]
+
+    def test_what_the_matcher_is_unsure_of_is_said(self, result: Result, tmp_path: Path) -> None:
+        merged, support = torch.tensor([[3, 0, 2]]), torch.tensor([4, 3, 2])
+        matching = replace(result.matching, merged=merged, support=support, residual_px=2)
+        save_result(replace(result, matching=matching), tmp_path / "out", {})
+        found = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
+        others = {index: one["other_instance_id"] for index, one in enumerate(found) if "other_instance_id" in one}
+        assert others == {3: 3}
+        assert [row["sure_views"] for row in read_rows(tmp_path / "out")] == ["4", "3", "2"]
+        assert json.loads((tmp_path / "out" / "run.json").read_text())["residual_px"] == 2
 
     def test_same_label_in_every_view(self, saved: Path, plant: Path) -> None:
         found = label_of_balls(saved, plant)

@@ -1,0 +1,135 @@
+"""The zoo: detectors that ship with mvseg, by name.
+
+A detector is a folder of its name with
+
+    weights.safetensors          float16; arch, categories and image_size in the file's metadata
+    weights.safetensors.sha256   one line, as `sha256sum` writes and checks it
+    train.yaml                   the recipe: `mvseg train --config train.yaml`
+    metrics.json                 what it reached
+    card.md                      data, intended use, limits
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import safetensors.torch
+from torchvision.models.detection import MaskRCNN
+
+from mvseg.detectors.mask_rcnn import build_detector, read_weights
+from mvseg.errors import InputError
+
+WEIGHTS, HASH = "weights.safetensors", "weights.safetensors.sha256"
+# an installed mvseg carries models/ inside the package, a checkout has it beside the package
+HOMES = (Path(str(files("mvseg") / "zoo")), Path(str(files("mvseg"))).parent / "models")
+
+
+@dataclass(frozen=True)
+class ZooEntry:
+    """What ships under one name.
+
+    Attributes:
+        name: of the folder.
+        weights: its weights file.
+        sha256: of the weights, as the folder states it.
+        metrics: content of metrics.json.
+    """
+
+    name: str
+    weights: Path
+    sha256: str
+    metrics: dict[str, Any]
+
+
+def list_detectors() -> tuple[ZooEntry, ...]:
+    """The shipped detectors, sorted by name; the hash is read here and checked by `find_weights`."""
+    folders = {path.parent.name: path.parent for home in reversed(HOMES) for path in home.glob(f"*/{HASH}")}
+    return tuple(_read_entry(folders[name]) for name in sorted(folders))
+
+
+def _read_entry(folder: Path) -> ZooEntry:
+    stated = (folder / HASH).read_text(encoding="utf-8").split()[0]
+    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    return ZooEntry(folder.name, folder / WEIGHTS, stated, metrics)
+
+
+def find_weights(name: str) -> Path | None:
+    """The weights file of a shipped detector, its hash checked; None when none of that name ships.
+
+    Raises:
+        InputError: the file is missing, or its SHA-256 is not the one stated beside it.
+    """
+    entry = next((entry for entry in list_detectors() if entry.name == name), None)
+    if entry is None:
+        return None
+    if not entry.weights.is_file():
+        raise InputError(f"{entry.weights}: the weights of '{name}' are missing, expected a complete installation")
+    found = hashlib.sha256(entry.weights.read_bytes()).hexdigest()
+    if found != entry.sha256:
+        raise InputError(
+            f"{entry.weights}: the SHA-256 is {found[:12]}..., expected {entry.sha256[:12]}...: the file is damaged"
+        )
+    return entry.weights
+
+
+def load_detector(weights: str | Path, *, image_size: int | None = None) -> MaskRCNN:
+    """A trained detector, in eval mode, on the CPU, in float32.
+
+    Args:
+        weights: the name of a shipped detector (`list_detectors`), or a .safetensors file that a training run wrote.
+        image_size: longer side, in pixels, that photos are scaled to; None for what the file says.
+
+    Raises:
+        InputError: neither a name nor a readable file, a wrong hash, or a file that does not say what it holds.
+    """
+    path = find_weights(str(weights)) or Path(weights)
+    if not path.is_file():
+        names = ", ".join(entry.name for entry in list_detectors()) or "none"
+        raise InputError(f"'{weights}' is neither a shipped detector ({names}) nor a file of weights")
+    arch, categories = read_description(path)
+    return build_detector(arch, len(categories) + 1, str(path), image_size=image_size).eval()
+
+
+def read_description(path: Path) -> tuple[str, tuple[str, ...]]:
+    """Architecture and categories (without background) of a weights file, from its metadata.
+
+    Raises:
+        InputError: the file is no .safetensors of a training run.
+    """
+    _, metadata = read_weights(path)
+    if not {"arch", "categories"} <= metadata.keys():
+        raise InputError(f"{path} does not say its architecture, expected a model.safetensors of a training run")
+    return metadata["arch"], tuple(json.loads(metadata["categories"]))
+
+
+def pack_detector(run: Path, folder: Path, image_size: int | None = None) -> None:
+    """Make a zoo folder of a training run: half-precision weights, hash, recipe and metrics; the card is yours.
+
+    Args:
+        run: output folder of the run.
+        folder: of the detector's name; made when missing. A card.md in it stays.
+        image_size: longer side, in pixels, that photos are scaled to from now on; None for that of the training.
+
+    Raises:
+        InputError: the run has no weights, metrics or config yet.
+    """
+    for name in ("model.safetensors", "metrics.json", "config.yaml"):
+        if not (run / name).is_file():
+            raise InputError(f"{run / name}: is missing, expected the output of a training run")
+    state, described = read_weights(run / "model.safetensors")
+    metadata = dict(described)
+    halves = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
+    content = safetensors.torch.save(halves, metadata | ({"image_size": str(image_size)} if image_size else {}))
+    best = json.loads((run / "metrics.json").read_text(encoding="utf-8"))["best"]
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / WEIGHTS).write_bytes(content)
+    (folder / "metrics.json").write_text(json.dumps({"validation": best}, indent=1) + "\n", encoding="utf-8")
+    shutil.copyfile(run / "config.yaml", folder / "train.yaml")
+    # last: without it the folder is no entry
+    (folder / HASH).write_text(f"{hashlib.sha256(content).hexdigest()}  {WEIGHTS}\n", encoding="utf-8")
