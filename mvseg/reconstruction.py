@@ -30,7 +30,8 @@ class VoxelGrid:
         origin: (3,) float64, world position of the corner of voxel (0, 0, 0); voxel (a, b, c) is centred at
             origin + voxel_size * (a + 0.5, b + 0.5, c + 0.5).
         voxel_size: edge length in world units.
-        votes: (X, Y, Z) float32 in [0, 1]: share of the instance's views whose mask contains the centre (I_k, Eq. 6).
+        votes: (X, Y, Z) float32 in [0, 1]: share of the instance's views whose mask contains the centre (I_k, Eq. 6);
+            0 where `ReconstructConfig.seen_share` forbids the voxel.
         num_views: views that could vote.
         threshold: a voxel is occupied when its share exceeds this.
     """
@@ -96,11 +97,14 @@ def reconstruct_instances(
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
-    shapes = {}
+    shapes, free = {}, None
+    if config is not None and config.seen_share > 0:
+        ones = torch.ones_like(instance_ids)
+        free = [regions.label_map(view, ones, *size) == 0 for view, size in enumerate(cameras.sizes.tolist())]
     instances = instance_ids[instance_ids >= 0].unique().tolist()
     for instance in tqdm(instances, desc="back-projection", unit="instance", disable=not progress):
         members = regions.select(instance_ids == instance)
-        grid = back_project(members, cameras, config)
+        grid = back_project(members, cameras, config, free)
         if grid is not None:
             shapes[instance] = grid
         elif len(members.view_index.unique()) > 1:
@@ -109,7 +113,9 @@ def reconstruct_instances(
     return shapes
 
 
-def back_project(members: Regions, cameras: Cameras, config: ReconstructConfig | None = None) -> VoxelGrid | None:
+def back_project(
+    members: Regions, cameras: Cameras, config: ReconstructConfig | None = None, free: list[Tensor] | None = None
+) -> VoxelGrid | None:
     """The voxels of one instance from all of its masks (Eq. 6), in a bounding box of its own.
 
     Departures from the paper: several masks of one view (pieces of a split mask) vote as one, their union; a voxel
@@ -120,15 +126,18 @@ def back_project(members: Regions, cameras: Cameras, config: ReconstructConfig |
         members: the masks of the instance.
         cameras: V cameras.
         config: threshold, voxel size (world units) or voxel budget.
+        free: V maps (H, W) bool, where the view shows no region of any instance; only `config.seen_share` asks for it.
 
     Returns:
         The grid, or None for an instance seen in fewer than two views or without a common point. Warns (InputWarning)
         when the common part has no bounds, as with views that are nearly parallel, and had to be cut off.
 
     Raises:
-        InputError: a voxel size that asks for more than 2e8 voxels.
+        InputError: a voxel size that asks for more than 2e8 voxels; `seen_share` without `free`.
     """
     config = config or ReconstructConfig()
+    if config.seen_share > 0 and free is None:
+        raise InputError(f"seen_share is {config.seen_share:g}, which needs to know where the views show nothing")
     cameras = cameras.to(members.device)
     views = members.view_index[members.areas > 0].unique().tolist()
     masks = [_ViewMask.union(members, view, cameras) for view in views]
@@ -145,7 +154,8 @@ def back_project(members: Regions, cameras: Cameras, config: ReconstructConfig |
         asked = int((last - first).prod())
         raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {MAX_VOXELS}")
     axes = [(first[a] + 0.5 + torch.arange(int(shape[a])).to(low)) * size for a in range(3)]
-    votes = _share_of_masks(masks, axes)
+    around = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
+    votes = _share_of_masks(masks, axes, around, config.seen_share)
     return VoxelGrid(first * size, size, votes, len(masks), config.threshold)
 
 
@@ -181,7 +191,11 @@ class _ViewMask:
         return _ViewMask(mask, (x1, y1), px_from_world, focal, slant, cameras.centers[view], ray)
 
     def contains(self, axes: list[Tensor]) -> Tensor:
-        """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask?
+        """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask?"""
+        return self.look_up(axes, self.mask, self.corner)
+
+    def look_up(self, axes: list[Tensor], mask: Tensor, corner: tuple[int, int]) -> Tensor:
+        """(X, Y, Z) bool: the same for any crop (h, w) of this view, with its top-left pixel at x, y.
 
         Computed about the first point, so that float32 keeps a thousandth of a pixel however far the world's origin is.
         """
@@ -192,11 +206,11 @@ class _ViewMask:
         rows = self.px_from_world.float()
         u, v, depth = (row[0] * x + row[1] * y + (row[2] * z + start) for row, start in zip(rows, offset, strict=True))
         scale = 1 / depth.clamp(min=1e-12)
-        height, width = self.mask.shape
+        height, width = mask.shape
         # One free pixel around the crop receives everything that falls outside.
-        framed = torch.nn.functional.pad(self.mask, (1, 1, 1, 1)).flatten()
-        column = (u * scale - (self.corner[0] - 1)).clamp(0, width + 1).long()
-        row = (v * scale - (self.corner[1] - 1)).clamp(0, height + 1).long()
+        framed = torch.nn.functional.pad(mask, (1, 1, 1, 1)).flatten()
+        column = (u * scale - (corner[0] - 1)).clamp(0, width + 1).long()
+        row = (v * scale - (corner[1] - 1)).clamp(0, height + 1).long()
         return framed[row * (width + 2) + column] & (depth > 0)
 
     def may_meet(self, points: Tensor, reach: float) -> Tensor:
@@ -222,8 +236,12 @@ class _ViewMask:
         return torch.where(depth > reach, count > 0, beside)
 
 
-def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor]) -> Tensor:
-    """(X, Y, Z) float32: I_k (Eq. 6) on a grid, a slab at a time to bound the memory."""
+def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor], free: list[Tensor] | None, seen_share: float) -> Tensor:
+    """(X, Y, Z) float32: I_k (Eq. 6) on a grid, a slab at a time to bound the memory.
+
+    With `free`, one map (H, W) bool per mask, it is 0 where not more than `seen_share` of the views whose pixel is in
+    the mask or free have it in the mask.
+    """
     slab = max(1, 2_000_000 // (len(axes[1]) * len(axes[2])))
     parts = []
     for planes in axes[0].split(slab):
@@ -231,7 +249,13 @@ def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor]) -> Tensor:
         votes = torch.zeros([len(axis) for axis in part], device=planes.device)
         for mask in masks:
             votes += mask.contains(part)
-        parts.append(votes / len(masks))
+        share = votes / len(masks)
+        if free is not None:
+            empty = torch.zeros_like(votes)
+            for mask, around in zip(masks, free, strict=True):
+                empty += mask.look_up(part, around, (0, 0))
+            share = share.where(votes > seen_share * (votes + empty) + 1e-6, 0)
+        parts.append(share)
     return torch.cat(parts)
 
 

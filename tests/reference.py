@@ -142,6 +142,23 @@ def back_project_reference(members: Regions, cameras: Cameras, points: Tensor) -
     return votes / len(views)
 
 
+def seen_share_reference(members: Regions, everything: Regions, cameras: Cameras, points: Tensor) -> Tensor:
+    """(P,) of the instance's views that show it at a point or show no region there, the share that show it."""
+    pixels, depth = cameras.project(points)
+    own, empty = torch.zeros(len(points)), torch.zeros(len(points))
+    for view in members.view_index.unique().tolist():
+        width, height = cameras.sizes[view].tolist()
+        masks = [
+            torch.stack([r.mask(n, width, height) for n in (r.view_index == view).nonzero()[:, 0].tolist()]).any(0)
+            for r in (members, everything)
+        ]
+        for p, (u, v) in enumerate(pixels[view].tolist()):
+            if depth[view, p] > 0 and 0 <= u < width and 0 <= v < height:
+                own[p] += masks[0][int(v), int(u)]
+                empty[p] += ~masks[1][int(v), int(u)]
+    return own / (own + empty)
+
+
 def ray_distance_reference(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> Tensor:
     """(N, M) distance of rays (origins, unit directions), one pair at a time: the least squares meeting point."""
     distance = torch.full((len(first[0]), len(second[0])), torch.inf, dtype=torch.float64)

@@ -13,7 +13,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction import back_project, reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
-from reference import back_project_reference
+from reference import back_project_reference, seen_share_reference
 from synthetic import arc_positions, ball_scene, cameras_at, moved, render_balls
 
 FAR = 1000.0  # cameras so far away that they see in parallel
@@ -75,6 +75,52 @@ def test_votes_agree_with_points_projected_one_by_one() -> None:
     assert ((grid.votes - expected).abs() > 1e-6).float().mean() < 0.002  # points on the edge of a pixel, in float32
     assert torch.equal(grid.occupied, grid.votes > 0.5 + 1e-6)
     torch.testing.assert_close(grid.points, centers[grid.occupied.flatten()])
+
+
+def test_seen_share_agrees_with_points_projected_one_by_one() -> None:
+    """It takes voxels away, none where another instance may hide the point, and changes no vote of the others."""
+    scene = ball_scene(4, 6, seed=2, focal=200.0, width=160, height=120)
+    ids = scene.regions.labels - 1
+    plain = reconstruct_instances(scene.regions, ids, scene.cameras, ReconstructConfig(voxel_size=0.1))
+    seen = reconstruct_instances(scene.regions, ids, scene.cameras, ReconstructConfig(voxel_size=0.1, seen_share=0.8))
+    removed = 0
+    for instance, grid in seen.items():
+        index = torch.cartesian_prod(*(torch.arange(side) for side in grid.votes.shape))
+        centers = grid.origin + grid.voxel_size * (index + 0.5)
+        share = seen_share_reference(scene.regions.select(ids == instance), scene.regions, scene.cameras, centers)
+        votes = plain[instance].votes.flatten()
+        expected = votes.where(share > 0.8 + 1e-6, 0)
+        assert ((grid.votes.flatten() - expected).abs() > 1e-6).float().mean() < 0.002
+        removed += int(plain[instance].occupied.sum() - grid.occupied.sum())
+        assert grid.mesh().is_watertight
+    assert removed > 100
+
+
+def test_what_stands_behind_something_is_not_carved_away() -> None:
+    """Two of six views see half of a ball: to ask all masks for a voxel loses half of it, seen_share does not."""
+    cameras = cameras_at(arc_positions(6, distance=40.0), focal=800.0)
+    maps = render_balls(cameras, torch.zeros(1, 3).double(), torch.ones(1).double())
+    for labels in maps[:2]:
+        columns = np.nonzero(labels)[1]
+        labels[:, : int(columns.mean())] = 2  # a wall in front of the left half
+    regions = regions_from_label_maps(maps)
+    ids = torch.where(regions.labels == 1, 0, -1)
+    ball = 4 / 3 * math.pi
+    volumes = {}
+    for name, config in {
+        "paper": ReconstructConfig(voxel_size=0.08),
+        "all masks": ReconstructConfig(voxel_size=0.08, threshold=0.9),
+        "seen": ReconstructConfig(voxel_size=0.08, seen_share=0.9),
+    }.items():
+        volumes[name] = reconstruct_instances(regions, ids, cameras, config)[0].volume / ball
+    assert volumes["all masks"] < 0.8
+    assert 0.98 < volumes["seen"] < volumes["paper"]
+
+
+def test_seen_share_must_be_told_where_nothing_is() -> None:
+    regions, cameras = ball_from(AXES)
+    with pytest.raises(InputError, match=r"seen_share is 0\.9, which needs"):
+        back_project(regions, cameras, ReconstructConfig(seen_share=0.9))
 
 
 def test_the_box_holds_all_that_exceeds_the_threshold() -> None:
@@ -173,6 +219,7 @@ def test_an_empty_grid_has_an_empty_mesh() -> None:
     ("config", "message"),
     [
         ({"threshold": 1.0}, "threshold is 1, expected"),
+        ({"seen_share": -0.1}, "seen_share is -0.1, expected"),
         ({"voxel_size": 0.0}, "voxel_size is 0, expected"),
         ({"voxel_size": float("nan")}, "voxel_size is nan, expected"),
         ({"voxel_budget": 0}, "voxel_budget is 0, expected"),
