@@ -1,0 +1,101 @@
+"""The simulated scenes: test plants of every number of leaves, photographed by every number of cameras, kept."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mvseg.errors import InputError
+from mvseg.formats.folder import load_scene
+from mvseg.formats.label_png import read_label_png
+from mvseg.scene import Scene
+from mvseg.simulation import dataset
+from mvseg.simulation.dataset import Preset, SceneSpec, list_scenes, scene_cameras, write_scene, write_text
+from mvseg.simulation.plants import grow_plant
+
+SEED = 7  # the test plants of seed 0 have been looked at
+Record = dict[str, Any]
+
+PAPER = replace(dataset.PRESETS["paper-eval"], plants=(("test", 3),))
+PRESETS = {
+    "paper": PAPER,
+    "small": replace(PAPER, plants=(("test", 1),), leaves=(4, 8), views=(3, 5), size=(240, 240)),
+    "tiny": replace(PAPER, plants=(("test", 1),), leaves=(4,), views=(3,), size=(120, 120)),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Cell:
+    """One plant seen by one set of cameras, or a real scene in the same layout.
+
+    Attributes:
+        name: unique among the cells.
+        axes: what the tables sort by: "leaves", "views", "family" of a simulated plant; empty for a real scene.
+        folder: of the scene: cameras, images/, masks/, truth/.
+        scene: cameras and views.
+        truth: V arrays (H, W) uint16, true leaf ids, 0 = no leaf, 65535 = ignore.
+    """
+
+    name: str
+    axes: Record
+    folder: Path
+    scene: Scene
+    truth: tuple[np.ndarray, ...]
+
+
+def list_cells(preset: Preset) -> list[SceneSpec]:
+    """The scenes of a preset, the cheapest first."""
+    return sorted(list_scenes(preset, SEED), key=lambda spec: (spec.num_leaves * spec.num_views, spec.folder))
+
+
+def open_cell(spec: SceneSpec, preset: Preset, cache: Path) -> Cell:
+    """The cell of a simulated scene, which is photographed into the cache when it is not there yet."""
+    folder = cache / "scenes" / f"{preset.size[0]}px-seed-{SEED}" / spec.folder
+    if not folder.exists():
+        plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
+        write_scene(folder, plant, scene_cameras(spec, plant, preset), seed=spec.seed)
+    axes = {"leaves": spec.num_leaves, "views": spec.num_views, "family": spec.family}
+    return read_cell(folder, spec.folder.replace("/", "_"), axes)
+
+
+def read_cell(folder: Path, name: str, axes: Record) -> Cell:
+    """The cell of a scene folder that is there.
+
+    Raises:
+        InputError: the folder has no cameras or no true labels; see `load_scene` and `read_label_png`.
+    """
+    scene = load_scene(folder)
+    maps = []
+    for view, (width, height) in zip(scene.views, scene.cameras.sizes.tolist(), strict=True):
+        if view.lens is not None:
+            raise InputError(f"{folder}: view {view.name} has lens distortion, expected undistorted photos and labels")
+        maps.append(read_label_png(folder / "truth" / f"{view.name}.png", width, height))
+    return Cell(name, axes, folder, scene, tuple(maps))
+
+
+def keep_record(path: Path, make: Callable[[], Record]) -> Record:
+    """The record in a file; made, and written whole, when there is none.
+
+    A record is not made again when the code changes: then delete the folder `records` of the cache, or the part of it
+    that is concerned.
+    """
+    if path.is_file():
+        return read_record(path)
+    record = make()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    # Two runs on one cache may make the same record: each writes a file of its own before it takes the name.
+    unfinished = path.with_suffix(f".{os.getpid()}")
+    write_text(unfinished, json.dumps(record))
+    os.replace(unfinished, path)
+    return record
+
+
+def read_record(path: Path) -> Record:
+    record: Record = json.loads(path.read_text(encoding="utf-8"))
+    return record

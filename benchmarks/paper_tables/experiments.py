@@ -1,0 +1,140 @@
+"""What is run on every cell, and where its records are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from benchmarks.paper_tables.cells import PRESETS, Cell, Record, keep_record, open_cell, read_cell, read_record
+from benchmarks.paper_tables.masks import Masks, degraded_masks, detected_masks, true_masks
+from benchmarks.paper_tables.methods import METHODS, score_method
+from benchmarks.paper_tables.number_of_leaves import score_numbers
+from benchmarks.paper_tables.shapes import SHAPES, measure_shape
+from mvseg.simulation.dataset import SceneSpec
+
+TABLES = ("1", "2", "3", "k")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to run.
+
+    Attributes:
+        preset: a key of `PRESETS`.
+        cache: folder for scenes and records.
+        tables: of `TABLES`.
+        methods: keys of `METHODS`.
+        shapes: keys of `SHAPES`.
+        shape_plants: plants per number of leaves that table 3 is made of.
+        detector: whose masks are matched too; None for none.
+        real: folders of real scenes.
+    """
+
+    preset: str
+    cache: Path
+    tables: tuple[str, ...] = TABLES
+    methods: tuple[str, ...] = tuple(METHODS)
+    shapes: tuple[str, ...] = tuple(SHAPES)
+    shape_plants: int = 1
+    detector: str | None = None
+    real: tuple[Path, ...] = ()
+
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """The kinds of masks."""
+        return ("true", "degraded", *([f"detected by {Path(self.detector).name}"] if self.detector else []))
+
+    @property
+    def records(self) -> Path:
+        """Folder of the records of simulated scenes: <table>/<kind of masks>/<method>/<cell>.json."""
+        return self.cache / "records" / self.preset
+
+
+def run_simulated(spec: SceneSpec, plan: Plan) -> None:
+    """Make the records of one simulated scene that are not there yet."""
+    wanted = [path for path, _ in list_records(spec, plan)]
+    if all(path.is_file() for path in wanted):
+        return
+    cell = open_cell(spec, PRESETS[plan.preset], plan.cache)
+    masks = remember(partial(make_masks, cell, plan))
+    for path, make in list_records(spec, plan):
+        keep_record(path, partial(make, cell, masks))
+
+
+def run_real(folder: Path, plan: Plan) -> None:
+    """Make the records of one real scene, matched with its true masks, that are not there yet."""
+    cell = read_cell(folder, folder.resolve().name, {})
+    masks = remember(partial(make_masks, cell, plan))
+    for method in plan.methods:
+        path = real_record(plan, folder, method)
+        keep_record(path, lambda method=method: score_method(cell, masks("true"), method, plan.cache))
+
+
+Maker = Callable[[Cell, Callable[[str], Masks]], Record]
+
+
+def list_records(spec: SceneSpec, plan: Plan) -> Iterator[tuple[Path, Maker]]:
+    """The path of every record that the plan asks of a scene, and what makes it of the cell and its masks by kind."""
+    file = spec.folder.replace("/", "_") + ".json"
+    if "1" in plan.tables:
+        for kind in plan.kinds:
+            for method in plan.methods:
+                path = plan.records / "match" / slug(kind) / slug(method) / file
+                yield path, lambda cell, masks, k=kind, m=method: score_method(cell, masks(k), m, plan.cache)
+    if "k" in plan.tables:
+        for kind in ("true", "degraded"):
+            path = plan.records / "numbers" / slug(kind) / file
+            yield path, lambda cell, masks, k=kind: score_numbers(cell, masks(k))
+    if "3" in plan.tables and plant_index(spec) < plan.shape_plants:
+        for name in plan.shapes:
+            path = plan.records / "shapes" / slug(name) / file
+            yield path, lambda cell, masks, n=name: measure_shape(cell, masks, n, plan.cache)
+
+
+def read_records(folder: Path, specs: list[SceneSpec]) -> list[Record]:
+    """The records in a folder of `list_records` that are there, with the axes of their scenes."""
+    found = []
+    for spec in specs:
+        path = folder / (spec.folder.replace("/", "_") + ".json")
+        if path.is_file():
+            axes = {"scene": spec.folder, "leaves": spec.num_leaves, "views": spec.num_views, "family": spec.family}
+            found.append(axes | read_record(path))
+    return found
+
+
+def plant_index(spec: SceneSpec) -> int:
+    """Which plant of its number of leaves a scene shows, from 0."""
+    return int(spec.folder.split("-")[1].split("_")[0])
+
+
+def real_record(plan: Plan, folder: Path, method: str) -> Path:
+    return plan.cache / "records" / "real" / folder.resolve().name / f"{slug(method)}.json"
+
+
+def make_masks(cell: Cell, plan: Plan, kind: str) -> Masks:
+    if kind == "true":
+        return true_masks(cell)
+    if kind == "degraded":
+        return degraded_masks(cell)
+    assert plan.detector is not None
+    return detected_masks(cell, plan.detector)
+
+
+def remember(make: Callable[[str], Masks]) -> Callable[[str], Masks]:
+    """The function, which makes each kind of masks once."""
+    made: dict[str, Masks] = {}
+
+    def once(kind: str) -> Masks:
+        if kind not in made:
+            made[kind] = make(kind)
+        return made[kind]
+
+    return once
+
+
+def slug(name: str) -> str:
+    """A name as a part of a path: letters, digits, dots and dashes."""
+    words = "".join(letter if letter.isalnum() or letter == "." else " " for letter in name.lower()).split()
+    return "-".join(words)

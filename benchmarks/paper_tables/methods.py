@@ -1,0 +1,87 @@
+"""The systems of the paper and ours, behind one call: masks and scene in, instance ids out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+import torch
+
+from benchmarks.paper_tables.cells import Cell, Record
+from benchmarks.paper_tables.dense import dense_points
+from benchmarks.paper_tables.masks import Masks
+from mvseg.baselines.mvs import match_mvs
+from mvseg.baselines.points import match_points
+from mvseg.baselines.sparse import match_sparse
+from mvseg.config import MatchConfig
+from mvseg.errors import InputError
+from mvseg.matching import Matching, match_regions
+from mvseg.metrics import matching_metrics
+from mvseg.regions import Regions
+
+Method = Callable[[Regions, Cell, Path], Matching]
+
+# row of the tables -> row of the paper that it stands beside
+PRINTED = {
+    "MVS-based": "MVS-based",
+    "Point-based": "Point-based",
+    "Sparse": "Sparse",
+    "MVIS (paper)": "MVIS",
+    "MVIS (one-per-view)": "MVIS",
+    "MVIS (nview)": "MVIS",
+}
+
+
+def mvs_matching(regions: Regions, cell: Cell, cache: Path) -> Matching:
+    return match_mvs(regions, cell.scene, dense_points(cell, cache))
+
+
+def point_matching(regions: Regions, cell: Cell, cache: Path) -> Matching:
+    return match_points(regions, cell.scene)
+
+
+def sparse_matching(regions: Regions, cell: Cell, cache: Path) -> Matching:
+    return match_sparse(regions, cell.scene)
+
+
+def mvis(method: Literal["symnmf", "one-per-view", "nview"]) -> Method:
+    def match(regions: Regions, cell: Cell, cache: Path) -> Matching:
+        return match_regions(regions, cell.scene.cameras, MatchConfig(method=method))
+
+    return match
+
+
+METHODS: dict[str, Method] = {
+    "MVS-based": mvs_matching,
+    "Point-based": point_matching,
+    "Sparse": sparse_matching,
+    "MVIS (paper)": mvis("symnmf"),
+    "MVIS (one-per-view)": mvis("one-per-view"),
+    "MVIS (nview)": mvis("nview"),
+}
+
+
+def score_method(cell: Cell, masks: Masks, method: str, cache: Path) -> Record:
+    """Match the masks of a cell and compare with the truth.
+
+    Masks that show no leaf are matched with the others and left out of the scores.
+
+    Returns:
+        The measures; only {"na": why} where the method has no answer.
+    """
+    start = time.perf_counter()
+    try:
+        matching = METHODS[method](masks.regions, cell, cache)
+    except InputError as error:
+        return {"na": str(error)}
+    seconds = time.perf_counter() - start
+    ids, judged = matching.instance_ids, masks.true_ids > 0
+    found = matching_metrics(ids[judged], masks.true_ids[judged])
+    # Eq. 8 counts a mask on its own as right; with all of them in one cluster, as an arg max over rows of zeros has it:
+    together = matching_metrics(torch.where(ids < 0, len(ids), ids)[judged], masks.true_ids[judged])
+    purity = {"s_match": found.s_match, "s_together": together.s_match}
+    measures = {"e_k": found.e_k, "ari": found.ari, "f1": found.pair_f1}
+    counts = {"masks": len(ids), "untied": int((ids < 0).sum()), "no_leaf": int((~judged).sum())}
+    return {**purity, **measures, **counts, "missed": masks.num_missed, "by": matching.method, "seconds": seconds}

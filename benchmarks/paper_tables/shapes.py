@@ -1,0 +1,197 @@
+"""Table 3: what is reconstructed from which masks and ids, and by which rule."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from benchmarks.paper_tables.cells import Cell, Record
+from benchmarks.paper_tables.dense import dense_points
+from benchmarks.paper_tables.masks import Masks
+from benchmarks.paper_tables.shape_error import (
+    measure_points,
+    measure_shares,
+    measure_voxelised_truth,
+    true_leaves,
+    unite,
+)
+from mvseg.baselines.semantic import reconstruct_semantic
+from mvseg.config import MatchConfig, ReconstructConfig
+from mvseg.errors import InputError, InputWarning
+from mvseg.matching import match_regions
+from mvseg.reconstruction import VoxelGrid, back_project, reconstruct_instances
+
+VOXELS_PER_LEAF = 50  # along the mean length of a leaf
+PAPER_THRESHOLD = 0.5
+THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
+
+Masked = Callable[[str], Masks]  # the masks of a cell by kind
+Shape = Callable[[Cell, Masked, Path], Record]
+
+
+@lru_cache(maxsize=100)
+def carve(cell: Cell, masks: Masks, members: tuple[int, ...], threshold: float, size: float) -> VoxelGrid | None:
+    """The voxels of one instance (see `back_project`); kept, because the methods agree on most instances.
+
+    Args:
+        cell: whose cameras.
+        masks: of the cell.
+        members: indices of the instance's masks.
+        threshold: share of the masks that a voxel needs.
+        size: of the voxels, world units.
+    """
+    regions = masks.regions.select(torch.tensor(members))
+    with warnings.catch_warnings():  # an instance without a shape is part of the error that is measured
+        warnings.simplefilter("ignore", InputWarning)
+        return back_project(regions, cell.scene.cameras, ReconstructConfig(threshold=threshold, voxel_size=size))
+
+
+def members_of(ids: Tensor) -> dict[int, tuple[int, ...]]:
+    """{instance: indices of its masks}."""
+    return {i: tuple((ids == i).nonzero()[:, 0].tolist()) for i in ids[ids >= 0].unique().tolist()}
+
+
+def measure_thresholds(cell: Cell, masks: Masks, ids: Tensor, per_leaf: int = VOXELS_PER_LEAF) -> Record:
+    """{"0.5": measures, ...}: d of the shapes of some instances, by the share of masks that a voxel needs.
+
+    Args:
+        cell: with true leaf meshes.
+        masks: D masks.
+        ids: (D,) instance ids.
+        per_leaf: voxels along the mean length of a leaf.
+    """
+    truth, length = true_leaves(cell)
+    size = length / per_leaf
+    grids = [carve(cell, masks, members, min(THRESHOLDS), size) for members in members_of(ids).values()]
+    shares = [(grid.points, grid.votes[grid.occupied]) for grid in grids if grid is not None]
+    return {"shapes": len(shares)} | measure_shares(*unite(shares, size), THRESHOLDS, truth, length)
+
+
+def measure_hidden(cell: Cell, masks: Masks, ids: Tensor) -> Record:
+    """{"0.5": measures, ...} by the rule for hidden parts, `ReconstructConfig.seen_share`, beside the paper's 0.5."""
+    truth, length = true_leaves(cell)
+    size = length / VOXELS_PER_LEAF
+    record: Record = {}
+    for share in THRESHOLDS:
+        config = ReconstructConfig(threshold=PAPER_THRESHOLD, seen_share=share, voxel_size=size)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)
+            grids = reconstruct_instances(masks.regions, ids, cell.scene.cameras, config).values()
+        points = unite([(grid.points, torch.ones(int(grid.occupied.sum()))) for grid in grids], size)[0]
+        record[f"{share:g}"] = measure_points(points, truth, length)
+    return {"shapes": len(grids)} | record
+
+
+def instance_maps(cell: Cell, masks: Masks, ids: Tensor) -> list[Tensor]:
+    """V maps (H, W) int64: instance + 1, 0 = no mask, -1 = a mask without an instance."""
+    values = torch.where(ids >= 0, ids + 1, -1)
+    sizes = cell.scene.cameras.sizes.tolist()
+    return [masks.regions.label_map(view, values, *size) for view, size in enumerate(sizes)]
+
+
+def look_up(cell: Cell, maps: list[Tensor], points: Tensor) -> Iterator[Tensor]:
+    """Per view (P,) int64: the label at the pixel of each point, -1 outside of the image and behind the camera."""
+    for labels, px, z in zip(maps, *cell.scene.cameras.project(points), strict=True):
+        height, width = labels.shape
+        column, row = px.nan_to_num(-1, -1, -1).floor().clamp(-1, max(height, width)).long().unbind(1)
+        inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
+        yield torch.where(inside, labels[row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)
+
+
+def measure_shape(cell: Cell, masks: Masked, name: str, cache: Path) -> Record:
+    """The record of one entry of `SHAPES`; {"na": why} where nothing can be reconstructed."""
+    try:
+        return SHAPES[name](cell, masks, cache)
+    except InputError as error:
+        return {"na": str(error)}
+
+
+def dense(cell: Cell, masks: Masked, cache: Path) -> Record:
+    """All points of stereo: of leaves, stems, pot and ground."""
+    points = dense_points(cell, cache)
+    return {"by": f"mvs ({points.backend})", "0.5": measure_points(points.positions.numpy(), *true_leaves(cell))}
+
+
+def dense_on_leaves(cell: Cell, masks: Masked, cache: Path) -> Record:
+    """The points of stereo that lie in some true mask of more than half of the views."""
+    points = dense_points(cell, cache)
+    own = masks("true")
+    maps = instance_maps(cell, own, own.true_ids)
+    shown = torch.stack([labels > 0 for labels in look_up(cell, maps, points.positions)]).double().mean(0)
+    on_leaves = points.positions[shown > PAPER_THRESHOLD].numpy()
+    return {"by": f"mvs ({points.backend})", "0.5": measure_points(on_leaves, *true_leaves(cell))}
+
+
+def semantic(kind: str) -> Shape:
+    """All masks of a view as one: voxels twice as large as those of single leaves, for there are many."""
+
+    def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
+        truth, length = true_leaves(cell)
+        config = ReconstructConfig(threshold=PAPER_THRESHOLD, voxel_size=2 * length / VOXELS_PER_LEAF)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", InputWarning)
+            grid = reconstruct_semantic(masks(kind).regions, cell.scene, config)
+        points = np.zeros((0, 3)) if grid is None else grid.points.numpy()
+        return {"0.5": measure_points(points, truth, length)}
+
+    return measure
+
+
+def matched(kind: str, method: Literal["symnmf", "nview"]) -> Shape:
+    """Estimated ids and the paper's rule."""
+
+    def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
+        own = masks(kind)
+        return measure_thresholds(cell, own, estimate(cell, own, method))
+
+    return measure
+
+
+def matched_hidden(kind: str) -> Shape:
+    """Estimated ids and the rule for hidden parts."""
+
+    def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
+        own = masks(kind)
+        return measure_hidden(cell, own, estimate(cell, own, "nview"))
+
+    return measure
+
+
+def known(per_leaf: int = VOXELS_PER_LEAF) -> Shape:
+    """True masks with their true ids."""
+
+    def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
+        ids = masks("true").true_ids
+        return measure_thresholds(cell, masks("true"), torch.where(ids > 0, ids, -1), per_leaf)
+
+    return measure
+
+
+@lru_cache(maxsize=8)
+def estimate(cell: Cell, masks: Masks, method: Literal["symnmf", "nview"]) -> Tensor:
+    return match_regions(masks.regions, cell.scene.cameras, MatchConfig(method=method)).instance_ids
+
+
+SHAPES: dict[str, Shape] = {
+    "MVS points": dense,
+    "MVS points on leaves": dense_on_leaves,
+    "semantic segmentation, true masks": semantic("true"),
+    "semantic segmentation, degraded masks": semantic("degraded"),
+    "MVIS (paper), true masks": matched("true", "symnmf"),
+    "MVIS (nview), true masks": matched("true", "nview"),
+    "MVIS (nview), true masks, hidden parts": matched_hidden("true"),
+    "true ids": known(),
+    "MVIS (paper), degraded masks": matched("degraded", "symnmf"),
+    "MVIS (nview), degraded masks": matched("degraded", "nview"),
+    "MVIS (nview), degraded masks, hidden parts": matched_hidden("degraded"),
+    "true ids, 25 voxels": known(25),
+    "true ids, 100 voxels": known(100),
+    "voxels of the truth": lambda cell, masks, cache: {"0.5": measure_voxelised_truth(cell, VOXELS_PER_LEAF)},
+}

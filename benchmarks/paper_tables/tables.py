@@ -1,0 +1,226 @@
+"""The tables of the paper from the records, the paper's printed rows beside ours, in Markdown."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from benchmarks.paper_tables import printed
+from benchmarks.paper_tables.averages import average, average_columns, markdown_table, measure
+from benchmarks.paper_tables.cells import PRESETS, Record, list_cells, read_record
+from benchmarks.paper_tables.experiments import Plan, plant_index, read_records, real_record, slug
+from benchmarks.paper_tables.methods import PRINTED
+from benchmarks.paper_tables.number_of_leaves import RULES
+from benchmarks.paper_tables.shapes import SHAPES, THRESHOLDS
+
+MEASURES = {"s_match": ("s_match", 3), "e_k": ("e_k", 2), "ARI": ("ari", 3), "pair F1": ("f1", 3)}
+TOGETHER = "s_match, untied together"
+
+
+def axes(plan: Plan) -> tuple[list[int], list[int]]:
+    """The numbers of cameras and of leaves, the largest first, as the paper's columns stand."""
+    preset = PRESETS[plan.preset]
+    return sorted(preset.views, reverse=True), sorted(preset.leaves, reverse=True)
+
+
+def printed_cells(values: Sequence[float | None], plan: Plan, decimals: int) -> list[str]:
+    """Printed values of the columns that the preset has; the average over all columns only where it has all."""
+    views, leaves = axes(plan)
+    cells = ["N/A" if value is None else f"{value:.{decimals}f}" for value in values]
+    by_views = dict(zip(printed.VIEWS, cells[:4], strict=True))
+    by_leaves = dict(zip(printed.LEAVES, cells[4:8], strict=True))
+    is_whole = by_views.keys() == set(views) and by_leaves.keys() == set(leaves)
+    shown = [by_views.get(n, "-") for n in views] + [by_leaves.get(n, "-") for n in leaves]
+    return shown + [cell if is_whole else "-" for cell in cells[8:]]
+
+
+def read_matches(plan: Plan, kind: str) -> dict[str, list[Record]]:
+    """{method: records} of table 1, for one kind of masks."""
+    specs = list_cells(PRESETS[plan.preset])
+    found = {m: read_records(plan.records / "match" / slug(kind) / slug(m), specs) for m in plan.methods}
+    return {method: records for method, records in found.items() if records}
+
+
+def read_shapes(plan: Plan, names: Iterable[str] = tuple(SHAPES)) -> dict[str, list[Record]]:
+    """{shape: records} of table 3 for those of the names that were run, of the scenes that all of them have."""
+    specs = [spec for spec in list_cells(PRESETS[plan.preset]) if plant_index(spec) < plan.shape_plants]
+    wanted = [name for name in names if name in plan.shapes]
+    found = {name: read_records(plan.records / "shapes" / slug(name), specs) for name in wanted}
+    return shared_scenes({name: records for name, records in found.items() if records})
+
+
+def shared_scenes(groups: dict[str, list[Record]]) -> dict[str, list[Record]]:
+    """The records of the scenes that all groups have: a run that was stopped compares the same scenes."""
+    names = [{record["scene"] for record in records} for records in groups.values()]
+    shared = set.intersection(*names) if names else set()
+    return {name: [record for record in records if record["scene"] in shared] for name, records in groups.items()}
+
+
+def row_name(method: str, records: Sequence[Record]) -> str:
+    """The method with the back end that answered, where that says more than the method's own name."""
+    by = sorted({record["by"] for record in records if "by" in record})
+    details = [name[name.index("(") + 1 : -1] for name in by if "(" in name]
+    return f"{method} ({', '.join(details)})" if details else method
+
+
+def table_1(plan: Plan, kind: str) -> str:
+    """Every measure of every method, per number of cameras and leaves; the paper's rows in italics."""
+    views, leaves = axes(plan)
+    matches = read_matches(plan, kind)
+    most = max(len(records) for records in matches.values())
+    rows = []
+    for name, (key, decimals) in {TOGETHER: ("s_together", 3), **MEASURES}.items():
+        beside = set()
+        for method, records in matches.items():
+            if name == TOGETHER and not any(record.get("untied") for record in records):
+                continue
+            found = average_columns(records, measure(key), views, leaves)
+            label = row_name(method, records) + (f", {len(records)} scenes" if len(records) < most else "")
+            rows.append([name, label, *(one.text(decimals) for one in found)])
+            beside.add(PRINTED[method])
+        for method, values in printed.TABLE_1.get(name, {}).items():
+            if method in beside:
+                digits = 3 if name == "s_match" else 2
+                rows.append([name, f"*paper: {method}*", *printed_cells(values, plan, digits)])
+    order = [*list(MEASURES)[:1], TOGETHER, *list(MEASURES)[1:]]
+    rows.sort(key=lambda row: order.index(row[0]))
+    header = ["measure", "method", *(f"{n} cams" for n in views), *(f"{n} leaves" for n in leaves), "average"]
+    return markdown_table(header, rows)
+
+
+def count_masks(plan: Plan, kind: str) -> str:
+    """One sentence: how many scenes and masks, and of detections how many showed no leaf or were missed."""
+    records = next((found for found in read_matches(plan, kind).values() if not any("na" in one for one in found)), [])
+    total, free, missed = (sum(r.get(key, 0) for r in records) for key in ("masks", "no_leaf", "missed"))
+    text = f"{len(records)} of {len(list_cells(PRESETS[plan.preset]))} scenes, {total} masks"
+    if free or missed:
+        text += f", of which {free} show no leaf (matched, not scored); {missed} true masks have no detection"
+    return text + "."
+
+
+def table_2(plan: Plan) -> str:
+    """Every method on every real scene; the paper's scenes for orientation."""
+    rows = []
+    for folder in plan.real:
+        for method in plan.methods:
+            path = real_record(plan, folder, method)
+            if path.is_file():
+                found = read_record(path)
+                values = [measure(key)(found) for key, _ in MEASURES.values()]
+                texts = ["N/A" if value is None else f"{value:.3f}" for value in values]
+                rows.append([folder.resolve().name, row_name(method, [found]), *texts])
+    for place, scene in enumerate(("real plant", "balloon", "ornament", "average")):
+        for method, scores in printed.TABLE_2.items():
+            s_match, e_k = scores[place]
+            rows.append([f"*paper: {scene}*", f"*{method}*", f"{s_match:.3f}", f"{e_k:g}", "-", "-"])
+    return markdown_table(["scene", "method", *MEASURES], rows)
+
+
+def table_3(plan: Plan) -> str:
+    """d(I, T) per number of cameras, and per number of leaves with 10 cameras; the paper's rows in italics."""
+    views, leaves = axes(plan)
+    at = 10 if 10 in views else max(views)
+    wanted = [
+        ("MVS points", "MVS points", "0.5"),
+        ("MVS points", "MVS points on leaves", "0.5"),
+        ("Semantic segmentation", "semantic segmentation, true masks", "0.5"),
+        ("Semantic segmentation", "semantic segmentation, degraded masks", "0.5"),
+        ("MVIS", "MVIS (paper), true masks", "0.5"),
+        ("MVIS", "MVIS (paper), degraded masks", "0.5"),
+        ("MVIS", "MVIS (nview), true masks", "0.5"),
+        ("MVIS", "MVIS (nview), degraded masks", "0.5"),
+        ("MVIS", "MVIS (nview), true masks, hidden parts", "0.9"),
+        ("MVIS", "MVIS (nview), degraded masks, hidden parts", "0.9"),
+    ]
+    shapes = read_shapes(plan, [name for _, name, _ in wanted])
+    rows, last = [], None
+    for paper, name, threshold in wanted:
+        if paper != last:
+            cells = printed_cells(printed.TABLE_3[paper], plan, 3)
+            rows.append([f"*paper: {paper}*", *(cells if at == 10 else [*cells[: len(views)], *["-"] * len(leaves)])])
+            last = paper
+        if name in shapes:
+            found = average_columns(shapes[name], measure(threshold, "d"), views, leaves, leaves_at=at)[:-1]
+            label = name + (f" {threshold}" if "hidden" in name else "")
+            rows.append([row_name(label, shapes[name]), *(one.text(3) for one in found)])
+    header = ["method", *(f"{n} cams" for n in views), *(f"{n} leaves, {at} cams" for n in leaves)]
+    return f"{count_scenes(shapes, plan)}\n\n{markdown_table(header, rows)}"
+
+
+def count_scenes(groups: dict[str, list[Record]], plan: Plan) -> str:
+    """One sentence: of how many scenes a table is made, and of how many it would be when everything has been run."""
+    asked = sum(plant_index(spec) < plan.shape_plants for spec in list_cells(PRESETS[plan.preset]))
+    found = len(next(iter(groups.values()), []))
+    remark = "" if found == asked else " The others were not run yet: columns are not of the same plants."
+    return f"{found} of {asked} scenes.{remark}"
+
+
+def table_error(plan: Plan) -> str:
+    """What d is made of: one thing changed at a time; d (excess / gaps) per number of cameras."""
+    wanted = [
+        ("voxels that hold the true points", "voxels of the truth"),
+        ("true masks and ids, 25 voxels per leaf length", "true ids, 25 voxels"),
+        ("true masks and ids, 50 voxels (all other rows)", "true ids"),
+        ("true masks and ids, 100 voxels", "true ids, 100 voxels"),
+        ("true masks, ids of nview", "MVIS (nview), true masks"),
+        ("true masks, ids of the paper's clustering", "MVIS (paper), true masks"),
+        ("degraded masks, ids of nview", "MVIS (nview), degraded masks"),
+        ("degraded masks, ids of the paper's clustering", "MVIS (paper), degraded masks"),
+    ]
+    views, _ = axes(plan)
+    shapes = read_shapes(plan, [name for _, name in wanted])
+    rows = [[label, *split_cells(shapes[name], "0.5", views)] for label, name in wanted if name in shapes]
+    table = markdown_table(["changed", *(f"{n} cams" for n in views), "average"], rows)
+    return f"{count_scenes(shapes, plan)}\n\n{table}"
+
+
+def table_rules(plan: Plan) -> str:
+    """d (excess / gaps) per number of cameras, for every threshold of both rules."""
+    views, _ = axes(plan)
+    wanted = [
+        ("share of the masks", "true", "MVIS (nview), true masks"),
+        ("hidden parts", "true", "MVIS (nview), true masks, hidden parts"),
+        ("share of the masks", "degraded", "MVIS (nview), degraded masks"),
+        ("hidden parts", "degraded", "MVIS (nview), degraded masks, hidden parts"),
+    ]
+    shapes = read_shapes(plan, [name for _, _, name in wanted])
+    rows = []
+    for rule, kind, name in wanted:
+        if name in shapes:
+            for threshold in THRESHOLDS:
+                text = f"{threshold:g}"
+                rows.append([kind, rule, f"> {text}", *split_cells(shapes[name], text, views)])
+    table = markdown_table(["masks", "rule", "threshold", *(f"{n} cams" for n in views), "average"], rows)
+    return f"{count_scenes(shapes, plan)}\n\n{table}"
+
+
+def split_cells(records: Sequence[Record], threshold: str, views: Sequence[int]) -> list[str]:
+    """"d (excess / gaps)" per number of cameras, and over all."""
+    columns = [[r for r in records if r["views"] == number] for number in views] + [list(records)]
+    cells = []
+    for column in columns:
+        d, excess, gaps = (average(column, measure(threshold, key)).text(3) for key in ("d", "excess", "gaps"))
+        cells.append(f"{d} ({excess} / {gaps})" if column else "-")
+    return cells
+
+
+def table_numbers(plan: Plan) -> str:
+    """SymNMF with the number of leaves given, and found in ranges: averages over all cells."""
+    specs = list_cells(PRESETS[plan.preset])
+    kinds = ("true", "degraded")
+    records = {kind: read_records(plan.records / "numbers" / slug(kind), specs) for kind in kinds}
+    rows = []
+    for rule in RULES:
+        row = [rule]
+        for kind in kinds:
+            for key, decimals in (("s_match", 3), ("e_k", 2), ("ari", 3)):
+                row.append(average(records[kind], measure(rule, key)).text(decimals))
+        rows.append(row)
+    table = markdown_table(["k", *(f"{kind}: {name}" for kind in kinds for name in ("s_match", "e_k", "ARI"))], rows)
+    return f"{len(records['true'])} of {len(specs)} scenes.\n\n{table}"
+
+
+def read_notes(path: Path) -> dict[str, str]:
+    """{heading: text} of a file of `## heading` sections, written by hand."""
+    sections = path.read_text(encoding="utf-8").split("\n## ")
+    return {name.strip(): text.strip() for name, _, text in (section.partition("\n") for section in sections[1:])}

@@ -1,0 +1,95 @@
+"""benchmarks.md, benchmarks.json and the plots, from the records."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from benchmarks.paper_tables.cells import PRESETS, SEED, list_cells
+from benchmarks.paper_tables.experiments import Plan, read_records, real_record, slug
+from benchmarks.paper_tables.number_of_leaves import RULES
+from benchmarks.paper_tables.plots import plot_all
+from benchmarks.paper_tables.shapes import SHAPES
+from benchmarks.paper_tables.tables import (
+    count_masks,
+    read_matches,
+    read_notes,
+    read_shapes,
+    table_1,
+    table_2,
+    table_3,
+    table_error,
+    table_numbers,
+    table_rules,
+)
+from mvseg.simulation.dataset import write_text
+
+TEMPLATE = Path(__file__).with_name("benchmarks.template.md")
+NOTES = Path(__file__).with_name("notes.md")
+
+
+def write_up(plan: Plan, out: Path) -> str:
+    """Write `benchmarks.md`, `.json` and the plots into a folder; what was written, as text.
+
+    What stands between the tables is written by hand: in the template what holds for any run, in the notes what holds
+    for the records of the preset "paper", which alone gets them.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    plots = {path.stem: path.name for path in plot_all(plan, out)}
+    notes = read_notes(NOTES) if plan.preset == "paper" else {}
+    base = f"python -m benchmarks.paper_tables --preset {plan.preset}"
+    detector = f" --detector {plan.detector}" if plan.detector else ""
+    parts = [TEMPLATE.read_text(encoding="utf-8").strip(), notes.get("summary", "")]
+    for kind in plan.kinds:
+        if read_matches(plan, kind):
+            option = detector if kind.startswith("detected") else ""
+            parts += [f"## Table 1: ids, masks {kind}", f"{count_masks(plan, kind)} `{base} --tables 1{option}`"]
+            parts += [table_1(plan, kind), picture(plots, f"benchmarks-{kind.split()[0]}")]
+            parts.append(notes.get(f"table 1 {kind.split()[0]}", ""))
+    if any(real_record(plan, folder, method).is_file() for folder in plan.real for method in plan.methods):
+        parts += ["## Table 2: real scenes, hand-made masks", f"`{base} --tables 2 --real FOLDER ...`", table_2(plan)]
+        parts.append(notes.get("table 2", ""))
+    if read_shapes(plan):
+        parts += ["## Table 3: d(I, T) in mean leaf lengths", f"`{base} --tables 3`", table_3(plan)]
+        parts += [picture(plots, "benchmarks-shapes"), notes.get("table 3", "")]
+        parts += ["### What d is made of", notes.get("error before", ""), table_error(plan), notes.get("error", "")]
+        parts += ["### Other thresholds, and parts that other leaves hide", notes.get("rules before", "")]
+        parts += [table_rules(plan), notes.get("rules", "")]
+    if read_records(plan.records / "numbers" / "true", list_cells(PRESETS[plan.preset])):
+        parts += ["## The number of leaves: given, and found", f"`{base} --tables k`", table_numbers(plan)]
+        parts.append(notes.get("numbers", ""))
+    text = "\n\n".join(part for part in parts if part) + "\n"
+    write_text(out / "benchmarks.md", text)
+    real = " --real FOLDER ..." if plan.real else ""
+    write_text(out / "benchmarks.json", describe_records(plan, f"{base}{detector}{real}"))
+    return text
+
+
+def picture(plots: dict[str, str], name: str) -> str:
+    return f"![{name}]({plots[name]})" if name in plots else ""
+
+
+def describe_records(plan: Plan, command: str) -> str:
+    """All records as JSON, one scene a line, numbers to five digits."""
+    specs = list_cells(PRESETS[plan.preset])
+    groups = {f"table 3, {name}": found for shape in SHAPES for name, found in read_shapes(plan, [shape]).items()}
+    for kind in plan.kinds:
+        groups |= {f"table 1, {kind}, {name}": found for name, found in read_matches(plan, kind).items()}
+    for kind in ("true", "degraded"):
+        groups[f"number of leaves, {kind}"] = read_records(plan.records / "numbers" / slug(kind), specs)
+    for folder in plan.real:
+        paths = {method: real_record(plan, folder, method) for method in plan.methods}
+        found = [{"method": m} | json.loads(path.read_text()) for m, path in paths.items() if path.is_file()]
+        groups[f"table 2, {folder.resolve().name}"] = found
+    about = {"command": command, "preset": plan.preset, "seed": SEED, "rules for the number of leaves": RULES}
+    parts = [json.dumps(about)[1:-1]]
+    for name, records in groups.items():
+        parts.append(f"{json.dumps(name)}: [\n" + ",\n".join(shorten(record) for record in records) + "\n]")
+    return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def shorten(record: dict) -> str:
+    """One record as compact JSON, without timings (which no two runs share), numbers to five digits."""
+    rounded = json.loads(json.dumps(record), parse_float=lambda text: float(f"{float(text):.5g}"))
+    rounded.pop("seconds", None)
+    return json.dumps(rounded, separators=(",", ":"))
