@@ -50,8 +50,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--cache", type=Path, required=True, help="folder for label maps")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
+    parser.add_argument("--seed", type=int, default=0, help="of the plants; another one for plants never looked at")
     args = parser.parse_args()
-    scenes = [scene for scene in list_scenes(PRESETS["paper-eval"], seed=0) if scene.split == args.split]
+    scenes = [scene for scene in list_scenes(PRESETS["paper-eval"], args.seed) if scene.split == args.split]
     with multiprocessing.get_context("fork").Pool(2) as pool:
         rows = np.concatenate(pool.map(partial(score_scene, cache=args.cache), scenes, chunksize=1))
     print(f"{'views':>6}{'scored':>14}{'mean score':>12}{'right':>8}{'regions':>9}")

@@ -88,7 +88,7 @@ def visible_ids(plant: Plant, cameras: Cameras) -> Maps:
 
 def load_maps(spec: SceneSpec, cache: Path) -> tuple[Maps, Maps, Cameras]:
     """True and degraded label maps, (V, H, W) each, and the cameras of a scene; rendered when not in the cache."""
-    path = cache / "maps" / (spec.folder.replace("/", "_") + ".npz")
+    path = cache / "maps" / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
     if not path.exists():
         plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
         cameras = scene_cameras(spec, plant, PRESETS["paper-eval"])
@@ -154,6 +154,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, required=True, help="folder for label maps and records")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
+    parser.add_argument("--seed", type=int, default=0, help="of the plants; another one for plants never looked at")
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=["symnmf", "one-per-view", "nview"])
     parser.add_argument("--ablate", action="store_true", help="nview whole, and without one of its parts at a time")
     parser.add_argument("--masks", nargs="+", choices=("true", "degraded"), default=("true", "degraded"))
@@ -165,7 +166,7 @@ def main() -> None:
     args = parser.parse_args()
     scenes = [
         spec
-        for spec in list_scenes(PRESETS["paper-eval"], seed=0)
+        for spec in list_scenes(PRESETS["paper-eval"], args.seed)
         if spec.split == args.split and spec.num_leaves in args.leaves and spec.num_views in args.views
         if int(spec.folder.split("-")[1].split("_")[0]) < args.plants
     ]
