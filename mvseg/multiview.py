@@ -154,8 +154,9 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         keep, matching = self._match(proposals, cameras.to("cpu"))
         order = proposals.regions.view_index[keep].argsort(stable=True)
         kept = proposals.select(keep[order])
-        ids, scores = matching.instance_ids[order], matching.match_scores[order]
-        return kept, replace(matching, instance_ids=ids, match_scores=scores)
+        ids, scores, merged = matching.instance_ids[order], matching.match_scores[order], matching.merged.clone()
+        merged[:, 0] = order.argsort()[merged[:, 0]]
+        return kept, replace(matching, instance_ids=ids, match_scores=scores, merged=merged)
 
     def _match(self, proposals: Proposals, cameras: Cameras) -> tuple[Tensor, Matching]:
         """Indices of the proposals to keep, without those whose mask is empty, and their matching."""
@@ -275,16 +276,37 @@ def _match_classes(
     ids = torch.full_like(classes, -1)
     scores = torch.zeros_like(proposals.scores[keep])
     found: dict[int, int] = {}
+    parts = []
     for one_class in classes.unique().tolist():
         members = classes == one_class
         config = match or MatchConfig()
         if counts.get(one_class) and choose_method(config) == "symnmf":
             config = replace(config, num_instances=counts[one_class])
         matching = match_regions(regions.select(members), cameras, config)
-        ids[members] = torch.where(matching.instance_ids >= 0, matching.instance_ids + sum(found.values()), -1)
+        first = sum(found.values())
+        ids[members] = torch.where(matching.instance_ids >= 0, matching.instance_ids + first, -1)
         scores[members] = matching.match_scores
+        places, merged = members.nonzero()[:, 0], matching.merged
+        merged = torch.stack((places[merged[:, 0]], merged[:, 1] + first, merged[:, 2] + first), 1)
+        parts.append(replace(matching, merged=merged))
         found[one_class] = matching.num_instances
-    return Matching(ids, scores, sum(found.values()), choose_method(match or MatchConfig())), found
+    return _join_matchings(parts, ids, scores, choose_method(match or MatchConfig())), found
+
+
+def _join_matchings(parts: list[Matching], ids: Tensor, scores: Tensor, method: str) -> Matching:
+    """What is known of the instances of all classes, class after class; the largest residual."""
+    if not parts:
+        return Matching(ids, scores, 0, method)
+    supports = [part.support for part in parts if part.support is not None]
+    return Matching(
+        ids,
+        scores,
+        sum(part.num_instances for part in parts),
+        parts[0].method if len({part.method for part in parts}) == 1 else method,
+        torch.cat(supports) if len(supports) == len(parts) else None,
+        torch.cat([part.merged for part in parts]),
+        max((part.residual_px for part in parts if part.residual_px is not None), default=None),
+    )
 
 
 def gather_proposals(found: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:

@@ -12,7 +12,7 @@ from mvseg.multiview import MultiViewMaskRCNN, Proposals, gather_proposals, matc
 from mvseg.nms import cluster_aware_nms
 from mvseg.regions import regions_from_label_maps
 from mvseg.simulation.proposals import simulate_proposals
-from synthetic import BallScene, arc_positions, ball_scene, cameras_at
+from synthetic import BallScene, arc_positions, ball_scene, cameras_at, touching_balls
 
 
 class TinyBackbone(torch.nn.Sequential):
@@ -188,6 +188,31 @@ def test_iterating_is_deterministic_and_zero_iterations_only_match() -> None:
     keep, _ = match_proposals(proposals, scene.cameras, num_iterations=0)
     groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
     assert torch.equal(keep, cluster_aware_nms(proposals.boxes, proposals.scores, groups, 0.3))
+
+
+def test_classes_are_matched_apart_and_what_is_known_of_both_is_kept() -> None:
+    """True masks of balls, the even ones of another class; one mask of class 1 covers two balls."""
+    scene = ball_scene(6, 8, seed=3)
+    (small, large), view = touching_balls(scene)
+    maps = [labels.copy() for labels in scene.label_maps]
+    maps[view][maps[view] == small] = large
+    regions = regions_from_label_maps(maps)
+    first = (regions.labels == small) | (regions.labels == large)
+    classes = torch.where(first | (regions.labels % 2 == 1), 1, 2)
+    order = torch.randperm(len(regions), generator=torch.Generator().manual_seed(0))
+    proposals = Proposals(regions, regions.boxes.float(), torch.rand(len(regions)), classes).select(order)
+    keep, matching = match_proposals(proposals, scene.cameras, num_iterations=0, cluster_iou=0.99)
+    labels = proposals.regions.labels[keep]
+    assert matching.support is not None
+    assert len(matching.support) == matching.num_instances == 6
+    assert matching.residual_px == 1
+    for instance in range(6):
+        (classes_of,) = {tuple(proposals.classes[keep][matching.instance_ids == instance].unique().tolist())}
+        assert len(classes_of) == 1
+    ((region, own, other),) = matching.merged.tolist()
+    assert labels[region] == large
+    assert matching.instance_ids[region] == own
+    assert {int(labels[matching.instance_ids == one].mode().values) for one in (own, other)} == {small, large}
 
 
 def test_at_most_so_many_detections_per_view() -> None:

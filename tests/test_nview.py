@@ -33,6 +33,7 @@ from synthetic import (
     moved,
     permute_views,
     render_balls,
+    touching_balls,
 )
 
 COSTS = Costs()
@@ -293,17 +294,6 @@ def test_a_mask_that_covers_two_instances_is_found() -> None:
     assert found.merged[:, 0].tolist() == [region]
     assert sorted(found.merged[0, 1:].tolist()) == sorted(instances)
     assert found.merged[0, 1] == found.instance_ids[region]
-
-
-def touching_balls(scene: BallScene) -> tuple[tuple[int, int], int]:
-    """The numbers of two balls that touch each other in a view and show as much as possible there; and that view."""
-    best = (0, (0, 0), 0)
-    for view, labels in enumerate(scene.label_maps):
-        sizes = np.bincount(labels.ravel())
-        ends = np.stack([labels[:, 1:].ravel(), labels[:, :-1].ravel()], 1)
-        for a, b in np.unique(ends[(ends[:, 0] != ends[:, 1]) & (ends.min(1) > 0)], axis=0).tolist():
-            best = max(best, (int(min(sizes[a], sizes[b])), (a, b), view))
-    return best[1], best[2]
 
 
 def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
