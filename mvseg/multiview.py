@@ -17,7 +17,7 @@ from torchvision.models.detection.transform import resize_boxes
 from mvseg.config import MatchConfig
 from mvseg.errors import InputError
 from mvseg.matching import Matching, choose_method, match_regions
-from mvseg.nms import EpipolarAssignment, cluster_aware_nms
+from mvseg.nms import EpipolarAssignment, cluster_aware_nms, confirmed
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
 
@@ -57,6 +57,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     3. Alternate `num_iterations` times: every mask of the excessive set takes the cluster whose epipolar map it
        resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each cluster; match the survivors
        again. Masks that resemble no map form one more group.
+    4. Where match scores are chances (`match` names no other method than "nview"): a box that overlaps a better one
+       stays only if the other views are sure that it is something else (`confirmed`); match what is left.
 
     Departures from the paper: it matches the excessive set itself at first, and estimates |k| anew each time; here,
     where `match` names "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the number of
@@ -229,7 +231,7 @@ def match_proposals(
     assignment: EpipolarAssignment | None = None,
     match: MatchConfig | None = None,
 ) -> tuple[Tensor, Matching]:
-    """Match first, then alternate assignment and NMS (steps 2 and 3 of `MultiViewMaskRCNN`).
+    """Match first, alternate assignment and NMS, and ask the other views (steps 2 to 4 of `MultiViewMaskRCNN`).
 
     Args:
         proposals: the excessive set of all V views.
@@ -253,6 +255,12 @@ def match_proposals(
         groups = torch.cat((per_class, clusters[:, None]), 1)
         keep = _suppress(proposals, groups, cluster_iou, detections_per_view)
         matching, _ = _match_classes(proposals, keep, cameras, match, counts)
+    if num_iterations and matching.support is not None:
+        ids, scores = matching.instance_ids, matching.match_scores
+        stays = confirmed(proposals.boxes[keep], per_class[keep], ids, scores, iou_threshold=cluster_iou)
+        if not stays.all():
+            keep = keep[stays]
+            matching, _ = _match_classes(proposals, keep, cameras, match, counts)
     return keep, matching
 
 

@@ -142,3 +142,40 @@ def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_thresho
     _, group = groups.reshape(len(groups), -1).unique(dim=0, return_inverse=True)
     # batched_nms moves the groups apart by adding to the coordinates: in float32 a thousand groups blur the boxes.
     return torchvision.ops.batched_nms(boxes.double(), scores.double(), group, iou_threshold)
+
+
+def confirmed(
+    boxes: Tensor,
+    groups: Tensor,
+    instance_ids: Tensor,
+    match_scores: Tensor,
+    *,
+    iou_threshold: float = 0.3,
+    min_score: float = 0.5,
+) -> Tensor:
+    """Which boxes stay: those that no better one overlaps, and those that the other views are sure to be another thing.
+
+    Cluster-aware NMS keeps a duplicate as well as a half-hidden leaf when it takes another cluster than the better box.
+    Only the half-hidden leaf finds its match in the other views. Not in the paper.
+
+    Args:
+        boxes: (S, 4) xyxy, best score first.
+        groups: (S, G) integers; only boxes of one group are compared (view and class).
+        instance_ids: (S,) int64, -1 = matched to nothing.
+        match_scores: (S,) chances that the ids are right.
+        iou_threshold: an IoU above this is an overlap.
+        min_score: least match score of a box that overlaps a better one; its id must also differ from that one's.
+
+    Returns:
+        (S,) bool. A box that goes does not count as a better one for the rest.
+    """
+    if not len(boxes):
+        return torch.ones(0, dtype=torch.bool, device=boxes.device)
+    _, group = groups.unique(dim=0, return_inverse=True)
+    overlaps = (torchvision.ops.box_iou(boxes, boxes) > iou_threshold) & (group[:, None] == group)
+    other = (instance_ids[:, None] != instance_ids) & ((instance_ids >= 0) & (match_scores >= min_score))[:, None]
+    refuses = (overlaps & ~other).tril(-1)
+    stays = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
+    for box in refuses.any(1).nonzero()[:, 0].tolist():
+        stays[box] = not bool((refuses[box] & stays).any())
+    return stays

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import torch
 from torch import Tensor
+from torchvision.ops import box_iou
 
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -123,6 +124,20 @@ def cluster_aware_nms_reference(boxes: Tensor, scores: Tensor, groups: Tensor, i
         else:
             kept.append(candidate)
     return kept
+
+
+def confirmed_reference(
+    boxes: Tensor, groups: Tensor, ids: Tensor, scores: Tensor, iou_threshold: float, min_score: float
+) -> list[bool]:
+    """Best box first: refused by any box that stayed, overlaps it, and is not surely something else."""
+    stays: list[int] = []
+    for box in range(len(boxes)):
+        rivals = [one for one in stays if (groups[one] == groups[box]).all()]
+        over = [one for one in rivals if float(box_iou(boxes[[one]], boxes[[box]])) > iou_threshold]
+        is_sure = ids[box] >= 0 and scores[box] >= min_score
+        if all(is_sure and ids[one] != ids[box] for one in over):
+            stays.append(box)
+    return [box in stays for box in range(len(boxes))]
 
 
 def back_project_reference(members: Regions, cameras: Cameras, points: Tensor) -> Tensor:

@@ -7,8 +7,8 @@ import torch
 import torchvision
 
 from mvseg.errors import InputError
-from mvseg.nms import EpipolarAssignment, cluster_aware_nms, ruzicka_similarity
-from reference import cluster_aware_nms_reference, epipolar_map_reference, ruzicka_reference
+from mvseg.nms import EpipolarAssignment, cluster_aware_nms, confirmed, ruzicka_similarity
+from reference import cluster_aware_nms_reference, confirmed_reference, epipolar_map_reference, ruzicka_reference
 from synthetic import ball_scene
 
 
@@ -107,3 +107,28 @@ def test_nothing_in_nothing_out_and_lengths_must_agree() -> None:
     assert cluster_aware_nms(torch.zeros(0, 4), nothing, nothing.long()).shape == (0,)
     with pytest.raises(InputError, match="2 boxes with 1 scores"):
         cluster_aware_nms(torch.zeros(2, 4), torch.zeros(1), torch.zeros(2))
+
+
+def test_an_overlap_is_settled_by_the_other_views() -> None:
+    box = torch.tensor([[0.0, 0, 10, 10]]).expand(6, 4)
+    groups = torch.tensor([[0, 1]] * 5 + [[1, 1]])
+    ids = torch.tensor([3, 3, 4, 5, -1, 3])
+    scores = torch.tensor([0.2, 0.9, 0.9, 0.4, 0.0, 0.1])
+    # the best; the same instance; surely another; not sure; nothing; alone in its view
+    assert confirmed(box, groups, ids, scores).tolist() == [True, False, True, False, False, True]
+    apart = box + 20 * torch.arange(6)[:, None]
+    assert confirmed(apart, groups, ids, scores).all()
+    assert confirmed(box[:0], groups[:0], ids[:0], scores[:0]).shape == (0,)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_confirmed_agrees_with_a_loop(seed: int) -> None:
+    boxes, scores = random_boxes(120, seed)
+    generator = torch.Generator().manual_seed(seed)
+    groups = torch.randint(2, (120, 2), generator=generator)
+    ids = torch.randint(-1, 9, (120,), generator=generator)
+    stays = confirmed(boxes, groups, ids, scores)
+    assert stays.tolist() == confirmed_reference(boxes, groups, ids, scores, 0.3, 0.5)
+    assert 10 < stays.sum() < 110
+    again = confirmed(boxes[stays], groups[stays], ids[stays], scores[stays])
+    assert again.all()  # idempotent
