@@ -53,7 +53,8 @@ class DetectConfig:
     Attributes:
         weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
         min_score: detections that are less sure are dropped; in [0, 1].
-        image_size: longer side, in pixels, that photos are scaled to; null for what the weights say.
+        image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to what the
+            weights say, smaller ones stay as they are.
         num_iterations: of assignment to epipolar maps and NMS; 0 only matches what plain NMS leaves.
     """
 

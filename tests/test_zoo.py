@@ -57,6 +57,18 @@ def test_what_ships_is_whole_small_and_described(name: str) -> None:
     assert found["masks"].shape[1:] == (1, 64, 96)
 
 
+def test_photos_are_scaled_down_never_up_unless_a_size_is_asked_for(packed: Path) -> None:
+    photos = [torch.rand(3, 200, 300), torch.rand(3, 40, 60)]
+    asked, default = (load_detector("leaf-test", image_size=size).transform for size in (96, None))
+    assert default(photos[:1])[0].image_sizes == asked(photos[:1])[0].image_sizes == [(64, 96)]
+    assert torch.equal(default(photos[:1])[0].tensors, asked(photos[:1])[0].tensors)
+    assert asked(photos[1:])[0].image_sizes == [(64, 96)]
+    assert default(photos[1:])[0].image_sizes == [(40, 60)]
+    model = load_detector("leaf-test")
+    with torch.no_grad():
+        assert model(photos[1:])[0]["masks"].shape[1:] == (1, 40, 60)
+
+
 def test_the_default_of_infer_ships() -> None:
     assert "leaf-slim" in SHIPPED
 

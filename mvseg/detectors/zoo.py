@@ -20,7 +20,9 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+from torch import Tensor
 from torchvision.models.detection import MaskRCNN
+from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from mvseg.detectors.mask_rcnn import build_detector, read_weights
 from mvseg.errors import InputError
@@ -83,7 +85,8 @@ def load_detector(weights: str | Path, *, image_size: int | None = None) -> Mask
 
     Args:
         weights: the name of a shipped detector (`list_detectors`), or a .safetensors file that a training run wrote.
-        image_size: longer side, in pixels, that photos are scaled to; None for what the file says.
+        image_size: longer side, in pixels, that photos are scaled to. None: larger photos are scaled down to what the
+            file says, smaller ones stay as they are.
 
     Raises:
         InputError: neither a name nor a readable file, a wrong hash, or a file that does not say what it holds.
@@ -93,7 +96,24 @@ def load_detector(weights: str | Path, *, image_size: int | None = None) -> Mask
         names = ", ".join(entry.name for entry in list_detectors()) or "none"
         raise InputError(f"'{weights}' is neither a shipped detector ({names}) nor a file of weights")
     arch, categories = read_description(path)
-    return build_detector(arch, len(categories) + 1, str(path), image_size=image_size).eval()
+    detector = build_detector(arch, len(categories) + 1, str(path), image_size=image_size)
+    if image_size is None:
+        detector.transform = _ShrinkOnly.like(detector.transform)
+    return detector.eval()
+
+
+class _ShrinkOnly(GeneralizedRCNNTransform):  # type: ignore[misc]  # torchvision carries no types
+    """Leaves photos alone whose longer side is at most `max_size`."""
+
+    @classmethod
+    def like(cls, transform: GeneralizedRCNNTransform) -> _ShrinkOnly:
+        sizes = (transform.min_size, transform.max_size)
+        return cls(*sizes, transform.image_mean, transform.image_std, transform.size_divisible)
+
+    def resize(
+        self, image: Tensor, target: dict[str, Tensor] | None = None
+    ) -> tuple[Tensor, dict[str, Tensor] | None]:
+        return (image, target) if max(image.shape[-2:]) <= self.max_size else super().resize(image, target)
 
 
 def read_description(path: Path) -> tuple[str, tuple[str, ...]]:
