@@ -8,7 +8,7 @@ demo: $(VENV)/installed
 	$(PYTHON) infer.py
 
 test: $(VENV)/installed
-	$(PYTHON) -m pytest
+	$(PYTHON) -m pytest -n 2
 
 lint: $(VENV)/installed
 	$(PYTHON) -m ruff check .

@@ -238,7 +238,7 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
 
 
 def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:
-    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(), small_cameras()
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), proposals_per_view=40), some_images(), small_cameras()
     proposals, matching = wrapped.find_regions(iter(images), cameras)
     results = wrapped(images, cameras=cameras)
     views = proposals.regions.view_index
