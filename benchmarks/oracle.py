@@ -57,7 +57,8 @@ def main() -> None:
     print(f"{'leaves':>6}{'views':>6}{'found':>16}{'from the truth':>20}{'truth':>16}   (ARI, value)")
     for leaves, views in sorted({row[:2] for row in rows}):
         mean = np.mean([row[2] for row in rows if row[:2] == (leaves, views)], 0)
-        print(f"{leaves:6}{views:6}" + "".join(f"{a:10.3f} {b:8.1f}" for a, b in zip(mean[::2], mean[1::2], strict=True)))
+        cells = [f"{ari:10.3f} {value:8.1f}" for ari, value in zip(mean[::2], mean[1::2], strict=True)]
+        print(f"{leaves:6}{views:6}" + "".join(cells))
 
 
 if __name__ == "__main__":
