@@ -21,6 +21,7 @@ from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.models.detection.transform import resize_boxes
 
+from mvseg.expected_iou import CUT, decide_masks
 from mvseg.formats.coco import encode_mask
 from mvseg.training_data import LabelledPhoto, SampleList, read_sample
 
@@ -58,7 +59,7 @@ def detect_and_label(
 
 
 def detect(model: MaskRCNN, photo: Tensor) -> tuple[dict[str, Tensor], Iterator[Tensor]]:
-    """What `model([photo])[0]` finds, with one full-sized mask in memory at a time.
+    """What `model([photo])[0]` finds, decided by `decide_masks`, with one full-sized mask in memory at a time.
 
     (torchvision would make all masks at once: 100 detections in a photo of 24 megapixels take some 30 GB.)
 
@@ -67,14 +68,15 @@ def detect(model: MaskRCNN, photo: Tensor) -> tuple[dict[str, Tensor], Iterator[
         photo: (3, H, W) float32 in [0, 1].
 
     Returns:
-        "boxes" (D, 4) xyxy in the frame of the photo, "labels" (D,), "scores" (D,); and D masks (H, W) float32, 0 to 1.
+        "boxes" (D, 4) xyxy in the frame of the photo, "labels" (D,), "scores" (D,); and D masks (H, W) float32, 0 to 1,
+        to be cut at 0.5.
     """
     images, _ = model.transform([photo])
     features = model.backbone(images.tensors)
     if isinstance(features, Tensor):
         features = {"0": features}
     proposals, _ = model.rpn(images, features)
-    found = model.roi_heads(features, proposals, images.image_sizes)[0][0]
+    found = decide_masks(model.roi_heads(features, proposals, images.image_sizes)[0][0])
     size = (photo.shape[1], photo.shape[2])
     found["boxes"] = resize_boxes(found["boxes"], images.image_sizes[0], size)
     crops, boxes = found.pop("masks"), found["boxes"]
@@ -101,7 +103,7 @@ def annotate_detections(found: dict[str, Tensor], masks: Iterable[Tensor], image
         found["boxes"].tolist(), found["labels"].tolist(), found["scores"].tolist(), masks, strict=True
     ):
         x1, y1, x2, y2 = box
-        described = describe_mask(mask >= 0.5, image_id)
+        described = describe_mask(mask > CUT, image_id)
         annotations.append(
             {**described, "category_id": category, "iscrowd": 0, "score": score, "bbox": [x1, y1, x2 - x1, y2 - y1]}
         )

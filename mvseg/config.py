@@ -52,14 +52,15 @@ class DetectConfig:
 
     Attributes:
         weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
-        min_score: detections that are less sure are dropped; in [0, 1].
+        min_score: detections that score less are dropped; in [0, 1]. A score is how sure the detector is that it sees a
+            leaf, times the IoU that its mask is expected to have.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to what the
             weights say, smaller ones stay as they are.
         num_iterations: of assignment to epipolar maps and NMS; 0 only matches what plain NMS leaves.
     """
 
     weights: str = "leaf-slim"
-    min_score: float = 0.5
+    min_score: float = 0.3
     image_size: int | None = None
     num_iterations: int = 1
 

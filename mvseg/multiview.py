@@ -16,12 +16,11 @@ from torchvision.models.detection.transform import resize_boxes
 
 from mvseg.config import MatchConfig
 from mvseg.errors import InputError
+from mvseg.expected_iou import CUT, decide_masks
 from mvseg.matching import Matching, choose_method, match_regions
 from mvseg.nms import EpipolarAssignment, cluster_aware_nms, confirmed
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
-
-MASK_THRESHOLD = 0.5  # of the mask head's probability, as in torchvision's examples
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,7 +50,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     In train mode, and in eval mode without cameras, it is the detector it wraps. With cameras, in eval mode:
 
     1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper:
-       0.7): an excessive set of masks.
+       0.7): an excessive set of masks. Each mask is cut where its expected IoU is largest, and its score multiplied by
+       that (`mvseg.expected_iou`); what then scores less than the detector's `roi_heads.score_thresh` goes.
     2. Match first: what plain NMS at `cluster_iou` leaves of it is matched across views. Things of different classes
        are never matched.
     3. Alternate `num_iterations` times: every mask of the excessive set takes the cluster whose epipolar map it
@@ -114,8 +114,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             cameras: the V undistorted cameras of the images; ignored in train mode.
 
         Returns:
-            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`; with
-            cameras also `instance_ids` (int64, the same number for the same instance in every view, -1 = matched to
+            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks` (to be cut
+            at 0.5); with cameras also `instance_ids` (int64, the same number for the same instance in every view, -1 = matched to
             nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
 
         Raises:
@@ -186,7 +186,9 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         (found,), _ = lenient(features, boxes, resized.image_sizes)
         height, width = resized.image_sizes[0]
         exact = {key: found[key].float() for key in ("boxes", "scores", "masks")}
-        return found | exact | {"frame": torch.tensor([width, height])}
+        found = decide_masks(found | exact)
+        good = found["scores"] >= self.roi_heads.score_thresh
+        return {key: value[good] for key, value in found.items()} | {"frame": torch.tensor([width, height])}
 
     def _collect(
         self,
@@ -337,7 +339,7 @@ def gather_proposals(found: list[dict[str, Tensor]], sizes: list[list[int]]) -> 
             x1, y1 = pasted[:2].clamp(min=0).tolist()
             x2, y2 = min(int(pasted[2]) + 1, width), min(int(pasted[3]) + 1, height)
             local = pasted - torch.tensor([x1, y1, x1, y1], device=pasted.device)
-            crops.append((paste_mask_in_image(mask, local, y2 - y1, x2 - x1) > MASK_THRESHOLD).flatten())
+            crops.append((paste_mask_in_image(mask, local, y2 - y1, x2 - x1) > CUT).flatten())
             windows.append((x1, y1, x2, y2))
         boxes.append(scaled)
         view_index += [view] * len(scaled)

@@ -83,7 +83,8 @@ def test_nothing_found_and_nothing_there() -> None:
     assert average_precision([], [], 1)["box_AR"] is None
 
 
-def test_detect_is_the_models_own_forward_pass() -> None:
+def test_detect_is_the_models_own_forward_pass_with_decided_masks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvseg.average_precision.decide_masks", lambda found: found)
     model = build_tiny().eval()
     model.transform.min_size, model.transform.max_size = (64,), 64
     photo = torch.rand((3, 50, 90), generator=torch.Generator().manual_seed(1))

@@ -34,6 +34,7 @@ ORDER = [
     "nview",
     "matching",
     "nms",
+    "expected_iou",
     "multiview",
     "detectors",
     "reconstruction",

@@ -14,7 +14,7 @@ from mvseg.formats.photos import load_photos
 from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps, stack_regions
 from mvseg.simulation.degrade import Faults, degrade_labels
 
-MIN_SCORE = 0.5  # of a detection
+MIN_SCORE = 0.3  # of a detection, the default of `infer.py`
 MIN_PIXELS = 30  # of a detected mask; true and degraded masks have as many
 MIN_IOU = 0.5  # with a true mask, for a detection to count as that leaf
 

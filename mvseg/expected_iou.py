@@ -1,0 +1,53 @@
+"""Where to cut a mask head's probabilities, and what the mask is then worth: by the IoU that is to be expected.
+
+Cutting at 0.5 minimises the expected number of wrong pixels, not the IoU that masks are judged by: a thin leaf that the
+head is unsure of never reaches 0.5 and comes out empty or in shreds. Of all cuts we take the one with the largest
+expected IoU (Nowozin, "Optimal Decisions from Probabilistic Models: the Intersection-over-Union Case", CVPR 2014, Eq. 8:
+the expectation of the intersection over that of the union, pixels taken as independent), and the score of the box is
+multiplied by it (as Huang et al., "Mask Scoring R-CNN", CVPR 2019, do with an IoU that they learn). Nothing is learned
+and nothing tuned.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+CUT = 0.5  # where everybody cuts the probabilities of torchvision's mask heads
+EPS = 1e-9  # probabilities are kept this far from 0 and 1, where log odds are infinite
+
+
+def expect_iou(probabilities: Tensor) -> tuple[Tensor, Tensor]:
+    """The cut with the largest expected IoU of each mask.
+
+    Args:
+        probabilities: (D, P) float, of P >= 1 pixels each, in [0, 1].
+
+    Returns:
+        (D,) float64 cuts: the mask is where the probability is larger. Half-way (in log odds) between the smallest
+        probability inside and the largest outside, or 1e-9 when none is outside. (D,) float64 IoU to be expected.
+    """
+    p = probabilities.double().sort(dim=1, descending=True).values
+    sums, counts = p.cumsum(1), torch.arange(1, p.shape[1] + 1, device=p.device)
+    # the k largest inside: intersection sums[k], union k + what is expected of the others
+    expected, last = (sums / (counts + sums[:, -1:] - sums)).max(dim=1)
+    log_odds = torch.cat((p, torch.zeros_like(p[:, :1])), 1).logit(eps=EPS)
+    cuts = torch.stack([log_odds.gather(1, index[:, None])[:, 0] for index in (last, last + 1)]).mean(0).sigmoid()
+    return cuts, expected
+
+
+def decide_masks(found: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Detections whose masks are best cut at 0.5 and whose scores count the quality of the mask.
+
+    Args:
+        found: what torchvision's RoI heads return for one photo: "masks" (D, 1, S, S) probabilities in the frame of
+            the boxes, "scores" (D,), and anything else.
+
+    Returns:
+        The same with other "masks": the log odds of each are shifted so that its best cut falls on 0.5; and with
+        "scores" multiplied by the expected IoU. The order of the detections stays.
+    """
+    masks, scores = found["masks"], found["scores"]
+    cuts, expected = expect_iou(masks.flatten(1))
+    log_odds = masks.double().logit(eps=EPS) - cuts.logit(eps=EPS)[:, None, None, None]
+    return found | {"masks": log_odds.sigmoid().to(masks.dtype), "scores": (scores * expected).to(scores.dtype)}
