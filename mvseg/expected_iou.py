@@ -2,10 +2,9 @@
 
 Cutting at 0.5 minimises the expected number of wrong pixels, not the IoU that masks are judged by: a thin leaf that the
 head is unsure of never reaches 0.5 and comes out empty or in shreds. Of all cuts we take the one with the largest
-expected IoU (Nowozin, "Optimal Decisions from Probabilistic Models: the Intersection-over-Union Case", CVPR 2014, Eq. 8:
-the expectation of the intersection over that of the union, pixels taken as independent), and the score of the box is
-multiplied by it (as Huang et al., "Mask Scoring R-CNN", CVPR 2019, do with an IoU that they learn). Nothing is learned
-and nothing tuned.
+expected IoU (after Nowozin, "Optimal Decisions from Probabilistic Models: the Intersection-over-Union Case", CVPR 2014;
+here the expectation of the intersection over that of the union), and the score of the box is multiplied by it (as Huang
+et al., "Mask Scoring R-CNN", CVPR 2019, do with an IoU that they learn). Nothing is learned and nothing tuned.
 """
 
 from __future__ import annotations

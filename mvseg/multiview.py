@@ -114,9 +114,9 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             cameras: the V undistorted cameras of the images; ignored in train mode.
 
         Returns:
-            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks` (to be cut
-            at 0.5); with cameras also `instance_ids` (int64, the same number for the same instance in every view, -1 = matched to
-            nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
+            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`, which
+            are to be cut at 0.5; with cameras also `instance_ids` (int64, the same number for the same instance in
+            every view, -1 = matched to nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
 
         Raises:
             InputError: two or more images are expected, as many cameras, and the cameras' sizes.
