@@ -3,7 +3,7 @@
 Scenes are folders as `mvseg simulate` writes them (photos, true label images, true leaf meshes) or anything in the same
 layout; without `truth/leaves` nothing is said about hidden leaves. Three questions:
 
-1. Average precision of the detector alone, photo by photo, as torchvision runs it (all detections from 0.05 on).
+1. Average precision of the detector alone, photo by photo (all that torchvision's class score puts at 0.05 or more).
 2. The loop: of what scores at least `--min_score`, plain NMS against cluster-aware NMS after 0, 1, 2, 3 iterations:
    mask AP, precision, recall of all leaves and of those less than half visible (visible pixels against the silhouette
    that the leaf would have alone).
@@ -121,8 +121,9 @@ def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dic
         photos, truth = load_photos(scene), load_masks(scene, folder / "truth")
         sizes = scene.cameras.sizes.tolist()
         hidden = visible_share(folder, scene.cameras, truth) < HIDDEN
-        for index, sample in enumerate(list_photos([folder]).samples):
-            truths += annotate_truth(read_sample(sample), num_images + index, 1)
+        by_name = {Path(sample.name).stem: sample for sample in list_photos([folder]).samples}
+        for view, name in enumerate(view.name for view in scene.views):
+            truths += annotate_truth(read_sample(by_name[Path(name).stem]), num_images + view, 1)
         for row in rows:
             found, matching = run_loop(scene, photos, args, row)
             shows = pair_up(found.regions, truth, sizes, found.scores)

@@ -57,12 +57,11 @@ def nview_ids(regions: Regions, cameras: Cameras, affinity: Affinity, *, costs: 
 METHODS: dict[str, Method] = {"symnmf": symnmf_ids, "one-per-view": one_per_view_ids, "nview": nview_ids}
 ABLATIONS = {
     "no weights": Costs(weight=0, weight_few=0),
-    "no landing": Costs(landing=0, merged_swap=math.inf),
+    "no landing": Costs(landing=0),
     "missed=absent": Costs(absent=Costs.missing),
     "hidden is free": Costs(hidden=0),
     "pieces alone": Costs(piece_landing=math.inf),
     "few views kept": Costs(few_landing=math.inf),
-    "no swap": Costs(merged_swap=math.inf),
 }
 METHODS |= {name: partial(nview_ids, costs=costs) for name, costs in ABLATIONS.items()}
 

@@ -120,6 +120,8 @@ def _match(args: Namespace) -> int:
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two scenes are called '{name}', expected different names: each gets a folder in --out")
+    if args.masks is None:
+        raise InputError("masks is null, expected the masks to match; mvseg infer finds them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
     for scene, name in zip(args.scenes, names, strict=True):
         try:
@@ -137,9 +139,12 @@ def _run(scene: Path, masks: Path | None, out: Path, args: Namespace, reconstruc
     check_out(out)
     masks = None if masks is None else _find_masks(scene, masks)
     detect = DetectConfig(**vars(args.detect)) if masks is None else None
+    ignored = masks is not None and "detect" in args and DetectConfig(**vars(args.detect)) != DetectConfig()
     match = MatchConfig(**vars(args.match))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
+        if ignored:
+            warnings.warn("the detect options do nothing: masks are given", InputWarning, stacklevel=1)
         result = run_scene(scene, masks, match, reconstruct, detect=detect, progress=not args.quiet)
     remarks = [str(one.message) for one in caught if issubclass(one.category, InputWarning)]
     for other in (one for one in caught if not issubclass(one.category, InputWarning)):
@@ -199,10 +204,12 @@ def _models(args: Namespace) -> int:
         pack_detector(args.pack, args.into, args.image_size)
         return 0
     for entry in list_detectors():
-        scores = entry.metrics.get("test") or entry.metrics["validation"]
-        size = entry.weights.stat().st_size / 1e6
-        shown = f"mask AP {scores['mask_AP']:.3f}, AP50 {scores['mask_AP50']:.3f} on simulated plants"
-        print(f"{entry.name:15} {size:.0f} MB, {shown}; {entry.weights.parent / 'card.md'}")
+        scores = entry.metrics.get("test") or entry.metrics.get("validation") or {}
+        found = [scores.get(name) for name in ("mask_AP", "mask_AP50")]
+        known = [value for value in found if value is not None]
+        shown = "mask AP {:.3f}, AP50 {:.3f}".format(*known) if len(known) == 2 else "not measured"
+        size = f"{entry.weights.stat().st_size / 1e6:.0f} MB" if entry.weights.is_file() else "weights missing"
+        print(f"{entry.name:15} {size}, {shown}; {entry.weights.parent / 'card.md'}")
     return 0
 
 

@@ -37,7 +37,6 @@ class Costs:
         few_landing: least landing of a cluster on a region of such a one that it takes over.
         merged_landing: least landing of a cluster on a region that it may share with another cluster.
         merged_share: least share of the pixels of such a region that it alone explains.
-        merged_swap: by how much more it must speak for the region than the other cluster to become its first one.
     """
 
     missing: float = 0.7
@@ -53,7 +52,6 @@ class Costs:
     few_landing: float = 0.02
     merged_landing: float = 0.25
     merged_share: float = 0.2
-    merged_swap: float = 0.15
 
     def pair_factor(self, num_views: int) -> float:
         """What an epipolar weight of 1.5 in place of 0.5 gains."""
@@ -130,7 +128,7 @@ def score_matrix(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: C
 
     A row scores (views that show c - hidden * views that show others - missing or absent * views that show nothing)
     / (views that the point lies in); a pixel scores as its best row, but not below -hidden; a region as the mean of its
-    pixels.
+    pixels, and -hidden without pixels.
 
     Args:
         table: rows of D regions.
@@ -144,8 +142,14 @@ def score_matrix(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: C
         (N, K) float32 in [-hidden, 1].
     """
     best = pixel_scores(table, ids, view, bounds, costs)
-    start = run_starts(table.pixel_region[bounds.of(view)[1]])
-    return np.add.reduceat(best, start, 0) / np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
+    regions, pixels, _ = bounds.of(view)
+    owner = table.pixel_region[pixels] - regions.start
+    start = run_starts(owner)
+    found = np.full((regions.stop - regions.start, best.shape[1]), -costs.hidden, np.float32)
+    if len(start):
+        counts = np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
+        found[owner[start]] = np.add.reduceat(best, start, 0) / counts
+    return found
 
 
 def pixel_scores(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs) -> Floats:
@@ -254,30 +258,28 @@ def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
     return np.bincount(table.pixel_region, best, len(ids)) / np.maximum(counts, 1)
 
 
-def merged_regions(table: RowTable, W: Floats, ids: Ints, costs: Costs, known: Known) -> tuple[Ints, Ints]:
+def merged_regions(table: RowTable, ids: Ints, costs: Costs, known: Known) -> Ints:
     """Masks that cover two instances: two clusters explain disjoint parts of them.
 
     A cluster that has no region in a view, but lands on one that belongs to another cluster, may share it. A pixel is
-    explained by a cluster when it scores at least half of what the cluster's regions score in the median. The cluster
-    for which more speaks comes first: landing, mean epipolar weight, and share of the pixels that it alone explains.
+    explained by a cluster when it scores at least half of what the cluster's regions score in the median. Of several
+    such clusters that one shares it which explains most pixels that the region's own cluster does not.
 
     Args:
         table: rows of D regions.
-        W: (D, D) symmetric epipolar weights.
         ids: (D,) cluster of each region in [0, K).
         costs: thresholds, and costs of views that do not show a cluster.
         known: what is found about clusters is added.
 
     Returns:
-        (D,) the ids, changed for merged masks whose second cluster comes first; (M, 3) int64 region, first and second
-        cluster.
+        (M, 3) int64: region, its cluster, the other one.
     """
     bounds, views = view_bounds(table), table.view_index
     landing, own = known_landings(table, ids, costs, known), own_scores(table, ids, costs)
     clusters = members_of(ids, len(landing))
     usual = np.array([np.median(own[members]) for members in clusters])
     is_real = np.array([len(np.unique(views[members])) >= max(2, costs.few * table.num_views) for members in clusters])
-    changed, found = ids.copy(), []
+    found: list[tuple[int, int, int]] = []
     for view in np.unique(views).tolist():
         regions, pixels, _ = bounds.of(view)
         here = np.arange(regions.start, regions.stop)
@@ -291,21 +293,14 @@ def merged_regions(table: RowTable, W: Floats, ids: Ints, costs: Costs, known: K
         column[asked] = np.arange(len(asked))
         scores = pixel_scores(table, np.where(views == view, len(asked), column[ids]), view, bounds, costs)
         is_explained = scores >= 0.5 * usual[asked]
-        num_others = np.maximum(np.bincount(ids[views != view], minlength=len(clusters)), 1)
         for region in shared.tolist():
             pair = np.append(ids[region], np.flatnonzero(is_second[:, region - regions.start]))
             part = is_explained[table.pixel_region[pixels] == region][:, column[pair]]
-            first_only, only = (part[:, :1] & ~part).mean(0), (part & ~part[:, :1]).mean(0)
-            weight = np.bincount(ids[views != view], W[region][views != view], len(clusters)) / num_others
-            speaks = landing[pair, region] + weight[pair]
-            margin = (speaks + only - first_only - speaks[0])[1:]
-            best = 1 + int(margin.argmax())
-            second, share = pair[best], only[best]
-            if margin[best - 1] > costs.merged_swap:
-                changed[region], second, share = pair[best], pair[0], first_only[best]
-            if share >= costs.merged_share:
-                found.append((region, changed[region], second))
-    return changed, np.array(found, np.int64).reshape(-1, 3)
+            share = (part & ~part[:, :1]).mean(0)
+            best = int(share.argmax())
+            if share[best] >= costs.merged_share:
+                found.append((region, int(pair[0]), int(pair[best])))
+    return np.array(found, np.int64).reshape(-1, 3)
 
 
 def partition_value(table: RowTable, evidence: Floats, ids: Ints, costs: Costs) -> float:

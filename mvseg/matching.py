@@ -66,7 +66,8 @@ def match_regions(
         at one place, which are skipped, and of a scene without regions.
 
     Raises:
-        InputError: fewer than two views, or regions and cameras of different numbers of views.
+        InputError: fewer than two views, regions and cameras of different numbers of views, or a region that is not
+            inside the image of its camera.
     """
     config = config or MatchConfig()
     if len(cameras) != regions.num_views:
@@ -74,6 +75,7 @@ def match_regions(
     if len(cameras) < 2:
         raise InputError("matching needs at least two views, got a single one")
     cameras = cameras.to(regions.device)
+    _check_sizes(regions, cameras)
     _warn_of_gaps(regions, cameras)
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
     method = choose_method(config)
@@ -102,7 +104,8 @@ def match_regions(
             progress=progress,
         ).instance_ids
         scores = mean_affinity(affinity, ids, regions)
-    return Matching(ids, scores, int(ids.max()) + 1 if len(ids) else 0, method)
+    merged = torch.zeros(0, 3, dtype=torch.int64, device=ids.device)
+    return Matching(ids, scores, int(ids.max()) + 1 if len(ids) else 0, method, merged=merged)
 
 
 def choose_method(config: MatchConfig) -> str:
@@ -117,6 +120,19 @@ def mean_affinity(affinity: Affinity, instance_ids: Tensor, regions: Regions) ->
     same = (instance_ids[:, None] == instance_ids) & (instance_ids >= 0)
     partners = same & (regions.view_index[:, None] != regions.view_index)
     return (affinity.to_dense() * partners).sum(1) / partners.sum(1).clamp(min=1)
+
+
+def _check_sizes(regions: Regions, cameras: Cameras) -> None:
+    sizes = cameras.sizes[regions.view_index]
+    outside = ((regions.boxes[:, :2] < 0) | (regions.boxes[:, 2:] > sizes)).any(1).nonzero()[:, 0]
+    if len(outside):
+        region = int(outside[0])
+        view, box = int(regions.view_index[region]), regions.boxes[region].tolist()
+        width, height = cameras.sizes[view].tolist()
+        raise InputError(
+            f"region {region} of view {view} has the box {box}, expected one inside the {width} x {height} pixels of "
+            "its camera: are the masks of another size than the photos?"
+        )
 
 
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:

@@ -127,7 +127,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         _check_cameras(cameras, sizes)
         with torch.no_grad():
             found = [self._propose(image) for image in images]
-        # Under autocast the heads may work in half precision; counts of pixels may not.
+        # Counts of pixels need single precision, too.
         with torch.no_grad(), torch.autocast(images[0].device.type, enabled=False):
             proposals = gather_proposals(found, sizes)
             keep, matching = self._match(proposals, cameras.to(images[0].device))
@@ -135,7 +135,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
     @torch.no_grad()
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> tuple[Proposals, Matching]:
-        """As `forward` with cameras, for large scenes: one image in memory at a time, masks as crops.
+        """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time, masks as crops.
 
         Args:
             images: V tensors (3, H, W) in [0, 1] on the detector's device, e.g. from a generator.
@@ -152,8 +152,9 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             found.append({key: value.cpu() for key, value in self._propose(image).items()})
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
-        proposals = gather_proposals(found, sizes)
-        keep, matching = self._match(proposals, cameras.to("cpu"))
+        with torch.autocast("cpu", enabled=False):
+            proposals = gather_proposals(found, sizes)
+            keep, matching = self._match(proposals, cameras.to("cpu"))
         order = proposals.regions.view_index[keep].argsort(stable=True)
         kept = proposals.select(keep[order])
         ids, scores, merged = matching.instance_ids[order], matching.match_scores[order], matching.merged.clone()
@@ -180,13 +181,15 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         features = self.backbone(resized.tensors)
         if isinstance(features, Tensor):
             features = OrderedDict([("0", features)])
-        boxes, _ = self.rpn(resized, features)
         lenient = copy.copy(self.roi_heads)  # shares the weights; the detector's own thresholds stay as they are
         lenient.nms_thresh, lenient.detections_per_img = self.proposal_iou, self.proposals_per_view
-        (found,), _ = lenient(features, boxes, resized.image_sizes)
+        # Under autocast the backbone may work in half precision; the coordinates of boxes may not.
+        with torch.autocast(image.device.type, enabled=False):
+            features = OrderedDict((level, map_.float()) for level, map_ in features.items())
+            boxes, _ = self.rpn(resized, features)
+            (found,), _ = lenient(features, boxes, resized.image_sizes)
         height, width = resized.image_sizes[0]
-        exact = {key: found[key].float() for key in ("boxes", "scores", "masks")}
-        found = decide_masks(found | exact)
+        found = decide_masks(found)
         good = found["scores"] >= self.roi_heads.score_thresh
         return {key: value[good] for key, value in found.items()} | {"frame": torch.tensor([width, height])}
 

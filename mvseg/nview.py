@@ -70,8 +70,8 @@ class NViewMatching:
         instance_ids: (D,) int64 in [0, K), clusters numbered by their first region; -1 = matched to nothing.
         match_scores: (D,) float32 in [0, 1], the chance that the id is right; 0 for -1.
         support: (K,) int64, in how many views each instance has a region whose match score is at least 0.5.
-        merged: (M, 3) int64, masks that seem to cover two instances: region, its instance, the second one. The region
-            has the id of the first; `hypotheses.merged_regions` says how they are found.
+        merged: (M, 3) int64, masks that seem to cover two instances: region, its instance, the other one;
+            `hypotheses.merged_regions` says how they are found.
         explained: mean score of the matched regions in their clusters, 1 = every pixel is seen in all other views.
         residual_px: reprojection error that the label maps were widened by, pixels.
         method: "nview", or "one-per-view" where the rows do not explain the regions (poses too far off, two views).
@@ -105,14 +105,12 @@ def match_nview(regions: Regions, cameras: Cameras, affinity: Affinity, *, costs
     pairwise = one_per_view_clusters(affinity, regions.view_index, len(cameras))[order].cpu().numpy()
     costs = view_costs(len(cameras), costs or Costs())
     table, residual_px = _table_of_poses(ordered, cameras, pairwise, costs)
-    known = nothing_known()
-    ids = search(table, W, costs, dense_ids(_alone_apart(pairwise)), known)
+    known, apart = nothing_known(), dense_ids(_alone_apart(pairwise))
+    ids = search(table, W, costs, apart, known) if len(cameras) > 2 else apart
     method, explained = "nview", _explained(table, ids, costs)
     if explained < UNEXPLAINED or len(cameras) == 2:
-        ids, method = dense_ids(_alone_apart(pairwise)), "one-per-view"
-        explained = _explained(table, ids, costs)
-    ids, found = merged_regions(table, W, ids, costs, known)
-    merged = torch.from_numpy(found)
+        ids, method, explained = apart, "one-per-view", _explained(table, apart, costs)
+    merged = torch.from_numpy(merged_regions(table, ids, costs, known))
     scores = torch.from_numpy(match_scores(support(table, W, ids, costs, known))).float()
     back = order.argsort().cpu()
     final = renumber(drop_singletons(ids)[back])
@@ -198,7 +196,7 @@ def search(table: RowTable, W: Floats, costs: Costs, pairwise: Ints, known: Know
         found.append(refine(table, W, ids, costs, join_pieces=True, known=known))
     values = [partition_value(table, evidence, ids, costs) for ids in (pairwise, *found)]
     best = pairwise
-    if values[0] < AS_GOOD * max(values):
+    if max(values) - values[0] > (1 - AS_GOOD) * abs(max(values)):
         best = found[int(np.argmax(values[1:]))]
         best = join_alone(W, table.view_index, table.num_views, best, SECOND_CHANCE)
     return join_few(table, W, best, costs, known)

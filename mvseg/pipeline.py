@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import platform
 import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,7 @@ from tqdm import tqdm
 import mvseg
 from mvseg.config import DetectConfig, MatchConfig, ReconstructConfig
 from mvseg.detectors.zoo import find_weights, load_detector
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.folder import load_masks, load_scene
 from mvseg.formats.photos import check_photos, read_photo
 from mvseg.matching import Matching, match_regions
@@ -91,7 +92,11 @@ def detect_regions(
     model = MultiViewMaskRCNN(detector, num_iterations=detect.num_iterations, match=match).to(device)
     views = tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress)
     photos = (torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1).float() / 255 for view in views)
-    return model.find_regions(photos, scene.cameras)
+    found, matching = model.find_regions(photos, scene.cameras)
+    if not len(found.regions):
+        nothing = f"the detector finds nothing that scores {detect.min_score:g} or more"
+        warnings.warn(nothing, InputWarning, stacklevel=3)
+    return found, matching
 
 
 @contextmanager
@@ -101,7 +106,7 @@ def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
     seconds[stage] = time.perf_counter() - start
 
 
-def describe_run(result: Result, masks: Path | None, config: dict[str, Any], warnings: list[str]) -> dict[str, Any]:
+def describe_run(result: Result, masks: Path | None, config: dict[str, Any], remarks: list[str]) -> dict[str, Any]:
     """What run.json says of where a result comes from: version, inputs with their SHA-256, config, warnings.
 
     `masks` is None for a result of a detector, whose weights `config["detect"]` names.
@@ -117,7 +122,7 @@ def describe_run(result: Result, masks: Path | None, config: dict[str, Any], war
         "scene": result.scene.name,
         "inputs": inputs,
         "config": config,
-        "warnings": warnings,
+        "warnings": remarks,
     }
 
 

@@ -105,7 +105,7 @@ def reconstruct_instances(
     for instance in tqdm(instances, desc="back-projection", unit="instance", disable=not progress):
         members = regions.select(instance_ids == instance)
         grid = back_project(members, cameras, config, free)
-        if grid is not None:
+        if grid is not None and grid.occupied.any():
             shapes[instance] = grid
         elif len(members.view_index.unique()) > 1:
             message = f"instance {instance + 1} has no shape: its {len(members)} masks have no point in common"

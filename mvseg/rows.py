@@ -71,7 +71,7 @@ def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1) -> RowTa
     """
     maps = [_padded_labels(regions, view, cameras.sizes[view].tolist(), widen_px) for view in range(len(cameras))]
     frames = [_label_box(labels) for labels in maps]
-    xy, region = sample_pixels(regions, round(PIXELS * min(1, PLENTY / len(cameras))))
+    xy, region = sample_pixels(regions, max(1, round(PIXELS * min(1, PLENTY / len(cameras)))))
     pixels = [torch.zeros(0, dtype=torch.int64)]
     labels = [torch.zeros(0, len(cameras), dtype=maps[0].dtype)]
     inverse = [torch.zeros(0)]
@@ -262,7 +262,7 @@ def em_affinities(table: RowTable) -> list[NDArray[np.floating]]:
         After each iteration (D, D) float64 in [0, 1], symmetric, 0 for regions of one view.
     """
     num, owner_of = len(table.view_index), table.pixel_region
-    most = round(EM_PIXELS * min(1, PLENTY / table.num_views))
+    most = max(1, round(EM_PIXELS * min(1, PLENTY / table.num_views)))
     counts = np.bincount(owner_of, minlength=num)
     rank = np.arange(len(owner_of)) - np.searchsorted(owner_of, owner_of)
     is_used = rank % np.maximum(1, -(-counts // most))[owner_of] == 0

@@ -19,6 +19,7 @@ import trimesh
 
 import mvseg
 from mvseg.cli import DEMO_SCENE, main
+from mvseg.config import DetectConfig
 from mvseg.formats.label_png import read_label_png
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
@@ -102,7 +103,7 @@ def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     out = tmp_path / "out"
     assert main(["infer", "--quiet", "--out", str(out)]) == 0
     found = json.loads((out / "instances.json").read_text())["annotations"]
-    assert all(0.5 <= one["score"] <= 1 and "source_label" not in one for one in found)
+    assert all(DetectConfig().min_score <= one["score"] <= 1 and "source_label" not in one for one in found)
     run = json.loads((out / "run.json").read_text())
     assert run["config"]["masks"] is None
     assert run["config"]["detect"]["weights"] == "leaf-slim"

@@ -92,6 +92,14 @@ def test_a_single_view_is_refused() -> None:
         match_regions(scene.regions, scene.cameras[:2])
 
 
+@pytest.mark.parametrize("method", ["nview", "one-per-view", "symnmf"])
+def test_masks_larger_than_the_photos_are_refused(method: str) -> None:
+    scene = ball_scene(3, 3)
+    maps = [labels.repeat(2, 0).repeat(2, 1) if view == 1 else labels for view, labels in enumerate(scene.label_maps)]
+    with pytest.raises(InputError, match=r"region \d of view 1 has the box .* inside the 320 x 240 pixels"):
+        match_regions(regions_from_label_maps(maps), scene.cameras, MatchConfig(method=method))
+
+
 def test_empty_masks_are_data() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [0.0, 10, 0]]))
     nothing = regions_from_label_maps([torch.zeros(240, 320).numpy().astype(int)] * 2)

@@ -8,6 +8,7 @@ from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.ops import box_iou
 
 from mvseg.errors import InputError
+from mvseg.expected_iou import decide_masks
 from mvseg.multiview import MultiViewMaskRCNN, Proposals, gather_proposals, match_proposals
 from mvseg.nms import cluster_aware_nms
 from mvseg.regions import regions_from_label_maps
@@ -115,6 +116,39 @@ def test_the_detectors_own_thresholds_stay_as_they_were() -> None:
     before = (detector.roi_heads.nms_thresh, detector.roi_heads.detections_per_img)
     MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
     assert (detector.roi_heads.nms_thresh, detector.roi_heads.detections_per_img) == before
+
+
+def test_masks_and_scores_are_decided_and_low_scores_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def watch(found: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        seen.append(found)
+        return decide_masks(found)
+
+    monkeypatch.setattr("mvseg.multiview.decide_masks", watch)
+    detector = tiny_detector()
+    detector.roi_heads.score_thresh = 0.16
+    proposals, _ = MultiViewMaskRCNN(detector, num_iterations=0).find_regions(some_images(), small_cameras())
+    decided = [decide_masks(found)["scores"] for found in seen]
+    assert sum(int((scores < 0.16).sum()) for scores in decided) > 0
+    allowed = torch.cat([scores[scores >= 0.16] for scores in decided])
+    assert len(proposals.scores) > 0
+    assert torch.isin(proposals.scores, allowed).all()
+
+
+def test_boxes_that_the_other_views_do_not_confirm_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(), small_cameras()
+    before, _ = wrapped.find_regions(images, cameras)
+
+    def refuse_first(boxes: torch.Tensor, *others: torch.Tensor, iou_threshold: float) -> torch.Tensor:
+        return torch.arange(len(boxes)) > 0
+
+    monkeypatch.setattr("mvseg.multiview.confirmed", refuse_first)
+    after, matching = wrapped.find_regions(images, cameras)
+    monkeypatch.setattr("mvseg.multiview.confirmed", lambda boxes, *others, iou_threshold: torch.ones(len(boxes)) > 0)
+    unasked, _ = wrapped.find_regions(images, cameras)
+    assert len(after.scores) == len(unasked.scores) - 1 == len(matching.instance_ids)
+    assert len(before.scores) <= len(unasked.scores)
 
 
 def test_wrong_arguments_are_named() -> None:
@@ -233,8 +267,12 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
     wrapped = MultiViewMaskRCNN(tiny_detector())
     with torch.autocast("cpu", torch.bfloat16):
         found = wrapped(some_images(), cameras=small_cameras())
+        proposals, matching = wrapped.find_regions(some_images(), small_cameras())
     assert found[0]["match_scores"].dtype == torch.float32
     assert max(int(one["instance_ids"].max()) for one in found) >= 0
+    assert torch.equal(matching.match_scores, torch.cat([one["match_scores"] for one in found]))
+    boxes = proposals.boxes[proposals.boxes > 16]
+    assert not torch.equal(boxes, boxes.bfloat16().float())
 
 
 def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:

@@ -24,7 +24,7 @@ from benchmarks.paper_tables.methods import METHODS, PRINTED  # noqa: E402
 from benchmarks.paper_tables.number_of_leaves import DEFAULT, RULES, score_numbers  # noqa: E402
 from benchmarks.paper_tables.shape_error import measure_points, measure_shares, unite  # noqa: E402
 from benchmarks.paper_tables.workers import start_process  # noqa: E402
-from mvseg.config import MatchConfig  # noqa: E402
+from mvseg.config import DetectConfig, MatchConfig  # noqa: E402
 from mvseg.matching import match_regions  # noqa: E402
 from mvseg.metrics import matching_metrics, shape_distance  # noqa: E402
 from mvseg.regions import regions_from_label_maps  # noqa: E402
@@ -176,7 +176,7 @@ def test_a_perfect_detector_gives_the_true_masks(cell: Cell, monkeypatch: pytest
         assert photo.shape == (3, *labels.shape)
         masks = [(labels == leaf).float() for leaf in labels.unique().tolist() if leaf]
         unsure = torch.ones_like(masks[0])
-        return {"scores": torch.tensor([0.9] * len(masks) + [0.4])}, [*masks, unsure]
+        return {"scores": torch.tensor([0.9] * len(masks) + [DetectConfig().min_score - 0.01])}, [*masks, unsure]
 
     monkeypatch.setattr("mvseg.average_precision.detect", detect)
     monkeypatch.setattr("mvseg.detectors.zoo.load_detector", lambda name: name)

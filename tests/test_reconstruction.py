@@ -215,6 +215,12 @@ def test_an_empty_grid_has_an_empty_mesh() -> None:
     assert len(grid.mesh().vertices) == 0
 
 
+def test_an_instance_without_a_voxel_is_left_out_and_warned_of() -> None:
+    regions, cameras = ball_from(AXES)
+    with pytest.warns(InputWarning, match="instance 1 has no shape"):
+        assert reconstruct_instances(regions, regions.labels - 1, cameras, ReconstructConfig(voxel_size=8.0)) == {}
+
+
 @pytest.mark.parametrize(
     ("config", "message"),
     [

@@ -118,6 +118,37 @@ def test_an_unfinished_run_cannot_be_packed(tmp_path: Path) -> None:
     assert not (tmp_path / "zoo").exists()
 
 
+def test_a_run_that_cannot_be_packed_is_named(run: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="image_size is -5"):
+        pack_detector(run, tmp_path / "zoo", -5)
+    with pytest.raises(InputError, match=r"metrics\.json: cannot be made"):
+        pack_detector(run, run / "metrics.json")
+    (run / "metrics.json").write_text("{}")
+    with pytest.raises(InputError, match="has no 'best'"):
+        pack_detector(run, tmp_path / "zoo")
+    assert not (tmp_path / "zoo").exists()
+
+
+def test_damaged_neighbours_do_not_keep_a_detector_from_loading(
+    packed: Path, run: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pack_detector(run, packed.parent / "unmeasured")
+    (packed.parent / "unmeasured" / "metrics.json").write_text('{"validation": {"mask_AP": null}}')
+    (packed.parent / "unmeasured" / zoo.WEIGHTS).unlink()
+    assert main(["models"]) == 0
+    assert "unmeasured      weights missing, not measured" in capsys.readouterr().out
+    (packed.parent / "unmeasured" / "metrics.json").unlink()
+    assert load_detector("leaf-test") is not None
+    assert main(["models"]) == 2
+    assert "is no complete detector" in capsys.readouterr().err
+
+
+def test_loading_leaves_the_random_generator_alone(packed: Path) -> None:
+    before = torch.get_rng_state()
+    load_detector("leaf-test")
+    assert torch.equal(torch.get_rng_state(), before)
+
+
 def test_training_starts_from_a_shipped_detector(packed: Path, tmp_path: Path) -> None:
     photos, labels = write_photos(tmp_path / "data", 2)
     config = TrainConfig(photos, labels, tmp_path / "out", arch="mobilenet_v3_large_fpn", weights="leaf-test")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import hashlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
@@ -12,6 +14,7 @@ from benchmarks.paper_tables.masks import Masks, degraded_masks, detected_masks,
 from benchmarks.paper_tables.methods import METHODS, score_method
 from benchmarks.paper_tables.number_of_leaves import score_numbers
 from benchmarks.paper_tables.shapes import SHAPES, measure_shape
+from mvseg.detectors.zoo import find_weights
 from mvseg.simulation.dataset import SceneSpec
 
 TABLES = ("1", "2", "3", "k")
@@ -51,6 +54,11 @@ class Plan:
         """Folder of the records of simulated scenes: <table>/<kind of masks>/<method>/<cell>.json."""
         return self.cache / "records" / self.preset
 
+    def match_records(self, kind: str) -> Path:
+        """Folder of the records of matching, by method; the weights of a detector are told apart by their hash."""
+        weights = f"-{hash_detector(self.detector)}" if self.detector and kind.startswith("detected") else ""
+        return self.records / "match" / f"{slug(kind)}{weights}"
+
 
 def run_simulated(spec: SceneSpec, plan: Plan) -> None:
     """Make the records of one simulated scene that are not there yet."""
@@ -81,7 +89,7 @@ def list_records(spec: SceneSpec, plan: Plan) -> Iterator[tuple[Path, Maker]]:
     if "1" in plan.tables:
         for kind in plan.kinds:
             for method in plan.methods:
-                path = plan.records / "match" / slug(kind) / slug(method) / file
+                path = plan.match_records(kind) / slug(method) / file
                 yield path, lambda cell, masks, k=kind, m=method: score_method(cell, masks(k), m, plan.cache)
     if "k" in plan.tables:
         for kind in ("true", "degraded"):
@@ -132,6 +140,13 @@ def remember(make: Callable[[str], Masks]) -> Callable[[str], Masks]:
         return made[kind]
 
     return once
+
+
+@functools.cache
+def hash_detector(detector: str) -> str:
+    """First digits of the SHA-256 of a detector's weights; of nothing where there is no such file."""
+    path = find_weights(detector) or Path(detector)
+    return hashlib.sha256(path.read_bytes() if path.is_file() else b"").hexdigest()[:8]
 
 
 def slug(name: str) -> str:

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor
 
 from benchmarks.paper_tables.cells import Cell
+from mvseg.config import DetectConfig
 from mvseg.formats.folder import load_masks
 from mvseg.formats.photos import load_photos
 from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps, stack_regions
 from mvseg.simulation.degrade import Faults, degrade_labels
 
-MIN_SCORE = 0.3  # of a detection, the default of `infer.py`
 MIN_PIXELS = 30  # of a detected mask; true and degraded masks have as many
 MIN_IOU = 0.5  # with a true mask, for a detection to count as that leaf
 
@@ -61,7 +61,7 @@ def detected_masks(cell: Cell, detector: str) -> Masks:
             found, pasted = detect(model, photo)
             for score, soft in zip(found["scores"].tolist(), pasted, strict=True):
                 mask = soft > 0.5
-                if score < MIN_SCORE or int(mask.sum()) < MIN_PIXELS:
+                if score < DetectConfig.min_score or int(mask.sum()) < MIN_PIXELS:
                     continue
                 rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
                 x1, y1, x2, y2 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1

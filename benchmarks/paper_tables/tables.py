@@ -37,7 +37,7 @@ def printed_cells(values: Sequence[float | None], plan: Plan, decimals: int) -> 
 def read_matches(plan: Plan, kind: str) -> dict[str, list[Record]]:
     """{method: records} of table 1, for one kind of masks."""
     specs = list_cells(PRESETS[plan.preset])
-    found = {m: read_records(plan.records / "match" / slug(kind) / slug(m), specs) for m in plan.methods}
+    found = {m: read_records(plan.match_records(kind) / slug(m), specs) for m in plan.methods}
     return {method: records for method, records in found.items() if records}
 
 

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import safetensors.torch
+import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
@@ -50,14 +51,25 @@ class ZooEntry:
 
 
 def list_detectors() -> tuple[ZooEntry, ...]:
-    """The shipped detectors, sorted by name; the hash is read here and checked by `find_weights`."""
-    folders = {path.parent.name: path.parent for home in reversed(HOMES) for path in home.glob(f"*/{HASH}")}
+    """The shipped detectors, sorted by name; the hash is read here and checked by `find_weights`.
+
+    Raises:
+        InputError: a folder lacks its metrics, or its hash cannot be read.
+    """
+    folders = _list_folders()
     return tuple(_read_entry(folders[name]) for name in sorted(folders))
 
 
+def _list_folders() -> dict[str, Path]:
+    return {path.parent.name: path.parent for home in reversed(HOMES) for path in home.glob(f"*/{HASH}")}
+
+
 def _read_entry(folder: Path) -> ZooEntry:
-    stated = (folder / HASH).read_text(encoding="utf-8").split()[0]
-    metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    try:
+        stated = (folder / HASH).read_text(encoding="utf-8").split()[0]
+        metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError, IndexError) as error:
+        raise InputError(f"{folder} is no complete detector ({type(error).__name__}: {error})") from error
     return ZooEntry(folder.name, folder / WEIGHTS, stated, metrics)
 
 
@@ -67,9 +79,10 @@ def find_weights(name: str) -> Path | None:
     Raises:
         InputError: the file is missing, or its SHA-256 is not the one stated beside it.
     """
-    entry = next((entry for entry in list_detectors() if entry.name == name), None)
-    if entry is None:
+    folder = _list_folders().get(name)
+    if folder is None:
         return None
+    entry = _read_entry(folder)
     if not entry.weights.is_file():
         raise InputError(f"{entry.weights}: the weights of '{name}' are missing, expected a complete installation")
     found = hashlib.sha256(entry.weights.read_bytes()).hexdigest()
@@ -93,10 +106,11 @@ def load_detector(weights: str | Path, *, image_size: int | None = None) -> Mask
     """
     path = find_weights(str(weights)) or Path(weights)
     if not path.is_file():
-        names = ", ".join(entry.name for entry in list_detectors()) or "none"
+        names = ", ".join(sorted(_list_folders())) or "none"
         raise InputError(f"'{weights}' is neither a shipped detector ({names}) nor a file of weights")
     arch, categories = read_description(path)
-    detector = build_detector(arch, len(categories) + 1, str(path), image_size=image_size)
+    with torch.random.fork_rng(devices=[]):  # random weights are drawn before the file's take their place
+        detector = build_detector(arch, len(categories) + 1, str(path), image_size=image_size)
     if image_size is None:
         detector.transform = _ShrinkOnly.like(detector.transform)
     return detector.eval()
@@ -137,8 +151,10 @@ def pack_detector(run: Path, folder: Path, image_size: int | None = None) -> Non
         image_size: longer side, in pixels, that photos are scaled to from now on; None for that of the training.
 
     Raises:
-        InputError: the run has no weights, metrics or config yet.
+        InputError: the run has no weights, metrics or config yet, or the folder cannot be written.
     """
+    if image_size is not None and image_size < 32:
+        raise InputError(f"image_size is {image_size}, expected at least 32")
     for name in ("model.safetensors", "metrics.json", "config.yaml"):
         if not (run / name).is_file():
             raise InputError(f"{run / name}: is missing, expected the output of a training run")
@@ -146,8 +162,14 @@ def pack_detector(run: Path, folder: Path, image_size: int | None = None) -> Non
     metadata = dict(described)
     halves = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
     content = safetensors.torch.save(halves, metadata | ({"image_size": str(image_size)} if image_size else {}))
-    best = json.loads((run / "metrics.json").read_text(encoding="utf-8"))["best"]
-    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        best = json.loads((run / "metrics.json").read_text(encoding="utf-8"))["best"]
+    except (ValueError, KeyError) as error:
+        raise InputError(f"{run / 'metrics.json'}: has no 'best', expected the file of a training run") from error
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot be made ({error.strerror}), expected a folder") from error
     (folder / WEIGHTS).write_bytes(content)
     (folder / "metrics.json").write_text(json.dumps({"validation": best}, indent=1) + "\n", encoding="utf-8")
     shutil.copyfile(run / "config.yaml", folder / "train.yaml")
