@@ -100,8 +100,7 @@ def annotate(found: Proposals, sizes: list[list[int]], first_image: int) -> list
 
 def run_loop(scene: Scene, photos: list[torch.Tensor], args: argparse.Namespace, row: str) -> tuple[Proposals, Any]:
     """One row of the table: "plain 0.5" is NMS without clusters, a number is that many iterations."""
-    detector = load_detector(args.weights, image_size=args.image_size)
-    detector.roi_heads.score_thresh = args.min_score
+    detector = load_detector(args.weights, image_size=args.image_size, min_score=args.min_score)
     plain = row.startswith("plain")
     model = MultiViewMaskRCNN(
         detector, num_iterations=0 if plain else int(row), cluster_iou=float(row.split()[1]) if plain else 0.3

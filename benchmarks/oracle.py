@@ -1,6 +1,6 @@
 """Where is the limit of the N-view matcher? `python benchmarks/oracle.py --cache DIR [--leaves 16 32]`
 
-On development plants (the scenes of benchmarks/matching.py): the answer found; the one that much more search finds,
+On development plants (like those of benchmarks/matching.py): the answer found; the one that much more search finds,
 from eight starts and by set packing (the best disjoint ones of all clusters ever seen, by an integer programme); the
 one refined from the true ids; and the true ids themselves. Each with its ARI and with what the matcher thinks that it
 is worth. As long as the truth is worth less than what is found, more search cannot help; only another objective can.

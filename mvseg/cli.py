@@ -23,7 +23,7 @@ from mvseg.training_config import TrainConfig
 
 DEMO_SCENE = Path(str(files("mvseg") / "demo_plant"))
 DEFAULT_OUT = Path("results")
-BAD_INPUT = 2
+BAD_INPUT, INTERRUPTED = 2, 130
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
 
 
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: words after the program's name; None for those of the process.
 
     Returns:
-        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input.
+        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 130 after Ctrl-C.
     """
     # Idle threads shall sleep: on a shared machine spinning ones make small tensor work ten times slower. Must be set
     # before torch is loaded, which the verbs do when they start.
@@ -52,6 +52,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
+    except OSError as error:  # a full disk, a folder that cannot be made
+        return _complain(error)
+    except KeyboardInterrupt:
+        print("mvseg: interrupted", file=sys.stderr)
+        return INTERRUPTED
 
 
 def build_parser() -> ArgumentParser:
@@ -82,7 +87,7 @@ def build_parser() -> ArgumentParser:
     verbs.add_subcommand("train", train, help="fine-tune a Mask R-CNN")
 
     simulate = ArgumentParser(exit_on_error=False, description="Render plants with known answers.")
-    simulate.add_argument("preset", help="paper-eval or train")
+    simulate.add_argument("preset", help="paper-eval (144 scenes of 3 to 20 photos) or train (768 of 9 photos)")
     simulate.add_argument("--out", type=Path, required=True, help="folder for the scenes; finished ones are kept")
     simulate.add_argument("--seed", type=int, default=0)
     simulate.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")
@@ -137,6 +142,7 @@ def _run(scene: Path, masks: Path | None, out: Path, args: Namespace, reconstruc
     from mvseg.result import check_out, save_result
 
     check_out(out)
+    replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
     masks = None if masks is None else _find_masks(scene, masks)
     detect = DetectConfig(**vars(args.detect)) if masks is None else None
     ignored = masks is not None and "detect" in args and DetectConfig(**vars(args.detect)) != DetectConfig()
@@ -156,7 +162,7 @@ def _run(scene: Path, masks: Path | None, out: Path, args: Namespace, reconstruc
     config |= {name: dataclasses.asdict(stage) for name, stage in stages.items() if stage is not None}
     save_result(result, out, describe_run(result, masks, config, remarks), progress=not args.quiet)
     num_masks, num_views = len(result.regions), len(result.scene.views)
-    print(f"{out}: {result.matching.num_instances} instances from {num_masks} masks in {num_views} views")
+    print(f"{out}: {result.matching.num_instances} instances from {num_masks} masks in {num_views} views{replaces}")
 
 
 def _find_masks(scene: Path, masks: Path) -> Path:
@@ -176,6 +182,9 @@ def _eval(args: Namespace) -> int:
     judged = (true != 0) & (true != IGNORE_LABEL)
     metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[judged], true[judged]))
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
+    if metrics["no_instance"]:
+        remark = f"{metrics['no_instance']} of {len(ids)} masks show no leaf of the truth: they are not judged"
+        print(f"mvseg: warning: {remark}", file=sys.stderr)
     for name, value in metrics.items():
         print(f"{name:15} {value:.4f}" if isinstance(value, float) else f"{name:15} {value}")
     try:
@@ -214,13 +223,17 @@ def _models(args: Namespace) -> int:
 
 
 def _simulate(args: Namespace) -> int:
-    from mvseg.simulation.dataset import write_dataset
-
+    try:
+        from mvseg.simulation.dataset import write_dataset
+    except ModuleNotFoundError as error:
+        raise InputError(f"simulate needs {error.name}: pip install 'mvseg[simulate]'") from error
     write_dataset(args.preset, args.out, seed=args.seed, num_workers=args.num_workers)
     return 0
 
 
 def _complain(error: Exception) -> int:
+    if isinstance(error, OSError) and error.filename:
+        error = InputError(f"{error.filename}: {error.strerror}")
     print(f"mvseg: error: {' '.join(str(error).split())}", file=sys.stderr)
     return BAD_INPUT
 

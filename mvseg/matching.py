@@ -63,7 +63,7 @@ def match_regions(
 
     Returns:
         The matching, on the device of the regions. Without regions it is empty. Warns (InputWarning) of pairs of views
-        at one place, which are skipped, and of a scene without regions.
+        at one place, which are skipped, of a scene without regions, and of one whose views agree on little.
 
     Raises:
         InputError: fewer than two views, regions and cameras of different numbers of views, or a region that is not
@@ -81,6 +81,12 @@ def match_regions(
     method = choose_method(config)
     if method == "nview":
         found = match_nview(regions, cameras, affinity)
+        if found.method != "nview" and len(cameras) > 2 and len(regions):
+            message = (
+                f"the views agree on little (rays explain {found.explained:.0%} of the masks, which 'one-per-view' then "
+                "matched): do R and t take world points to the camera, and are the masks those of their photos?"
+            )
+            warnings.warn(message, InputWarning, stacklevel=2)
         return Matching(
             found.instance_ids,
             found.match_scores,

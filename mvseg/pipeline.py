@@ -86,8 +86,7 @@ def detect_regions(
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
     """
-    detector = load_detector(detect.weights, image_size=detect.image_size)
-    detector.roi_heads.score_thresh = detect.min_score
+    detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(detector, num_iterations=detect.num_iterations, match=match).to(device)
     views = tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress)

@@ -146,6 +146,7 @@ def run_epochs(run: Run, state: TrainingState) -> None:
             close_epoch(run, state, board)
     if board is not None:
         board.close()
+    logger.info("finished; %s holds epoch %d", run.config.output / "model.safetensors", best_epoch(state.history) + 1)
 
 
 def train_epoch(

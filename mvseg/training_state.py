@@ -58,7 +58,9 @@ def start_state(
     """
     checkpoint = config.output / "checkpoint.pt"
     if checkpoint.is_file() and not config.resume:
-        raise InputError(f"{config.output} holds the checkpoint of an earlier run, set resume or choose another output")
+        raise InputError(
+            f"{config.output} holds the checkpoint of an earlier run, expected --resume true or another output"
+        )
     torch.manual_seed(config.seed)
     if model is None:
         weights = config.weights and str(find_weights(config.weights) or config.weights)

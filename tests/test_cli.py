@@ -20,7 +20,7 @@ import trimesh
 import mvseg
 from mvseg.cli import DEMO_SCENE, main
 from mvseg.config import DetectConfig
-from mvseg.formats.label_png import read_label_png
+from mvseg.formats.label_png import read_label_png, write_label_png
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent
@@ -518,3 +518,83 @@ def test_options_out_of_range(plant: Path, tmp_path: Path, option: str, capsys: 
     assert error.count("\n") == 1
     assert f"match.{name} is" in error
     assert not (tmp_path / "out").exists()
+
+
+# --- What the user is told ------------------------------------------------------------------------
+
+
+def test_an_earlier_result_is_not_replaced_in_silence(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.endswith("in 4 views\n")
+    assert main(arguments) == 0
+    assert capsys.readouterr().out.endswith("in 4 views (in place of an earlier result)\n")
+
+
+def test_masks_that_show_no_true_leaf_are_counted(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out, truth = tmp_path / "out", tmp_path / "truth"
+    assert main(["match", str(plant), "--out", str(out), "--quiet"]) == 0
+    shutil.copytree(plant / "masks", truth)
+    labels = read_label_png(truth / "001.png", WIDTH, HEIGHT)
+    write_label_png(truth / "001.png", np.zeros_like(labels))
+    capsys.readouterr()
+    assert main(["eval", str(out / "plant"), "--truth", str(truth)]) == 0
+    assert "3 of 12 masks show no leaf of the truth" in capsys.readouterr().err
+
+
+def test_detect_options_beside_masks_are_warned_of(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    arguments = ["infer", str(plant), "--masks", "masks", "--detect.min_score", "0.9", "--quiet"]
+    assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
+    assert "the detect options do nothing" in capsys.readouterr().err
+    assert "detect" in json.loads((tmp_path / "out" / "run.json").read_text())["warnings"][0]
+
+
+def test_match_without_masks_is_refused(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["match", str(plant), "--masks", "null", "--out", str(tmp_path / "out")]) == 2
+    assert "masks is null" in complaint(capsys)
+
+
+def test_a_detector_that_finds_nothing_says_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plant = write_scene(tmp_path / "plant", 2)
+    assert main(["infer", str(plant), "--detect.min_score", "1", "--quiet", "--out", str(tmp_path / "out")]) == 0
+    assert "the detector finds nothing that scores 1 or more" in capsys.readouterr().err
+
+
+def test_a_file_in_the_place_of_a_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "file").write_text("")
+    assert main(["simulate", "paper-eval", "--out", str(tmp_path / "file")]) == 2
+    assert complaint(capsys) == f"{tmp_path / 'file'}: File exists"
+    assert main(["infer", str(tmp_path / "file"), "--out", str(tmp_path / "out")]) == 2
+    assert "is a file, expected the scene's folder" in complaint(capsys)
+
+
+def test_simulate_keeps_out_of_folders_with_other_things(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = sorted(plant.rglob("*"))
+    assert main(["simulate", "paper-eval", "--out", str(plant)]) == 2
+    assert "holds files that are no data set" in complaint(capsys)
+    assert sorted(plant.rglob("*")) == before
+
+
+def test_simulate_says_what_it_needs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in [name for name in sys.modules if name.startswith(("embreex", "mvseg.simulation"))]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "embreex", None)
+    assert main(["simulate", "paper-eval", "--out", str(tmp_path / "out")]) == 2
+    assert "pip install 'mvseg[simulate]'" in complaint(capsys)
+
+
+def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    def stop(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("mvseg.cli._run", stop)
+    assert main(["infer", str(plant)]) == 130
+    assert capsys.readouterr().err == "mvseg: interrupted\n"

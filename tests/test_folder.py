@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.coco import encode_mask
 from mvseg.formats.folder import load_masks, load_scene
-from mvseg.formats.label_png import read_label_png
+from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.rig import opencv_lens
 from mvseg.regions import IGNORE_LABEL, Regions
@@ -55,6 +55,16 @@ def test_cameras_json_goes_first_then_transforms(tmp_path: Path) -> None:
     (folder / "cameras.json").unlink()
     scene = load_scene(str(folder))
     assert (len(scene.views), scene.source) == (2, folder / "transforms.json")
+
+
+def test_binary_masks_are_warned_of(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    for path in (folder / "masks").iterdir():
+        labels = read_label_png(path, WIDTH, HEIGHT)
+        write_label_png(path, np.where(labels > 0, 255, 0))
+    with pytest.warns(InputWarning, match="all leaves of a photo have the number 255"):
+        regions = load_masks(load_scene(folder), folder / "masks")
+    assert regions.labels.tolist() == [255] * 4
 
 
 def test_no_folder_and_no_cameras(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.matching import match_regions
 from mvseg.metrics import matching_metrics
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.scene import Scene
+from mvseg.scene import Cameras, Scene
 from synthetic import ball_scene, cameras_at, permute_views, render_balls
 
 
@@ -98,6 +98,14 @@ def test_masks_larger_than_the_photos_are_refused(method: str) -> None:
     maps = [labels.repeat(2, 0).repeat(2, 1) if view == 1 else labels for view, labels in enumerate(scene.label_maps)]
     with pytest.raises(InputError, match=r"region \d of view 1 has the box .* inside the 320 x 240 pixels"):
         match_regions(regions_from_label_maps(maps), scene.cameras, MatchConfig(method=method))
+
+
+def test_views_that_agree_on_nothing_are_warned_of() -> None:
+    scene = ball_scene(6, 4, seed=7, radius=0.1)
+    order = [2, 0, 3, 1]  # every photo has the pose of another
+    cameras = Cameras(scene.cameras.K, scene.cameras.R[order], scene.cameras.t[order], scene.cameras.sizes)
+    with pytest.warns(InputWarning, match="the views agree on little"):
+        assert match_regions(scene.regions, cameras).method == "one-per-view"
 
 
 def test_empty_masks_are_data() -> None:

@@ -206,7 +206,7 @@ def test_broken_samples_stop_the_start_or_are_counted(tmp_path: Path, caplog: py
 
 
 def test_another_run_is_not_overwritten(leaves: Path, finished: Path) -> None:
-    with pytest.raises(InputError, match="holds the checkpoint of an earlier run, set resume"):
+    with pytest.raises(InputError, match="holds the checkpoint of an earlier run, expected --resume true"):
         train(make_config(leaves, finished), build_tiny())
     with pytest.raises(InputError, match=r"made with another lr \(0.02, now 0.5\)"):
         train(make_config(leaves, finished, resume=True, lr=0.5), build_tiny())

@@ -143,6 +143,11 @@ def test_damaged_neighbours_do_not_keep_a_detector_from_loading(
     assert "is no complete detector" in capsys.readouterr().err
 
 
+def test_the_least_score_may_be_given(packed: Path) -> None:
+    assert load_detector("leaf-test").roi_heads.score_thresh == 0.05
+    assert load_detector("leaf-test", min_score=0.4).roi_heads.score_thresh == 0.4
+
+
 def test_loading_leaves_the_random_generator_alone(packed: Path) -> None:
     before = torch.get_rng_state()
     load_detector("leaf-test")

@@ -93,13 +93,16 @@ def find_weights(name: str) -> Path | None:
     return entry.weights
 
 
-def load_detector(weights: str | Path, *, image_size: int | None = None) -> MaskRCNN:
+def load_detector(
+    weights: str | Path, *, image_size: int | None = None, min_score: float | None = None
+) -> MaskRCNN:
     """A trained detector, in eval mode, on the CPU, in float32.
 
     Args:
         weights: the name of a shipped detector (`list_detectors`), or a .safetensors file that a training run wrote.
         image_size: longer side, in pixels, that photos are scaled to. None: larger photos are scaled down to what the
             file says, smaller ones stay as they are.
+        min_score: detections that score less are dropped; `mvseg infer` does so at 0.3. None for torchvision's 0.05.
 
     Raises:
         InputError: neither a name nor a readable file, a wrong hash, or a file that does not say what it holds.
@@ -111,6 +114,8 @@ def load_detector(weights: str | Path, *, image_size: int | None = None) -> Mask
     arch, categories = read_description(path)
     with torch.random.fork_rng(devices=[]):  # random weights are drawn before the file's take their place
         detector = build_detector(arch, len(categories) + 1, str(path), image_size=image_size)
+    if min_score is not None:
+        detector.roi_heads.score_thresh = min_score
     if image_size is None:
         detector.transform = _ShrinkOnly.like(detector.transform)
     return detector.eval()

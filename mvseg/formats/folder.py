@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import numpy as np
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.coco import read_coco
 from mvseg.formats.colmap import is_colmap_model, read_colmap
 from mvseg.formats.label_png import read_label_png
@@ -15,6 +16,8 @@ from mvseg.formats.rig import read_rig
 from mvseg.formats.transforms_json import read_transforms
 from mvseg.regions import Regions, regions_from_label_maps, stack_regions
 from mvseg.scene import Scene
+
+BINARY = 255  # what segmenters write that tell leaf from background only
 
 
 def load_scene(folder: Path | str) -> Scene:
@@ -28,7 +31,8 @@ def load_scene(folder: Path | str) -> Scene:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise InputError(f"{folder}: no such scene folder")
+        found = "is a file, expected the scene's folder" if folder.exists() else "no such scene folder"
+        raise InputError(f"{folder}: {found}")
     if (folder / "cameras.json").is_file():
         return read_rig(folder / "cameras.json")
     for model in (folder / "sparse", folder / "sparse" / "0", folder / "colmap" / "sparse" / "0"):
@@ -47,14 +51,19 @@ def load_masks(scene: Scene, masks: Path | str) -> Regions:
         masks: a folder with one label PNG per view, `<view name>.png` (`IMG_1.jpg`: `IMG_1.png`), or a COCO JSON file.
 
     Returns:
-        Regions in the undistorted frame; `labels` holds the numbers in the PNGs or the annotation ids.
+        Regions in the undistorted frame; `labels` holds the numbers in the PNGs or the annotation ids. Warns
+        (InputWarning) of label PNGs in which all leaves have the number 255.
 
     Raises:
         InputError: a file is missing, broken, or does not fit its view; see the readers.
     """
     masks = Path(masks)
     if masks.is_dir():
-        return regions_from_label_maps([_read_view(scene, view, masks) for view in range(len(scene.views))])
+        regions = regions_from_label_maps([_read_view(scene, view, masks) for view in range(len(scene.views))])
+        if len(regions) and bool((regions.labels == BINARY).all()):
+            message = f"{masks}: all leaves of a photo have the number 255, expected one number per leaf"
+            warnings.warn(message, InputWarning, stacklevel=2)
+        return regions
     if masks.suffix.lower() == ".json" and masks.is_file():
         return _regions_from_coco(scene, masks)
     raise InputError(f"{masks}: no such masks, expected a folder of label PNGs or a COCO .json file")

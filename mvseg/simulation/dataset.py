@@ -227,6 +227,8 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
     if seed < 0:
         raise InputError(f"the seed is {seed}, expected 0 or more")
     folder = Path(folder)
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "dataset.json").is_file():
+        raise InputError(f"{folder}: holds files that are no data set, expected a new or an empty folder")
     folder.mkdir(parents=True, exist_ok=True)
     recipe = json.dumps({"preset": asdict(preset), "seed": seed}, indent=1)
     made_from = folder / "dataset.json"
