@@ -83,8 +83,8 @@ def match_regions(
         found = match_nview(regions, cameras, affinity)
         if found.method != "nview" and len(cameras) > 2 and len(regions):
             message = (
-                f"the views agree on little (rays explain {found.explained:.0%} of the masks, which 'one-per-view' then "
-                "matched): do R and t take world points to the camera, and are the masks those of their photos?"
+                f"the views agree on little (rays explain {found.explained:.0%} of the masks; 'one-per-view' matched "
+                "them): do R and t take world points to the camera, and are the masks those of their photos?"
             )
             warnings.warn(message, InputWarning, stacklevel=2)
         return Matching(
