@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mvseg.formats.photos import load_photos as load_photos
     from mvseg.matching import Matching as Matching
     from mvseg.matching import match_regions as match_regions
+    from mvseg.matching import split_merged as split_merged
     from mvseg.metrics import matching_metrics as matching_metrics
     from mvseg.metrics import shape_distance as shape_distance
     from mvseg.multiview import MultiViewMaskRCNN as MultiViewMaskRCNN
@@ -50,7 +51,7 @@ _HOME = {
     "epipolar": ("epipolar_map",),
     "affinity": ("Affinity", "region_affinity"),
     "clustering": ("cluster_affinity",),
-    "matching": ("Matching", "match_regions"),
+    "matching": ("Matching", "match_regions", "split_merged"),
     "nms": ("EpipolarAssignment", "cluster_aware_nms"),
     "multiview": ("MultiViewMaskRCNN",),
     "detectors.zoo": ("load_detector",),

@@ -23,6 +23,7 @@ class MatchConfig:
             only.
         num_restarts: random starts of each factorisation of symnmf.
         seed: of the random pixels and starts.
+        split_merged: cut a mask that seems to cover two instances in two, in the results of `mvseg infer` and `match`.
     """
 
     method: Literal["auto", "nview", "one-per-view", "symnmf"] = "auto"
@@ -31,6 +32,7 @@ class MatchConfig:
     search_range: tuple[int, int] | None = None
     num_restarts: int = 2
     seed: int = 0
+    split_merged: bool = False
 
     def __post_init__(self) -> None:
         for name in ("num_points", "num_instances", "num_restarts"):

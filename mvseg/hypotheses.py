@@ -258,51 +258,6 @@ def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
     return np.bincount(table.pixel_region, best, len(ids)) / np.maximum(counts, 1)
 
 
-def merged_regions(table: RowTable, ids: Ints, costs: Costs, known: Known) -> Ints:
-    """Masks that cover two instances: two clusters explain disjoint parts of them.
-
-    A cluster that has no region in a view, but lands on one that belongs to another cluster, may share it. A pixel is
-    explained by a cluster when it scores at least half of what the cluster's regions score in the median. Of several
-    such clusters that one shares it which explains most pixels that the region's own cluster does not.
-
-    Args:
-        table: rows of D regions.
-        ids: (D,) cluster of each region in [0, K).
-        costs: thresholds, and costs of views that do not show a cluster.
-        known: what is found about clusters is added.
-
-    Returns:
-        (M, 3) int64: region, its cluster, the other one.
-    """
-    bounds, views = view_bounds(table), table.view_index
-    landing, own = known_landings(table, ids, costs, known), own_scores(table, ids, costs)
-    clusters = members_of(ids, len(landing))
-    usual = np.array([np.median(own[members]) for members in clusters])
-    is_real = np.array([len(np.unique(views[members])) >= max(2, costs.few * table.num_views) for members in clusters])
-    found: list[tuple[int, int, int]] = []
-    for view in np.unique(views).tolist():
-        regions, pixels, _ = bounds.of(view)
-        here = np.arange(regions.start, regions.stop)
-        is_second = (landing[:, here] >= costs.merged_landing) & is_real[:, None] & is_real[ids[here]]
-        is_second[ids[here]] = False
-        shared = here[is_second.any(0)]
-        if not len(shared):
-            continue
-        asked = np.union1d(np.flatnonzero(is_second.any(1)), ids[shared])
-        column = np.full(len(clusters), len(asked))
-        column[asked] = np.arange(len(asked))
-        scores = pixel_scores(table, np.where(views == view, len(asked), column[ids]), view, bounds, costs)
-        is_explained = scores >= 0.5 * usual[asked]
-        for region in shared.tolist():
-            pair = np.append(ids[region], np.flatnonzero(is_second[:, region - regions.start]))
-            part = is_explained[table.pixel_region[pixels] == region][:, column[pair]]
-            share = (part & ~part[:, :1]).mean(0)
-            best = int(share.argmax())
-            if share[best] >= costs.merged_share:
-                found.append((region, int(pair[0]), int(pair[best])))
-    return np.array(found, np.int64).reshape(-1, 3)
-
-
 def partition_value(table: RowTable, evidence: Floats, ids: Ints, costs: Costs) -> float:
     """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all pairs
     that are put together.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor
@@ -15,7 +15,7 @@ from mvseg.epipolar import is_coincident
 from mvseg.errors import InputError, InputWarning
 from mvseg.nview import match_nview
 from mvseg.one_per_view import one_per_view_clusters
-from mvseg.regions import Regions
+from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
 
 
@@ -34,8 +34,9 @@ class Matching:
         support: (K,) int64, in how many views each instance has a region whose match score is at least 0.5; None where
             the match scores are no chances.
         merged: (M, 3) int64, masks that seem to cover two instances: region, its instance, the other instance. Nothing
-            is changed in the masks. Only "nview" looks for them.
+            is changed in the masks (`split_merged` does so). Only "nview" looks for them.
         residual_px: about how far, in pixels, the reprojections of matched regions are off; None where not estimated.
+        merged_parts: M (h, w) bool tensors on the CPU, where in the region's box such a mask shows the other instance.
     """
 
     instance_ids: Tensor
@@ -45,6 +46,7 @@ class Matching:
     support: Tensor | None = None
     merged: Tensor = field(default_factory=lambda: torch.zeros(0, 3, dtype=torch.int64))
     residual_px: int | None = None
+    merged_parts: tuple[Tensor, ...] = ()
 
 
 def match_regions(
@@ -95,6 +97,7 @@ def match_regions(
             found.support,
             found.merged,
             found.residual_px,
+            found.merged_parts,
         )
     if method == "one-per-view":
         ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
@@ -112,6 +115,51 @@ def match_regions(
         scores = mean_affinity(affinity, ids, regions)
     merged = torch.zeros(0, 3, dtype=torch.int64, device=ids.device)
     return Matching(ids, scores, int(ids.max()) + 1 if len(ids) else 0, method, merged=merged)
+
+
+def split_merged(regions: Regions, matching: Matching) -> tuple[Regions, Matching, Tensor]:
+    """Cut the masks that cover two instances in two, each part with its own instance.
+
+    Args:
+        regions: the D regions that were matched.
+        matching: their matching.
+
+    Returns:
+        D' >= D regions in the same order, the second part after the first. Their matching, with the match scores of
+        the masks and nothing merged. And (D',) int64, the region that each comes from. A mask of which one part would
+        be empty stays whole.
+    """
+    cuts = {row[0]: (row[2], part) for row, part in zip(matching.merged.tolist(), matching.merged_parts, strict=True)}
+    source, boxes, crops, ids = [], [], [], []
+    for region, (own, box) in enumerate(zip(matching.instance_ids.tolist(), regions.boxes.tolist(), strict=True)):
+        mask = regions.crop(region)
+        other, part = cuts.get(region, (-1, torch.zeros_like(mask)))
+        part = part.to(mask.device) & mask
+        halves = [(own, mask & ~part), (other, part)]
+        if not all(bool(half.any()) for _, half in halves):
+            halves = [(own, mask)]
+        for instance, half in halves:
+            x1, y1, x2, y2 = _extent(half) if len(halves) > 1 else (0, 0, mask.shape[1], mask.shape[0])
+            source.append(region)
+            boxes.append((box[0] + x1, box[1] + y1, box[0] + x2, box[1] + y2))
+            crops.append(half[y1:y2, x1:x2].flatten().cpu())
+            ids.append(instance)
+    index = torch.tensor(source, dtype=torch.int64, device=regions.device)
+    views, labels = regions.view_index[index].tolist(), regions.labels[index].tolist()
+    matched = replace(
+        matching,
+        instance_ids=torch.tensor(ids, dtype=torch.int64, device=regions.device),
+        match_scores=matching.match_scores[index],
+        merged=matching.merged[:0],
+        merged_parts=(),
+    )
+    return stack_regions(views, boxes, crops, labels, regions.num_views).to(regions.device), matched, index
+
+
+def _extent(mask: Tensor) -> tuple[int, int, int, int]:
+    """x1, y1, x2, y2 of the pixels of a mask (h, w) that has some."""
+    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
+    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def choose_method(config: MatchConfig) -> str:

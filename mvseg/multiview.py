@@ -319,6 +319,7 @@ def _join_matchings(parts: list[Matching], ids: Tensor, scores: Tensor, method: 
         torch.cat(supports) if len(supports) == len(parts) else None,
         torch.cat([part.merged for part in parts]),
         max((part.residual_px for part in parts if part.residual_px is not None), default=None),
+        tuple(crop for part in parts for crop in part.merged_parts),
     )
 
 

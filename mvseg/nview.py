@@ -26,12 +26,12 @@ from mvseg.hypotheses import (
     Known,
     known_landings,
     known_scores,
-    merged_regions,
     nothing_known,
     own_scores,
     partition_value,
     view_bounds,
 )
+from mvseg.merged import merged_regions, second_part
 from mvseg.one_per_view import (
     assign_one_to_one,
     dense_ids,
@@ -71,7 +71,9 @@ class NViewMatching:
         match_scores: (D,) float32 in [0, 1], the chance that the id is right; 0 for -1.
         support: (K,) int64, in how many views each instance has a region whose match score is at least 0.5.
         merged: (M, 3) int64, masks that seem to cover two instances: region, its instance, the other one;
-            `hypotheses.merged_regions` says how they are found.
+            `merged.merged_regions` says how they are found.
+        merged_parts: M (h, w) bool tensors on the CPU, where in the region's box each of these masks shows the other
+            instance.
         explained: mean score of the matched regions in their clusters, 1 = every pixel is seen in all other views.
         residual_px: reprojection error that the label maps were widened by, pixels.
         method: "nview", or "one-per-view" where the rows do not explain the regions (poses too far off, two views).
@@ -81,6 +83,7 @@ class NViewMatching:
     match_scores: Tensor
     support: Tensor
     merged: Tensor
+    merged_parts: tuple[Tensor, ...]
     explained: float
     residual_px: int
     method: str
@@ -111,17 +114,20 @@ def match_nview(regions: Regions, cameras: Cameras, affinity: Affinity, *, costs
     if explained < UNEXPLAINED or len(cameras) == 2:
         ids, method, explained = apart, "one-per-view", _explained(table, apart, costs)
     merged = torch.from_numpy(merged_regions(table, ids, costs, known))
+    parts = [second_part(ordered, table, ids, one, other, costs) for one, _, other in merged.tolist()]
     scores = torch.from_numpy(match_scores(support(table, W, ids, costs, known))).float()
     back = order.argsort().cpu()
     final = renumber(drop_singletons(ids)[back])
     confidence = scores[back] * (final >= 0)
     number = final[order.cpu()[np.unique(ids, return_index=True)[1]]]  # of each cluster
     merged = torch.cat((order.cpu()[merged[:, :1]], number[merged[:, 1:]]), 1)
+    is_matched = (merged >= 0).all(1)
     return NViewMatching(
         final.to(regions.device),
         confidence.to(regions.device),
         _count_views(final, regions.view_index.cpu(), confidence).to(regions.device),
-        merged[(merged >= 0).all(1)].to(regions.device),
+        merged[is_matched].to(regions.device),
+        tuple(part for part, keep in zip(parts, is_matched.tolist(), strict=True) if keep),
         explained,
         residual_px,
         method,

@@ -20,7 +20,7 @@ from mvseg.detectors.zoo import find_weights, load_detector
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.folder import load_masks, load_scene
 from mvseg.formats.photos import check_photos, read_photo
-from mvseg.matching import Matching, match_regions
+from mvseg.matching import Matching, match_regions, split_merged
 from mvseg.multiview import MultiViewMaskRCNN, Proposals
 from mvseg.reconstruction import reconstruct_instances
 from mvseg.result import Result
@@ -67,6 +67,9 @@ def run_scene(
     else:
         with _timed(seconds, "match"):
             matching = match_regions(regions, scene.cameras, match, progress=progress)
+    if match is not None and match.split_merged:
+        regions, matching, source = split_merged(regions, matching)
+        scores = None if scores is None else scores[source]
     shapes = None
     if reconstruct is not None:
         with _timed(seconds, "reconstruct"):

@@ -30,6 +30,7 @@ ORDER = [
     "one_per_view",
     "rows",
     "hypotheses",
+    "merged",
     "confidence",
     "nview",
     "matching",

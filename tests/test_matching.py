@@ -8,11 +8,11 @@ from sklearn.metrics import adjusted_rand_score
 
 from mvseg.config import MatchConfig
 from mvseg.errors import InputError, InputWarning
-from mvseg.matching import match_regions
+from mvseg.matching import match_regions, split_merged
 from mvseg.metrics import matching_metrics
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
-from synthetic import ball_scene, cameras_at, permute_views, render_balls
+from synthetic import ball_scene, cameras_at, permute_views, render_balls, touching_balls
 
 
 @pytest.mark.parametrize("method", ["auto", "nview", "one-per-view", "symnmf"])
@@ -98,6 +98,37 @@ def test_masks_larger_than_the_photos_are_refused(method: str) -> None:
     maps = [labels.repeat(2, 0).repeat(2, 1) if view == 1 else labels for view, labels in enumerate(scene.label_maps)]
     with pytest.raises(InputError, match=r"region \d of view 1 has the box .* inside the 320 x 240 pixels"):
         match_regions(regions_from_label_maps(maps), scene.cameras, MatchConfig(method=method))
+
+
+def test_merged_masks_can_be_cut_in_two() -> None:
+    """Every pixel keeps exactly one region; only the merged mask is cut, about where the two balls meet."""
+    scene = ball_scene(6, 8, seed=3)
+    (small, large), view = touching_balls(scene)
+    maps = [labels.copy() for labels in scene.label_maps]
+    maps[view][maps[view] == small] = large
+    regions = regions_from_label_maps(maps)
+    matching = match_regions(regions, scene.cameras)
+    ((merged, _, _),) = matching.merged.tolist()
+    cut, matched, source = split_merged(regions, matching)
+    assert len(cut) == len(regions) + 1
+    assert source.tolist() == sorted([*range(len(regions)), merged])
+    assert len(matched.merged) == len(matched.merged_parts) == 0
+    assert torch.equal(matched.match_scores, matching.match_scores[source])
+    assert torch.equal(cut.view_index, regions.view_index[source])
+    whole = torch.arange(len(regions)) != merged
+    assert torch.equal(matched.instance_ids[whole[source]], matching.instance_ids[whole])
+    pieces = (source == merged).nonzero()[:, 0].tolist()
+    first, second = (cut.mask(piece, 320, 240) for piece in pieces)
+    assert not (first & second).any()
+    assert torch.equal(first | second, regions.mask(merged, 320, 240))
+    truth = torch.from_numpy(scene.label_maps[view])
+    shown = [int(truth[piece].mode().values) for piece in (first, second)]
+    assert sorted(shown) == sorted([small, large])
+    instances = [int(matching.instance_ids[whole][regions.labels[whole] == ball][0]) for ball in shown]
+    assert matched.instance_ids[pieces].tolist() == instances
+    again, same, _ = split_merged(cut, matched)
+    assert torch.equal(again.crops, cut.crops)
+    assert torch.equal(same.instance_ids, matched.instance_ids)
 
 
 def test_views_that_agree_on_nothing_are_warned_of() -> None:

@@ -246,6 +246,7 @@ def test_classes_are_matched_apart_and_what_is_known_of_both_is_kept() -> None:
     ((region, own, other),) = matching.merged.tolist()
     assert labels[region] == large
     assert matching.instance_ids[region] == own
+    assert matching.merged_parts[0].shape == proposals.regions.crop(int(keep[region])).shape
     assert {int(labels[matching.instance_ids == one].mode().values) for one in (own, other)} == {small, large}
 
 

@@ -294,6 +294,12 @@ def test_a_mask_that_covers_two_instances_is_found() -> None:
     assert found.merged[:, 0].tolist() == [region]
     assert sorted(found.merged[0, 1:].tolist()) == sorted(instances)
     assert found.merged[0, 1] == found.instance_ids[region]
+    x1, y1, x2, y2 = regions.boxes[region].tolist()
+    true = scene.label_maps[view][y1:y2, x1:x2]
+    other = numbers[0] if int(found.merged[0, 2]) == instances[0] else numbers[1]
+    mask, part = regions.crop(region).numpy(), found.merged_parts[0].numpy()
+    assert not part[~mask].any()
+    assert ((true == other) == part)[mask].mean() > 0.9
 
 
 def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
