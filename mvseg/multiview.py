@@ -185,11 +185,12 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         lenient.nms_thresh, lenient.detections_per_img = self.proposal_iou, self.proposals_per_view
         # Under autocast the backbone may work in half precision; the coordinates of boxes may not.
         with torch.autocast(image.device.type, enabled=False):
-            features = OrderedDict((level, map_.float()) for level, map_ in features.items())
+            kind = next(self.roi_heads.parameters()).dtype
+            features = OrderedDict((level, map_.to(kind)) for level, map_ in features.items())
             boxes, _ = self.rpn(resized, features)
             (found,), _ = lenient(features, boxes, resized.image_sizes)
         height, width = resized.image_sizes[0]
-        found = decide_masks(found)
+        found = decide_masks(found | {key: found[key].float() for key in ("boxes", "scores", "masks")})
         good = found["scores"] >= self.roi_heads.score_thresh
         return {key: value[good] for key, value in found.items()} | {"frame": torch.tensor([width, height])}
 
