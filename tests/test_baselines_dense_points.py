@@ -121,6 +121,14 @@ def test_patch_match_gets_a_whole_workspace(leafy: LeafyScene, monkeypatch: pyte
     assert np.quantile(distance_to(leafy.vertices, points.positions), 0.99) < 0.03 * leaf_size
 
 
+@pytest.mark.skipif(not pycolmap.has_cuda, reason="PatchMatch needs a pycolmap with CUDA and a graphics card")
+def test_patch_match_finds_the_leaves(leafy: LeafyScene) -> None:
+    points = patch_match_points(leafy.scene)
+    leaf_size = float((leafy.vertices.amax(0) - leafy.vertices.amin(0)).max())
+    assert len(points.positions) > 1000
+    assert np.quantile(distance_to(leafy.vertices, points.positions), 0.5) < 0.03 * leaf_size
+
+
 def test_model_of_a_workspace_holds_the_cameras(leafy: LeafyScene, photos: list[np.ndarray], tmp_path: Path) -> None:
     workspace = Workspace(tmp_path, leafy.scene.cameras)
     workspace.write(photos)
