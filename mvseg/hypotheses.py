@@ -92,15 +92,17 @@ class Known:
         scores: by view and members in other views (their indices as bytes): (N,) float32, the scores of the view's
             regions.
         landings: by members: (D,) float32, where the cluster expects to be seen.
+        own: by the ids of all regions as bytes: (D,) scores of the regions in their own clusters.
     """
 
     scores: dict[tuple[int, bytes], Floats]
     landings: dict[bytes, Floats]
+    own: dict[bytes, Floats]
 
 
 def nothing_known() -> Known:
     """To start from, for one table and its costs."""
-    return Known({}, {})
+    return Known({}, {}, {})
 
 
 def members_of(ids: Ints, num_clusters: int) -> list[Ints]:
@@ -246,6 +248,14 @@ def own_row_gains(
     return gain * is_inside, is_inside
 
 
+def known_own_scores(table: RowTable, ids: Ints, costs: Costs, known: Known) -> Floats:
+    """What `own_scores` returns, looked for once."""
+    key = ids.tobytes()
+    if key not in known.own:
+        known.own[key] = own_scores(table, ids, costs)
+    return known.own[key]
+
+
 def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
     """(D,) score of each region in its own cluster, its own view left out: see `nview.score_matrix`."""
     gain, is_inside = own_row_gains(table, ids, costs)
@@ -258,7 +268,9 @@ def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
     return np.bincount(table.pixel_region, best, len(ids)) / np.maximum(counts, 1)
 
 
-def partition_value(table: RowTable, evidence: Floats, ids: Ints, costs: Costs) -> float:
+def partition_value(
+    table: RowTable, evidence: Floats, ids: Ints, costs: Costs, known: Known | None = None
+) -> float:
     """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all pairs
     that are put together.
 
@@ -267,8 +279,9 @@ def partition_value(table: RowTable, evidence: Floats, ids: Ints, costs: Costs) 
         evidence: (D, D) symmetric, for (> 0) or against (< 0) each pair.
         ids: (D,) cluster of each region in [0, K).
         costs: of views that do not show the cluster.
+        known: what is found about the ids is added.
     """
     is_alone = np.bincount(ids)[ids] < 2
     together = (ids[:, None] == ids) & (table.view_index[:, None] != table.view_index)
     pairs = costs.pair_factor(table.num_views) * float((evidence * together).sum()) / 2
-    return float(own_scores(table, ids, costs)[~is_alone].sum()) + pairs
+    return float(known_own_scores(table, ids, costs, known or nothing_known())[~is_alone].sum()) + pairs

@@ -7,7 +7,15 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.hypotheses import Costs, Known, known_landings, members_of, own_scores, pixel_scores, view_bounds
+from mvseg.hypotheses import (
+    Costs,
+    Known,
+    known_landings,
+    known_own_scores,
+    members_of,
+    pixel_scores,
+    view_bounds,
+)
 from mvseg.regions import Regions
 from mvseg.rows import RowTable
 
@@ -32,7 +40,7 @@ def merged_regions(table: RowTable, ids: Ints, costs: Costs, known: Known) -> In
         (M, 3) int64: region, its cluster, the other one.
     """
     bounds, views = view_bounds(table), table.view_index
-    landing, own = known_landings(table, ids, costs, known), own_scores(table, ids, costs)
+    landing, own = known_landings(table, ids, costs, known), known_own_scores(table, ids, costs, known)
     clusters = members_of(ids, len(landing))
     usual = np.array([np.median(own[members]) for members in clusters])
     is_real = np.array([len(np.unique(views[members])) >= max(2, costs.few * table.num_views) for members in clusters])

@@ -25,9 +25,9 @@ from mvseg.hypotheses import (
     Costs,
     Known,
     known_landings,
+    known_own_scores,
     known_scores,
     nothing_known,
-    own_scores,
     partition_value,
     view_bounds,
 )
@@ -110,9 +110,9 @@ def match_nview(regions: Regions, cameras: Cameras, affinity: Affinity, *, costs
     table, residual_px = _table_of_poses(ordered, cameras, pairwise, costs)
     known, apart = nothing_known(), dense_ids(_alone_apart(pairwise))
     ids = search(table, W, costs, apart, known) if len(cameras) > 2 else apart
-    method, explained = "nview", _explained(table, ids, costs)
+    method, explained = "nview", _explained(table, ids, costs, known)
     if explained < UNEXPLAINED or len(cameras) == 2:
-        ids, method, explained = apart, "one-per-view", _explained(table, apart, costs)
+        ids, method, explained = apart, "one-per-view", _explained(table, apart, costs, known)
     merged = torch.from_numpy(merged_regions(table, ids, costs, known))
     parts = [second_part(ordered, table, ids, one, other, costs) for one, _, other in merged.tolist()]
     scores = torch.from_numpy(match_scores(support(table, W, ids, costs, known))).float()
@@ -170,10 +170,11 @@ def _alone_apart(ids: Ints) -> Ints:
     return np.where(ids < 0, int(ids.max(initial=-1)) + 1 + np.arange(len(ids)), ids)
 
 
-def _explained(table: RowTable, ids: Ints, costs: Costs) -> float:
+def _explained(table: RowTable, ids: Ints, costs: Costs, known: Known | None = None) -> float:
     """Mean score of the regions that are not alone in their cluster; 0 without any."""
     together = np.bincount(ids, minlength=1)[ids] > 1
-    return float(own_scores(table, ids, costs)[together].mean()) if together.any() else 0.0
+    scores = known_own_scores(table, ids, costs, known or nothing_known())
+    return float(scores[together].mean()) if together.any() else 0.0
 
 
 def search(table: RowTable, W: Floats, costs: Costs, pairwise: Ints, known: Known | None = None) -> Ints:
@@ -200,7 +201,7 @@ def search(table: RowTable, W: Floats, costs: Costs, pairwise: Ints, known: Know
         ids = link_average(history[iteration], table.view_index, table.num_views, stop)
         ids = refine(table, W, ids, costs, known=known)
         found.append(refine(table, W, ids, costs, join_pieces=True, known=known))
-    values = [partition_value(table, evidence, ids, costs) for ids in (pairwise, *found)]
+    values = [partition_value(table, evidence, ids, costs, known) for ids in (pairwise, *found)]
     best = pairwise
     if max(values) - values[0] > (1 - AS_GOOD) * abs(max(values)):
         best = found[int(np.argmax(values[1:]))]

@@ -12,6 +12,7 @@ from mvseg.affinity import region_affinity
 from mvseg.hypotheses import (
     Costs,
     known_landings,
+    known_own_scores,
     known_scores,
     landing_matrix,
     nothing_known,
@@ -144,6 +145,8 @@ def test_what_is_known_of_clusters_is_what_looking_again_would_find(table: RowTa
         np.testing.assert_allclose(
             known_landings(table, ids, COSTS, known), landing_matrix(table, ids, COSTS), atol=1e-6
         )
+        for _ in range(2):
+            np.testing.assert_array_equal(known_own_scores(table, ids, COSTS, known), own_scores(table, ids, COSTS))
         for view in range(table.num_views):
             rest = np.where(table.view_index == view, ids.max() + 1, ids)
             rest[rest <= ids.max()] = np.unique(rest[rest <= ids.max()], return_inverse=True)[1]
