@@ -102,7 +102,14 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
 
 
 def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
-    """The training and the validation samples, checked; broken_samples.txt is written when some are skipped."""
+    """The training and the validation samples, checked; broken_samples.txt is written when some are skipped.
+
+    Raises:
+        InputError: an output folder with other things, broken samples, nothing to train on.
+    """
+    there = {path.name.removesuffix(".partial") for path in config.output.glob("*")}  # a run may be killed at once
+    if there and not there & {"config.yaml", "broken_samples.txt"}:
+        raise InputError(f"{config.output}: holds files that are no training run, expected a new or an empty folder")
     samples, held_out = list_samples(config.photos, config.labels), None
     if config.val_photos is not None and config.val_labels is not None:
         held_out = list_samples(config.val_photos, config.val_labels)
@@ -119,8 +126,8 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
         problems += broken.values()
     num_held_out = len(held_out) if held_out is not None else 0
     logger.info("%d samples to train on, %d to validate, %d skipped", len(samples), num_held_out, len(problems))
-    config.output.mkdir(parents=True, exist_ok=True)
     if problems:
+        config.output.mkdir(parents=True, exist_ok=True)
         write_text_whole(config.output / "broken_samples.txt", "\n".join(problems) + "\n")
     return samples, held_out
 
@@ -266,6 +273,7 @@ def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
 def open_files(run: Run, state: TrainingState) -> Any | None:
     """Write the config, cut the log to the state's step, and open TensorBoard's writer, if it is installed."""
     output = run.config.output
+    output.mkdir(parents=True, exist_ok=True)
     write_config(output / "config.yaml", config_values(run.config))
     cut_log(output / "log.jsonl", state.step)
     return open_tensorboard(output / "tensorboard", state.step)

@@ -123,12 +123,12 @@ def test_bf16_on_the_cpu_is_close_to_fp32(leaves: Path, tmp_path: Path, finished
 
 def test_a_shipped_architecture_trains_and_its_export_loads(tmp_path: Path) -> None:
     write_photos(tmp_path, 4)
-    config = make_config(tmp_path, tmp_path, arch="mobilenet_v3_large_fpn", epochs=1, hold_out_every=0)
+    config = make_config(tmp_path, tmp_path / "out", arch="mobilenet_v3_large_fpn", epochs=1, hold_out_every=0)
     train(dataclasses.replace(config, ema_decay=0.0))
-    weights = str(tmp_path / "model.safetensors")
+    weights = str(tmp_path / "out" / "model.safetensors")
     loaded = build_detector("mobilenet_v3_large_fpn", 2, weights)
     assert loaded.transform.max_size == 64
-    expected = torch.load(tmp_path / "checkpoint.pt", weights_only=True)["model"]
+    expected = torch.load(tmp_path / "out" / "checkpoint.pt", weights_only=True)["model"]
     assert all(torch.equal(value, expected[key]) for key, value in loaded.state_dict().items())
 
 
@@ -140,13 +140,14 @@ def test_two_processes_do_what_one_does(leaves: Path, tmp_path: Path, finished: 
     script = "from tiny_training import *; train(make_config(Path(sys.argv[1]), Path(sys.argv[2])), build_tiny())"
     (tmp_path / "run.py").write_text(script)
     launch = ("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", str(tmp_path / "run.py"))
-    result = run_script(*launch, str(leaves), str(tmp_path))
+    out = tmp_path / "out"
+    result = run_script(*launch, str(leaves), str(out))
     assert result.returncode == 0, result.stderr
-    for ours, theirs in zip(read_log(tmp_path), read_log(finished), strict=True):
+    for ours, theirs in zip(read_log(out), read_log(finished), strict=True):
         assert ours == pytest.approx(theirs, rel=1e-5)
     for key, value in load_weights(finished / "model.safetensors").items():
-        torch.testing.assert_close(load_weights(tmp_path / "model.safetensors")[key], value, rtol=1e-4, atol=1e-6)
-    for ours, theirs in zip(read_metrics(tmp_path)["epochs"], read_metrics(finished)["epochs"], strict=True):
+        torch.testing.assert_close(load_weights(out / "model.safetensors")[key], value, rtol=1e-4, atol=1e-6)
+    for ours, theirs in zip(read_metrics(out)["epochs"], read_metrics(finished)["epochs"], strict=True):
         assert ours == pytest.approx(theirs, rel=1e-4)
 
 
@@ -212,6 +213,23 @@ def test_another_run_is_not_overwritten(leaves: Path, finished: Path) -> None:
         train(make_config(leaves, finished, resume=True, lr=0.5), build_tiny())
 
 
+def test_a_folder_of_other_things_is_left_alone_and_a_failed_start_leaves_none(leaves: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("precious")
+    with pytest.raises(InputError, match="holds files that are no training run"):
+        train(make_config(leaves, tmp_path / "mine"), build_tiny())
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+    with pytest.raises(InputError, match="leaf-slimm"):
+        train(make_config(leaves, tmp_path / "out", weights="leaf-slimm"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_killed_while_it_wrote_its_first_file_goes_on(leaves: Path, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml.partial").write_text("")
+    train(make_config(leaves, tmp_path, resume=True, epochs=1, batch_size=24), build_tiny())
+    assert (tmp_path / "model.safetensors").is_file()
+
+
 def test_a_run_does_not_go_on_with_other_samples(tmp_path: Path) -> None:
     write_photos(tmp_path, 5)
     config = make_config(tmp_path, tmp_path / "out", epochs=1, hold_out_every=0)
@@ -251,7 +269,7 @@ def test_validation_set_of_other_categories(leaves: Path, tmp_path: Path) -> Non
     coco = {"images": [image], "annotations": [], "categories": [{"id": 1, "name": "fruit"}]}
     (tmp_path / "val.json").write_text(json.dumps(coco))
     config = make_config(
-        leaves, tmp_path, hold_out_every=0, val_photos=leaves / "photos", val_labels=tmp_path / "val.json"
+        leaves, tmp_path / "out", hold_out_every=0, val_photos=leaves / "photos", val_labels=tmp_path / "val.json"
     )
     with pytest.raises(InputError, match="has categories"):
         train(config, build_tiny())
