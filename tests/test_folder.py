@@ -62,7 +62,7 @@ def test_binary_masks_are_warned_of(tmp_path: Path) -> None:
     for path in (folder / "masks").iterdir():
         labels = read_label_png(path, WIDTH, HEIGHT)
         write_label_png(path, np.where(labels > 0, 255, 0))
-    with pytest.warns(InputWarning, match="all leaves of a photo have the number 255"):
+    with pytest.warns(InputWarning, match="holds 0 and 255 only"):
         regions = load_masks(load_scene(folder), folder / "masks")
     assert regions.labels.tolist() == [255] * 4
 

@@ -12,6 +12,7 @@ import torch
 
 from conftest import true_ids
 from mvseg.config import MatchConfig, ReconstructConfig
+from mvseg.errors import InputWarning
 from mvseg.formats.folder import load_masks, load_scene
 from mvseg.formats.photos import read_photo
 from mvseg.matching import match_regions
@@ -39,7 +40,8 @@ def test_maize_is_one_plant_of_its_height(shared_data: Path) -> None:
     folder = shared_data / "maize-plant1"
     scene = load_scene(folder)
     assert scene.unit == "mm"
-    regions = load_masks(scene, folder / "silhouettes")
+    with pytest.warns(InputWarning, match="each photo shows one instance"):
+        regions = load_masks(scene, folder / "silhouettes")
     assert len(regions) == 12
     matching = match_regions(regions, scene.cameras)
     assert matching.instance_ids.unique().tolist() == [0]

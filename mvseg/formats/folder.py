@@ -52,7 +52,7 @@ def load_masks(scene: Scene, masks: Path | str) -> Regions:
 
     Returns:
         Regions in the undistorted frame; `labels` holds the numbers in the PNGs or the annotation ids. Warns
-        (InputWarning) of label PNGs in which all leaves have the number 255.
+        (InputWarning) of label PNGs that hold 0 and 255 only.
 
     Raises:
         InputError: a file is missing, broken, or does not fit its view; see the readers.
@@ -61,7 +61,7 @@ def load_masks(scene: Scene, masks: Path | str) -> Regions:
     if masks.is_dir():
         regions = regions_from_label_maps([_read_view(scene, view, masks) for view in range(len(scene.views))])
         if len(regions) and bool((regions.labels == BINARY).all()):
-            message = f"{masks}: all leaves of a photo have the number 255, expected one number per leaf"
+            message = f"{masks}: holds 0 and 255 only, so that each photo shows one instance; leaves need a number each"
             warnings.warn(message, InputWarning, stacklevel=2)
         return regions
     if masks.suffix.lower() == ".json" and masks.is_file():
