@@ -152,7 +152,8 @@ def _run(scene: Path, masks: Path | None, out: Path, args: Namespace, reconstruc
         if ignored:
             warnings.warn("the detect options do nothing: masks are given", InputWarning, stacklevel=1)
         result = run_scene(scene, masks, match, reconstruct, detect=detect, progress=not args.quiet)
-    remarks = [str(one.message) for one in caught if issubclass(one.category, InputWarning)]
+    # each matching of a detector's loop may remark the same
+    remarks = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, InputWarning)))
     for other in (one for one in caught if not issubclass(one.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
     for remark in remarks:

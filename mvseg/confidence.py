@@ -1,4 +1,4 @@
-"""Stage 5d: how sure a match is: the chance that a region's id is right, from what speaks for it.
+"""Stage 5e: how sure a match is: the chance that a region's id is right, from what speaks for it.
 
 A logistic regression, fitted once on simulated development plants (true and degraded masks, 3 to 20 views, 4 to 32
 leaves): of the regions scored about 0.8, about 80 % are right there. A region is right when its cluster is the largest

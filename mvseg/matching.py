@@ -1,4 +1,4 @@
-"""Stage 5f: region matching in one call: masks and cameras in, instance ids out."""
+"""Stage 5g: region matching in one call: masks and cameras in, instance ids out."""
 
 from __future__ import annotations
 
@@ -126,8 +126,8 @@ def split_merged(regions: Regions, matching: Matching) -> tuple[Regions, Matchin
 
     Returns:
         D' >= D regions in the same order, the second part after the first. Their matching, with the match scores of
-        the masks and nothing merged. And (D',) int64, the region that each comes from. A mask of which one part would
-        be empty stays whole.
+        the masks, the support of before, and nothing merged. And (D',) int64, the region that each comes from. A mask
+        of which one part would be empty stays whole.
     """
     cuts = {row[0]: (row[2], part) for row, part in zip(matching.merged.tolist(), matching.merged_parts, strict=True)}
     source, boxes, crops, ids = [], [], [], []

@@ -1,4 +1,4 @@
-"""Stage 5e: matching that all views must agree on.
+"""Stage 5f: matching that all views must agree on.
 
 Pairs of views cannot tell leaves apart that share their epipolar lines; a third view can. A start comes from a soft
 multi-view stereo on region labels: how likely two regions are one instance, and which row of a ray is the right one,

@@ -103,6 +103,17 @@ def moved(cameras: Cameras, scale: float, rotation: Tensor, shift: Tensor) -> Ca
     return Cameras(cameras.K, R, scale * cameras.t - (R @ shift[:, None])[:, :, 0], cameras.sizes)
 
 
+def merged_balls(scene: BallScene) -> tuple[Regions, tuple[int, int], int]:
+    """The regions when two touching balls share one mask in a view, with the number of the second; their numbers; the
+    index of that region."""
+    (first, second), view = touching_balls(scene)
+    maps = [labels.copy() for labels in scene.label_maps]
+    maps[view][maps[view] == first] = second
+    regions = regions_from_label_maps(maps)
+    (region,) = ((regions.view_index == view) & (regions.labels == second)).nonzero()[:, 0].tolist()
+    return regions, (first, second), region
+
+
 def touching_balls(scene: BallScene) -> tuple[tuple[int, int], int]:
     """The numbers of two balls that touch each other in a view and show as much as possible there; and that view."""
     best = (0, (0, 0), 0)

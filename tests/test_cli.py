@@ -8,6 +8,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,9 @@ import trimesh
 import mvseg
 from mvseg.cli import DEMO_SCENE, main
 from mvseg.config import DetectConfig
+from mvseg.errors import InputWarning
 from mvseg.formats.label_png import read_label_png, write_label_png
+from mvseg.matching import Matching, match_regions
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent
@@ -554,6 +557,20 @@ def test_detect_options_beside_masks_are_warned_of(
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
     assert "the detect options do nothing" in capsys.readouterr().err
     assert "detect" in json.loads((tmp_path / "out" / "run.json").read_text())["warnings"][0]
+
+
+def test_the_same_remark_is_made_once(
+    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def remark_twice(*args: Any, **options: Any) -> Matching:
+        for _ in range(2):
+            warnings.warn("look here", InputWarning, stacklevel=1)
+        return match_regions(*args, **options)
+
+    monkeypatch.setattr("mvseg.pipeline.match_regions", remark_twice)
+    assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert capsys.readouterr().err == "mvseg: warning: look here\n"
+    assert json.loads((tmp_path / "out" / "plant" / "run.json").read_text())["warnings"] == ["look here"]
 
 
 def test_match_without_masks_is_refused(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -12,7 +12,7 @@ from mvseg.matching import match_regions, split_merged
 from mvseg.metrics import matching_metrics
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
-from synthetic import ball_scene, cameras_at, permute_views, render_balls, touching_balls
+from synthetic import ball_scene, cameras_at, merged_balls, permute_views, render_balls
 
 
 @pytest.mark.parametrize("method", ["auto", "nview", "one-per-view", "symnmf"])
@@ -103,12 +103,9 @@ def test_masks_larger_than_the_photos_are_refused(method: str) -> None:
 def test_merged_masks_can_be_cut_in_two() -> None:
     """Every pixel keeps exactly one region; only the merged mask is cut, about where the two balls meet."""
     scene = ball_scene(6, 8, seed=3)
-    (small, large), view = touching_balls(scene)
-    maps = [labels.copy() for labels in scene.label_maps]
-    maps[view][maps[view] == small] = large
-    regions = regions_from_label_maps(maps)
+    regions, balls, merged = merged_balls(scene)
     matching = match_regions(regions, scene.cameras)
-    ((merged, _, _),) = matching.merged.tolist()
+    assert matching.merged[:, 0].tolist() == [merged]
     cut, matched, source = split_merged(regions, matching)
     assert len(cut) == len(regions) + 1
     assert source.tolist() == sorted([*range(len(regions)), merged])
@@ -121,9 +118,9 @@ def test_merged_masks_can_be_cut_in_two() -> None:
     first, second = (cut.mask(piece, 320, 240) for piece in pieces)
     assert not (first & second).any()
     assert torch.equal(first | second, regions.mask(merged, 320, 240))
-    truth = torch.from_numpy(scene.label_maps[view])
+    truth = torch.from_numpy(scene.label_maps[int(regions.view_index[merged])])
     shown = [int(truth[piece].mode().values) for piece in (first, second)]
-    assert sorted(shown) == sorted([small, large])
+    assert sorted(shown) == sorted(balls)
     instances = [int(matching.instance_ids[whole][regions.labels[whole] == ball][0]) for ball in shown]
     assert matched.instance_ids[pieces].tolist() == instances
     again, same, _ = split_merged(cut, matched)

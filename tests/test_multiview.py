@@ -13,7 +13,7 @@ from mvseg.multiview import MultiViewMaskRCNN, Proposals, gather_proposals, matc
 from mvseg.nms import cluster_aware_nms
 from mvseg.regions import regions_from_label_maps
 from mvseg.simulation.proposals import simulate_proposals
-from synthetic import BallScene, arc_positions, ball_scene, cameras_at, touching_balls
+from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
 
 
 class TinyBackbone(torch.nn.Sequential):
@@ -227,10 +227,7 @@ def test_iterating_is_deterministic_and_zero_iterations_only_match() -> None:
 def test_classes_are_matched_apart_and_what_is_known_of_both_is_kept() -> None:
     """True masks of balls, the even ones of another class; one mask of class 1 covers two balls."""
     scene = ball_scene(6, 8, seed=3)
-    (small, large), view = touching_balls(scene)
-    maps = [labels.copy() for labels in scene.label_maps]
-    maps[view][maps[view] == small] = large
-    regions = regions_from_label_maps(maps)
+    regions, (small, large), _ = merged_balls(scene)
     first = (regions.labels == small) | (regions.labels == large)
     classes = torch.where(first | (regions.labels % 2 == 1), 1, 2)
     order = torch.randperm(len(regions), generator=torch.Generator().manual_seed(0))

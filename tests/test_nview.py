@@ -34,7 +34,6 @@ from synthetic import (
     moved,
     permute_views,
     render_balls,
-    touching_balls,
 )
 
 COSTS = Costs()
@@ -280,29 +279,6 @@ def test_pieces_do_not_make_up_an_instance() -> None:
     found = solve(regions, scene.cameras)
     assert same_partition(found.instance_ids, truth)
     assert len(found.support) == 6
-
-
-def test_a_mask_that_covers_two_instances_is_found() -> None:
-    scene = ball_scene(6, 8, seed=3)
-    numbers, view = touching_balls(scene)
-    labels = scene.label_maps[view].copy()
-    labels[labels == numbers[1]] = numbers[0]
-    regions = regions_from_label_maps([*scene.label_maps[:view], labels, *scene.label_maps[view + 1 :]])
-    (region,) = ((regions.view_index == view) & (regions.labels == numbers[0])).nonzero()[:, 0].tolist()
-    rest = torch.arange(len(regions)) != region
-    found = solve(regions, scene.cameras)
-    assert same_partition(found.instance_ids[rest], regions.labels[rest])
-    assert len(found.support) == 6
-    instances = [int(found.instance_ids[rest][regions.labels[rest] == number][0]) for number in numbers]
-    assert found.merged[:, 0].tolist() == [region]
-    assert sorted(found.merged[0, 1:].tolist()) == sorted(instances)
-    assert found.merged[0, 1] == found.instance_ids[region]
-    x1, y1, x2, y2 = regions.boxes[region].tolist()
-    true = scene.label_maps[view][y1:y2, x1:x2]
-    other = numbers[0] if int(found.merged[0, 2]) == instances[0] else numbers[1]
-    mask, part = regions.crop(region).numpy(), found.merged_parts[0].numpy()
-    assert not part[~mask].any()
-    assert ((true == other) == part)[mask].mean() > 0.9
 
 
 def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
