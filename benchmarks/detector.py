@@ -25,6 +25,7 @@ import trimesh
 from tqdm import tqdm
 
 from mvseg.average_precision import annotate_truth, average_precision, describe_mask, detect_and_label
+from mvseg.config import DetectConfig
 from mvseg.detectors.zoo import load_detector
 from mvseg.formats.folder import load_masks, load_scene
 from mvseg.formats.photos import load_photos
@@ -156,7 +157,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, nargs="+", required=True, help="scene folders with truth/")
     parser.add_argument("--weights", default="leaf-slim")
     parser.add_argument("--image_size", type=int, help="longer side that photos are scaled to (what the weights say)")
-    parser.add_argument("--min_score", type=float, default=0.3, help="of the loop's detections")
+    parser.add_argument("--min_score", type=float, default=DetectConfig.min_score, help="of the loop's detections")
     parser.add_argument("--iterations", type=int, default=3, help="0 for average precision alone")
     parser.add_argument("--json", type=Path, help="write the figures here")
     args = parser.parse_args()

@@ -18,6 +18,7 @@ from torchvision.ops import FrozenBatchNorm2d
 from mvseg.detectors.mask_rcnn import (
     build_bare,
     build_detector,
+    build_mask_head,
     count_parameters,
     describe_detector,
     freeze_norm,
@@ -87,6 +88,18 @@ def test_small_detectors(arch: str, millions: float, download: list[Download]) -
     assert all(parameter.grad is not None for parameter in model.parameters())  # none unused: DDP would wait for it
     strides = [64 // level.shape[-1] for level in model.backbone(torch.rand(1, 3, 64, 64)).values()]
     assert strides == [4, 8, 16, 32, 64]
+
+
+def test_the_middle_of_a_box_sees_all_of_it() -> None:
+    head = build_mask_head(2)
+    for parameter in head.parameters():
+        nn.init.ones_(parameter)
+    crop = torch.ones((1, 2, 14, 14), requires_grad=True)
+    features = head(crop)
+    assert features.shape == crop.shape
+    features[0, 0, 7, 7].backward()
+    assert crop.grad is not None
+    assert bool((crop.grad > 0).all())
 
 
 @pytest.mark.parametrize("arch", SMALL)

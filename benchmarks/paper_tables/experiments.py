@@ -14,6 +14,7 @@ from benchmarks.paper_tables.masks import Masks, degraded_masks, detected_masks,
 from benchmarks.paper_tables.methods import METHODS, score_method
 from benchmarks.paper_tables.number_of_leaves import score_numbers
 from benchmarks.paper_tables.shapes import SHAPES, measure_shape
+from mvseg.config import DetectConfig
 from mvseg.detectors.zoo import find_weights
 from mvseg.simulation.dataset import SceneSpec
 
@@ -55,9 +56,9 @@ class Plan:
         return self.cache / "records" / self.preset
 
     def match_records(self, kind: str) -> Path:
-        """Folder of the records of matching, by method; the weights of a detector are told apart by their hash."""
-        weights = f"-{hash_detector(self.detector)}" if self.detector and kind.startswith("detected") else ""
-        return self.records / "match" / f"{slug(kind)}{weights}"
+        """Folder of the records of matching, by method; detectors are told apart by `hash_detector`."""
+        detector = f"-{hash_detector(self.detector)}" if self.detector and kind.startswith("detected") else ""
+        return self.records / "match" / f"{slug(kind)}{detector}"
 
 
 def run_simulated(spec: SceneSpec, plan: Plan) -> None:
@@ -144,9 +145,11 @@ def remember(make: Callable[[str], Masks]) -> Callable[[str], Masks]:
 
 @functools.cache
 def hash_detector(detector: str) -> str:
-    """First digits of the SHA-256 of a detector's weights; of nothing where there is no such file."""
+    """First digits of the SHA-256 of a detector's weights (nothing where there is no such file) and of the least score
+    of its masks."""
     path = find_weights(detector) or Path(detector)
-    return hashlib.sha256(path.read_bytes() if path.is_file() else b"").hexdigest()[:8]
+    weights = path.read_bytes() if path.is_file() else b""
+    return hashlib.sha256(weights + str(DetectConfig.min_score).encode()).hexdigest()[:8]
 
 
 def slug(name: str) -> str:
