@@ -18,7 +18,7 @@ from benchmarks.paper_tables import printed  # noqa: E402
 from benchmarks.paper_tables.__main__ import main  # noqa: E402
 from benchmarks.paper_tables.averages import average_columns, measure  # noqa: E402
 from benchmarks.paper_tables.cells import PRESETS, Cell, keep_record, list_cells, open_cell, read_cell  # noqa: E402
-from benchmarks.paper_tables.experiments import run_real, run_simulated  # noqa: E402
+from benchmarks.paper_tables.experiments import hash_detector, run_real, run_simulated  # noqa: E402
 from benchmarks.paper_tables.masks import detected_masks, tie_detections, true_masks  # noqa: E402
 from benchmarks.paper_tables.methods import METHODS, PRINTED  # noqa: E402
 from benchmarks.paper_tables.number_of_leaves import DEFAULT, RULES, score_numbers  # noqa: E402
@@ -184,6 +184,17 @@ def test_a_perfect_detector_gives_the_true_masks(cell: Cell, monkeypatch: pytest
     assert found.num_missed == 0
     assert sorted(found.true_ids.tolist()) == sorted(true.true_ids.tolist())
     assert found.regions.areas.sum() == true.regions.areas.sum()
+
+
+def test_detectors_differ_by_weights_and_by_least_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    hash_now = hash_detector.__wrapped__  # not the cached one
+    one, other = tmp_path / "one.safetensors", tmp_path / "other.safetensors"
+    one.write_bytes(b"weights")
+    other.write_bytes(b"others")
+    before = hash_now(str(one))
+    assert hash_now(str(one)) == before != hash_now(str(other))
+    monkeypatch.setattr(DetectConfig, "min_score", 0.9)
+    assert hash_now(str(one)) != before
 
 
 # --- the number of leaves
