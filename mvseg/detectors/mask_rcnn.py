@@ -6,7 +6,7 @@ detector with weights keeps the statistics it was trained with, frozen. The epsi
 `running_var` (so it is 0 in every detector built here), which makes a saved state dict complete by itself.
 
 The parameter names are torchvision's: state dicts of its builders load here, and those saved here load there as far as
-the norms agree.
+the norms agree. The small detectors have dilated mask heads, which a state dict does not tell: build them here.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def build_bare(arch: str, num_classes: int, backbone_weights: str | None = None)
 
 
 def build_small(backbone: nn.Module, num_classes: int) -> MaskRCNN:
-    """Mask R-CNN with light heads on a pyramid of levels "0" to "3" and "pool" (strides 4 to 64)."""
+    """Mask R-CNN with light heads, the mask head dilated, on levels "0" to "3" and "pool" (strides 4 to 64)."""
     channels = backbone.out_channels
     assert isinstance(channels, int)
     names = ["0", "1", "2", "3"]
@@ -129,7 +129,7 @@ def build_small(backbone: nn.Module, num_classes: int) -> MaskRCNN:
 
 
 def build_mask_head(channels: int) -> MaskRCNNHeads:
-    """torchvision's four convolutions, dilated: a pixel of the 14 x 14 sees 17 x 17 around it, not 9 x 9.
+    """torchvision's four convolutions, dilated: a pixel of the (D, channels, 14, 14) crops sees 17 x 17, not 9 x 9.
 
     A box around a thin slanted leaf holds more of other leaves than of its own; which leaf reaches all four of its
     sides can only be seen from afar.
