@@ -87,7 +87,7 @@ def build_parser() -> ArgumentParser:
     verbs.add_subcommand("train", train, help="fine-tune a Mask R-CNN")
 
     simulate = ArgumentParser(exit_on_error=False, description="Render plants with known answers.")
-    simulate.add_argument("preset", help="paper-eval (144 scenes of 3 to 20 photos) or train (768 of 9 photos)")
+    simulate.add_argument("preset", help="paper-eval (144 scenes of 3 to 20 photos) or train (888 of 9 photos)")
     simulate.add_argument("--out", type=Path, required=True, help="folder for the scenes; finished ones are kept")
     simulate.add_argument("--seed", type=int, default=0)
     simulate.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")

@@ -79,6 +79,7 @@ class Family:
     per_node: int = 1  # fronds at a node, evenly around the stem
     per_shoot: int = 12  # fronds before a new shoot starts
     tillers: float = 0.0  # chance that further shoots come out of the soil and not out of the first one
+    lean: Range = (2, 7)  # of a shoot at the soil, from the vertical
     lobes: tuple[int, float] = (0, 0.0)  # per side, and their depth / half-width
     teeth: float = 0.0  # depth of the serration / half-width
     leaflets: tuple[int, ...] = (1,)
@@ -101,6 +102,8 @@ FAMILIES: dict[str, Family] = {
                     curl=(-40, 5), per_shoot=10, lobes=(3, 0.62), teeth=0.04, rows=44, tillers=0.3),
     "compound": Family((0.6, 0.8), (36, 58), (0.48, 0.64), (0.6, 0.9), (70, 25), (5, 40), (26, 44),
                        per_shoot=6, leaflets=(3, 5, 5, 7), teeth=0.04, tillers=0.3),
+    "leggy": Family((0.6, 0.85), (45, 90), (0.42, 0.64), (0.15, 0.5), (60, -10), (20, 80), (60, 140), 90.0,
+                    curl=(-50, 0), per_node=2, per_shoot=4, tillers=0.8, lean=(0, 40)),
 }  # fmt: skip
 
 
@@ -251,7 +254,7 @@ def grow_shoots(num_fronds: int, kind: Family, rng: np.random.Generator) -> tupl
         if index == 0 or tillering:
             out = rng.uniform(0.2, 0.45) * kind.pot_radius * (index > 0)
             foot = np.array([out * math.cos(azimuth), out * math.sin(azimuth), 0.0])
-            tilt, scale = math.radians(rng.uniform(2, 7) + 6 * (index > 0)), rng.uniform(0.85, 1.1)
+            tilt, scale = math.radians(rng.uniform(*kind.lean) + 6 * (index > 0)), rng.uniform(0.85, 1.1)
         else:
             parent = nodes[(2 * (index - 1)) % max(len(parts[0]) // 2, 1)]
             foot, azimuth = parent.point, parent.azimuth + rng.normal(0, 0.3)
