@@ -97,8 +97,9 @@ def reconstruct_instances(
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+    config = config or ReconstructConfig()
     shapes, free = {}, None
-    if config is not None and config.seen_share > 0:
+    if config.seen_share > 0:
         ones = torch.ones_like(instance_ids)
         free = [regions.label_map(view, ones, *size) == 0 for view, size in enumerate(cameras.sizes.tolist())]
     instances = instance_ids[instance_ids >= 0].unique().tolist()
@@ -108,7 +109,7 @@ def reconstruct_instances(
         if grid is not None and grid.occupied.any():
             shapes[instance] = grid
         elif len(members.view_index.unique()) > 1:
-            message = f"instance {instance + 1} has no shape: its {len(members)} masks have no point in common"
+            message = f"instance {instance + 1} has no shape: its {len(members)} masks agree on no point"
             warnings.warn(message, InputWarning, stacklevel=2)
     return shapes
 
@@ -126,18 +127,17 @@ def back_project(
         members: the masks of the instance.
         cameras: V cameras.
         config: threshold, voxel size (world units) or voxel budget.
-        free: V maps (H, W) bool, where the view shows no region of any instance; only `config.seen_share` asks for it.
+        free: V maps (H, W) bool, where the view shows no region of any instance, for `config.seen_share`. None: no
+            pixel is known to be free, which leaves the paper's rule.
 
     Returns:
         The grid, or None for an instance seen in fewer than two views or without a common point. Warns (InputWarning)
         when the common part has no bounds, as with views that are nearly parallel, and had to be cut off.
 
     Raises:
-        InputError: a voxel size that asks for more than 2e8 voxels; `seen_share` without `free`.
+        InputError: a voxel size that asks for more than 2e8 voxels.
     """
     config = config or ReconstructConfig()
-    if config.seen_share > 0 and free is None:
-        raise InputError(f"seen_share is {config.seen_share:g}, which needs to know where the views show nothing")
     cameras = cameras.to(members.device)
     views = members.view_index[members.areas > 0].unique().tolist()
     masks = [_ViewMask.union(members, view, cameras) for view in views]

@@ -149,7 +149,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "seed": 9,
             "split_merged": False,
         },
-        "reconstruct": {"threshold": 0.4, "seen_share": 0.0, "voxel_size": 1.5, "voxel_budget": 250_000},
+        "reconstruct": {"threshold": 0.4, "seen_share": 0.8, "voxel_size": 1.5, "voxel_budget": 250_000},
     }
     assert run["mvseg"] == mvseg.__version__
     assert run["inputs"].keys() == {str(plant / "cameras.json"), str(plant / "masks")}

@@ -81,7 +81,7 @@ def test_seen_share_agrees_with_points_projected_one_by_one() -> None:
     """It takes voxels away, none where another instance may hide the point, and changes no vote of the others."""
     scene = ball_scene(4, 6, seed=2, focal=200.0, width=160, height=120)
     ids = scene.regions.labels - 1
-    plain = reconstruct_instances(scene.regions, ids, scene.cameras, ReconstructConfig(voxel_size=0.1))
+    plain = reconstruct_instances(scene.regions, ids, scene.cameras, ReconstructConfig(voxel_size=0.1, seen_share=0))
     seen = reconstruct_instances(scene.regions, ids, scene.cameras, ReconstructConfig(voxel_size=0.1, seen_share=0.8))
     removed = 0
     for instance, grid in seen.items():
@@ -108,8 +108,8 @@ def test_what_stands_behind_something_is_not_carved_away() -> None:
     ball = 4 / 3 * math.pi
     volumes = {}
     for name, config in {
-        "paper": ReconstructConfig(voxel_size=0.08),
-        "all masks": ReconstructConfig(voxel_size=0.08, threshold=0.9),
+        "paper": ReconstructConfig(voxel_size=0.08, seen_share=0),
+        "all masks": ReconstructConfig(voxel_size=0.08, seen_share=0, threshold=0.9),
         "seen": ReconstructConfig(voxel_size=0.08, seen_share=0.9),
     }.items():
         volumes[name] = reconstruct_instances(regions, ids, cameras, config)[0].volume / ball
@@ -117,10 +117,15 @@ def test_what_stands_behind_something_is_not_carved_away() -> None:
     assert 0.98 < volumes["seen"] < volumes["paper"]
 
 
-def test_seen_share_must_be_told_where_nothing_is() -> None:
+def test_without_free_pixels_the_paper_rule_is_left() -> None:
     regions, cameras = ball_from(AXES)
-    with pytest.raises(InputError, match=r"seen_share is 0\.9, which needs"):
-        back_project(regions, cameras, ReconstructConfig(seen_share=0.9))
+    nowhere = [torch.zeros(height, width, dtype=torch.bool) for width, height in cameras.sizes.tolist()]
+    paper = back_project(regions, cameras, ReconstructConfig(voxel_size=0.1, seen_share=0))
+    assert paper is not None
+    for free in (None, nowhere):
+        grid = back_project(regions, cameras, ReconstructConfig(voxel_size=0.1, seen_share=0.9), free)
+        assert grid is not None
+        assert torch.equal(grid.votes, paper.votes)
 
 
 def test_the_box_holds_all_that_exceeds_the_threshold() -> None:

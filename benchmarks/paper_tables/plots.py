@@ -10,6 +10,7 @@ from benchmarks.paper_tables import printed
 from benchmarks.paper_tables.averages import Average, average_columns, measure
 from benchmarks.paper_tables.experiments import Plan
 from benchmarks.paper_tables.methods import PRINTED
+from benchmarks.paper_tables.shapes import DEFAULT_SHARE
 from benchmarks.paper_tables.tables import axes, read_matches, read_shapes
 
 COLORS = {"MVS-based": "tab:green", "Point-based": "tab:orange", "Sparse": "tab:purple", "MVIS (paper)": "tab:blue"}
@@ -66,7 +67,7 @@ def plot_shapes(plan: Plan, out: Path) -> Path:
         "semantic segmentation, true masks": ("tab:gray", "0.5"),
         "MVIS (paper), true masks": ("tab:blue", "0.5"),
         "MVIS (nview), true masks": ("tab:red", "0.5"),
-        "MVIS (nview), true masks, hidden parts": ("black", "0.9"),
+        "MVIS (nview), true masks, hidden parts": ("black", DEFAULT_SHARE),
     }
     shapes = read_shapes(plan, lines)
     figure, panels = pyplot.subplots(1, 2, figsize=(9, 3.9), sharey=True, layout="constrained")

@@ -31,6 +31,7 @@ from mvseg.reconstruction import VoxelGrid, back_project, reconstruct_instances
 VOXELS_PER_LEAF = 50  # along the mean length of a leaf
 PAPER_THRESHOLD = 0.5
 THRESHOLDS = (0.5, 0.7, 0.8, 0.9)
+DEFAULT_SHARE = f"{ReconstructConfig.seen_share:g}"  # one of these
 
 Masked = Callable[[str], Masks]  # the masks of a cell by kind
 Shape = Callable[[Cell, Masked, Path], Record]

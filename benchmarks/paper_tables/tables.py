@@ -11,7 +11,7 @@ from benchmarks.paper_tables.cells import PRESETS, Record, list_cells, read_reco
 from benchmarks.paper_tables.experiments import Plan, plant_index, read_records, real_record, slug
 from benchmarks.paper_tables.methods import PRINTED
 from benchmarks.paper_tables.number_of_leaves import RULES
-from benchmarks.paper_tables.shapes import SHAPES, THRESHOLDS
+from benchmarks.paper_tables.shapes import DEFAULT_SHARE, SHAPES, THRESHOLDS
 
 MEASURES = {"s_match": ("s_match", 3), "e_k": ("e_k", 2), "ARI": ("ari", 3), "pair F1": ("f1", 3)}
 TOGETHER = "s_match, untied together"
@@ -129,8 +129,8 @@ def table_3(plan: Plan) -> str:
         ("MVIS", "MVIS (paper), degraded masks", "0.5"),
         ("MVIS", "MVIS (nview), true masks", "0.5"),
         ("MVIS", "MVIS (nview), degraded masks", "0.5"),
-        ("MVIS", "MVIS (nview), true masks, hidden parts", "0.9"),
-        ("MVIS", "MVIS (nview), degraded masks, hidden parts", "0.9"),
+        ("MVIS", "MVIS (nview), true masks, hidden parts", DEFAULT_SHARE),
+        ("MVIS", "MVIS (nview), degraded masks, hidden parts", DEFAULT_SHARE),
     ]
     shapes = read_shapes(plan, [name for _, name, _ in wanted])
     rows, last = [], None
