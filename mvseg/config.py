@@ -84,7 +84,8 @@ class ReconstructConfig:
             paper: 0.5); in [0, 1).
         seen_share: against matter around thin instances: of the instance's views whose pixel shows the instance or
             no instance at all, more than this share must show the instance. A view in which another instance may stand
-            in front of the voxel does not count. In [0, 1); 0 is the paper's rule, which leaves thin things thick.
+            in front of the voxel does not count; what has no mask (stems, leaves that were missed) counts as none. In
+            [0, 1); 0 is the paper's rule, which leaves thin things thick.
         voxel_size: edge of a voxel in the scene's unit; null to derive it from the budget.
         voxel_budget: voxels in an instance's bounding box when no size is given.
     """

@@ -81,6 +81,8 @@ def reconstruct_instances(
 ) -> dict[int, VoxelGrid]:
     """Back-project every instance that is seen in at least two views.
 
+    Departs from the paper by `config.seen_share`, which brings shapes nearer to the true leaves (docs/benchmarks.md).
+
     Args:
         regions: D regions.
         instance_ids: (D,) int64, -1 = no instance.

@@ -9,7 +9,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from mvseg.errors import InputError
-from mvseg.simulation.plants import FAMILIES, Plant, grow_plant
+from mvseg.simulation.plants import FAMILIES, Plant, grow_plant, grow_shoots
 
 
 def share_of_crossing_leaves(plant: Plant) -> float:
@@ -60,6 +60,14 @@ def test_plants_have_the_size_of_plants(family: str) -> None:
     tops = [max(leaf.vertices[:, 2].max() for leaf in grow_plant(family, 16, seed).leaves) for seed in range(4)]
     assert min(tops) > 20
     assert max(tops) < 900
+
+
+def test_leggy_stems_are_bare() -> None:
+    lowest = {}
+    for family in ("leggy", "ovate"):
+        shoots = [grow_shoots(8, FAMILIES[family], np.random.default_rng(seed))[1] for seed in range(20)]
+        lowest[family] = np.median([nodes[0].point[2] for nodes in shoots])
+    assert lowest["leggy"] > 2 * lowest["ovate"]
 
 
 def flatten(plant: Plant) -> bytes:
