@@ -19,7 +19,7 @@ from mvseg.errors import InputError
 from mvseg.scene import Cameras
 from mvseg.simulation import dataset
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.dataset import PRESETS, SIX, Preset, list_scenes, write_dataset, write_scene
+from mvseg.simulation.dataset import EVALUATED_FAMILIES, PRESETS, Preset, list_scenes, write_dataset, write_scene
 from mvseg.simulation.plants import FAMILIES, Plant, grow_plant
 from mvseg.simulation.render import render_view
 
@@ -235,7 +235,7 @@ def test_paper_eval_has_every_cell_in_both_splits() -> None:
                 cell = [s for s in scenes if (s.split, s.num_leaves, s.num_views) == (split, num_leaves, num_views)]
                 assert len({s.seed for s in cell}) == len(cell) >= least
     assert not {s.seed for s in scenes if s.split == "dev"} & {s.seed for s in scenes if s.split == "test"}
-    assert {s.family for s in scenes if s.split == "test"} == set(SIX)
+    assert {s.family for s in scenes if s.split == "test"} == set(EVALUATED_FAMILIES)
     plants = {(s.split, s.num_leaves, s.family, s.seed) for s in scenes}
     assert len(plants) == len(scenes) / 4  # one plant for every number of views
 

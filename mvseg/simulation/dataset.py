@@ -140,21 +140,21 @@ def write_table(path: Path, columns: list[str], rows: list[tuple[Any, ...]]) -> 
 # --- data sets
 
 
-# What is evaluated on. Bare stems are left out: they are there to be learnt, and published figures stay comparable.
-SIX = ("ovate", "lanceolate", "rosette", "strap", "lobed", "compound")
+# Without "leggy", which is there to be learnt: so published figures stay comparable.
+EVALUATED_FAMILIES = ("ovate", "lanceolate", "rosette", "strap", "lobed", "compound")
 
 
 @dataclass(frozen=True)
 class Preset:
     """What a data set consists of: for every split, number of leaves and number of views, that many plants.
 
-    The plants of a cell have different families in turn. A plant is the same for every number of views, and different
-    from every plant of another split.
+    A plant is the same for every number of views, and different from every plant of another split.
 
     Attributes:
         plants: (split, plants per number of leaves) pairs.
         leaves, views: the numbers that are crossed with each other.
         size: image width and height in pixels.
+        families: the plants of a cell have these in turn, each cell starting one further on.
         has_free_cameras: all around the plant, at any height and zoom, instead of the 200 degree arc.
         has_coco: write `<split>.json` with the leaves of all photos, category "leaf".
     """
@@ -163,7 +163,7 @@ class Preset:
     leaves: tuple[int, ...]
     views: tuple[int, ...]
     size: tuple[int, int] = (480, 480)
-    families: tuple[str, ...] = SIX
+    families: tuple[str, ...] = EVALUATED_FAMILIES
     has_free_cameras: bool = False
     has_coco: bool = False
 
@@ -174,7 +174,7 @@ PRESETS = {
         plants=(("train", 70), ("val", 4)),
         leaves=(2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48),
         views=(9,),
-        families=SIX * 10 + ("leggy",) * 10,  # to learn that bare stems are no leaves
+        families=EVALUATED_FAMILIES * 10 + ("leggy",) * 10,  # to learn that bare stems are no leaves
         has_free_cameras=True,
         has_coco=True,
     ),
