@@ -18,14 +18,14 @@ import torch
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-from mvseg.affinity import region_affinity  # noqa: E402
 from mvseg.cli import DEMO_SCENE  # noqa: E402
-from mvseg.formats.folder import load_masks, load_scene  # noqa: E402
+from mvseg.formats.scene_folder import load_masks, load_scene  # noqa: E402
+from mvseg.matching.affinity import region_affinity  # noqa: E402
 from mvseg.regions import regions_from_label_maps  # noqa: E402
 from mvseg.simulation.cameras import arc_cameras  # noqa: E402
 from mvseg.simulation.dataset import drop_small  # noqa: E402
-from mvseg.simulation.plants import grow_plant  # noqa: E402
-from mvseg.simulation.render import build_stage, render_stage  # noqa: E402
+from mvseg.simulation.growth import grow_plant  # noqa: E402
+from mvseg.simulation.ray_cast import build_stage, render_stage  # noqa: E402
 from reference import affinity_reference  # noqa: E402
 
 

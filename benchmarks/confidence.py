@@ -15,10 +15,10 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matching import load_maps, true_ids
 
-from mvseg.affinity import region_affinity
-from mvseg.nview import match_nview
+from matching import load_maps, true_ids
+from mvseg.matching.affinity import region_affinity
+from mvseg.matching.nview.match_nview import match_nview
 from mvseg.regions import regions_from_label_maps
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes
 

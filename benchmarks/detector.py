@@ -24,16 +24,16 @@ import torch
 import trimesh
 from tqdm import tqdm
 
-from mvseg.average_precision import annotate_truth, average_precision, describe_mask, detect_and_label
 from mvseg.config import DetectConfig
 from mvseg.detectors.zoo import load_detector
-from mvseg.formats.folder import load_masks, load_scene
+from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import load_photos
-from mvseg.metrics import matching_metrics
-from mvseg.multiview import MultiViewMaskRCNN, Proposals
+from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN, Proposals
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
-from mvseg.training_data import SampleList, list_samples, read_sample
+from mvseg.training.average_precision import annotate_truth, average_precision, describe_mask, detect_and_label
+from mvseg.training.data import SampleList, list_samples, read_sample
 
 FOUND_IOU = 0.5
 HIDDEN = 0.5  # less than this share visible

@@ -25,17 +25,17 @@ import torch
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
-from mvseg.affinity import Affinity, region_affinity
-from mvseg.clustering import cluster_affinity
-from mvseg.hypotheses import Costs
-from mvseg.metrics import matching_metrics
-from mvseg.nview import match_nview
-from mvseg.one_per_view import one_per_view_clusters
+from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.matching.affinity import Affinity, region_affinity
+from mvseg.matching.nview.cluster_scores import Costs
+from mvseg.matching.nview.match_nview import match_nview
+from mvseg.matching.one_per_view import one_per_view_clusters
+from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, drop_small, list_scenes, scene_cameras
-from mvseg.simulation.degrade import Faults, degrade_labels
-from mvseg.simulation.plants import Plant, grow_plant
+from mvseg.simulation.faults import Faults, degrade_labels
+from mvseg.simulation.growth import Plant, grow_plant
 
 MIN_PIXELS = 30
 Maps = np.ndarray

@@ -14,14 +14,14 @@ import torch
 import torchvision
 
 from mvseg.config import MatchConfig
-from mvseg.multiview import Proposals, match_proposals
-from mvseg.nms import cluster_aware_nms
+from mvseg.multiview.mask_rcnn import Proposals, match_proposals
+from mvseg.multiview.nms import cluster_aware_nms
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.dataset import drop_small
-from mvseg.simulation.plants import grow_plant
+from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.proposals import simulate_proposals
-from mvseg.simulation.render import build_stage, render_stage
+from mvseg.simulation.ray_cast import build_stage, render_stage
 
 FAMILIES = ("ovate", "rosette", "lanceolate", "lobed", "compound", "strap")
 

@@ -16,18 +16,18 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from matching import load_maps, true_ids
 from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csc_array
 
-from mvseg.affinity import region_affinity
-from mvseg.hypotheses import Costs, nothing_known, own_scores, partition_value
-from mvseg.metrics import matching_metrics
-from mvseg.nview import refine, search, view_costs, weight_evidence
-from mvseg.one_per_view import dense_ids, link_average, one_per_view_clusters
+from matching import load_maps, true_ids
+from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.matching.affinity import region_affinity
+from mvseg.matching.nview.cluster_scores import Costs, nothing_known, own_scores, partition_value
+from mvseg.matching.nview.label_rows import RowTable, em_affinities, row_table
+from mvseg.matching.nview.match_nview import refine, search, view_costs, weight_evidence
+from mvseg.matching.one_per_view import dense_ids, link_average, one_per_view_clusters
 from mvseg.regions import regions_from_label_maps
-from mvseg.rows import RowTable, em_affinities, row_table
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes
 
 Floats = NDArray[np.floating]

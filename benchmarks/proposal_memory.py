@@ -12,9 +12,9 @@ import time
 
 import torch
 
-from mvseg.multiview import gather_proposals, match_proposals
+from mvseg.multiview.mask_rcnn import gather_proposals, match_proposals
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.plants import grow_plant
+from mvseg.simulation.growth import grow_plant
 
 
 def mask_head_output(plant, cameras, view: int, count: int, generator: torch.Generator) -> dict[str, torch.Tensor]:

@@ -16,9 +16,9 @@ from mvseg import load_masks, load_scene, match_regions
 from mvseg.cli import DEMO_SCENE
 from mvseg.formats.photos import read_photo
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.report.overlay import draw_overlay
+from mvseg.results.overlay import draw_overlay
 from mvseg.scene import Scene
-from mvseg.simulation.degrade import Faults, degrade_labels
+from mvseg.simulation.faults import Faults, degrade_labels
 
 DOCS = Path(__file__).parent
 WHITE = (255, 255, 255)

@@ -11,8 +11,8 @@ import torch
 from mvseg import epipolar_map, load_masks, load_scene, match_regions
 from mvseg.cli import DEMO_SCENE
 from mvseg.formats.photos import read_photo
-from mvseg.report.overlay import draw_overlay
-from mvseg.rows import row_table
+from mvseg.matching.nview.label_rows import row_table
+from mvseg.results.overlay import draw_overlay
 
 DOCS = Path(__file__).parent
 SOURCE, OTHERS = 1, (3, 5, 7)

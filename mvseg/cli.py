@@ -19,7 +19,7 @@ from jsonargparse import ArgumentParser, Namespace
 import mvseg
 from mvseg.config import DetectConfig, MatchConfig, ReconstructConfig
 from mvseg.errors import InputError, InputWarning
-from mvseg.training_config import TrainConfig
+from mvseg.training.config import TrainConfig
 
 DEMO_SCENE = Path(str(files("mvseg") / "demo_plant"))
 DEFAULT_OUT = Path("results")
@@ -139,7 +139,7 @@ def _match(args: Namespace) -> int:
 def _run(scene: Path, masks: Path | None, out: Path, args: Namespace, reconstruct: ReconstructConfig | None) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
     from mvseg.pipeline import describe_run, run_scene  # keeps --help and wrong options quick
-    from mvseg.result import check_out, save_result
+    from mvseg.results.folder import check_out, save_result
 
     check_out(out)
     replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
@@ -175,9 +175,9 @@ def _find_masks(scene: Path, masks: Path) -> Path:
 
 
 def _eval(args: Namespace) -> int:
-    from mvseg.metrics import matching_metrics
+    from mvseg.evaluation.id_metrics import matching_metrics
     from mvseg.regions import IGNORE_LABEL
-    from mvseg.result import read_instances
+    from mvseg.results.folder import read_instances
 
     ids, true = read_instances(args.result, args.truth)
     judged = (true != 0) & (true != IGNORE_LABEL)
@@ -196,7 +196,7 @@ def _eval(args: Namespace) -> int:
 
 
 def _train(args: Namespace) -> int:
-    from mvseg.training import train
+    from mvseg.training.loop import train
 
     is_first = os.environ.get("RANK", "0") == "0"  # under torchrun one process speaks
     logging.basicConfig(level=logging.INFO if is_first else logging.WARNING, format="%(message)s")

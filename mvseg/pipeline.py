@@ -18,12 +18,12 @@ import mvseg
 from mvseg.config import DetectConfig, MatchConfig, ReconstructConfig
 from mvseg.detectors.zoo import find_weights, load_detector
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.folder import load_masks, load_scene
 from mvseg.formats.photos import check_photos, read_photo
-from mvseg.matching import Matching, match_regions, split_merged
-from mvseg.multiview import MultiViewMaskRCNN, Proposals
-from mvseg.reconstruction import reconstruct_instances
-from mvseg.result import Result
+from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.matching.match_regions import Matching, match_regions, split_merged
+from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN, Proposals
+from mvseg.reconstruction.voxels import reconstruct_instances
+from mvseg.results.folder import Result
 from mvseg.scene import Scene
 
 

@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from mvseg.cli import DEMO_SCENE
-from mvseg.formats.folder import load_masks, load_scene
+from mvseg.evaluation.id_metrics import region_truth
 from mvseg.formats.label_png import read_label_png
-from mvseg.metrics import region_truth
+from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 

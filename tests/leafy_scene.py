@@ -13,8 +13,8 @@ from torch import Tensor
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene, View
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.plants import grow_plant
-from mvseg.simulation.render import build_stage, render_stage
+from mvseg.simulation.growth import grow_plant
+from mvseg.simulation.ray_cast import build_stage, render_stage
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,7 +23,7 @@ from mvseg.cli import DEMO_SCENE, main
 from mvseg.config import DetectConfig
 from mvseg.errors import InputWarning
 from mvseg.formats.label_png import read_label_png, write_label_png
-from mvseg.matching import Matching, match_regions
+from mvseg.matching.match_regions import Matching, match_regions
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent

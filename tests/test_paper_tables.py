@@ -25,8 +25,8 @@ from benchmarks.paper_tables.number_of_leaves import DEFAULT, RULES, score_numbe
 from benchmarks.paper_tables.shape_error import measure_points, measure_shares, unite  # noqa: E402
 from benchmarks.paper_tables.workers import start_process  # noqa: E402
 from mvseg.config import DetectConfig, MatchConfig  # noqa: E402
-from mvseg.matching import match_regions  # noqa: E402
-from mvseg.metrics import matching_metrics, shape_distance  # noqa: E402
+from mvseg.evaluation.id_metrics import matching_metrics, shape_distance  # noqa: E402
+from mvseg.matching.match_regions import match_regions  # noqa: E402
 from mvseg.regions import regions_from_label_maps  # noqa: E402
 from mvseg.simulation.dataset import list_scenes  # noqa: E402
 
@@ -178,7 +178,7 @@ def test_a_perfect_detector_gives_the_true_masks(cell: Cell, monkeypatch: pytest
         unsure = torch.ones_like(masks[0])
         return {"scores": torch.tensor([0.9] * len(masks) + [DetectConfig().min_score - 0.01])}, [*masks, unsure]
 
-    monkeypatch.setattr("mvseg.average_precision.detect", detect)
+    monkeypatch.setattr("mvseg.training.average_precision.detect", detect)
     monkeypatch.setattr("mvseg.detectors.zoo.load_detector", lambda name: name)
     found, true = detected_masks(cell, "leaf"), true_masks(cell)
     assert found.num_missed == 0

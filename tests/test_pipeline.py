@@ -12,7 +12,7 @@ import torch
 import mvseg
 from mvseg import InputError, MatchConfig, ReconstructConfig, load_masks, load_scene, match_regions, run_scene
 from mvseg.pipeline import describe_run
-from mvseg.reconstruction import reconstruct_instances
+from mvseg.reconstruction.voxels import reconstruct_instances
 from scene_folders import write_scene
 
 

@@ -13,11 +13,11 @@ import torch
 from conftest import true_ids
 from mvseg.config import MatchConfig, ReconstructConfig
 from mvseg.errors import InputWarning
-from mvseg.formats.folder import load_masks, load_scene
+from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import read_photo
-from mvseg.matching import match_regions
-from mvseg.metrics import matching_metrics
-from mvseg.reconstruction import back_project
+from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.matching.match_regions import match_regions
+from mvseg.reconstruction.voxels import back_project
 
 pytestmark = pytest.mark.shared_data
 

@@ -21,9 +21,9 @@ from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHe
 from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
 from torchvision.ops import MultiScaleRoIAlign
 
-import mvseg.training
-from mvseg.training import TrainConfig, train
-from mvseg.training_state import apply_gradients
+import mvseg.training.loop
+from mvseg.training.loop import TrainConfig, train
+from mvseg.training.state import apply_gradients
 
 
 def write_photos(folder: Path, count: int, size: int = 64) -> tuple[Path, Path]:
@@ -123,7 +123,7 @@ def die_at(moment: str) -> None:
 
     if what == "step":
         step = lambda *args: die() if is_due() else apply_gradients(*args)  # noqa: E731
-        patch.object(mvseg.training, "apply_gradients", step).start()
+        patch.object(mvseg.training.loop, "apply_gradients", step).start()
     elif what == "checkpoint":
         save = torch.save
 
@@ -135,7 +135,7 @@ def die_at(moment: str) -> None:
 
         patch.object(torch, "save", write_half).start()
     else:
-        patch.object(mvseg.training, "detect_and_label", lambda *args: die()).start()
+        patch.object(mvseg.training.loop, "detect_and_label", lambda *args: die()).start()
 
 
 def load_weights(path: Path) -> dict[str, Tensor]:

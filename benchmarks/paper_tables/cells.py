@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from mvseg.errors import InputError
-from mvseg.formats.folder import load_scene
 from mvseg.formats.label_png import read_label_png
+from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
 from mvseg.simulation import dataset
 from mvseg.simulation.dataset import Preset, SceneSpec, list_scenes, scene_cameras, write_scene, write_text
-from mvseg.simulation.plants import grow_plant
+from mvseg.simulation.growth import grow_plant
 
 SEED = 7  # the test plants of seed 0 have been looked at
 Record = dict[str, Any]

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from benchmarks.paper_tables.cells import Cell
 from mvseg.config import DetectConfig
-from mvseg.formats.folder import load_masks
 from mvseg.formats.photos import load_photos
+from mvseg.formats.scene_folder import load_masks
 from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps, stack_regions
-from mvseg.simulation.degrade import Faults, degrade_labels
+from mvseg.simulation.faults import Faults, degrade_labels
 
 MIN_PIXELS = 30  # of a detected mask; true and degraded masks have as many
 MIN_IOU = 0.5  # with a true mask, for a detection to count as that leaf
@@ -51,8 +51,8 @@ def degraded_masks(cell: Cell) -> Masks:
 
 def detected_masks(cell: Cell, detector: str) -> Masks:
     """What a shipped detector, or one in a .safetensors file, finds in each photo on its own."""
-    from mvseg.average_precision import detect
     from mvseg.detectors.zoo import load_detector
+    from mvseg.training.average_precision import detect
 
     model = load_detector(detector)
     view_index, boxes, crops = [], [], []

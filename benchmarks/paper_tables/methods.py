@@ -17,8 +17,8 @@ from mvseg.baselines.points import match_points
 from mvseg.baselines.sparse import match_sparse
 from mvseg.config import MatchConfig
 from mvseg.errors import InputError
-from mvseg.matching import Matching, match_regions
-from mvseg.metrics import matching_metrics
+from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.matching.match_regions import Matching, match_regions
 from mvseg.regions import Regions
 
 Method = Callable[[Regions, Cell, Path], Matching]

@@ -9,9 +9,9 @@ from torch import Tensor
 
 from benchmarks.paper_tables.cells import Cell, Record
 from benchmarks.paper_tables.masks import Masks
-from mvseg.affinity import region_affinity
-from mvseg.clustering import factorise, renumber, size_spread
-from mvseg.metrics import matching_metrics
+from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.matching.affinity import region_affinity
+from mvseg.matching.symnmf import factorise, renumber, size_spread
 
 KS_AT_ONCE = 8
 DEFAULT = "[m, 2 m]"

@@ -25,8 +25,8 @@ from benchmarks.paper_tables.shape_error import (
 from mvseg.baselines.semantic import reconstruct_semantic
 from mvseg.config import MatchConfig, ReconstructConfig
 from mvseg.errors import InputError, InputWarning
-from mvseg.matching import match_regions
-from mvseg.reconstruction import VoxelGrid, back_project, reconstruct_instances
+from mvseg.matching.match_regions import match_regions
+from mvseg.reconstruction.voxels import VoxelGrid, back_project, reconstruct_instances
 
 VOXELS_PER_LEAF = 50  # along the mean length of a leaf
 PAPER_THRESHOLD = 0.5

@@ -5,12 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mvseg.affinity import Affinity
 from mvseg.baselines.dense_points import DensePoints
 from mvseg.baselines.ties import check_views, cluster_ties, tie_graph
 from mvseg.config import MatchConfig
 from mvseg.errors import InputError
-from mvseg.matching import Matching
+from mvseg.matching.affinity import Affinity
+from mvseg.matching.match_regions import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 

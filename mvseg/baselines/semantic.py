@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from mvseg.config import ReconstructConfig
 from mvseg.errors import InputError
-from mvseg.reconstruction import VoxelGrid, back_project
+from mvseg.reconstruction.voxels import VoxelGrid, back_project
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 

@@ -10,11 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.affinity import Affinity
 from mvseg.baselines.ties import check_views, cluster_ties, tie_graph
 from mvseg.config import MatchConfig
 from mvseg.formats.photos import read_photo
-from mvseg.matching import Matching
+from mvseg.matching.affinity import Affinity
+from mvseg.matching.match_regions import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mvseg.affinity import Affinity
-from mvseg.clustering import cluster_affinity
 from mvseg.config import MatchConfig
 from mvseg.errors import InputError
-from mvseg.matching import Matching, mean_affinity
+from mvseg.matching.affinity import Affinity
+from mvseg.matching.match_regions import Matching, mean_affinity
+from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError
 from mvseg.scene import Cameras
-from mvseg.simulation.plants import Plant
+from mvseg.simulation.growth import Plant
 
 FRAME_FILL = 0.94  # of the half image that the farthest point of the plant may reach
 DISTANCE = 3.5  # of the cameras from the plant's centre, in radii of the plant

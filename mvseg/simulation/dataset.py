@@ -37,8 +37,8 @@ from tqdm import tqdm
 from mvseg.errors import InputError
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.plants import Plant, grow_plant
-from mvseg.simulation.render import build_stage, render_stage
+from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.ray_cast import build_stage, render_stage
 
 JPEG_QUALITY = 90
 

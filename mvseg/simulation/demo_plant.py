@@ -10,7 +10,7 @@ from pathlib import Path
 
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.dataset import write_scene
-from mvseg.simulation.plants import grow_plant
+from mvseg.simulation.growth import grow_plant
 
 NUM_LEAVES = 12
 NUM_VIEWS = 9

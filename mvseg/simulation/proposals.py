@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.multiview import Proposals
+from mvseg.multiview.mask_rcnn import Proposals
 from mvseg.regions import regions_from_label_maps, stack_regions
 
 

@@ -1,0 +1,1 @@
+"""How right masks, ids and shapes are."""

@@ -1,0 +1,1 @@
+"""Region matching: masks and cameras in, instance ids out."""

@@ -1,0 +1,111 @@
+"""Stage 4: the weighted graph of regions (Eq. 3)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvseg.matching.epipolar import BinnedPair, Bins, Samples, bin_histogram, binned_pairs, dilate, view_samples
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class Affinity:
+    """The undirected weighted graph G = (V, E, w) of the paper, sparse.
+
+    Attributes:
+        edges: (E, 2) int64, pairs of regions of different views, first < second, each pair once.
+        weights: (E,) float32 in (0, 1], the mean of the two directions of Eq. 3; pairs of weight 0 are left out.
+        num_regions: D.
+    """
+
+    edges: Tensor
+    weights: Tensor
+    num_regions: int
+
+    def to_dense(self) -> Tensor:
+        """(D, D) float32, symmetric, zero diagonal: the paper's W."""
+        dense = torch.zeros(self.num_regions, self.num_regions, device=self.weights.device)
+        first, second = self.edges.unbind(1)
+        dense[first, second] = self.weights
+        dense[second, first] = self.weights
+        return dense
+
+
+def region_affinity(
+    regions: Regions, cameras: Cameras, *, num_points: int | None = None, seed: int = 0, progress: bool = False
+) -> Affinity:
+    """Affinity of all pairs of regions in different views (Eq. 3), symmetrised.
+
+    Args:
+        regions: D regions in V views.
+        cameras: V cameras. Pairs of views at one place are skipped: their regions get no edge.
+        num_points: how many random pixels of a region send out epipolar lines. None takes all pixels, which is no
+            slower, has no sampling noise and is the default; the paper takes 200.
+        seed: of the random pixels.
+        progress: show a progress bar over the pairs of views.
+
+    Returns:
+        The graph. A region in a view alone, or whose bands meet nothing, has no edge.
+    """
+    samples, members = view_samples(regions)
+    senders = None if num_points is None else _draw_points(samples, num_points, seed)
+    edges, weights = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)], []
+    for pair in binned_pairs(samples, cameras, progress=progress):
+        i, j = pair.i, pair.j
+        lines = pair.counts if senders is None else _line_counts(pair, senders[i], senders[j])
+        forth, back = pairwise_affinity(pair.bins, pair.counts, lines)
+        mean = (forth + back.T) / 2
+        place = mean.nonzero()
+        edges.append(torch.stack((members[i][place[:, 0]], members[j][place[:, 1]]), 1).sort(1).values)
+        weights.append(mean[place[:, 0], place[:, 1]])
+    empty = torch.zeros(0, device=regions.device)
+    return Affinity(torch.cat(edges), torch.cat([empty, *weights]), len(regions))
+
+
+def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
+    """Both directions of Eq. 3 for the regions of two views.
+
+    w(n -> m) is the fraction of m's pixels inside the band of n, times the fraction of n's lines that pass through m.
+
+    Args:
+        bins: B half-planes of the two views' pencil.
+        pixels: (N, B) and (M, B) float32, pixels of the regions of view i and of view j in each bin.
+        lines: (N, B) and (M, B) float32, lines that the same regions send out in each bin.
+
+    Returns:
+        w(i -> j) (N, M) and w(j -> i) (M, N), float32 in [0, 1].
+    """
+    forth = _directed(lines[0], pixels[1], bins.band_radius(0), bins.half_line[1])
+    return forth, _directed(lines[1], pixels[0], bins.band_radius(1), bins.half_line[0])
+
+
+def _directed(lines: Tensor, pixels: Tensor, band_radius: int, half_line: int) -> Tensor:
+    """(N, M) affinity from (N, B) line counts and (M, B) pixel counts."""
+    covered = dilate(lines > 0, band_radius) @ pixels.T / pixels.sum(1).clamp(min=1)
+    passing = lines @ dilate(pixels > 0, half_line).T / lines.sum(1, keepdim=True).clamp(min=1)
+    return covered * passing
+
+
+def _line_counts(pair: BinnedPair, first: Samples, second: Samples) -> tuple[Tensor, Tensor]:
+    """(N, B) and (M, B): how many of the drawn points lie in each bin."""
+    angles = [pair.pencil.angles(side, sample.xy) for side, sample in enumerate((first, second))]
+    return bin_histogram(pair.bins, angles[0], first), bin_histogram(pair.bins, angles[1], second)
+
+
+def _draw_points(samples: list[Samples], num_points: int, seed: int) -> list[Samples]:
+    """`num_points` random pixels of each region, drawn with replacement as in the paper; weights 1."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = []
+    for sample in samples:
+        counts = torch.bincount(sample.owner, minlength=sample.num_regions)
+        first = counts.cumsum(0) - counts
+        draw = torch.rand(sample.num_regions, num_points, generator=generator).to(sample.xy.device)
+        order = sample.owner.argsort(stable=True)
+        picks = order[(first[:, None] + (draw * counts[:, None]).long()).flatten()]
+        owner = sample.owner[picks]
+        drawn.append(Samples(sample.xy[picks], owner, torch.ones_like(sample.weight[picks]), sample.num_regions))
+    return drawn

@@ -1,0 +1,1 @@
+"""Matching by what all views show along the rays of each region."""

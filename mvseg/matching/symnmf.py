@@ -1,0 +1,144 @@
+"""Stage 5: graph clustering by symmetric NMF, and the number of clusters by Eq. 7, as in the paper (Sec. 3.1, 3.4).
+
+The paper does not state the range in which Eq. 7 looks for |k|, and that range decides everything: Eq. 7 is 0 for every
+partition in equal parts, so that k = 1, k = |V| and, where all leaves are seen in all views, any merging into equal
+groups tie with the truth. The default range here is [max_v n_v, 2 max_v n_v], n_v the number of masks in view v: an
+instance has at most one mask per view, so the lower end holds as long as no mask is split.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mvseg.errors import InputError
+from mvseg.matching.affinity import Affinity
+
+KS_AT_ONCE = 8
+DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
+
+
+@dataclass(frozen=True, eq=False)
+class Clustering:
+    """Instance ids of the regions.
+
+    Attributes:
+        instance_ids: (D,) int64 in [0, K), or -1 for a region that is tied to no other. Clusters are numbered in the
+            order of their first region; none is empty.
+        num_clusters: the |k| asked of the factorisation; K is smaller where SymNMF left a cluster empty.
+        criterion: {k: value of Eq. 7} for each k that was tried.
+    """
+
+    instance_ids: Tensor
+    num_clusters: int
+    criterion: dict[int, float]
+
+
+def cluster_affinity(
+    affinity: Affinity,
+    num_per_view: Tensor,
+    *,
+    num_instances: int | None = None,
+    search_range: tuple[int, int] | None = None,
+    num_restarts: int = 2,
+    seed: int = 0,
+    progress: bool = False,
+) -> Clustering:
+    """Cluster the graph with SymNMF; without `num_instances`, |k| is the one with the least Eq. 7 in a range.
+
+    Args:
+        affinity: the graph of D regions.
+        num_per_view: (V,) int64, regions in each view; sets the default range.
+        num_instances: k, when it is known (>= 1).
+        search_range: smallest and largest k to try, both included; None for [max_v n_v, 2 max_v n_v]. The smallest k
+            wins a tie.
+        num_restarts: random starts of each factorisation; the best objective wins.
+        seed: of the starts.
+        progress: show a progress bar over k.
+
+    Returns:
+        The clustering. Regions without an edge are -1 (the paper does not say; an arg max over a row of zeros would put
+        them all into cluster 0). No region or no edge: no cluster.
+
+    Raises:
+        InputError: a k or a range that is not positive and ordered.
+    """
+    largest_view = int(num_per_view.max()) if len(num_per_view) else 0
+    low, high = search_range or (max(1, largest_view), max(1, 2 * largest_view))
+    if num_instances is not None:
+        low = high = num_instances
+    if not 1 <= low <= high:
+        raise InputError(f"the number of instances is searched in [{low}, {high}], expected 1 <= low <= high")
+    W = affinity.to_dense()
+    tied = W.sum(1) > 0
+    labels = torch.full((len(W),), -1, dtype=torch.int64, device=W.device)
+    if not tied.any():
+        return Clustering(labels, 0, {})
+    tied_W = W[tied][:, tied]
+    candidates: dict[int, Tensor] = {}
+    criterion: dict[int, float] = {}
+    with tqdm(total=high - low + 1, desc="number of instances", unit="k", disable=not progress or low == high) as bar:
+        for ks in torch.arange(low, high + 1).split(KS_AT_ONCE):
+            factors = factorise(tied_W, ks.tolist(), num_restarts=num_restarts, seed=seed)
+            for k, H in zip(ks.tolist(), factors, strict=True):
+                candidates[k] = H.argmax(1)
+                criterion[k] = size_spread(candidates[k], k)
+            bar.update(len(ks))
+    best = min(criterion, key=lambda k: (criterion[k], k))
+    labels[tied] = candidates[best]
+    return Clustering(renumber(labels), best, criterion)
+
+
+def factorise(
+    W: Tensor, ks: Sequence[int], *, num_restarts: int = 2, num_iterations: int = 200, seed: int = 0
+) -> list[Tensor]:
+    """Symmetric non-negative matrix factorisation W ~ H H^T (Kuang et al. 2012), by multiplicative updates.
+
+    All numbers of columns are factorised together: the columns that a smaller k has too many start at 0, and a
+    multiplicative update keeps them there.
+
+    Args:
+        W: (D, D) symmetric, >= 0.
+        ks: numbers of columns of H; the result for one k does not depend on the others.
+        num_restarts: random starts for each k; the H of the smallest |W - H H^T| is returned.
+        num_iterations: updates of each start.
+        seed: of the starts; drawn on the CPU, so that every device starts alike.
+
+    Returns:
+        For each k an H, (D, k) float32 >= 0; the arg max of a row is the cluster of that node.
+    """
+    widest = max(ks)
+    scale = 2 * W.mean().clamp(min=torch.finfo(W.dtype).tiny).sqrt()
+    starts = torch.zeros(len(ks), num_restarts, widest, len(W))
+    for row, k in enumerate(ks):
+        generator = torch.Generator().manual_seed(seed + 1_000_003 * k)
+        starts[row, :, :k] = torch.rand(num_restarts, k, len(W), generator=generator) / k**0.5
+    H = starts.flatten(0, 1).to(W) * scale  # transposed, (B, k, D), so that H W is one matrix product
+    for _ in range(num_iterations):
+        denominator = (H @ H.mT) @ H
+        H = H * (1 - DAMPING + DAMPING * (H @ W) / denominator.clamp(min=1e-12))
+    # |W - H^T H|^2 without its constant |W|^2
+    loss = (H @ H.mT).square().sum((1, 2)) - 2 * ((H @ W) * H).sum((1, 2))
+    best = loss.reshape(len(ks), num_restarts).argmin(1)
+    return [H[row * num_restarts + int(best[row]), :k].T for row, k in enumerate(ks)]
+
+
+def size_spread(labels: Tensor, k: int) -> float:
+    """Eq. 7: root of the sum (as printed, no mean) of squared deviations of the k cluster sizes from their mean."""
+    sizes = torch.bincount(labels, minlength=k).double()
+    return float((sizes - sizes.mean()).square().sum().sqrt())
+
+
+def renumber(labels: Tensor | Sequence[int]) -> Tensor:
+    """(D,) int64: the same partition, clusters numbered from 0 in the order of their first member; -1 stays -1."""
+    labels = torch.as_tensor(labels)
+    values, inverse = labels.unique(return_inverse=True)
+    order = torch.arange(len(labels), device=labels.device)
+    first = torch.full((len(values),), len(labels), device=labels.device).scatter_reduce(0, inverse, order, "amin")
+    first[values < 0] = -1  # unmatched regions rank before all clusters, and get -1
+    rank = first.argsort().argsort() - int((values < 0).any())
+    return rank[inverse]

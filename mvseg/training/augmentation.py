@@ -1,0 +1,188 @@
+"""From samples to what a detector trains on: augmentation, targets, and the order of an epoch.
+
+Everything random here is a pure function of (seed, epoch, index): neither the number of workers nor of processes nor an
+interruption changes what a training run sees.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset
+from torchvision import tv_tensors
+from torchvision.ops import masks_to_boxes
+from torchvision.transforms import v2
+
+from mvseg.training.config import Orientation
+from mvseg.training.data import LabelledPhoto, SampleList, read_sample
+
+MEAN_COLOR = (124, 116, 104)  # RGB; what the detectors' normalisation maps to zero
+MIN_INSTANCE_PX = 16  # smaller leftovers of a crop teach noise
+
+Target = dict[str, Tensor]
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What happens to a training sample.
+
+    Attributes:
+        image_size: S; samples leave as S x S pixels.
+        orientation: "any" flips and turns by right angles (photos from above), "upright" mirrors left and right only
+            (plants from the side), "fixed" does neither.
+        scale_range: the photo's longer side becomes a factor from this range (log-uniform) times S; then a random S x S
+            window is taken, or the photo is placed at random in an S x S frame of the mean colour.
+        color_jitter: strength of brightness, contrast and saturation changes, in [0, 1]; hue gets a tenth of it.
+        blur_probability: share of the samples that are blurred (Gaussian, sigma 0.1 to 2 px).
+    """
+
+    image_size: int
+    orientation: Orientation = "any"
+    scale_range: tuple[float, float] = (0.6, 1.6)
+    color_jitter: float = 0.3
+    blur_probability: float = 0.2
+
+
+class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
+    """Samples by (epoch, index), augmented: (3, S, S) float32 photo in [0, 1], target as `make_target`, index.
+
+    The same key gives the same bits in every process.
+
+    Raises:
+        InputError: on access, when a sample broke since it was checked; see `read_sample`.
+    """
+
+    def __init__(self, samples: SampleList, augmentation: Augmentation, seed: int) -> None:
+        self.samples = samples
+        self.augmentation = augmentation
+        self.seed = seed
+
+    def __len__(self) -> int:
+        return len(self.samples)
+
+    def __getitem__(self, key: tuple[int, int]) -> tuple[Tensor, Target, int]:
+        epoch, index = key
+        labelled = read_sample(self.samples.samples[index])
+        photo, target = augment(labelled, self.augmentation, mix_seed(self.seed, epoch, index))
+        return photo, target, index
+
+
+def augment(labelled: LabelledPhoto, how: Augmentation, seed: int) -> tuple[Tensor, Target]:
+    """Augment one sample; torch's global generator is left as it was.
+
+    Ignored pixels are painted over with the mean colour first: the network can then learn neither a leaf nor background
+    from them.
+
+    Returns:
+        (3, S, S) float32 photo in [0, 1] and its target, see `make_target`.
+    """
+    photo = labelled.photo.clone()
+    photo[:, labelled.ignore] = mean_color(photo)[:, None]
+    with torch.random.fork_rng(devices=[]):
+        torch.default_generator.manual_seed(seed)
+        photo, layers = orient(photo, labelled.layers, how.orientation)
+        photo, layers = rescale(photo, layers, how)
+        photo = distort_color(how)(tv_tensors.Image(photo))
+    return photo.as_subclass(Tensor).float() / 255, make_target(layers, labelled.classes)
+
+
+def orient(photo: Tensor, layers: Tensor, orientation: Orientation) -> tuple[Tensor, Tensor]:
+    """Mirror and turn a photo and its layers together."""
+    if orientation == "fixed":
+        return photo, layers
+    both = v2.RandomHorizontalFlip()(tv_tensors.Image(photo), tv_tensors.Mask(layers))
+    turns = int(torch.randint(4, ())) if orientation == "any" else 0
+    photo, layers = (torch.rot90(plain.as_subclass(Tensor), turns, (-2, -1)) for plain in both)
+    return photo, layers
+
+
+def rescale(photo: Tensor, layers: Tensor, how: Augmentation) -> tuple[Tensor, Tensor]:
+    """Scale by a random factor and take, or fill, an S x S window at a random place.
+
+    Layers are resized with nearest-exact: plain nearest, which torchvision's transforms use, shifts a mask against its
+    photo by up to half a pixel.
+    """
+    low, high = (math.log(factor) for factor in how.scale_range)
+    factor = math.exp(low + (high - low) * float(torch.rand(()))) * how.image_size / max(photo.shape[1:])
+    size = [max(1, round(factor * side)) for side in photo.shape[1:]]
+    photo = v2.functional.resize(photo, size, antialias=True)
+    layers = torch.nn.functional.interpolate(layers[None].float(), size, mode="nearest-exact")[0].to(layers.dtype)
+    room = [how.image_size - side for side in size]
+    top, left = (int(torch.randint(min(0, free), max(0, free) + 1, ())) for free in room)
+    frame = mean_color(photo)[:, None, None].expand(3, how.image_size, how.image_size)
+    empty = layers.new_zeros((len(layers), how.image_size, how.image_size))
+    return paste(photo, frame.clone(), top, left), paste(layers, empty, top, left)
+
+
+def paste(image: Tensor, frame: Tensor, top: int, left: int) -> Tensor:
+    """Put an image into a frame (which is changed) at an offset that may be negative."""
+    rows = slice(max(0, top), max(0, min(frame.shape[1], top + image.shape[1])))
+    columns = slice(max(0, left), max(0, min(frame.shape[2], left + image.shape[2])))
+    frame[:, rows, columns] = image[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
+    return frame
+
+
+def mean_color(photo: Tensor) -> Tensor:
+    return torch.tensor(MEAN_COLOR, dtype=photo.dtype)
+
+
+def distort_color(how: Augmentation) -> v2.Transform:
+    """Colour jitter and blur, for uint8 photos."""
+    strength = how.color_jitter
+    return v2.Compose(
+        [
+            v2.ColorJitter(strength, strength, strength, strength / 10),
+            v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=how.blur_probability),
+        ]
+    )
+
+
+def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_PX) -> Target:
+    """The target of torchvision's detectors.
+
+    Args:
+        layers: (L, H, W) int, k where instance k is, see `LabelledPhoto`.
+        classes: (N,) int64, class of instance 1..N.
+        min_pixels: instances of fewer pixels are left out.
+
+    Returns:
+        "masks" (M, H, W) uint8, "labels" (M,) int64, "boxes" (M, 4) float32 xyxy, half-open, recomputed from the masks.
+        M may be 0.
+    """
+    areas = torch.bincount(layers.flatten(), minlength=len(classes) + 1)[1:]
+    kept = (areas >= min_pixels).nonzero()[:, 0]
+    masks = torch.zeros((len(kept), *layers.shape[1:]), dtype=torch.bool)
+    for layer in layers:
+        masks |= layer == kept[:, None, None] + 1
+    # torchvision's boxes end on the last pixel, ours after it
+    boxes = masks_to_boxes(masks).float() + torch.tensor([0.0, 0.0, 1.0, 1.0])
+    return {"boxes": boxes, "labels": classes[kept], "masks": masks.to(torch.uint8)}
+
+
+# --- the order of an epoch
+
+
+def order_epoch(num_samples: int, batch_size: int, seed: int, epoch: int) -> list[list[int]]:
+    """The batches of an epoch: every sample once, in random order; the last batch is filled up from a second shuffle.
+
+    (Dropping an incomplete batch would lose up to batch_size - 1 of a user's few photos, a small one would change what
+    the learning rate means.)
+
+    Returns:
+        ceil(num_samples / batch_size) lists of batch_size sample indices.
+    """
+    generator = torch.Generator().manual_seed(mix_seed(seed, epoch))
+    num_batches = math.ceil(num_samples / batch_size)
+    order: list[int] = []
+    while len(order) < num_batches * batch_size:
+        order += torch.randperm(num_samples, generator=generator).tolist()
+    return [order[step * batch_size : (step + 1) * batch_size] for step in range(num_batches)]
+
+
+def mix_seed(*values: int) -> int:
+    """A seed below 2^63 that depends on all the values (>= 0) and their order, well mixed."""
+    return int(np.random.SeedSequence(values).generate_state(1, np.uint64)[0]) & (2**63 - 1)

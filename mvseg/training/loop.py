@@ -1,0 +1,316 @@
+"""Fine-tuning a single-view detector: epochs, evaluation, checkpoints, on one process or many.
+
+One optimisation step takes `batch_size` samples, in chunks of `images_per_forward`. torchrun's processes share the
+chunks of a step out; one process alone does them one after another and adds up the gradients. Each chunk seeds the
+random samplers of torchvision's losses from (seed, step, chunk), and no norm looks at the batch
+(mvseg/detectors/mask_rcnn.py). So a run depends on `batch_size` and `images_per_forward` but not on the number of
+processes: torchvision normalises its losses over the images of one forward call, and these are the same images. What
+remains is the order in which the gradients of the chunks are added up.
+
+All randomness is a function of the seed and the step. To continue a killed run with the same bits (on a CPU with the
+same number of threads) a checkpoint therefore needs no state of a generator, and none of a scheduler.
+
+Files in `output`: config.yaml (resolved), log.jsonl (losses by step), metrics.json (by epoch), model.safetensors (the
+best epoch by mask AP; without validation samples the last), checkpoint.pt, tensorboard/ when tensorboard is installed,
+broken_samples.txt when samples were skipped.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import time
+from collections.abc import Iterator
+from contextlib import nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.nn.parallel import DistributedDataParallel
+from torch.utils.data import DataLoader
+from torchvision.models.detection import MaskRCNN
+from tqdm import tqdm
+
+from mvseg.detectors.mask_rcnn import count_parameters, describe_detector
+from mvseg.errors import InputError
+from mvseg.training.augmentation import Augmentation, AugmentedSamples, Target, mix_seed, order_epoch
+from mvseg.training.average_precision import average_precision, detect_and_label
+from mvseg.training.config import TrainConfig as TrainConfig
+from mvseg.training.config import config_values
+from mvseg.training.data import SampleList, keep_sound, list_samples
+from mvseg.training.files import (
+    append_record,
+    cut_log,
+    open_tensorboard,
+    write_config,
+    write_metrics,
+    write_text_whole,
+    write_weights,
+)
+from mvseg.training.processes import Processes, join_processes
+from mvseg.training.state import TrainingState, apply_gradients, learning_rate, save_state, start_state
+
+logger = logging.getLogger(__name__)
+Chunk = tuple[list[Tensor], list[Target], list[int]]
+
+
+@dataclass(frozen=True, eq=False)
+class Run:
+    """What stays the same during a run: its config, its place among the processes, its sound samples.
+
+    `held_out` are the validation samples, None without validation.
+    """
+
+    config: TrainConfig
+    processes: Processes
+    samples: SampleList
+    held_out: SampleList | None
+
+    @property
+    def steps_per_epoch(self) -> int:
+        return math.ceil(len(self.samples) / self.config.batch_size)
+
+
+def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
+    """Train a detector and write its files into `config.output`.
+
+    Under torchrun every process calls this with the same config. torch's global generators are left as they were.
+
+    Args:
+        config: everything about the run.
+        model: a detector of your own, with a class for every category of the data, to train in place of
+            `build_detector(config.arch, ...)`; `config.arch` is then only its name in the files. If its norms look at
+            the batch, the run depends on the number of processes.
+
+    Raises:
+        InputError: broken samples (unless `skip_broken`), nothing to train on, an output folder with another run, a
+            checkpoint that does not belong to this config, weights that do not fit, a loss or gradient that is not
+            finite (the message names the photos).
+    """
+    with join_processes(config.device) as processes:
+        if config.num_chunks % processes.count:
+            raise InputError(
+                f"batch_size / images_per_forward is {config.num_chunks}, "
+                f"expected a multiple of the number of processes ({processes.count})"
+            )
+        cuda = [processes.device] if processes.device.type == "cuda" else []
+        with torch.random.fork_rng(devices=cuda):
+            samples, held_out = processes.ask_first(lambda: find_samples(config))
+            state = start_state(config, samples, processes.device, model)
+            run_epochs(Run(config, processes, samples, held_out), state)
+
+
+def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
+    """The training and the validation samples, checked; broken_samples.txt is written when some are skipped.
+
+    Raises:
+        InputError: an output folder with other things, broken samples, nothing to train on.
+    """
+    there = {path.name.removesuffix(".partial") for path in config.output.glob("*")}  # a run may be killed at once
+    if there and not there & {"config.yaml", "broken_samples.txt"}:
+        raise InputError(f"{config.output}: holds files that are no training run, expected a new or an empty folder")
+    samples, held_out = list_samples(config.photos, config.labels), None
+    if config.val_photos is not None and config.val_labels is not None:
+        held_out = list_samples(config.val_photos, config.val_labels)
+        if held_out.categories != samples.categories:
+            raise InputError(f"{config.val_labels} has categories {held_out.categories}, expected {samples.categories}")
+    elif config.hold_out_every:
+        indices = range(len(samples))
+        held_out = samples.select(indices[:: config.hold_out_every])
+        samples = samples.select([index for index in indices if index % config.hold_out_every])
+    samples, broken = keep_sound(samples, "training", config.skip_broken)
+    problems = list(broken.values())
+    if held_out is not None:
+        held_out, broken = keep_sound(held_out, "validation", config.skip_broken)
+        problems += broken.values()
+    num_held_out = len(held_out) if held_out is not None else 0
+    logger.info("%d samples to train on, %d to validate, %d skipped", len(samples), num_held_out, len(problems))
+    if problems:
+        config.output.mkdir(parents=True, exist_ok=True)
+        write_text_whole(config.output / "broken_samples.txt", "\n".join(problems) + "\n")
+    return samples, held_out
+
+
+def run_epochs(run: Run, state: TrainingState) -> None:
+    """Train and evaluate until the last epoch; the first process writes the files."""
+    board = open_files(run, state) if run.processes.is_first else None
+    network: nn.Module = state.model
+    if run.processes.count > 1:
+        network = DistributedDataParallel(state.model)
+    chunks = load_chunks(run, state.step)
+    for epoch in range(len(state.history), run.config.epochs):
+        started = time.monotonic()
+        train_epoch(run, state, network, chunks, board)
+        losses = {name: total / run.steps_per_epoch for name, total in state.loss_sums.items()}
+        scores = evaluate(run, state) if run.held_out is not None else {}
+        record = {"epoch": epoch, "step": state.step, **losses, **scores}
+        shown = ", ".join(f"{name} {value:.3f}" for name, value in record.items() if isinstance(value, float))
+        logger.info("epoch %d of %d: %s", epoch + 1, run.config.epochs, shown)
+        state.history.append(record | {"seconds": round(time.monotonic() - started, 1)})
+        state.loss_sums = {}
+        if run.processes.is_first:
+            close_epoch(run, state, board)
+    if board is not None:
+        board.close()
+    logger.info("finished; %s holds epoch %d", run.config.output / "model.safetensors", best_epoch(state.history) + 1)
+
+
+def train_epoch(
+    run: Run, state: TrainingState, network: nn.Module, chunks: Iterator[Chunk], board: Any | None
+) -> None:
+    """Do the steps that the current epoch still lacks, with a checkpoint now and then and one at the end.
+
+    Raises:
+        InputError: a loss or a gradient is not finite; the message names the photos.
+    """
+    config, epoch, num_steps = run.config, len(state.history), run.steps_per_epoch
+    first = state.step - epoch * num_steps
+    hidden = None if run.processes.is_first else True  # None: hidden unless on a terminal
+    for step in tqdm(range(first, num_steps), f"epoch {epoch + 1}", num_steps, initial=first, disable=hidden):
+        rate = learning_rate(config, state.step, num_steps * config.epochs)
+        losses = add_gradients(run, state, network, chunks)
+        if not apply_gradients(config, state, rate):
+            batch = order_epoch(len(run.samples), config.batch_size, config.seed, epoch)[step]
+            raise not_finite("the gradient", run, state, batch)
+        for name, value in losses.items():
+            state.loss_sums[name] = state.loss_sums.get(name, 0.0) + value
+        if run.processes.is_first:
+            if state.step % config.log_every == 0:
+                log_losses(run, state, {"lr": rate, **losses}, board)
+            if state.step % config.checkpoint_every == 0 or step == num_steps - 1:
+                save_state(state, config, run.samples)
+
+
+def add_gradients(
+    run: Run, state: TrainingState, network: nn.Module, chunks: Iterator[Chunk]
+) -> dict[str, float]:
+    """Forward and backward of this process's chunks of a step.
+
+    Returns:
+        The losses and their sum "loss", averaged over all chunks of all processes.
+    """
+    processes, config = run.processes, run.config
+    state.optimizer.zero_grad()
+    numbers = range(processes.rank, config.num_chunks, processes.count)
+    sums: dict[str, Tensor] = {}
+    for number in numbers:
+        photos, targets, indices = next(chunks)
+        photos = [photo.to(processes.device, non_blocking=True) for photo in photos]
+        targets = [{key: value.to(processes.device) for key, value in target.items()} for target in targets]
+        torch.manual_seed(mix_seed(config.seed, state.step, number))  # torchvision samples anchors and RoIs at random
+        is_last = number == numbers[-1]  # DDP averages the gradients over the processes once, with the last chunk
+        with network.no_sync() if isinstance(network, DistributedDataParallel) and not is_last else nullcontext():
+            with torch.autocast(processes.device.type, torch.bfloat16, enabled=uses_bf16(config, processes.device)):
+                losses = network(photos, targets)
+            losses = {name: value.float() for name, value in losses.items()}
+            losses["loss"] = torch.stack(list(losses.values())).sum()
+            if not math.isfinite(losses["loss"].item()):
+                raise not_finite("the loss", run, state, indices)
+            (losses["loss"] / len(numbers)).backward()
+        for name, value in losses.items():
+            sums[name] = sums.get(name, torch.zeros_like(value)) + value.detach() / config.num_chunks
+    return processes.add_up(sums)
+
+
+def not_finite(what: str, run: Run, state: TrainingState, indices: list[int]) -> InputError:
+    names = ", ".join(run.samples.samples[index].name for index in indices)
+    return InputError(
+        f"{what} of step {state.step} (epoch {len(state.history) + 1}) is not finite on {names}: look at these photos, "
+        "or lower lr, or set precision to fp32"
+    )
+
+
+def uses_bf16(config: TrainConfig, device: torch.device) -> bool:
+    if config.precision == "auto":
+        return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
+    return config.precision == "bf16"
+
+
+def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
+    """This process's chunks of all steps from `first_step` to the end of the run, read and augmented by workers."""
+    config = run.config
+    augmentation = Augmentation(
+        config.image_size, config.orientation, config.scale_range, config.color_jitter, config.blur_probability
+    )
+    keys = []
+    for epoch in range(first_step // run.steps_per_epoch, config.epochs):
+        batches = order_epoch(len(run.samples), config.batch_size, config.seed, epoch)
+        for batch in batches[max(0, first_step - epoch * run.steps_per_epoch) :]:
+            for number in range(run.processes.rank, config.num_chunks, run.processes.count):
+                chunk = batch[number * config.images_per_forward : (number + 1) * config.images_per_forward]
+                keys.append([(epoch, index) for index in chunk])
+    loader = DataLoader(
+        AugmentedSamples(run.samples, augmentation, config.seed),
+        batch_sampler=keys,
+        num_workers=config.num_workers,
+        collate_fn=collate,
+        pin_memory=run.processes.device.type == "cuda",
+    )
+    return iter(loader)
+
+
+def collate(items: list[tuple[Tensor, Target, int]]) -> Chunk:
+    photos, targets, indices = (list(column) for column in zip(*items, strict=True))
+    return photos, targets, indices
+
+
+def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
+    """Average precision on the validation samples, which the processes share out; the same dict in every process."""
+    assert run.held_out is not None
+    processes = run.processes
+    indices = range(processes.rank, len(run.held_out), processes.count)
+    shown = tqdm(indices, "evaluating", disable=None if processes.is_first else True, leave=False)
+    state.result.eval()
+    truth, detections = detect_and_label(state.result, run.held_out, shown, processes.device)
+    state.model.train()
+    return average_precision(processes.gather(truth), processes.gather(detections), len(run.held_out))
+
+
+# --- files of the run
+
+
+def open_files(run: Run, state: TrainingState) -> Any | None:
+    """Write the config, cut the log to the state's step, and open TensorBoard's writer, if it is installed."""
+    output = run.config.output
+    output.mkdir(parents=True, exist_ok=True)
+    write_config(output / "config.yaml", config_values(run.config))
+    cut_log(output / "log.jsonl", state.step)
+    return open_tensorboard(output / "tensorboard", state.step)
+
+
+def log_losses(run: Run, state: TrainingState, values: dict[str, float], board: Any | None) -> None:
+    append_record(run.config.output / "log.jsonl", {"step": state.step, **values})
+    if board is not None:
+        for name, value in values.items():
+            board.add_scalar(f"train/{name}", value, state.step)
+
+
+def close_epoch(run: Run, state: TrainingState, board: Any | None) -> None:
+    """Export the weights if the epoch is the best so far, then metrics and the checkpoint."""
+    config, output, best = run.config, run.config.output, best_epoch(state.history)
+    if best == len(state.history) - 1:
+        metadata = describe_detector(config.arch, run.samples.categories, config.image_size)
+        write_weights(output / "model.safetensors", state.result, metadata)
+    metrics = {
+        "best_epoch": best,
+        "best": state.history[best],
+        "finished": len(state.history) == config.epochs,
+        "num_parameters": count_parameters(state.model),
+        "num_training_samples": len(run.samples),
+        "num_validation_samples": 0 if run.held_out is None else len(run.held_out),
+        "epochs": state.history,
+    }
+    write_metrics(output / "metrics.json", metrics)
+    save_state(state, config, run.samples)
+    if board is not None:
+        for name, value in state.history[-1].items():
+            if value is not None:
+                board.add_scalar(f"epoch/{name}", value, state.step)
+
+
+def best_epoch(history: list[dict[str, Any]]) -> int:
+    """Index of the record with the largest mask AP, the first of equals; the last record when none has one."""
+    if all(record.get("mask_AP") is None for record in history):
+        return len(history) - 1
+    return max(range(len(history)), key=lambda index: history[index].get("mask_AP") or 0.0)

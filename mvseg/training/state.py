@@ -1,0 +1,167 @@
+"""The state of a training run: what it starts with, what a checkpoint holds, how a step changes it."""
+
+from __future__ import annotations
+
+import copy
+import logging
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchvision.models.detection import MaskRCNN
+
+from mvseg.detectors.mask_rcnn import build_detector
+from mvseg.detectors.zoo import find_weights
+from mvseg.errors import InputError
+from mvseg.training.config import TrainConfig, config_difference, config_values
+from mvseg.training.data import SampleList
+from mvseg.training.files import read_checkpoint, write_checkpoint
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass
+class TrainingState:
+    """All that changes during a run, and what a checkpoint holds.
+
+    Attributes:
+        model: the detector itself, in train mode.
+        optimizer: over its trainable parameters.
+        averaged: exponential moving average of the model in eval mode, or None.
+        step: steps done since the start of the run.
+        history: one record per epoch that was trained and evaluated.
+        loss_sums: sums of the losses over the steps of the unfinished epoch.
+    """
+
+    model: MaskRCNN
+    optimizer: torch.optim.Optimizer
+    averaged: MaskRCNN | None
+    step: int = 0
+    history: list[dict[str, Any]] = field(default_factory=list)
+    loss_sums: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def result(self) -> MaskRCNN:
+        """The model to evaluate and export."""
+        return self.model if self.averaged is None else self.averaged
+
+
+def start_state(
+    config: TrainConfig, samples: SampleList, device: torch.device, model: MaskRCNN | None
+) -> TrainingState:
+    """The state that a run begins with, or goes on from when `config.resume` is set and there is a checkpoint.
+
+    Raises:
+        InputError: a checkpoint without `resume`, or one of another config or of other samples; see `build_detector`.
+    """
+    checkpoint = config.output / "checkpoint.pt"
+    if checkpoint.is_file() and not config.resume:
+        raise InputError(
+            f"{config.output} holds the checkpoint of an earlier run, expected --resume true or another output"
+        )
+    torch.manual_seed(config.seed)
+    if model is None:
+        weights = config.weights and str(find_weights(config.weights) or config.weights)
+        model = build_detector(config.arch, len(samples.categories) + 1, weights)
+    model.transform.min_size, model.transform.max_size = (config.image_size,), config.image_size
+    model.rpn.head.register_forward_hook(leave_autocast)
+    model = model.to(device).train()
+    averaged = copy.deepcopy(model).eval() if config.ema_decay else None
+    state = TrainingState(model, build_optimizer(config, model), averaged)
+    if checkpoint.is_file():
+        restore_state(state, read_checkpoint(checkpoint, device), config, samples)
+        logger.info("going on from step %d of %s", state.step, checkpoint)
+    elif config.resume:
+        logger.info("%s has no checkpoint yet: starting from the beginning", config.output)
+    return state
+
+
+def leave_autocast(head: nn.Module, inputs: Any, outputs: tuple[list[Tensor], ...]) -> tuple[list[Tensor], ...]:
+    """Forward hook of an RPN's head: float32 from here on.
+
+    Under autocast torchvision would decode proposals, and round true boxes, in bfloat16, whose numbers above 256 are
+    even: boxes one pixel wide collapse, and their regression loss is not a number.
+    """
+    return tuple([level.float() for level in levels] for levels in outputs)
+
+
+def restore_state(state: TrainingState, saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
+    """Put a checkpoint's content into a fresh state.
+
+    Raises:
+        InputError: the checkpoint was made with another config or with other samples.
+    """
+    difference = config_difference(saved["config"], config_values(config))
+    if difference:
+        raise InputError(f"the checkpoint in {config.output} was made with another {difference}, expected the same")
+    if saved["samples"] != [sample.name for sample in samples.samples]:
+        raise InputError(f"the checkpoint in {config.output} was made with other training samples, expected the same")
+    state.model.load_state_dict(saved["model"])
+    state.optimizer.load_state_dict(saved["optimizer"])
+    if state.averaged is not None:
+        state.averaged.load_state_dict(saved["ema"])
+    state.step, state.history, state.loss_sums = saved["step"], saved["history"], saved["loss_sums"]
+
+
+def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -> None:
+    """Write the checkpoint into `config.output`, whole. `build_detector` reads it as weights, too."""
+    content = {
+        "model": state.model.state_dict(),
+        "ema": None if state.averaged is None else state.averaged.state_dict(),
+        "optimizer": state.optimizer.state_dict(),
+        "step": state.step,
+        "history": state.history,
+        "loss_sums": state.loss_sums,
+        "config": config_values(config),
+        "samples": [sample.name for sample in samples.samples],
+    }
+    write_checkpoint(config.output / "checkpoint.pt", content)
+
+
+def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimizer:
+    """AdamW, or SGD with momentum 0.9; biases and norms are not decayed, frozen parameters are left out."""
+    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
+    groups = [
+        {"params": [parameter for parameter in trainable if parameter.ndim > 1], "weight_decay": config.weight_decay},
+        {"params": [parameter for parameter in trainable if parameter.ndim <= 1], "weight_decay": 0.0},
+    ]
+    if config.optimizer == "adamw":
+        return torch.optim.AdamW(groups, lr=config.lr, fused=True)
+    return torch.optim.SGD(groups, lr=config.lr, momentum=0.9)
+
+
+def learning_rate(config: TrainConfig, step: int, num_steps: int) -> float:
+    """The rate of step 0 <= step < num_steps, see `TrainConfig.lr`, `schedule` and `warmup_steps`."""
+    scale = config.batch_size / 16
+    peak = config.lr * (scale if config.optimizer == "sgd" else math.sqrt(scale))
+    warmup = min(config.warmup_steps, num_steps // 10)
+    if step < warmup:
+        return peak * (step + 1) / (warmup + 1)
+    if config.schedule == "multistep":
+        return peak * 0.1 ** sum(step >= share * num_steps for share in (0.6, 0.85))
+    progress = (step - warmup) / (num_steps - warmup)
+    return peak * (0.01 + 0.99 * (1 + math.cos(math.pi * progress)) / 2)
+
+
+@torch.no_grad()
+def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> bool:
+    """Clip the gradients, step the optimizer, follow with the average, count the step.
+
+    Returns:
+        False, and nothing is changed, when a gradient is not finite.
+    """
+    parameters = [parameter for group in state.optimizer.param_groups for parameter in group["params"]]
+    norm = nn.utils.clip_grad_norm_(parameters, config.clip_norm or math.inf)
+    if not bool(torch.isfinite(norm)):
+        return False
+    for group in state.optimizer.param_groups:
+        group["lr"] = rate
+    state.optimizer.step()
+    if state.averaged is not None:
+        decay = min(config.ema_decay, (1 + state.step) / (10 + state.step))
+        for average, current in zip(state.averaged.parameters(), state.model.parameters(), strict=True):
+            average.lerp_(current, 1 - decay)
+    state.step += 1
+    return True

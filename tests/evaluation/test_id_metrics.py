@@ -1,0 +1,77 @@
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError
+from mvseg.evaluation.id_metrics import matching_metrics, region_truth, shape_distance
+
+
+def test_eq_8_by_hand() -> None:
+    estimated = torch.tensor([0, 0, 0, 1, 1, 2])
+    true = torch.tensor([5, 5, 7, 7, 7, 5])
+    metrics = matching_metrics(estimated, true)
+    assert metrics.s_match == pytest.approx((2 + 2 + 1) / 6)
+    assert (metrics.num_estimated, metrics.num_true, metrics.e_k) == (3, 2, 1)
+
+
+def test_pairs_agree_with_a_loop() -> None:
+    generator = np.random.default_rng(0)
+    estimated, true = generator.integers(0, 5, 40), generator.integers(0, 4, 40)
+    together = tied = both = 0
+    for a in range(40):
+        for b in range(a):
+            together += estimated[a] == estimated[b]
+            tied += true[a] == true[b]
+            both += estimated[a] == estimated[b] and true[a] == true[b]
+    metrics = matching_metrics(torch.from_numpy(estimated), torch.from_numpy(true))
+    assert metrics.pair_precision == pytest.approx(both / together)
+    assert metrics.pair_recall == pytest.approx(both / tied)
+    assert metrics.pair_f1 == pytest.approx(2 * both / (together + tied))
+
+
+def test_numbers_mean_nothing() -> None:
+    true = torch.tensor([1, 1, 2, 2, 3])
+    one, other = (matching_metrics(ids, true) for ids in (torch.tensor([0, 0, 1, 1, 1]), torch.tensor([9, 9, 4, 4, 4])))
+    assert one == other
+
+
+def test_unmatched_regions_are_clusters_of_their_own() -> None:
+    true = torch.tensor([1, 1, 2, 2])
+    unmatched = matching_metrics(torch.tensor([-1, -1, 0, 0]), true)
+    single = matching_metrics(torch.tensor([1, 2, 0, 0]), true)
+    assert unmatched == single
+    assert unmatched.num_estimated == 3
+    assert matching_metrics(torch.full((4,), -1), true).s_match == 1  # why s_match is never read alone
+
+
+def test_degenerate_cases() -> None:
+    nothing = torch.zeros(0, dtype=torch.int64)
+    assert matching_metrics(nothing, nothing).ari == 1
+    alone = matching_metrics(torch.tensor([0, 1]), torch.tensor([3, 4]))
+    assert (alone.pair_precision, alone.pair_recall, alone.pair_f1) == (1, 1, 1)
+    with pytest.raises(InputError, match="estimated ids"):
+        matching_metrics(torch.tensor([0]), torch.tensor([0, 1]))
+
+
+def test_shape_distance_agrees_with_a_loop_and_scales() -> None:
+    generator = torch.Generator().manual_seed(0)
+    first, second = torch.randn(30, 3, generator=generator), torch.randn(20, 3, generator=generator)
+    apart = torch.cdist(first, second)
+    expected = float((apart.min(1)[0].mean() + apart.min(0)[0].mean()) / 2)
+    assert shape_distance(first, second) == pytest.approx(expected, rel=1e-5)
+    assert shape_distance(second, first) == pytest.approx(expected, rel=1e-5)
+    assert shape_distance(10 * first, 10 * second) == pytest.approx(10 * expected, rel=1e-5)
+    assert shape_distance(first, first) == 0
+    assert math.isnan(shape_distance(first, torch.zeros(0, 3)))
+
+
+def test_truth_of_a_region_is_the_label_under_most_of_it() -> None:
+    truth = np.array([[0, 0, 3, 3], [0, 65535, 65535, 3]], np.uint16)
+    assert region_truth(truth, np.array([[0, 1, 1, 1], [0, 0, 0, 0]])) == 3
+    assert region_truth(truth, np.array([[1, 1, 1, 0], [0, 0, 0, 0]])) == 0
+    assert region_truth(truth, np.array([[0, 0, 0, 0], [0, 1, 1, 1]])) == 65535
+    assert region_truth(truth, np.zeros((2, 4))) == 0

@@ -1,0 +1,241 @@
+"""COLMAP models, written by pycolmap, against pycolmap's own projection; and models that are not whole."""
+
+from __future__ import annotations
+
+import shutil
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+import torch
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.colmap import is_colmap_model, read_colmap
+from mvseg.formats.lens import photo_from_pinhole
+from mvseg.formats.scene_folder import load_scene
+from scene_folders import arc_pose
+
+WIDTH, HEIGHT = 128, 96
+PINHOLES = {"SIMPLE_PINHOLE": [150, 64, 48], "PINHOLE": [150, 155, 63.5, 48.25]}
+LENSES = {
+    "SIMPLE_RADIAL": [150, 64, 48, -0.1],
+    "RADIAL": [150, 64, 48, -0.1, 0.02],
+    "OPENCV": [150, 155, 63.5, 48.25, -0.1, 0.02, 0.001, -0.002],
+    "FULL_OPENCV": [150, 155, 63.5, 48.25, -0.1, 0.02, 0.001, -0.002, 0.01, 0.02, 0.01, 0.001],
+    "OPENCV_FISHEYE": [120, 125, 64, 48, 0.02, -0.01, 0.003, 0.001],
+    "SIMPLE_RADIAL_FISHEYE": [120, 64, 48, 0.02],
+    "FOV": [120, 125, 64, 48, 0.8],
+    "THIN_PRISM_FISHEYE": [120, 125, 64, 48, 0.02, -0.01, 0.001, -0.001, 0.002, 0.001, 0.003, 0.002],
+}
+POINTS = np.random.default_rng(1).uniform(-8, 8, (20, 3))
+
+
+def build_model(lenses: dict[str, Sequence[float]]) -> pycolmap.Reconstruction:
+    """One image per camera, with observations of all points."""
+    model = pycolmap.Reconstruction()
+    for number, (name, params) in enumerate(lenses.items(), start=1):
+        camera = pycolmap.Camera(model=name, width=WIDTH, height=HEIGHT, params=params)
+        camera.camera_id = number
+        model.add_camera_with_trivial_rig(camera)
+        R, t = arc_pose(number - 1, len(lenses))
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(R), t)
+        image = pycolmap.Image()
+        image.name, image.image_id, image.camera_id = f"{name.lower()}/{number:02d}.jpg", number, number
+        pixels = camera.img_from_cam(POINTS @ R.T + t)
+        image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in pixels])
+        model.add_image_with_trivial_frame(image, pose)
+    for index, point in enumerate(POINTS):
+        track = [pycolmap.TrackElement(number + 1, index) for number in range(len(lenses))]
+        model.add_point3D(point, pycolmap.Track(track), np.array([1, 2, 3], np.uint8))
+    return model
+
+
+@pytest.fixture(scope="module")
+def model() -> pycolmap.Reconstruction:
+    return build_model(PINHOLES | LENSES)
+
+
+@pytest.fixture(scope="module")
+def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A scene folder with a binary model of two views."""
+    folder = tmp_path_factory.mktemp("plant")
+    (folder / "sparse").mkdir()
+    build_model({"PINHOLE": PINHOLES["PINHOLE"], "OPENCV": LENSES["OPENCV"]}).write_binary(folder / "sparse")
+    return folder
+
+
+@pytest.mark.parametrize("place", ["sparse", "sparse/0", "colmap/sparse/0"])
+@pytest.mark.parametrize("kind", ["text", "binary"])
+def test_projections_agree_with_pycolmap(model: pycolmap.Reconstruction, kind: str, place: str, tmp_path: Path) -> None:
+    (tmp_path / place).mkdir(parents=True)
+    getattr(model, f"write_{kind}")(tmp_path / place)
+    scene = load_scene(tmp_path)
+    assert scene.source == tmp_path / place
+    assert scene.unit == ""
+    assert len(scene.views) == len(model.images)
+    pinhole_px, depth = scene.cameras.project(torch.from_numpy(POINTS))
+    assert (depth > 0).all()
+    names = [view.path.relative_to(tmp_path / "images").as_posix() for view in scene.views]
+    assert names == sorted(image.name for image in model.images.values())
+    for index, view in enumerate(scene.views):
+        image = model.find_image_with_name(names[index])
+        expected = np.stack([image.project_point(point) for point in POINTS])
+        found = pinhole_px[index].numpy()
+        if view.lens is not None:
+            found = photo_from_pinhole(view.lens, scene.cameras.K[index].numpy(), found)
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+        np.testing.assert_allclose(scene.cameras.centers[index], image.projection_center(), atol=1e-9)
+        assert (view.lens is None) == (names[index].split("/")[0].upper() in PINHOLES)
+        assert view.name == names[index].removesuffix(".jpg")
+
+
+def test_radial_without_distortion_is_a_pinhole_but_a_fisheye_is_not(tmp_path: Path) -> None:
+    lenses = {"OPENCV": [150, 150, 64, 48, 0, 0, 0, 0], "OPENCV_FISHEYE": [150, 150, 64, 48, 0, 0, 0, 0]}
+    build_model(lenses).write_binary(tmp_path)
+    by_name = {view.name: view.lens for view in read_colmap(tmp_path, tmp_path).views}
+    assert by_name["opencv/01"] is None
+    assert by_name["opencv_fisheye/02"].model_name == "OPENCV_FISHEYE"
+
+
+def test_what_is_a_model(small: Path, tmp_path: Path) -> None:
+    assert is_colmap_model(small / "sparse")
+    assert not is_colmap_model(small)
+    assert not is_colmap_model(tmp_path / "absent")
+
+
+def copy_model(small: Path, folder: Path) -> Path:
+    shutil.copytree(small, folder)
+    return folder / "sparse"
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin"])
+def test_cut_binary_files_are_named(name: str, small: Path, tmp_path: Path) -> None:
+    """Wherever they are cut: pycolmap itself takes some of these as whole, or asks for gigabytes."""
+    model = copy_model(small, tmp_path / "plant")
+    data = (model / name).read_bytes()
+    assert len(read_colmap(model, tmp_path).views) == 2
+    for length in [*range(0, len(data), 17), 1, 4, 8, 9, len(data) - 9, len(data) - 8, len(data) - 1]:
+        (model / name).write_bytes(data[:length])
+        with pytest.raises(InputError, match=rf"{name}: not a whole COLMAP file"):
+            read_colmap(model, tmp_path)
+
+
+@pytest.mark.parametrize("name", ["cameras.bin", "images.bin", "points3D.bin"])
+def test_too_long_binary_files_and_absurd_counts_are_named(name: str, small: Path, tmp_path: Path) -> None:
+    model = copy_model(small, tmp_path / "plant")
+    data = (model / name).read_bytes()
+    for content in (data + b"\0", struct.pack("<Q", 2**63) + data[8:], b"\xff" * len(data)):
+        (model / name).write_bytes(content)
+        with pytest.raises(InputError, match=rf"{name}: (not a whole COLMAP file|camera model number -1 is not known)"):
+            read_colmap(model, tmp_path)
+
+
+def test_unknown_camera_model_in_a_binary_file(small: Path, tmp_path: Path) -> None:
+    model = copy_model(small, tmp_path / "plant")
+    data = bytearray((model / "cameras.bin").read_bytes())
+    data[12:16] = struct.pack("<i", 77)
+    (model / "cameras.bin").write_bytes(data)
+    with pytest.raises(InputError, match=r"cameras\.bin: camera model number 77 is not known"):
+        read_colmap(model, tmp_path)
+
+
+class TestText:
+    @pytest.fixture
+    def folder(self, small: Path, tmp_path: Path) -> Path:
+        (tmp_path / "sparse").mkdir()
+        pycolmap.Reconstruction(small / "sparse").write_text(tmp_path / "sparse")
+        return tmp_path
+
+    def replace(self, folder: Path, name: str, old: str, new: str) -> None:
+        path = folder / "sparse" / name
+        text = path.read_text()
+        assert old in text
+        path.write_text(text.replace(old, new))
+
+    def test_unknown_camera_model(self, folder: Path) -> None:
+        self.replace(folder, "cameras.txt", "OPENCV", "CUBIST")
+        with pytest.raises(
+            InputError, match=r"sparse: cannot be read as a COLMAP model \(Camera model does not exist\)"
+        ):
+            load_scene(folder)
+
+    def test_zero_focal_length(self, folder: Path) -> None:
+        self.replace(folder, "cameras.txt", "PINHOLE 128 96 150 ", "PINHOLE 128 96 0 ")
+        with pytest.raises(InputError, match=r"sparse: view 1 \(images/pinhole/01.jpg\): the focal length is 0, 155"):
+            load_scene(folder)
+
+    def test_absurd_image_size(self, folder: Path) -> None:
+        self.replace(folder, "cameras.txt", "PINHOLE 128 96", "PINHOLE 9999999999 96")
+        with pytest.raises(InputError, match=r"view 1 .*: the image size is 9999999999 x 96, expected at most"):
+            load_scene(folder)
+
+    def test_name_that_leads_out(self, folder: Path) -> None:
+        self.replace(folder, "images.txt", "pinhole/01.jpg", "../../01.jpg")
+        with pytest.raises(InputError, match=r"sparse: view 0 \(images/../../01.jpg\): the file name leads out"):
+            load_scene(folder)
+
+    def test_no_perspective(self, folder: Path) -> None:
+        path = folder / "sparse" / "cameras.txt"
+        lines = [line for line in path.read_text().splitlines() if not line.startswith("2 ")]
+        path.write_text("\n".join([*lines, "2 EQUIRECTANGULAR 128 96 128 96"]) + "\n")
+        with pytest.raises(
+            InputError, match=r"image opencv/02.jpg: camera model EQUIRECTANGULAR is no perspective one"
+        ):
+            load_scene(folder)
+
+    @pytest.mark.parametrize("share", [0.0, 0.5, 0.8, 0.95])
+    @pytest.mark.parametrize("name", ["cameras.txt", "images.txt"])
+    def test_cut(self, folder: Path, name: str, share: float) -> None:
+        path = folder / "sparse" / name
+        text = path.read_text()
+        path.write_text(text[: int(share * len(text))])
+        with pytest.raises(InputError, match=r"sparse: (cannot be read as a COLMAP model|there are no views)"):
+            load_scene(folder)
+
+
+def test_single_view(tmp_path: Path) -> None:
+    (tmp_path / "sparse").mkdir()
+    model = build_model(PINHOLES)
+    model.deregister_frame(2)
+    model.write_binary(tmp_path / "sparse")
+    with pytest.raises(InputError, match=r"sparse: there is a single view"):
+        load_scene(tmp_path)
+
+
+@pytest.mark.parametrize("missing", ["images.bin", "points3D.bin"])
+def test_missing_file_of_a_model(missing: str, small: Path, tmp_path: Path) -> None:
+    model = copy_model(small, tmp_path / "plant")
+    (model / missing).unlink()
+    with pytest.raises(InputError, match=r"sparse: cannot be read as a COLMAP model"):
+        read_colmap(model, tmp_path)
+
+
+@pytest.mark.shared_data
+def test_a_real_model_reprojects_its_own_points(shared_data: Path) -> None:
+    folder = shared_data / "fern-llff"
+    scene = load_scene(folder)
+    model = pycolmap.Reconstruction(scene.source)
+    points = np.stack([point.xyz for point in model.points3D.values()])
+    order = {number: index for index, number in enumerate(model.points3D)}
+    px, _ = scene.cameras.project(torch.from_numpy(points))
+    for view in range(0, len(scene.views), 7):
+        name = scene.views[view].path.relative_to(folder / "images").as_posix()
+        seen = [point for point in model.find_image_with_name(name).points2D if point.has_point3D()]
+        found = px[view, [order[point.point3D_id] for point in seen]].numpy()
+        lens = scene.views[view].lens
+        if lens is not None:
+            found = photo_from_pinhole(lens, scene.cameras.K[view].numpy(), found)
+        errors = np.linalg.norm(found - np.stack([point.xy for point in seen]), axis=1)
+        assert np.median(errors) < 1.0
+
+
+def test_photos_without_a_pose_are_warned_of(small: Path, tmp_path: Path) -> None:
+    model = copy_model(small, tmp_path / "plant")
+    (tmp_path / "plant" / "images").mkdir(exist_ok=True)
+    (tmp_path / "plant" / "images" / "stranger.jpg").write_bytes(b"")
+    with pytest.warns(InputWarning, match=r"1 photos in images/ have no pose .* the first is stranger\.jpg"):
+        scene = read_colmap(model, tmp_path / "plant")
+    assert "stranger" not in [view.name for view in scene.views]

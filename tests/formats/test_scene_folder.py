@@ -1,0 +1,152 @@
+"""Scene folders: which cameras are read, and masks that arrive in the undistorted frame."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.coco import encode_mask
+from mvseg.formats.label_png import read_label_png, write_label_png
+from mvseg.formats.lens import distort
+from mvseg.formats.rig import opencv_lens
+from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.regions import IGNORE_LABEL, Regions
+from scene_folders import HEIGHT, WIDTH, K, arc_pose, draw_labels, edit_rig, rig_content, write_image, write_scene
+
+DISTORTION = [-0.8, 0.3, 0.01, -0.01, 0.0]
+
+
+def write_coco_masks(folder: Path, path: Path, num_views: int = 4) -> None:
+    """The label PNGs of a scene as COCO, annotation ids counted over all views."""
+    images, annotations = [], []
+    for view in range(num_views):
+        images.append({"id": view, "file_name": f"{view:03d}.png", "width": WIDTH, "height": HEIGHT})
+        labels = read_label_png(folder / "masks" / f"{view:03d}.png", WIDTH, HEIGHT)
+        for number in np.unique(labels)[1:].tolist():
+            segmentation = encode_mask(labels == number)
+            annotations.append({"id": len(annotations) + 1, "image_id": view, "segmentation": segmentation})
+    path.write_text(json.dumps({"images": images, "annotations": annotations, "categories": []}))
+
+
+def union(regions: Regions, view: int) -> np.ndarray:
+    return regions.label_map(view, torch.ones(len(regions), dtype=torch.int64), WIDTH, HEIGHT).numpy() > 0
+
+
+def overlap(first: np.ndarray, second: np.ndarray) -> float:
+    return float((first & second).sum() / (first | second).sum())
+
+
+def test_cameras_json_goes_first_then_transforms(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    pose = np.eye(4)
+    frames = []
+    for view in range(2):
+        pose[0, 3] = view
+        frames.append({"file_path": f"images/{view:03d}.png", "transform_matrix": pose.tolist()})
+    intrinsics = {"w": WIDTH, "h": HEIGHT, "fl_x": 99, "cx": 64, "cy": 48}
+    (folder / "transforms.json").write_text(json.dumps({**intrinsics, "frames": frames}))
+    scene = load_scene(folder)
+    assert (len(scene.views), scene.source, scene.name) == (4, folder / "cameras.json", "plant")
+    (folder / "cameras.json").unlink()
+    scene = load_scene(str(folder))
+    assert (len(scene.views), scene.source) == (2, folder / "transforms.json")
+
+
+def test_binary_masks_are_warned_of(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    for path in (folder / "masks").iterdir():
+        labels = read_label_png(path, WIDTH, HEIGHT)
+        write_label_png(path, np.where(labels > 0, 255, 0))
+    with pytest.warns(InputWarning, match="holds 0 and 255 only"):
+        regions = load_masks(load_scene(folder), folder / "masks")
+    assert regions.labels.tolist() == [255] * 4
+
+
+def test_no_folder_and_no_cameras(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="absent: no such scene folder"):
+        load_scene(tmp_path / "absent")
+    with pytest.raises(InputError, match=r"no cameras, expected cameras\.json, a COLMAP model in"):
+        load_scene(tmp_path)
+
+
+def test_label_pngs_become_regions(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    labels = read_label_png(folder / "masks" / "001.png", WIDTH, HEIGHT)
+    labels[:2, :5] = IGNORE_LABEL
+    write_image(folder / "masks" / "001.png", labels)
+    regions = load_masks(load_scene(folder), folder / "masks")
+    assert regions.num_per_view.tolist() == [3, 3, 3, 3]
+    assert regions.labels.tolist() == [1, 2, 3, 11, 12, 13, 21, 22, 23, 31, 32, 33]
+    for index, (view, label) in enumerate(zip(regions.view_index.tolist(), regions.labels.tolist(), strict=True)):
+        painted = read_label_png(folder / "masks" / f"{view:03d}.png", WIDTH, HEIGHT) == label
+        np.testing.assert_array_equal(regions.mask(index, WIDTH, HEIGHT), painted)
+
+
+def test_coco_masks_are_the_same_regions(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    write_coco_masks(folder, folder / "masks.json")
+    scene = load_scene(folder)
+    png, coco = load_masks(scene, folder / "masks"), load_masks(scene, folder / "masks.json")
+    for field in ("view_index", "boxes", "crops"):
+        assert torch.equal(getattr(png, field), getattr(coco, field))
+    assert coco.labels.tolist() == list(range(1, 13))
+
+
+@pytest.mark.parametrize("kind", ["png", "coco"])
+def test_masks_of_distorted_photos_are_undistorted(kind: str, tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    straight = load_masks(load_scene(folder), folder / "masks")
+    lens = opencv_lens(WIDTH, HEIGHT, K, DISTORTION)
+    for view in range(4):
+        edit_rig(folder, view, distortion=DISTORTION)
+        path = folder / "masks" / f"{view:03d}.png"
+        write_image(path, distort(read_label_png(path, WIDTH, HEIGHT), lens, K))
+    masks = folder / "masks"
+    if kind == "coco":
+        masks = folder / "masks.json"
+        write_coco_masks(folder, masks)
+    regions = load_masks(load_scene(folder), masks)
+    raw = [read_label_png(folder / "masks" / f"{view:03d}.png", WIDTH, HEIGHT) > 0 for view in range(4)]
+    for view in range(4):
+        assert overlap(union(regions, view), union(straight, view)) > 0.95
+        assert overlap(union(regions, view), union(straight, view)) > overlap(raw[view], union(straight, view))
+    assert min(overlap(raw[view], union(straight, view)) for view in range(4)) < 0.93  # there was something to do
+    if kind == "png":
+        assert torch.equal(regions.labels, straight.labels)
+
+
+def test_views_in_subfolders_have_masks_in_subfolders(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant", images=False)
+    rig = rig_content()
+    for view, name in enumerate(("left/1", "left/2", "right/1", "right/2")):
+        rig["views"][view]["file"] = f"images/{name}.jpg"
+        write_image(folder / "nested" / f"{name}.png", draw_labels(*arc_pose(view, 4)))
+    (folder / "cameras.json").write_text(json.dumps(rig))
+    scene = load_scene(folder)
+    assert [view.name for view in scene.views] == ["left/1", "left/2", "right/1", "right/2"]
+    assert load_masks(scene, folder / "nested").num_per_view.tolist() == [3, 3, 3, 3]
+
+
+def test_all_masks_empty(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    for path in (folder / "masks").iterdir():
+        write_image(path, np.zeros((HEIGHT, WIDTH), np.uint16))
+    assert load_masks(load_scene(folder), folder / "masks").num_per_view.tolist() == [0, 0, 0, 0]
+    write_coco_masks(folder, folder / "masks.json")
+    assert load_masks(load_scene(folder), folder / "masks.json").num_per_view.tolist() == [0, 0, 0, 0]
+
+
+def test_missing_masks_are_named(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    scene = load_scene(folder)
+    (folder / "masks" / "002.png").unlink()
+    with pytest.raises(InputError, match=r"masks/002\.png: the mask file is missing \(view 2\)"):
+        load_masks(scene, folder / "masks")
+    for place in ("absent", "cameras.txt", "absent.json"):
+        with pytest.raises(InputError, match=f"{place}: no such masks, expected a folder of label PNGs or a COCO"):
+            load_masks(scene, folder / place)

@@ -1,0 +1,145 @@
+"""Eq. 3 by angles, against Eq. 3 by drawn lines."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from mvseg.matching.affinity import region_affinity
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Scene
+from reference import affinity_reference
+from synthetic import arc_positions, ball_scene, cameras_at, moved, permute_views, render_balls
+
+
+def symmetric(directed: torch.Tensor) -> torch.Tensor:
+    return (directed + directed.T) / 2
+
+
+@pytest.fixture(scope="module")
+def two_views(demo_scene: Scene, demo_regions: Regions) -> tuple[Regions, Scene]:
+    """Views 1 and 4 of the shipped scene: what the drawn twin can do in seconds."""
+    keep = (demo_regions.view_index == 1) | (demo_regions.view_index == 4)
+    chosen = demo_regions.select(keep)
+    renumbered = (chosen.view_index == 4).long()
+    cameras = demo_scene.cameras[[1, 4]]
+    views = (demo_scene.views[1], demo_scene.views[4])
+    regions = Regions(renumbered, chosen.boxes, chosen.crops, 2, chosen.labels)
+    return regions, Scene("two", views, cameras)
+
+
+def test_agrees_with_drawn_lines_better_than_two_samplings_do(two_views: tuple[Regions, Scene]) -> None:
+    """The whole shipped scene is compared by benchmarks/affinity_speed.py --agreement."""
+    regions, scene = two_views
+    drawn = torch.stack([symmetric(affinity_reference(regions, scene.cameras, 200, seed)) for seed in range(4)])
+    pairs = regions.view_index[:, None] != regions.view_index
+    ours = region_affinity(regions, scene.cameras).to_dense()
+    difference = (ours - drawn.mean(0))[pairs].abs()
+    assert difference.mean() <= 0.01
+    assert difference.max() <= 0.12
+    samplings = torch.stack([(drawn[a] - drawn[b])[pairs].abs().mean() for a in range(4) for b in range(a)])
+    assert difference.mean() < samplings.mean()
+
+
+def test_random_points_agree_with_all_points(two_views: tuple[Regions, Scene]) -> None:
+    regions, scene = two_views
+    everything = region_affinity(regions, scene.cameras).to_dense()
+    one = region_affinity(regions, scene.cameras, num_points=200, seed=1).to_dense()
+    again = region_affinity(regions, scene.cameras, num_points=200, seed=1).to_dense()
+    other = region_affinity(regions, scene.cameras, num_points=200, seed=2).to_dense()
+    assert torch.equal(one, again)
+    assert not torch.equal(one, other)
+    assert (one - everything).abs().mean() < 0.01
+
+
+def test_dense_form_is_symmetric_and_ties_different_views_only() -> None:
+    scene = ball_scene(8, 4)
+    affinity = region_affinity(scene.regions, scene.cameras)
+    W = affinity.to_dense()
+    assert torch.equal(W, W.T)
+    same_view = scene.regions.view_index[:, None] == scene.regions.view_index
+    assert W[same_view].max() == 0
+    assert 0 < W.max() <= 1
+    assert (affinity.edges[:, 0] < affinity.edges[:, 1]).all()
+    assert len(affinity.edges.unique(dim=0)) == len(affinity.edges)
+
+
+def test_true_pairs_weigh_most() -> None:
+    scene = ball_scene(6, 5, seed=1)
+    W = region_affinity(scene.regions, scene.cameras).to_dense()
+    same = scene.regions.labels[:, None] == scene.regions.labels
+    other_view = scene.regions.view_index[:, None] != scene.regions.view_index
+    assert W[same & other_view].mean() > 0.8
+    assert W[~same & other_view].mean() < 0.2
+
+
+def test_views_and_regions_may_come_in_any_order() -> None:
+    scene = ball_scene(7, 4, seed=5)
+    W = region_affinity(scene.regions, scene.cameras).to_dense()
+    shuffle = torch.randperm(len(scene.regions), generator=torch.Generator().manual_seed(0))
+    shuffled = region_affinity(scene.regions.select(shuffle), scene.cameras).to_dense()
+    torch.testing.assert_close(shuffled, W[shuffle][:, shuffle], atol=1e-5, rtol=0)
+
+    order = [2, 0, 3, 1]
+    turned = permute_views(scene, order)
+    first = {(v, n): d for d, (v, n) in enumerate(_keys(scene.regions))}
+    index = torch.tensor([first[(order[v], n)] for v, n in _keys(turned.regions)])
+    W_turned = region_affinity(turned.regions, turned.cameras).to_dense()
+    # Taking a pair the other way round mirrors its bins, so that pixels on a rim may change bins.
+    torch.testing.assert_close(W_turned, W[index][:, index], atol=0.03, rtol=0)
+
+
+def _keys(regions: Regions) -> list[tuple[int, int]]:
+    return list(zip(regions.view_index.tolist(), regions.labels.tolist(), strict=True))
+
+
+def test_the_world_may_be_moved_turned_and_scaled() -> None:
+    scene = ball_scene(7, 4, seed=6)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)).double())[0]
+    rotation = rotation * torch.linalg.det(rotation)
+    other = moved(scene.cameras, 0.01, rotation, torch.tensor([5.0, -2.0, 40.0]).double())
+    W = region_affinity(scene.regions, scene.cameras).to_dense()
+    torch.testing.assert_close(region_affinity(scene.regions, other).to_dense(), W, atol=0.02, rtol=0)
+
+
+def test_a_finer_image_of_the_same_scene_gives_the_same_weights() -> None:
+    coarse = ball_scene(5, 3, seed=7)
+    fine = ball_scene(5, 3, seed=7, focal=800.0, width=640, height=480)
+    assert torch.equal(coarse.regions.labels, fine.regions.labels)
+    W, W_fine = (region_affinity(s.regions, s.cameras).to_dense() for s in (coarse, fine))
+    torch.testing.assert_close(W_fine, W, atol=0.08, rtol=0)  # bands are 2 px wide, whatever a pixel is
+
+
+def test_a_coarse_sender_leaves_no_gaps_in_a_fine_image() -> None:
+    """A camera of a quarter of the resolution: its neighbouring pixels are four fine pixels apart."""
+    positions = arc_positions(2)
+    centers, radii = torch.tensor([[0.0, 0, 0]]).double(), torch.tensor([0.8]).double()
+    fine = cameras_at(positions[:1], focal=1600.0, width=1280, height=960)
+    coarse = cameras_at(positions[1:], focal=200.0, width=160, height=120)
+    cameras = type(fine)(*(torch.cat((getattr(fine, f), getattr(coarse, f))) for f in ("K", "R", "t", "sizes")))
+    regions = regions_from_label_maps(render_balls(cameras, centers, radii))
+    assert region_affinity(regions, cameras).weights.item() > 0.95
+
+
+def test_pairs_without_baseline_are_skipped() -> None:
+    positions = torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]])
+    cameras = cameras_at(positions)
+    regions = regions_from_label_maps(
+        render_balls(cameras, torch.tensor([[0.0, 0, 0]]).double(), torch.tensor([0.5]).double())
+    )
+    edges = region_affinity(regions, cameras).edges.tolist()
+    assert sorted(edges) == [[0, 2], [1, 2]]
+
+
+def test_no_regions_no_edges() -> None:
+    cameras = cameras_at(arc_positions(3))
+    empty = Regions(
+        torch.zeros(0, dtype=torch.int64),
+        torch.zeros(0, 4, dtype=torch.int64),
+        torch.zeros(0, dtype=torch.bool),
+        3,
+        torch.zeros(0, dtype=torch.int64),
+    )
+    affinity = region_affinity(empty, cameras)
+    assert affinity.edges.shape == (0, 2)
+    assert affinity.to_dense().shape == (0, 0)

@@ -1,0 +1,197 @@
+"""Eqs. 1, 2 and 4 without lines, against lines: OpenCV's, and drawn ones."""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError
+from mvseg.matching.epipolar import (
+    bin_histogram,
+    choose_bins,
+    dilate,
+    epipolar_bands,
+    epipolar_map,
+    epipolar_pencil,
+    is_coincident,
+    view_samples,
+)
+from mvseg.scene import Cameras
+from reference import epipolar_map_reference, fundamental_reference
+from synthetic import arc_positions, ball_scene, cameras_at, moved
+
+# Two cameras side by side; one behind the other (epipoles inside both images); one above the other; face to face.
+RIGS = {
+    "side by side": [[10.0, 0, 0], [9.0, 4, 0]],
+    "one behind the other": [[10.0, 0, 0], [6.0, 0.2, 0.1]],
+    "one above the other": [[10.0, 0, 1], [8.0, 0, 6]],
+    "face to face": [[10.0, 0, 1], [-10.0, 0.5, 1]],
+}
+
+
+def rig(name: str) -> Cameras:
+    return cameras_at(torch.tensor(RIGS[name]))
+
+
+def pixels_of_a_grid(cameras: Cameras, view: int) -> torch.Tensor:
+    width, height = cameras.sizes[view].tolist()
+    return torch.cartesian_prod(torch.arange(5.5, width, 20), torch.arange(5.5, height, 20))
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_corresponding_pixels_have_equal_angles(name: str) -> None:
+    cameras = rig(name)
+    points = torch.randn(200, 3, generator=torch.Generator().manual_seed(1)).double()
+    px, depth = cameras.project(points)
+    assert (depth > 0).all()
+    pencil = epipolar_pencil(cameras, 0, 1)
+    first, second = (pencil.angles(side, px[side]) for side in (0, 1))
+    apart = (first - second).abs()
+    torch.testing.assert_close(torch.minimum(apart, 4 - apart), torch.zeros(200).double(), atol=1e-9, rtol=0)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_pixels_on_an_opencv_epipolar_line_share_its_half_plane(name: str) -> None:
+    cameras = rig(name)
+    pencil = epipolar_pencil(cameras, 0, 1)
+    F = fundamental_reference(cameras, 0, 1)
+    for pixel in pixels_of_a_grid(cameras, 0)[::7]:
+        line = cv2.computeCorrespondEpilines(pixel.numpy().reshape(1, 1, 2).astype(np.float64), 1, F)[0, 0]
+        u = torch.linspace(-500, 900, 50).double()
+        a, b, c = line
+        on_line = torch.stack((u, -(c + a * u) / b) if abs(b) > abs(a) else (-(c + b * u) / a, u), 1)
+        there = _angle(pencil.angles(1, on_line))
+        here = _angle(pencil.angles(0, pixel[None].double()))
+        # The line is one plane: its two halves differ by half a turn.
+        half_turn = torch.remainder(there - here + math.pi / 2, math.pi) - math.pi / 2
+        assert half_turn.abs().max() < 1e-6
+
+
+def _angle(pseudo: torch.Tensor) -> torch.Tensor:
+    """The true angle, in radians, of a 1-norm angle."""
+    y = torch.where(pseudo.abs() <= 1, pseudo, pseudo.sign() * (2 - pseudo.abs()))
+    x = (1 - y.abs()) * torch.where(pseudo.abs() <= 1, 1.0, -1.0)
+    return torch.atan2(y, x)
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_angles_grow_with_the_true_angle(name: str) -> None:
+    cameras = rig(name)
+    pencil = epipolar_pencil(cameras, 0, 1)
+    xy = pixels_of_a_grid(cameras, 0).double()
+    x, y = (torch.cat((xy, torch.ones(len(xy), 1).double()), 1) @ pencil.plane_from_px[0].T).unbind(1)
+    by_atan2 = torch.atan2(y, x).argsort(stable=True)
+    assert (pencil.angles(0, xy)[by_atan2].diff() >= 0).all()
+
+
+def test_pitch_is_the_angle_of_one_pixel_across_the_line() -> None:
+    cameras = rig("side by side")
+    pencil = epipolar_pencil(cameras, 0, 1)
+    xy = torch.tensor([[50.5, 60.5]]).double()
+    steps = torch.stack(
+        [torch.tensor([math.cos(a), math.sin(a)]) for a in torch.linspace(0, 6.28, 400).tolist()]
+    ).double()
+    change = (pencil.angles(0, xy + 0.01 * steps) - pencil.angles(0, xy)).abs().max() / 0.01
+    assert pencil.pitch(0, xy) == pytest.approx(float(change), rel=1e-3)
+
+
+def test_pencil_does_not_depend_on_the_world() -> None:
+    cameras = rig("side by side")
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)).double())[0]
+    rotation = rotation * torch.linalg.det(rotation)
+    other = moved(cameras, 37.0, rotation, torch.tensor([100.0, -5.0, 3.0]).double())
+    xy = pixels_of_a_grid(cameras, 0).double()
+    for side in (0, 1):
+        expected = epipolar_pencil(cameras, 0, 1).angles(side, xy)
+        torch.testing.assert_close(epipolar_pencil(other, 0, 1).angles(side, xy), expected, atol=1e-9, rtol=0)
+
+
+def test_views_of_one_place_have_no_pencil() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
+    assert is_coincident(cameras).tolist() == [[True, True, False], [True, True, False], [False, False, True]]
+    with pytest.raises(InputError, match="views 0 and 1"):
+        epipolar_pencil(cameras, 0, 1)
+
+
+def test_many_cameras_far_from_the_origin_keep_their_baselines() -> None:
+    shift = torch.tensor([5e5, 5e6, 0.0]).double()
+    cameras = moved(cameras_at(arc_positions(28, distance=0.35)), 1.0, torch.eye(3).double(), shift)
+    assert torch.equal(is_coincident(cameras), torch.eye(28, dtype=torch.bool))
+
+
+def test_dilate_agrees_with_a_loop() -> None:
+    occupied = torch.rand(4, 60, generator=torch.Generator().manual_seed(0)) < 0.08
+    for radius in (1, 3, 70):
+        expected = torch.zeros(4, 60)
+        for row, column in occupied.nonzero().tolist():
+            expected[row, max(0, column - radius) : column + radius + 1] = 1
+        assert torch.equal(dilate(occupied, radius), expected)
+
+
+def test_histograms_hold_every_pixel_once() -> None:
+    scene = ball_scene(6, 3)
+    samples, members = view_samples(scene.regions)
+    pencil = epipolar_pencil(scene.cameras, 0, 2)
+    angles = pencil.angles(0, samples[0].xy), pencil.angles(1, samples[2].xy)
+    bins = choose_bins(pencil, (samples[0].xy, samples[2].xy), angles)
+    for side, view in ((0, 0), (1, 2)):
+        counts = bin_histogram(bins, angles[side], samples[view])
+        torch.testing.assert_close(counts.sum(1), scene.regions.areas[members[view]].float())
+        elsewhere = bin_histogram(bins, angles[side] + 10, samples[view])
+        assert elsewhere.sum() == 0
+
+
+@pytest.mark.parametrize("name", RIGS)
+def test_epipolar_map_agrees_with_drawn_lines(name: str) -> None:
+    """All pixels of a ball send out lines; the map and the drawing may differ along the rim of the band only."""
+    scene = ball_scene(5, 3, seed=4)
+    cameras = Cameras(*(torch.cat(pair) for pair in _with_third(rig(name))))
+    members = scene.regions.select((scene.regions.labels == 1) & (scene.regions.view_index < 2))
+    members = type(members)(members.view_index, members.boxes, members.crops, 3, members.labels)
+    width, height = 320, 240
+    v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
+    ours = epipolar_map(members, cameras, 2, torch.stack((u, v), -1).reshape(-1, 2)).reshape(height, width)
+    drawn = epipolar_map_reference(members, cameras, 2)
+    assert ours.unique().numel() >= 2
+    inside_both = (ours.numpy() > 0) & (drawn > 0)
+    assert np.abs(ours.numpy() - drawn)[inside_both].mean() < 0.03
+    kernel = np.ones((7, 7), np.uint8)
+    rim = cv2.dilate(drawn, kernel) - cv2.erode(drawn, kernel)
+    half_plane = ours.numpy()[rim == 0]  # away from rims both agree, but for the half of a line beyond the epipole
+    assert (half_plane <= drawn[rim == 0] + 1e-6).mean() > 0.995
+    if name != "one behind the other":
+        assert np.abs(half_plane - drawn[rim == 0]).mean() < 0.01
+
+
+def _with_third(pair: Cameras) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    third = cameras_at(torch.tensor([[2.0, 10, 3]]))
+    return [(getattr(pair, name), getattr(third, name)) for name in ("K", "R", "t", "sizes")]
+
+
+def test_bands_of_the_own_view_are_empty_and_true_matches_lie_in_each_others_bands() -> None:
+    scene = ball_scene(8, 4, seed=2)
+    regions = scene.regions
+    for view in range(4):
+        here = regions.select(regions.view_index == view)
+        xy, owner, _ = here.pixels()
+        bands = epipolar_bands(regions, scene.cameras, view, xy)
+        assert not bands[regions.view_index == view].any()
+        for number, label in enumerate(here.labels.tolist()):
+            same = bands[(regions.labels == label) & (regions.view_index != view)][:, owner == number]
+            assert same.float().mean() > 0.6
+
+
+def test_a_map_without_members_elsewhere_is_zero() -> None:
+    scene = ball_scene(3, 3)
+    alone = scene.regions.select(scene.regions.view_index == 0)
+    xy = torch.tensor([[10.5, 10.5], [160.5, 120.5]])
+    assert epipolar_map(alone, scene.cameras, 0, xy).tolist() == [0.0, 0.0]
+    assert epipolar_map(alone, scene.cameras, 1, torch.zeros(0, 2)).shape == (0,)
+
+
+def test_an_arc_of_cameras_has_distinct_places() -> None:
+    assert is_coincident(cameras_at(arc_positions(6))).sum() == 6

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import warnings
+
+import pytest
+import torch
+from sklearn.metrics import adjusted_rand_score
+
+from mvseg.config import MatchConfig
+from mvseg.errors import InputError, InputWarning
+from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.matching.match_regions import match_regions, split_merged
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Cameras, Scene
+from synthetic import ball_scene, cameras_at, merged_balls, permute_views, render_balls
+
+
+@pytest.mark.parametrize("method", ["auto", "nview", "one-per-view", "symnmf"])
+def test_shipped_scene_is_solved(
+    method: str, demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
+) -> None:
+    matching = match_regions(demo_regions, demo_scene.cameras, MatchConfig(method=method))
+    assert matching.method == ("nview" if method == "auto" else method)
+    metrics = matching_metrics(matching.instance_ids, demo_truth)
+    assert (metrics.s_match, metrics.e_k, metrics.ari) == (1.0, 0, 1.0)
+    assert matching.num_instances == 12
+    assert matching.match_scores.min() > 0.3
+    assert matching.match_scores.max() <= 1
+    assert matching.merged.shape == (0, 3)
+    if method in ("auto", "nview"):
+        assert matching.support is not None
+        assert matching.support.shape == (12,)
+        assert matching.support.min() >= 2
+        assert matching.residual_px == 1
+    else:
+        assert matching.support is None
+        assert matching.residual_px is None
+
+
+def test_the_papers_random_points_solve_it_too(
+    demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
+) -> None:
+    matching = match_regions(demo_regions, demo_scene.cameras, MatchConfig(method="symnmf", num_points=200, seed=3))
+    assert matching_metrics(matching.instance_ids, demo_truth).ari > 0.95
+
+
+def test_same_seed_same_answer_and_any_order_of_views() -> None:
+    scene = ball_scene(5, 6, seed=2)
+    first, second = (match_regions(scene.regions, scene.cameras) for _ in range(2))
+    assert torch.equal(first.instance_ids, second.instance_ids)
+    turned = permute_views(scene, [3, 1, 5, 4, 0, 2])
+    found = match_regions(turned.regions, turned.cameras)
+    assert adjusted_rand_score(scene.regions.labels, first.instance_ids) == 1
+    assert adjusted_rand_score(turned.regions.labels, found.instance_ids) == 1
+
+
+def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
+    from mvseg.matching.affinity import region_affinity
+
+    scene = ball_scene(5, 4, seed=2)
+    matching = match_regions(scene.regions, scene.cameras, MatchConfig(method="symnmf"))
+    W = region_affinity(scene.regions, scene.cameras).to_dense()
+    for n in range(len(scene.regions)):
+        partners = [
+            m
+            for m in range(len(scene.regions))
+            if matching.instance_ids[m] == matching.instance_ids[n]
+            and scene.regions.view_index[m] != scene.regions.view_index[n]
+        ]
+        expected = sum(float(W[n, m]) for m in partners) / max(len(partners), 1)
+        assert float(matching.match_scores[n]) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_given_number_of_instances_is_for_symnmf() -> None:
+    scene = ball_scene(5, 4, seed=2)
+    assert match_regions(scene.regions, scene.cameras, MatchConfig(num_instances=4)).method == "symnmf"
+    assert match_regions(scene.regions, scene.cameras, MatchConfig(search_range=(4, 6))).method == "symnmf"
+    with pytest.raises(InputError, match="are for symnmf, not for nview"):
+        MatchConfig(method="nview", num_instances=4)
+
+
+def test_a_single_view_is_refused() -> None:
+    scene = ball_scene(2, 3)
+    one = Regions(
+        *(getattr(scene.regions.select(scene.regions.view_index == 0), f) for f in ("view_index", "boxes", "crops")),
+        1,
+        torch.tensor([1, 2]),
+    )
+    with pytest.raises(InputError, match="single"):
+        match_regions(one, scene.cameras[:1])
+    with pytest.raises(InputError, match="3 views with 2 cameras"):
+        match_regions(scene.regions, scene.cameras[:2])
+
+
+@pytest.mark.parametrize("method", ["nview", "one-per-view", "symnmf"])
+def test_masks_larger_than_the_photos_are_refused(method: str) -> None:
+    scene = ball_scene(3, 3)
+    maps = [labels.repeat(2, 0).repeat(2, 1) if view == 1 else labels for view, labels in enumerate(scene.label_maps)]
+    with pytest.raises(InputError, match=r"region \d of view 1 has the box .* inside the 320 x 240 pixels"):
+        match_regions(regions_from_label_maps(maps), scene.cameras, MatchConfig(method=method))
+
+
+def test_merged_masks_can_be_cut_in_two() -> None:
+    """Every pixel keeps exactly one region; only the merged mask is cut, about where the two balls meet."""
+    scene = ball_scene(6, 8, seed=3)
+    regions, balls, merged = merged_balls(scene)
+    matching = match_regions(regions, scene.cameras)
+    assert matching.merged[:, 0].tolist() == [merged]
+    cut, matched, source = split_merged(regions, matching)
+    assert len(cut) == len(regions) + 1
+    assert source.tolist() == sorted([*range(len(regions)), merged])
+    assert len(matched.merged) == len(matched.merged_parts) == 0
+    assert torch.equal(matched.match_scores, matching.match_scores[source])
+    assert torch.equal(cut.view_index, regions.view_index[source])
+    whole = torch.arange(len(regions)) != merged
+    assert torch.equal(matched.instance_ids[whole[source]], matching.instance_ids[whole])
+    pieces = (source == merged).nonzero()[:, 0].tolist()
+    first, second = (cut.mask(piece, 320, 240) for piece in pieces)
+    assert not (first & second).any()
+    assert torch.equal(first | second, regions.mask(merged, 320, 240))
+    truth = torch.from_numpy(scene.label_maps[int(regions.view_index[merged])])
+    shown = [int(truth[piece].mode().values) for piece in (first, second)]
+    assert sorted(shown) == sorted(balls)
+    instances = [int(matching.instance_ids[whole][regions.labels[whole] == ball][0]) for ball in shown]
+    assert matched.instance_ids[pieces].tolist() == instances
+    again, same, _ = split_merged(cut, matched)
+    assert torch.equal(again.crops, cut.crops)
+    assert torch.equal(same.instance_ids, matched.instance_ids)
+
+
+def test_views_that_agree_on_nothing_are_warned_of() -> None:
+    scene = ball_scene(6, 4, seed=7, radius=0.1)
+    order = [2, 0, 3, 1]  # every photo has the pose of another
+    cameras = Cameras(scene.cameras.K, scene.cameras.R[order], scene.cameras.t[order], scene.cameras.sizes)
+    with pytest.warns(InputWarning, match="the views agree on little"):
+        assert match_regions(scene.regions, cameras).method == "one-per-view"
+
+
+def test_empty_masks_are_data() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [0.0, 10, 0]]))
+    nothing = regions_from_label_maps([torch.zeros(240, 320).numpy().astype(int)] * 2)
+    with pytest.warns(InputWarning, match="empty"):
+        matching = match_regions(nothing, cameras)
+    assert matching.num_instances == 0
+    assert matching.instance_ids.shape == (0,)
+
+
+def test_two_cameras_at_one_place_are_warned_of() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
+    centers, radii = torch.tensor([[0.0, 1, 0], [0.0, -1, 1]]).double(), torch.tensor([0.5, 0.5]).double()
+    regions = regions_from_label_maps(render_balls(cameras, centers, radii))
+    with pytest.warns(InputWarning, match="views 0 and 1 were taken from one place"):
+        matching = match_regions(regions, cameras)
+    assert adjusted_rand_score(regions.labels, matching.instance_ids) == 1
+
+
+def test_all_cameras_at_one_place_match_nothing() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0]]))
+    regions = regions_from_label_maps(
+        render_balls(cameras, torch.tensor([[0.0, 0, 0]]).double(), torch.tensor([0.5]).double())
+    )
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        assert match_regions(regions, cameras).instance_ids.tolist() == [-1, -1]

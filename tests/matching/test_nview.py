@@ -1,0 +1,425 @@
+from __future__ import annotations
+
+import dataclasses
+import warnings
+
+import numpy as np
+import pytest
+import torch
+from sklearn.metrics import adjusted_rand_score
+
+from mvseg.matching.affinity import region_affinity
+from mvseg.matching.nview.cluster_scores import (
+    Costs,
+    known_landings,
+    known_own_scores,
+    known_scores,
+    landing_matrix,
+    nothing_known,
+    own_scores,
+    partition_value,
+    score_matrix,
+    view_bounds,
+)
+from mvseg.matching.nview.label_rows import EMPTY, OUTSIDE, RowTable, em_affinities, row_table, sample_pixels
+from mvseg.matching.nview.match_nview import NViewMatching, match_nview, refine, search
+from mvseg.matching.one_per_view import dense_ids, one_per_view_clusters
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Cameras, Scene
+from synthetic import (
+    BallScene,
+    arc_positions,
+    ball_scene,
+    cameras_at,
+    moved,
+    permute_views,
+    render_balls,
+)
+
+COSTS = Costs()
+
+
+def solve(regions: Regions, cameras: Cameras) -> NViewMatching:
+    return match_nview(regions, cameras, region_affinity(regions, cameras))
+
+
+def same_partition(first: torch.Tensor, second: torch.Tensor) -> bool:
+    return bool(adjusted_rand_score(first, second) == 1)
+
+
+@pytest.fixture(scope="module")
+def balls() -> BallScene:
+    return ball_scene(7, 5, seed=4)
+
+
+@pytest.fixture(scope="module")
+def table(balls: BallScene) -> RowTable:
+    return row_table(balls.regions, balls.cameras)
+
+
+# --- slow twins
+
+
+def row_score_reference(table: RowTable, row: int, members: set[int]) -> float:
+    """Score of one row in a cluster, from the definition."""
+    has_mask = {int(table.view_index[m]) for m in members}
+    total, inside = 0.0, 0
+    for view, label in enumerate(table.labels[row].tolist()):
+        if label == OUTSIDE:
+            continue
+        inside += 1
+        if label == EMPTY:
+            total -= COSTS.missing if view in has_mask else COSTS.absent
+        else:
+            total += 1 if label in members else -COSTS.hidden
+    return total / inside
+
+
+def score_reference(table: RowTable, region: int, members: set[int]) -> float:
+    """S(n, c) from the definition."""
+    scores = []
+    for pixel in np.flatnonzero(table.pixel_region == region):
+        rows = np.flatnonzero(table.pixel == pixel)
+        scores.append(max([-COSTS.hidden] + [row_score_reference(table, int(row), members) for row in rows]))
+    return float(np.mean(scores))
+
+
+def some_ids(table: RowTable, seed: int) -> np.ndarray:
+    return dense_ids(np.random.default_rng(seed).integers(0, 6, len(table.view_index)))
+
+
+def test_scores_agree_with_the_definition(table: RowTable) -> None:
+    ids = some_ids(table, 0)
+    for view in (0, 3):
+        rest = np.where(table.view_index == view, ids.max() + 1, ids)
+        kept, inverse = np.unique(rest[table.view_index != view], return_inverse=True)
+        rest[table.view_index != view] = inverse
+        rest[table.view_index == view] = len(kept)
+        scores = score_matrix(table, rest, view, view_bounds(table), COSTS)
+        for row, region in enumerate(np.flatnonzero(table.view_index == view).tolist()):
+            for cluster in range(len(kept)):
+                expected = score_reference(table, region, set(np.flatnonzero(rest == cluster).tolist()))
+                assert scores[row, cluster] == pytest.approx(expected, abs=1e-5)
+
+
+def test_own_scores_agree_with_the_definition(table: RowTable) -> None:
+    ids = some_ids(table, 1)
+    scores = own_scores(table, ids, COSTS)
+    for region in range(0, len(ids), 3):
+        members = {m for m in np.flatnonzero(ids == ids[region]).tolist() if m != region}
+        assert scores[region] == pytest.approx(score_reference(table, region, members | {region}), abs=1e-5)
+
+
+def test_landing_agrees_with_the_definition(table: RowTable) -> None:
+    ids = some_ids(table, 2)
+    found = landing_matrix(table, ids, COSTS)
+    view, cluster = 2, int(ids[0])
+    hits, pixels = np.zeros(len(ids)), 0
+    members = set(np.flatnonzero(ids == cluster).tolist())
+    hidden = dataclasses.replace(table, labels=np.where(np.arange(table.num_views) == view, OUTSIDE, table.labels))
+    for pixel, region in enumerate(table.pixel_region.tolist()):
+        rows = np.flatnonzero(table.pixel == pixel)
+        if region not in members or table.view_index[region] == view or not len(rows):
+            continue
+        scores = []
+        for row in rows.tolist():
+            is_alone = (hidden.labels[row] == OUTSIDE).all()
+            scores.append(0.0 if is_alone else row_score_reference(hidden, row, members))
+        best = [row for row, score in zip(rows.tolist(), scores, strict=True) if score >= max(scores) - 1e-6]
+        if max(scores) >= 0:
+            pixels += 1
+            for row in best:
+                if table.labels[row, view] >= 0:
+                    hits[table.labels[row, view]] += 1 / len(best)
+    np.testing.assert_allclose(
+        found[cluster, table.view_index == view], (hits / pixels)[table.view_index == view], atol=1e-5
+    )
+
+
+def test_what_is_known_of_clusters_is_what_looking_again_would_find(table: RowTable) -> None:
+    """Columns are kept while the members of a cluster stay; then some regions change their cluster."""
+    known, bounds, ids = nothing_known(), view_bounds(table), some_ids(table, 3)
+    for step in range(3):
+        ids = dense_ids(np.where(np.arange(len(ids)) % 7 == step, np.roll(ids, 1), ids))
+        np.testing.assert_allclose(
+            known_landings(table, ids, COSTS, known), landing_matrix(table, ids, COSTS), atol=1e-6
+        )
+        for _ in range(2):
+            np.testing.assert_array_equal(known_own_scores(table, ids, COSTS, known), own_scores(table, ids, COSTS))
+        for view in range(table.num_views):
+            rest = np.where(table.view_index == view, ids.max() + 1, ids)
+            rest[rest <= ids.max()] = np.unique(rest[rest <= ids.max()], return_inverse=True)[1]
+            rest[table.view_index == view] = rest[table.view_index != view].max() + 1
+            found = known_scores(table, rest, view, bounds, COSTS, known)
+            np.testing.assert_allclose(found, score_matrix(table, rest, view, bounds, COSTS), atol=1e-6)
+
+
+def test_rows_are_what_points_on_the_ray_show(balls: BallScene, table: RowTable) -> None:
+    """Every row is shown, label by label, by the label maps at the projections of its mean depth, or next to them."""
+    rng = np.random.default_rng(0)
+    for row in rng.choice(len(table.labels), 60, replace=False).tolist():
+        pixel = table.pixel[row]
+        view = int(table.view_index[table.pixel_region[pixel]])
+        ray = balls.cameras.world_from_px[view] @ torch.tensor([*table.pixel_xy[pixel], 1.0]).double()
+        point = balls.cameras.centers[view] + ray / float(table.inverse_depth[row])
+        xy, depth = balls.cameras.project(point[None])
+        assert table.labels[row, view] == OUTSIDE
+        for other, label in enumerate(table.labels[row].tolist()):
+            u, v = (int(x) for x in xy[other, 0].floor())
+            if other == view or label == OUTSIDE or depth[other] <= 0:
+                continue
+            patch = balls.label_maps[other][max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
+            shown = {number for number in np.unique(patch).tolist() if number}
+            numbers = balls.regions.labels[table.view_index == other].tolist()
+            regions = np.flatnonzero(table.view_index == other)
+            near = {int(regions[numbers.index(number)]) for number in shown}
+            assert label in near if label >= 0 else 0 in patch
+
+
+def test_pixels_are_spread_evenly_and_never_more_than_asked(balls: BallScene) -> None:
+    xy, region = sample_pixels(balls.regions, most=25)
+    counts = torch.bincount(region)
+    assert torch.equal(counts, balls.regions.areas.clamp(max=25))
+    for index in (0, 5):
+        x1, y1, _, _ = balls.regions.boxes[index].tolist()
+        column, row = (xy[region == index] - torch.tensor([x1, y1])).long().unbind(1)
+        assert balls.regions.crop(index)[row, column].all()
+        assert len(torch.unique(xy[region == index], dim=0)) == counts[index]
+
+
+# --- the search
+
+
+def test_balls_are_solved_and_scored(balls: BallScene) -> None:
+    found = solve(balls.regions, balls.cameras)
+    assert same_partition(found.instance_ids, balls.regions.labels)
+    assert found.method == "nview"
+    assert found.residual_px == 1
+    assert found.explained > 0.7
+    assert found.match_scores.min() >= 0
+    assert found.match_scores.max() <= 1
+    assert found.match_scores.median() > 0.9
+    sure = found.match_scores >= 0.5
+    seen = [len(set(balls.regions.view_index[sure & (found.instance_ids == k)].tolist())) for k in range(7)]
+    assert found.support.tolist() == seen
+    assert found.merged.shape == (0, 3)
+
+
+def test_shipped_scene_is_solved(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
+    assert same_partition(solve(demo_regions, demo_scene.cameras).instance_ids, demo_truth)
+
+
+def test_same_answer_twice_and_in_any_order_of_views_and_regions() -> None:
+    scene = ball_scene(16, 4, seed=11, spread=1.2)
+    first, second = solve(scene.regions, scene.cameras), solve(scene.regions, scene.cameras)
+    assert torch.equal(first.instance_ids, second.instance_ids)
+    assert torch.equal(first.match_scores, second.match_scores)
+    order = torch.randperm(len(scene.regions), generator=torch.Generator().manual_seed(1))
+    shuffled = solve(scene.regions.select(order), scene.cameras)
+    assert same_partition(shuffled.instance_ids, first.instance_ids[order])
+    torch.testing.assert_close(shuffled.match_scores, first.match_scores[order], atol=1e-4, rtol=0)
+    views = [2, 0, 3, 1]
+    turned = permute_views(scene, views)
+    place = {(v, n): i for i, (v, n) in enumerate(zip(*labels_of(scene.regions), strict=True))}
+    back = [place[views[v], n] for v, n in zip(*labels_of(turned.regions), strict=True)]
+    found = solve(turned.regions, turned.cameras)
+    assert same_partition(found.instance_ids, first.instance_ids[back])
+
+
+def labels_of(regions: Regions) -> tuple[list[int], list[int]]:
+    return regions.view_index.tolist(), regions.labels.tolist()
+
+
+def test_the_world_may_be_moved_turned_and_scaled() -> None:
+    scene = ball_scene(10, 4, seed=5)
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)).double())[0]
+    rotation = rotation * torch.linalg.det(rotation).sign()
+    expected = solve(scene.regions, scene.cameras)
+    found = solve(scene.regions, moved(scene.cameras, 250.0, rotation, torch.tensor([9.0, -4.0, 70.0]).double()))
+    assert same_partition(found.instance_ids, expected.instance_ids)
+    torch.testing.assert_close(found.match_scores, expected.match_scores, atol=0.02, rtol=0)
+
+
+def test_twice_the_resolution() -> None:
+    scene = ball_scene(10, 5, seed=6)
+    big = ball_scene(10, 5, seed=6, focal=800.0, width=640, height=480)
+    found, expected = solve(big.regions, big.cameras), solve(scene.regions, scene.cameras)
+    assert same_partition(found.instance_ids, big.regions.labels)
+    assert same_partition(expected.instance_ids, scene.regions.labels)
+
+
+def test_missed_masks_leave_the_rest_together(balls: BallScene) -> None:
+    keep = torch.ones(len(balls.regions), dtype=torch.bool)
+    keep[3::7] = False
+    regions = balls.regions.select(keep)
+    assert same_partition(solve(regions, balls.cameras).instance_ids, regions.labels)
+
+
+def test_pieces_of_a_split_mask_are_joined() -> None:
+    scene = ball_scene(5, 6, seed=2)
+    labels = scene.label_maps[2].copy()
+    rows, columns = np.nonzero(labels == labels[labels > 0].min())
+    whole = int(labels[rows[0], columns[0]])
+    labels[rows[columns > columns.mean()], columns[columns > columns.mean()]] = 90
+    regions = regions_from_label_maps([*scene.label_maps[:2], labels, *scene.label_maps[3:]])
+    truth = torch.where(regions.labels == 90, whole, regions.labels)
+    assert same_partition(solve(regions, scene.cameras).instance_ids, truth)
+
+
+def test_pieces_do_not_make_up_an_instance() -> None:
+    """One ball is cut in two in most views: the parts on one side are seen by too few views to stand for something."""
+    scene = ball_scene(6, 10, seed=2)
+    maps = [labels.copy() for labels in scene.label_maps]
+    for view in (1, 5):
+        rows, columns = np.nonzero(maps[view] == 2)
+        maps[view][rows[columns > columns.mean()], columns[columns > columns.mean()]] = 90
+    regions = regions_from_label_maps(maps)
+    assert int((regions.labels == 90).sum()) == 2
+    truth = torch.where(regions.labels == 90, 2, regions.labels)
+    found = solve(regions, scene.cameras)
+    assert same_partition(found.instance_ids, truth)
+    assert len(found.support) == 6
+
+
+def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
+    labels = balls.label_maps[0].copy()
+    free = np.argwhere(labels[:20, :20] == 0)
+    labels[free[:, 0], free[:, 1]] = 77
+    regions = regions_from_label_maps([labels, *balls.label_maps[1:]])
+    found = solve(regions, balls.cameras)
+    alone = regions.labels == 77
+    assert found.instance_ids[alone].tolist() == [-1]
+    assert found.match_scores[alone].tolist() == [0]
+    assert same_partition(found.instance_ids[~alone], regions.labels[~alone])
+
+
+def test_refinement_never_ends_below_the_truth_on_clear_scenes(balls: BallScene, table: RowTable) -> None:
+    W = region_affinity(balls.regions, balls.cameras).to_dense().double().numpy()
+    truth = dense_ids(balls.regions.labels.numpy())
+    np.testing.assert_array_equal(refine(table, W, truth, COSTS), truth)
+    found = search(table, W, COSTS, np.arange(len(truth)))
+    np.testing.assert_array_equal(search(table, W, COSTS, truth), truth)
+    value, best = (partition_value(table, W - 0.5, ids, COSTS) for ids in (found, truth))
+    assert value >= best - 1e-6
+
+
+def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, table: RowTable) -> None:
+    A = em_affinities(table)[-1]
+    np.testing.assert_allclose(A, A.T)
+    same = (balls.regions.labels[:, None] == balls.regions.labels).numpy()
+    across = table.view_index[:, None] != table.view_index
+    assert A.min() >= 0
+    assert A.max() <= 1 + 1e-6
+    assert A[same & across].mean() > 0.6 > 0.1 > A[~same & across].mean()
+    assert (A[~across] == 0).all()
+
+
+# --- cameras of every kind
+
+
+def test_full_ring() -> None:
+    angle = torch.arange(8) / 8 * 2 * torch.pi
+    cameras = cameras_at(torch.stack((10 * angle.cos(), 10 * angle.sin(), 3 + angle.sin()), 1))
+    scene = ball_scene(8, 3, seed=8)
+    regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
+    assert same_partition(solve(regions, cameras).instance_ids, regions.labels)
+
+
+def test_instances_that_leave_the_image() -> None:
+    scene = ball_scene(8, 6, seed=9, focal=900.0)
+    assert int((scene.regions.boxes[:, 0] == 0).sum()) > 3
+    assert adjusted_rand_score(scene.regions.labels, solve(scene.regions, scene.cameras).instance_ids) > 0.95
+
+
+def test_cameras_on_a_line() -> None:
+    x = torch.linspace(-3, 3, 6)
+    cameras = cameras_at(torch.stack((x, torch.full((6,), -10.0), torch.zeros(6)), 1))
+    scene = ball_scene(6, 3, seed=10, radius=0.3)
+    regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
+    assert adjusted_rand_score(regions.labels, solve(regions, cameras).instance_ids) > 0.9
+
+
+def test_epipoles_inside_the_images() -> None:
+    """Cameras that see each other, one behind the other and across."""
+    cameras = cameras_at(torch.tensor([[0.0, -8, 0.2], [0.3, -14, 0], [0, 9, 0.5], [8, 0.5, 1]]), focal=250.0)
+    scene = ball_scene(6, 3, seed=12)
+    regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
+    assert adjusted_rand_score(regions.labels, solve(regions, cameras).instance_ids) > 0.9
+
+
+def test_two_views_fall_back_on_the_pairs() -> None:
+    scene = ball_scene(3, 2, seed=1)
+    found = solve(scene.regions, scene.cameras)
+    assert found.method == "one-per-view"
+    assert same_partition(found.instance_ids, scene.regions.labels)
+
+
+def test_nothing_to_match() -> None:
+    cameras = cameras_at(arc_positions(3))
+    found = solve(regions_from_label_maps([np.zeros((240, 320), int)] * 3), cameras)
+    assert found.instance_ids.shape == found.match_scores.shape == found.support.shape == (0,)
+    one = render_balls(cameras[[0]], torch.zeros(1, 3), torch.ones(1))[0]
+    found = solve(regions_from_label_maps([one, np.zeros_like(one), np.zeros_like(one)]), cameras)
+    assert found.instance_ids.tolist() == [-1]
+
+
+def test_cameras_at_one_place() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0], [7.0, 7, 3]]))
+    scene = ball_scene(4, 3, seed=3)
+    regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = solve(regions, cameras)
+    assert adjusted_rand_score(regions.labels, found.instance_ids) > 0.9
+
+
+def test_wrong_poses_are_noticed() -> None:
+    scene = ball_scene(6, 6, seed=7, radius=0.25)
+    found = solve(scene.regions, turned_a_little(scene.cameras, 0.004))
+    assert same_partition(found.instance_ids, scene.regions.labels)
+    assert found.explained < solve(scene.regions, scene.cameras).explained
+
+
+def test_large_pose_errors_are_measured_and_endured() -> None:
+    scene = ball_scene(6, 6, seed=7, radius=0.1)
+    found = solve(scene.regions, turned_a_little(scene.cameras, 0.008))
+    assert found.residual_px > 1
+    assert found.method == "nview"
+    assert same_partition(found.instance_ids, scene.regions.labels)
+
+
+def test_where_the_views_agree_on_nothing_the_pairs_answer() -> None:
+    scene = ball_scene(6, 4, seed=7, radius=0.1)
+    cameras = turned_a_little(scene.cameras, 0.3)
+    found = solve(scene.regions, cameras)
+    assert found.method == "one-per-view"
+    assert found.explained < 0.3
+    affinity = region_affinity(scene.regions, cameras)
+    pairwise = one_per_view_clusters(affinity, scene.regions.view_index, 4)
+    assert same_partition(found.instance_ids, pairwise)
+
+
+def test_regions_without_a_pixel_and_very_many_views(balls: BallScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    empty = balls.regions.crop(0).clone().flatten().fill_(False)
+    size = len(empty)
+    regions = dataclasses.replace(balls.regions, crops=torch.cat((empty, balls.regions.crops[size:])))
+    found = solve(regions, balls.cameras)
+    assert found.instance_ids[0] == -1
+    assert same_partition(found.instance_ids[1:], regions.labels[1:])
+    # as with 500 times as many views: still one pixel per region
+    monkeypatch.setattr("mvseg.matching.nview.label_rows.PLENTY", 0.01)
+    table = row_table(balls.regions, balls.cameras)
+    assert np.bincount(table.pixel_region).tolist() == [1] * len(balls.regions)
+    assert np.isfinite(em_affinities(table)[-1]).all()
+
+
+def turned_a_little(cameras: Cameras, radians: float) -> Cameras:
+    """Cameras whose orientation is off by about so much."""
+    noise = radians * torch.randn(len(cameras), 3, generator=torch.Generator().manual_seed(3)).double()
+    turn = torch.linalg.matrix_exp(torch.stack([skew(axis) for axis in noise]))
+    return Cameras(cameras.K, turn @ cameras.R, (turn @ cameras.t[:, :, None])[:, :, 0], cameras.sizes)
+
+
+def skew(axis: torch.Tensor) -> torch.Tensor:
+    x, y, z = axis.tolist()
+    return torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]]).double()

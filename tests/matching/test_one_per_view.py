@@ -1,0 +1,133 @@
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+import torch
+from sklearn.metrics import adjusted_rand_score
+
+from mvseg.matching.affinity import Affinity, region_affinity
+from mvseg.matching.one_per_view import (
+    assign_one_to_one,
+    dense_ids,
+    join_alone,
+    link_average,
+    one_per_view_clusters,
+    power_iteration,
+)
+from synthetic import ball_scene
+
+
+def graph_of(W: np.ndarray) -> Affinity:
+    first, second = np.nonzero(np.triu(W))
+    edges = torch.from_numpy(np.stack([first, second], 1))
+    return Affinity(edges, torch.from_numpy(W[first, second]).float(), len(W))
+
+
+def random_weights(views: np.ndarray, seed: int) -> np.ndarray:
+    W = np.random.default_rng(seed).random((len(views), len(views)))
+    W = (W + W.T) / 2
+    W[views[:, None] == views] = 0
+    return W
+
+
+def link_average_reference(W: np.ndarray, views: np.ndarray, stop: float) -> np.ndarray:
+    """Average linkage from its definition: every mean computed afresh from all pairs."""
+    clusters = [[n] for n in range(len(W))]
+    while True:
+        options = [
+            (float(np.mean([W[n, m] for n in a for m in b])), a, b)
+            for a, b in itertools.combinations(clusters, 2)
+            if not {views[n] for n in a} & {views[m] for m in b}
+        ]
+        best = max(options, key=lambda option: option[0], default=(0.0, [], []))
+        if best[0] < stop or best[0] <= 0:
+            break
+        clusters = [c for c in clusters if c is not best[1] and c is not best[2]] + [best[1] + best[2]]
+    ids = np.empty(len(W), np.int64)
+    for index, cluster in enumerate(clusters):
+        ids[cluster] = index
+    return ids
+
+
+def test_hand_made_triangle() -> None:
+    """0 and 1 are of one view, 2 of another; 2 prefers 1."""
+    W = np.array([[0, 0, 0.5], [0, 0, 0.6], [0.5, 0.6, 0]])
+    assert one_per_view_clusters(graph_of(W), torch.tensor([0, 0, 1]), 2).tolist() == [-1, 0, 0]
+
+
+def test_the_whole_view_decides_not_the_single_best_edge() -> None:
+    """Agglomeration would take 0.9 first and leave a pair of 0.1; the assignment finds 0.8 + 0.8."""
+    W = np.zeros((4, 4))
+    W[0, 2], W[0, 3], W[1, 2], W[1, 3] = 0.9, 0.8, 0.8, 0.1
+    W += W.T
+    views = np.array([0, 0, 1, 1])
+    assert dense_ids(link_average(W, views, 2)).tolist() == [0, 1, 0, 2]
+    assert one_per_view_clusters(graph_of(W), torch.from_numpy(views), 2).tolist() == [0, 1, 1, 0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("stop", [0.0, 0.4, 0.6])
+def test_average_linkage_agrees_with_its_definition(seed: int, stop: float) -> None:
+    views = np.random.default_rng(seed).integers(0, 4, 14)
+    W = random_weights(views, seed)
+    found, expected = link_average(W, views, 4, stop), link_average_reference(W, views, stop)
+    assert adjusted_rand_score(found, expected) == 1
+
+
+def test_assignment_agrees_with_trying_everything() -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        gain, alone = rng.random((3, 2)), 0.3
+        options = [
+            choice
+            for choice in itertools.product(range(3), repeat=3)
+            if all(sum(c == k for c in choice) <= 1 for k in range(2))
+        ]
+        best = max(sum(gain[n, c] if c < 2 else alone for n, c in enumerate(choice)) for choice in options)
+        chosen = assign_one_to_one(gain, alone)
+        assert sum(gain[n, c] if c < 2 else alone for n, c in enumerate(chosen)) == pytest.approx(best)
+        assert len(set(chosen.tolist())) == 3
+
+
+def test_never_two_regions_of_one_view() -> None:
+    for seed in range(5):
+        views = np.random.default_rng(seed).integers(0, 5, 40)
+        W = random_weights(views, seed)
+        ids = one_per_view_clusters(graph_of(W), torch.from_numpy(views), 5).numpy()
+        pairs = [(i, v) for i, v in zip(ids, views, strict=True) if i >= 0]
+        assert len(pairs) == len(set(pairs))
+
+
+def test_second_chance_for_those_alone() -> None:
+    """Cluster 0 holds views 0 and 1. Region 2 fits it; 3 is of a taken view; 4 and 5 only fit each other; 6 nothing."""
+    views, W = np.array([0, 1, 2, 0, 1, 2, 3]), np.zeros((7, 7))
+    W[0, 1], W[0, 2], W[1, 2], W[1, 3], W[4, 5], W[6, 0] = 0.9, 0.8, 0.6, 0.9, 0.5, 0.3
+    found = join_alone(W + W.T, views, 4, np.array([0, 0, 1, 2, 3, 4, 5]), 0.4)
+    assert found.tolist() == [0, 0, 0, 1, 2, 2, 3]
+
+
+def test_sweeps_settle() -> None:
+    views = np.random.default_rng(1).integers(0, 4, 30)
+    W = random_weights(views, 1)
+    once = power_iteration(W, views, 4, link_average(W, views, 4))
+    np.testing.assert_array_equal(power_iteration(W, views, 4, once), once)
+
+
+def test_balls_are_solved_in_any_order() -> None:
+    scene = ball_scene(9, 6, seed=3)
+    affinity = region_affinity(scene.regions, scene.cameras)
+    ids = one_per_view_clusters(affinity, scene.regions.view_index, 6)
+    assert adjusted_rand_score(scene.regions.labels, ids) == 1
+    order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(0))
+    shuffled = scene.regions.select(order)
+    again = one_per_view_clusters(region_affinity(shuffled, scene.cameras), shuffled.view_index, 6)
+    assert adjusted_rand_score(ids[order], again) == 1
+
+
+def test_no_edges_and_no_regions() -> None:
+    none = Affinity(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 2)
+    assert one_per_view_clusters(none, torch.tensor([0, 1]), 2).tolist() == [-1, -1]
+    empty = Affinity(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 0)
+    assert one_per_view_clusters(empty, torch.zeros(0, dtype=torch.int64), 3).tolist() == []

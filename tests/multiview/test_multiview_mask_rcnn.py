@@ -1,0 +1,293 @@
+from __future__ import annotations
+
+import pytest
+import torch
+from torchvision.models.detection import MaskRCNN, fasterrcnn_mobilenet_v3_large_320_fpn, maskrcnn_resnet50_fpn
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.roi_heads import paste_masks_in_image
+from torchvision.ops import box_iou
+
+from mvseg.detectors.mask_cut import decide_masks
+from mvseg.errors import InputError
+from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN, Proposals, gather_proposals, match_proposals
+from mvseg.multiview.nms import cluster_aware_nms
+from mvseg.regions import regions_from_label_maps
+from mvseg.simulation.proposals import simulate_proposals
+from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
+
+
+class TinyBackbone(torch.nn.Sequential):
+    out_channels = 8
+
+    def __init__(self) -> None:
+        super().__init__(torch.nn.Conv2d(3, 8, 7, stride=16, padding=3), torch.nn.ReLU())
+
+
+def tiny_detector() -> MaskRCNN:
+    """An untrained Mask R-CNN that answers in milliseconds, and calls almost everything an object."""
+    torch.manual_seed(0)
+    detector = MaskRCNN(
+        TinyBackbone(),
+        num_classes=3,
+        min_size=96,
+        max_size=128,
+        rpn_anchor_generator=AnchorGenerator(((24, 48),), ((0.5, 1.0, 2.0),)),
+        box_score_thresh=0.05,
+        box_detections_per_img=20,
+        rpn_post_nms_top_n_test=60,
+        box_roi_pool=_align(7),
+        mask_roi_pool=_align(14),
+    )
+    return detector.eval()
+
+
+def _align(size: int) -> torch.nn.Module:
+    from torchvision.ops import MultiScaleRoIAlign
+
+    return MultiScaleRoIAlign(["0"], size, 2)
+
+
+def some_images(count: int = 3, width: int = 160, height: int = 120) -> list[torch.Tensor]:
+    return list(torch.rand(count, 3, height, width, generator=torch.Generator().manual_seed(1)))
+
+
+def small_cameras(count: int = 3):
+    return cameras_at(arc_positions(count), focal=200.0, width=160, height=120)
+
+
+def test_without_cameras_it_is_the_detector_it_wraps() -> None:
+    detector = tiny_detector()
+    wrapped = MultiViewMaskRCNN(detector)
+    assert list(wrapped.state_dict()) == list(detector.state_dict())
+    images = some_images()
+    with torch.no_grad():
+        expected, found = detector(images), wrapped(images)
+    assert len(expected[0]["boxes"]) > 0
+    for plain, ours in zip(expected, found, strict=True):
+        assert plain.keys() == ours.keys()
+        assert all(torch.equal(plain[key], ours[key]) for key in plain)
+    fresh = MultiViewMaskRCNN(maskrcnn_resnet50_fpn(weights=None, weights_backbone=None))
+    fresh.load_state_dict(maskrcnn_resnet50_fpn(weights=None, weights_backbone=None).state_dict())
+
+
+def test_losses_in_train_mode_are_untouched_even_with_cameras() -> None:
+    detector = tiny_detector().train()
+    wrapped = MultiViewMaskRCNN(detector)
+    assert wrapped.training
+    images = some_images(2)
+    target = {
+        "boxes": torch.tensor([[20.0, 20, 90, 80]]),
+        "labels": torch.tensor([1]),
+        "masks": torch.ones(1, 120, 160, dtype=torch.uint8),
+    }
+    losses = []
+    for model, arguments in ((detector, {}), (wrapped, {}), (wrapped, {"cameras": small_cameras(2)})):
+        torch.manual_seed(5)
+        losses.append(model(images, [target, target], **arguments))
+    assert losses[0].keys() == losses[1].keys() == losses[2].keys()
+    assert all(losses[0][key] == losses[1][key] == losses[2][key] for key in losses[0])
+    sum(losses[2].values()).backward()
+    assert detector.backbone[0].weight.grad.abs().sum() > 0
+
+
+def test_with_cameras_the_usual_dicts_and_ids() -> None:
+    wrapped = MultiViewMaskRCNN(tiny_detector())
+    found = wrapped(some_images(), cameras=small_cameras())
+    assert len(found) == 3
+    for one in found:
+        count = len(one["boxes"])
+        assert one["masks"].shape == (count, 1, 120, 160)
+        assert one["instance_ids"].dtype == torch.int64
+        assert one["match_scores"].dtype == torch.float32
+        assert {len(value) for value in one.values()} == {count}
+        assert count <= 20
+        assert (one["scores"].diff() <= 0).all()
+        assert not one["boxes"].requires_grad
+    assert max(int(one["instance_ids"].max()) for one in found) >= 0
+    classes: dict[int, set[int]] = {}
+    for one in found:
+        for instance, label in zip(one["instance_ids"].tolist(), one["labels"].tolist(), strict=True):
+            classes.setdefault(instance, set()).add(label)
+    assert all(len(labels) == 1 for instance, labels in classes.items() if instance >= 0)
+
+
+def test_the_detectors_own_thresholds_stay_as_they_were() -> None:
+    detector = tiny_detector()
+    before = (detector.roi_heads.nms_thresh, detector.roi_heads.detections_per_img)
+    MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
+    assert (detector.roi_heads.nms_thresh, detector.roi_heads.detections_per_img) == before
+
+
+def test_masks_and_scores_are_decided_and_low_scores_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def watch(found: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        seen.append(found)
+        return decide_masks(found)
+
+    monkeypatch.setattr("mvseg.multiview.mask_rcnn.decide_masks", watch)
+    detector = tiny_detector()
+    detector.roi_heads.score_thresh = 0.16
+    proposals, _ = MultiViewMaskRCNN(detector, num_iterations=0).find_regions(some_images(), small_cameras())
+    decided = [decide_masks(found)["scores"] for found in seen]
+    assert sum(int((scores < 0.16).sum()) for scores in decided) > 0
+    allowed = torch.cat([scores[scores >= 0.16] for scores in decided])
+    assert len(proposals.scores) > 0
+    assert torch.isin(proposals.scores, allowed).all()
+
+
+def test_boxes_that_the_other_views_do_not_confirm_go(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(), small_cameras()
+    before, _ = wrapped.find_regions(images, cameras)
+
+    def refuse_first(boxes: torch.Tensor, *others: torch.Tensor, iou_threshold: float) -> torch.Tensor:
+        return torch.arange(len(boxes)) > 0
+
+    monkeypatch.setattr("mvseg.multiview.mask_rcnn.confirmed", refuse_first)
+    after, matching = wrapped.find_regions(images, cameras)
+    confirm_all = lambda boxes, *others, iou_threshold: torch.ones(len(boxes)) > 0  # noqa: E731
+    monkeypatch.setattr("mvseg.multiview.mask_rcnn.confirmed", confirm_all)
+    unasked, _ = wrapped.find_regions(images, cameras)
+    assert len(after.scores) == len(unasked.scores) - 1 == len(matching.instance_ids)
+    assert len(before.scores) <= len(unasked.scores)
+
+
+def test_wrong_arguments_are_named() -> None:
+    wrapped = MultiViewMaskRCNN(tiny_detector())
+    with pytest.raises(InputError, match="2 images with 3 cameras"):
+        wrapped(some_images(2), cameras=small_cameras(3))
+    with pytest.raises(InputError, match="image 0 is 150 x 120, its camera says 160 x 120"):
+        wrapped(some_images(3, width=150), cameras=small_cameras(3))
+    with pytest.raises(InputError, match="expected as many, two or more"):
+        wrapped(some_images(1), cameras=small_cameras(2)[:1])
+    with pytest.raises(InputError, match=r"expected Cameras \(of a scene"):
+        wrapped(some_images(3), cameras="cameras.json")
+    boxes_only = fasterrcnn_mobilenet_v3_large_320_fpn(weights=None, weights_backbone=None)
+    with pytest.raises(InputError, match="no mask head"):
+        MultiViewMaskRCNN(boxes_only)
+
+
+def test_crops_hold_the_very_pixels_that_torchvision_pastes() -> None:
+    generator = torch.Generator().manual_seed(0)
+    corner = torch.rand(12, 2, generator=generator) * 60 - 3
+    boxes = torch.cat((corner, corner + 5 + 40 * torch.rand(12, 2, generator=generator)), 1)
+    boxes = boxes.clamp(min=torch.zeros(4), max=torch.tensor([80.0, 60, 80, 60]))
+    masks = torch.rand(12, 1, 28, 28, generator=generator)
+    found = {"boxes": boxes, "masks": masks, "scores": torch.rand(12), "labels": torch.ones(12, dtype=torch.int64)}
+    proposals = gather_proposals([found | {"frame": torch.tensor([80, 60])}], [[160, 120]])
+    torch.testing.assert_close(proposals.boxes, boxes * 2)
+    pasted = paste_masks_in_image(masks, proposals.boxes, (120, 160))[:, 0] > 0.5
+    for number in range(12):
+        assert torch.equal(proposals.regions.mask(number, 160, 120), pasted[number])
+
+
+def crowded_scene() -> tuple[BallScene, Proposals, torch.Tensor]:
+    scene = ball_scene(14, 8, seed=3, radius=0.5, spread=1.3)
+    proposals, labels = simulate_proposals(scene.label_maps, seed=0)
+    excess = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.7)
+    chosen = (proposals.boxes[excess], proposals.scores[excess], proposals.classes[excess])
+    return scene, Proposals(proposals.regions.select(excess), *chosen), labels[excess]
+
+
+def test_cluster_aware_nms_finds_more_than_plain_nms_does() -> None:
+    """Balls count as found when a kept proposal was made from them; crowded ones share half of their box."""
+    scene, proposals, labels = crowded_scene()
+    truth = regions_from_label_maps(scene.label_maps)
+    overlap = box_iou(truth.boxes.float(), truth.boxes.float()).fill_diagonal_(0)
+    overlap[truth.view_index[:, None] != truth.view_index] = 0
+    crowded = [
+        (view, label)
+        for view, label, most in zip(
+            truth.view_index.tolist(), truth.labels.tolist(), overlap.max(1).values.tolist(), strict=True
+        )
+        if most > 0.4
+    ]
+    assert len(crowded) >= 8
+
+    def recall(keep: torch.Tensor) -> float:
+        kept = set(zip(proposals.regions.view_index[keep].tolist(), labels[keep].tolist(), strict=True))
+        return sum(pair in kept for pair in crowded) / len(crowded)
+
+    plain = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.3)
+    keep, matching = match_proposals(proposals, scene.cameras)
+    assert recall(keep) > recall(plain)
+    assert len(keep) < 1.35 * len(truth)
+    assert len(matching.instance_ids) == len(keep)
+
+
+def test_iterating_is_deterministic_and_zero_iterations_only_match() -> None:
+    scene, proposals, _ = crowded_scene()
+    first, second = (match_proposals(proposals, scene.cameras, num_iterations=1) for _ in range(2))
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1].instance_ids, second[1].instance_ids)
+    keep, _ = match_proposals(proposals, scene.cameras, num_iterations=0)
+    groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
+    assert torch.equal(keep, cluster_aware_nms(proposals.boxes, proposals.scores, groups, 0.3))
+
+
+def test_classes_are_matched_apart_and_what_is_known_of_both_is_kept() -> None:
+    """True masks of balls, the even ones of another class; one mask of class 1 covers two balls."""
+    scene = ball_scene(6, 8, seed=3)
+    regions, (small, large), _ = merged_balls(scene)
+    first = (regions.labels == small) | (regions.labels == large)
+    classes = torch.where(first | (regions.labels % 2 == 1), 1, 2)
+    order = torch.randperm(len(regions), generator=torch.Generator().manual_seed(0))
+    proposals = Proposals(regions, regions.boxes.float(), torch.rand(len(regions)), classes).select(order)
+    keep, matching = match_proposals(proposals, scene.cameras, num_iterations=0, cluster_iou=0.99)
+    labels = proposals.regions.labels[keep]
+    assert matching.support is not None
+    assert len(matching.support) == matching.num_instances == 6
+    assert matching.residual_px == 1
+    for instance in range(6):
+        (classes_of,) = {tuple(proposals.classes[keep][matching.instance_ids == instance].unique().tolist())}
+        assert len(classes_of) == 1
+    ((region, own, other),) = matching.merged.tolist()
+    assert labels[region] == large
+    assert matching.instance_ids[region] == own
+    assert matching.merged_parts[0].shape == proposals.regions.crop(int(keep[region])).shape
+    assert {int(labels[matching.instance_ids == one].mode().values) for one in (own, other)} == {small, large}
+
+
+def test_at_most_so_many_detections_per_view() -> None:
+    scene, proposals, _ = crowded_scene()
+    keep, _ = match_proposals(proposals, scene.cameras, num_iterations=1, detections_per_view=5)
+    assert proposals.regions.select(keep).num_per_view.max() == 5
+
+
+def test_nothing_found_is_an_empty_answer() -> None:
+    detector = tiny_detector()
+    detector.roi_heads.score_thresh = 0.999
+    found = MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
+    assert [len(one["instance_ids"]) for one in found] == [0, 0, 0]
+    assert found[0]["masks"].shape == (0, 1, 120, 160)
+
+
+def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
+    wrapped = MultiViewMaskRCNN(tiny_detector())
+    with torch.autocast("cpu", torch.bfloat16):
+        found = wrapped(some_images(), cameras=small_cameras())
+        proposals, matching = wrapped.find_regions(some_images(), small_cameras())
+    assert found[0]["match_scores"].dtype == torch.float32
+    assert max(int(one["instance_ids"].max()) for one in found) >= 0
+    assert torch.equal(matching.match_scores, torch.cat([one["match_scores"] for one in found]))
+    boxes = proposals.boxes[proposals.boxes > 16]
+    assert not torch.equal(boxes, boxes.bfloat16().float())
+
+
+def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), proposals_per_view=40), some_images(), small_cameras()
+    proposals, matching = wrapped.find_regions(iter(images), cameras)
+    results = wrapped(images, cameras=cameras)
+    views = proposals.regions.view_index
+    assert torch.equal(views, views.sort().values)
+    assert (proposals.regions.areas > 0).all()
+    for view, result in enumerate(results):
+        here = views == view
+        assert torch.equal(proposals.scores[here], result["scores"])
+        assert torch.equal(matching.instance_ids[here], result["instance_ids"])
+        assert torch.equal(matching.match_scores[here], result["match_scores"])
+        assert (result["scores"].diff() <= 0).all()
+        for number, mask in zip(here.nonzero()[:, 0].tolist(), result["masks"][:, 0], strict=True):
+            assert torch.equal(proposals.regions.mask(number, 160, 120), mask > 0.5)
+    with pytest.raises(InputError, match="2 images with 3 cameras"):
+        wrapped.find_regions(iter(images[:2]), cameras)

@@ -1,0 +1,415 @@
+"""The result folder: every file, what it says, and that it is there whole or not at all."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+import trimesh
+
+import mvseg.results.folder
+from mvseg.config import ReconstructConfig
+from mvseg.errors import InputError
+from mvseg.formats.label_png import read_label_png
+from mvseg.formats.lens import distort
+from mvseg.formats.rig import opencv_lens
+from mvseg.formats.scene_folder import load_masks
+from mvseg.matching.match_regions import Matching
+from mvseg.pipeline import run_scene
+from mvseg.results.folder import Result, check_out, read_instances, save_result
+from mvseg.results.overlay import instance_color
+from scene_folders import (
+    BALLS,
+    HEIGHT,
+    RADIUS,
+    WIDTH,
+    K,
+    arc_pose,
+    cut_file,
+    draw_labels,
+    edit_rig,
+    rig_content,
+    write_image,
+    write_scene,
+)
+
+DISTORTION = [-0.8, 0.3, 0.01, -0.01, 0.0]
+DISTORTED = 2  # the view
+IDS_FILES = {
+    *(f"labels/{view:03d}.png" for view in range(4)),
+    *(f"overlay/{view:03d}.png" for view in range(4)),
+    "contact.png",
+    "instances.json",
+    "run.json",
+}
+SHAPE_FILES = {*(f"leaves/leaf_{leaf:03d}.ply" for leaf in (1, 2, 3)), "scene.glb", "traits.csv"}
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three balls in four views, one of them through a lens."""
+    folder = write_scene(tmp_path_factory.mktemp("scenes") / "plant")
+    edit_rig(folder, DISTORTED, distortion=DISTORTION)
+    for kind in ("masks", "truth"):
+        path = folder / kind / f"{DISTORTED:03d}.png"
+        lens = opencv_lens(WIDTH, HEIGHT, K, DISTORTION)
+        write_image(path, distort(read_label_png(path, WIDTH, HEIGHT), lens, K))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def result(plant: Path) -> Result:
+    return run_scene(plant, plant / "masks", reconstruct=ReconstructConfig(voxel_budget=8000))
+
+
+@pytest.fixture(scope="module")
+def saved(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("results") / "new" / "plant"
+    save_result(result, out, {"mvseg": "1.2.3", "config": {"seed": 5}})
+    return out
+
+
+def ids_only(result: Result) -> Result:
+    return Result(result.scene, result.regions, result.matching)
+
+
+def files_below(folder: Path) -> set[str]:
+    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def read_rows(folder: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader((folder / "traits.csv").read_text().splitlines()))
+
+
+def label_of_balls(folder: Path, plant: Path) -> list[list[int]]:
+    """Per view, the label that covers most of each ball."""
+    found = []
+    for view in range(4):
+        truth = read_label_png(plant / "truth" / f"{view:03d}.png", WIDTH, HEIGHT)
+        labels = read_label_png(folder / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
+        found.append([int(np.bincount(labels[truth == ball]).argmax()) for ball in (1, 2, 3)])
+    return found
+
+
+class TestContent:
+    def test_names_of_all_files(self, saved: Path) -> None:
+        assert files_below(saved) == IDS_FILES | SHAPE_FILES
+        assert list(saved.parent.iterdir()) == [saved]
+
+    def test_what_the_matcher_is_unsure_of_is_said(self, result: Result, tmp_path: Path) -> None:
+        merged, support = torch.tensor([[3, 0, 2]]), torch.tensor([4, 3, 2])
+        matching = replace(result.matching, merged=merged, support=support, residual_px=2)
+        save_result(replace(result, matching=matching), tmp_path / "out", {})
+        found = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
+        others = {index: one["other_instance_id"] for index, one in enumerate(found) if "other_instance_id" in one}
+        assert others == {3: 3}
+        assert [row["sure_views"] for row in read_rows(tmp_path / "out")] == ["4", "3", "2"]
+        assert json.loads((tmp_path / "out" / "run.json").read_text())["residual_px"] == 2
+
+    def test_same_label_in_every_view(self, saved: Path, plant: Path) -> None:
+        found = label_of_balls(saved, plant)
+        assert sorted(found[0]) == [1, 2, 3]
+        assert found == [found[0]] * 4
+        image = cv2.imread(str(saved / "labels" / "000.png"), cv2.IMREAD_UNCHANGED)
+        assert (image.dtype, image.shape) == (np.uint16, (HEIGHT, WIDTH))
+
+    def test_labels_are_ids_plus_one_in_the_frame_of_the_photo(self, saved: Path, plant: Path, result: Result) -> None:
+        for view in range(4):
+            labels = read_label_png(saved / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
+            masks = read_label_png(plant / "masks" / f"{view:03d}.png", WIDTH, HEIGHT)
+            expected = np.zeros_like(masks)
+            for index in (result.regions.view_index == view).nonzero()[:, 0].tolist():
+                expected[masks == int(result.regions.labels[index])] = result.matching.instance_ids[index] + 1
+            if view == DISTORTED:  # there and back through the lens
+                assert (labels != expected).mean() < 0.01
+            else:
+                np.testing.assert_array_equal(labels, expected)
+
+    def test_instances_agree_with_labels(self, saved: Path, result: Result) -> None:
+        content = json.loads((saved / "instances.json").read_text())
+        assert [image["file_name"] for image in content["images"]] == [f"{view:03d}.png" for view in range(4)]
+        assert len(content["annotations"]) == len(result.regions) == 12
+        for index, one in enumerate(content["annotations"]):
+            view = one["image_id"] - 1
+            labels = read_label_png(saved / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
+            assert one["instance_id"] == result.matching.instance_ids[index] + 1
+            assert (labels == one["instance_id"]).sum() == one["area"]
+            assert 0 < one["match_score"] <= 1
+            assert one["source_label"] == result.regions.labels[index]
+
+    def test_instances_are_masks_to_read(self, saved: Path, result: Result) -> None:
+        again = load_masks(result.scene, saved / "instances.json")
+        assert torch.equal(again.view_index, result.regions.view_index)
+        straight = result.regions.view_index != DISTORTED
+        assert torch.equal(again.boxes[straight], result.regions.boxes[straight])
+        assert torch.equal(again.select(straight).crops, result.regions.select(straight).crops)
+        assert (again.boxes - result.regions.boxes).abs().max() <= 1
+
+    def test_shapes(self, saved: Path, plant: Path, result: Result) -> None:
+        rows = read_rows(saved)
+        scene = trimesh.load_scene(saved / "scene.glb")
+        assert set(scene.graph.nodes_geometry) == {"leaf_001", "leaf_002", "leaf_003"}
+        for leaf, row in enumerate(rows, start=1):
+            assert (row["id"], row["views"], row["unit"]) == (str(leaf), "4", "mm")
+            mesh = trimesh.load_mesh(saved / "leaves" / f"leaf_{leaf:03d}.ply")
+            assert mesh.is_watertight
+            assert float(row["volume"]) == pytest.approx(mesh.volume, rel=0.1)
+            assert float(row["volume"]) > 0.9 * 4 / 3 * np.pi * RADIUS**3  # a hull of four silhouettes
+            low, high = ([float(row[f"{axis}_{end}"]) for axis in "xyz"] for end in ("min", "max"))
+            np.testing.assert_allclose(mesh.bounds, [low, high], atol=1.5)
+            ball = label_of_balls(saved, plant)[0].index(leaf)
+            np.testing.assert_allclose((np.array(low) + high) / 2, BALLS[ball], atol=2)
+            np.testing.assert_array_equal(mesh.visual.vertex_colors[0], [*instance_color(leaf - 1), 255])
+
+    def test_pictures(self, saved: Path, plant: Path) -> None:
+        for view in range(4):
+            overlay = cv2.imread(str(saved / "overlay" / f"{view:03d}.png"))
+            assert overlay.shape == (HEIGHT, WIDTH, 3)
+        photo = cv2.imread(str(plant / "images" / "000.png"))
+        untouched = read_label_png(saved / "labels" / "000.png", WIDTH, HEIGHT) == 0
+        overlay = cv2.imread(str(saved / "overlay" / "000.png"))
+        assert (overlay == photo)[untouched].mean() > 0.8  # numbers stick out of small balls
+        assert cv2.imread(str(saved / "contact.png")).shape[1] == 4 * 484
+
+    def test_run_file(self, saved: Path) -> None:
+        run = json.loads((saved / "run.json").read_text())
+        assert (run["mvseg"], run["config"]) == ("1.2.3", {"seed": 5})
+        assert run["counts"] == {"regions": 12, "instances": 3}
+        assert set(run["seconds"]) == {"load", "match", "reconstruct"}
+
+    def test_eval_reads_it(self, saved: Path, plant: Path) -> None:
+        ids, true = read_instances(saved, plant / "truth")
+        assert len(ids) == len(true) == 12
+        assert len({*zip(ids.tolist(), true.tolist(), strict=True)}) == 3
+        assert set(true.tolist()) == {1, 2, 3}
+
+
+class TestVariants:
+    def test_ids_only(self, result: Result, tmp_path: Path) -> None:
+        save_result(ids_only(result), tmp_path / "out", {})
+        assert files_below(tmp_path / "out") == IDS_FILES
+
+    def test_unmatched_regions(self, result: Result, tmp_path: Path) -> None:
+        ids = result.matching.instance_ids.clone()
+        ids[ids == 1] = -1
+        matching = Matching(ids, result.matching.match_scores, 3, "nview")
+        save_result(Result(result.scene, result.regions, matching), tmp_path / "out", {})
+        annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
+        assert [one["instance_id"] for one in annotations].count(-1) == 4
+        assert {one["instance_id"] for one in annotations} == {-1, 1, 3}
+        found = [np.unique(read_label_png(path, WIDTH, HEIGHT)) for path in (tmp_path / "out" / "labels").iterdir()]
+        assert [numbers.tolist() for numbers in found] == [[0, 1, 3]] * 4
+
+    def test_an_instance_without_shape_has_a_row_but_no_mesh(self, result: Result, tmp_path: Path) -> None:
+        assert result.shapes is not None
+        shapes = {instance: grid for instance, grid in result.shapes.items() if instance != 1}
+        save_result(Result(result.scene, result.regions, result.matching, shapes), tmp_path / "out", {})
+        rows = read_rows(tmp_path / "out")
+        assert [row["id"] for row in rows] == ["1", "2", "3"]
+        assert [row["volume"] == "" for row in rows] == [False, True, False]
+        assert files_below(tmp_path / "out" / "leaves") == {"leaf_001.ply", "leaf_003.ply"}
+
+    def test_without_photos_overlays_are_drawn_on_grey(self, tmp_path: Path) -> None:
+        plant = write_scene(tmp_path / "plant", images=False)
+        save_result(run_scene(plant, plant / "masks"), tmp_path / "out", {})
+        assert files_below(tmp_path / "out") == IDS_FILES
+        overlay = cv2.imread(str(tmp_path / "out" / "overlay" / "000.png"))
+        assert overlay[0, 0].tolist() == [40, 40, 40]
+        assert overlay.max() > 200
+
+    def test_views_in_subfolders(self, tmp_path: Path) -> None:
+        rig, names = rig_content(), ("left/1", "left/2", "right/1", "right/2")
+        plant = tmp_path / "plant"
+        for view, name in enumerate(names):
+            rig["views"][view]["file"] = f"images/{name}.jpg"
+            write_image(plant / "masks" / f"{name}.png", draw_labels(*arc_pose(view, 4)))
+        (plant / "cameras.json").write_text(json.dumps(rig))
+        result = run_scene(plant, plant / "masks")
+        save_result(result, tmp_path / "out", {})
+        for kind in ("labels", "overlay"):
+            assert files_below(tmp_path / "out" / kind) == {f"{name}.png" for name in names}
+        again = load_masks(result.scene, tmp_path / "out" / "instances.json")
+        assert torch.equal(again.crops, result.regions.crops)
+        assert torch.equal(again.view_index, result.regions.view_index)
+
+
+class TestBrokenPhotos:
+    @pytest.fixture
+    def plant(self, tmp_path: Path) -> Path:
+        return write_scene(tmp_path / "plant")
+
+    def test_one_missing_photo(self, plant: Path, tmp_path: Path) -> None:
+        (plant / "images" / "002.png").unlink()
+        with pytest.raises(InputError, match=r"002\.png: the image of view 2 is missing"):
+            save_result(run_scene(plant, plant / "masks"), tmp_path / "out", {})
+        assert [path.name for path in tmp_path.iterdir()] == ["plant"]
+
+    def test_cut_photo(self, plant: Path, tmp_path: Path) -> None:
+        cut_file(plant / "images" / "002.png", 0.8)
+        with pytest.raises(InputError, match=r"002\.png: the image of view 2 cannot be read"):
+            save_result(run_scene(plant, plant / "masks"), tmp_path / "out", {})
+        assert [path.name for path in tmp_path.iterdir()] == ["plant"]
+
+
+WRITERS = ["write_label_png", "draw_overlay", "write_png", "draw_contact_sheet", "write_coco", "write_ply", "write_glb"]
+
+
+class TestWholeOrNotAtAll:
+    @pytest.mark.parametrize(
+        "error", [OSError(28, "No space left on device"), RuntimeError("bug"), KeyboardInterrupt()]
+    )
+    @pytest.mark.parametrize("writer", WRITERS)
+    def test_a_failure_half_way_leaves_nothing(
+        self, writer: str, error: BaseException, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        original, calls = getattr(mvseg.results.folder, writer), []
+
+        def fail_at_the_second_call(*args: object) -> object:
+            calls.append(args)
+            if len(calls) == 2 or writer in ("draw_contact_sheet", "write_coco", "write_glb"):
+                raise error
+            return original(*args)
+
+        monkeypatch.setattr(mvseg.results.folder, writer, fail_at_the_second_call)
+        expected = InputError if isinstance(error, OSError) else type(error)
+        with pytest.raises(expected):
+            save_result(result, tmp_path / "out", {})
+        assert list(tmp_path.iterdir()) == []
+
+        monkeypatch.undo()
+        save_result(ids_only(result), tmp_path / "out", {"first": True})
+        before = {name: (tmp_path / "out" / name).read_bytes() for name in files_below(tmp_path / "out")}
+        calls.clear()
+        monkeypatch.setattr(mvseg.results.folder, writer, fail_at_the_second_call)
+        with pytest.raises(expected):
+            save_result(result, tmp_path / "out", {"first": False})
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        assert {name: (tmp_path / "out" / name).read_bytes() for name in files_below(tmp_path / "out")} == before
+
+    def test_a_full_disk_is_one_sentence(self, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        def fail(*_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(mvseg.results.folder, "write_coco", fail)
+        with pytest.raises(InputError, match=r"out: the output folder is not writable \(No space left on device\)"):
+            save_result(result, tmp_path / "out", {})
+
+    def test_an_earlier_result_survives_a_failing_move(
+        self, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        save_result(result, tmp_path / "out", {})
+        rename = Path.rename
+
+        def fail_into_place(self: Path, target: Path) -> Path:
+            if target == tmp_path / "out" and not self.name.endswith(".earlier"):
+                raise OSError(5, "Input/output error")
+            return rename(self, target)
+
+        monkeypatch.setattr(Path, "rename", fail_into_place)
+        with pytest.raises(InputError, match="Input/output error"):
+            save_result(ids_only(result), tmp_path / "out", {})
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+        assert files_below(tmp_path / "out") == IDS_FILES | SHAPE_FILES
+
+    def test_an_earlier_result_is_replaced_whole(self, result: Result, tmp_path: Path) -> None:
+        save_result(result, tmp_path / "out", {})
+        (tmp_path / "out" / "metrics.json").touch()
+        save_result(ids_only(result), tmp_path / "out", {})
+        assert files_below(tmp_path / "out") == IDS_FILES
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    def test_an_empty_folder_and_a_link_to_it_are_taken(self, result: Result, tmp_path: Path) -> None:
+        (tmp_path / "disk" / "out").mkdir(parents=True)
+        (tmp_path / "link").symlink_to(tmp_path / "disk" / "out")
+        for _ in range(2):
+            save_result(ids_only(result), tmp_path / "link", {})
+            assert files_below(tmp_path / "disk" / "out") == IDS_FILES
+            assert (tmp_path / "link").is_symlink()
+            assert sorted(path.name for path in tmp_path.iterdir()) == ["disk", "link"]
+
+    def test_other_people_can_read_it(self, result: Result, tmp_path: Path) -> None:
+        save_result(ids_only(result), tmp_path / "out", {})
+        assert (tmp_path / "out").stat().st_mode & 0o777 == 0o755
+
+
+class TestPlaces:
+    def test_a_folder_of_other_files_is_refused(self, result: Result, tmp_path: Path) -> None:
+        (tmp_path / "thesis.tex").write_text("ten years of work")
+        with pytest.raises(InputError, match="holds files that are no earlier result, expected a new or an empty"):
+            save_result(result, tmp_path, {})
+        assert (tmp_path / "thesis.tex").read_text() == "ten years of work"
+
+    def test_a_file_is_refused(self, tmp_path: Path) -> None:
+        (tmp_path / "out").touch()
+        for place in (tmp_path / "out", tmp_path / "out" / "below", tmp_path / "out" / "far" / "below"):
+            with pytest.raises(InputError, match=r"the output folder is not writable \(a file is in its place\)"):
+                check_out(place)
+
+    def test_no_right_to_write(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(mvseg.results.folder.os, "access", lambda path, mode: path != tmp_path)
+        with pytest.raises(InputError, match=r"new/out: the output folder is not writable \(no right to write in"):
+            check_out(tmp_path / "new" / "out")
+
+    def test_a_device_is_refused(self) -> None:
+        with pytest.raises(InputError, match="the output folder is not writable"):
+            check_out(Path("/dev/null/out"))
+
+    def test_new_empty_and_earlier_places_are_fine(self, tmp_path: Path) -> None:
+        check_out(tmp_path / "a" / "b")
+        check_out(tmp_path)
+        (tmp_path / "run.json").touch()
+        check_out(tmp_path)
+        assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
+
+
+class TestReadInstances:
+    @pytest.fixture
+    def broken(self, saved: Path, tmp_path: Path) -> Path:
+        (tmp_path / "instances.json").write_bytes((saved / "instances.json").read_bytes())
+        return tmp_path
+
+    def test_no_result(self, tmp_path: Path, plant: Path) -> None:
+        with pytest.raises(InputError, match=r"instances\.json: is missing, expected a result folder"):
+            read_instances(tmp_path, plant / "truth")
+
+    def test_no_truth(self, saved: Path, tmp_path: Path) -> None:
+        with pytest.raises(InputError, match="absent: no such folder of true labels"):
+            read_instances(saved, tmp_path / "absent")
+
+    @pytest.mark.parametrize("share", [0, 0.1, 0.9])
+    def test_cut(self, broken: Path, plant: Path, share: float) -> None:
+        cut_file(broken / "instances.json", share)
+        with pytest.raises(InputError, match=r"instances\.json: not a whole JSON file"):
+            read_instances(broken, plant / "truth")
+
+    @pytest.mark.parametrize(
+        ("key", "value", "message"),
+        [
+            ("image_id", 99, r"annotations\[3\]: there is no image 99"),
+            ("instance_id", "first", r"annotations\[3\]\.instance_id: Input should be a valid integer"),
+            (
+                "segmentation",
+                {"size": [HEIGHT, WIDTH], "counts": "0"},
+                r"annotations\[3\]: its run lengths do not add up",
+            ),
+            ("segmentation", None, r"annotations\[3\]\.segmentation"),
+        ],
+    )
+    def test_edited(self, broken: Path, plant: Path, key: str, value: object, message: str) -> None:
+        content = json.loads((broken / "instances.json").read_text())
+        content["annotations"][3][key] = value
+        (broken / "instances.json").write_text(json.dumps(content))
+        with pytest.raises(InputError, match=rf"instances\.json: {message}"):
+            read_instances(broken, plant / "truth")
+
+    def test_truth_of_another_size(self, saved: Path, tmp_path: Path) -> None:
+        for view in range(4):
+            write_image(tmp_path / f"{view:03d}.png", np.zeros((HEIGHT, WIDTH + 1), np.uint16))
+        with pytest.raises(InputError, match=r"000\.png: the mask is 129 x 96, its camera says 128 x 96"):
+            read_instances(saved, tmp_path)

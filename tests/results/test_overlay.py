@@ -1,0 +1,113 @@
+"""Overlays and the contact sheet: colours, places and sizes."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.results.overlay import MAX_SIDE, TILE_WIDTH, UNMATCHED, draw_contact_sheet, draw_overlay, instance_color
+
+GREY = np.full((200, 300, 3), 90, np.uint8)
+
+
+@pytest.fixture
+def regions() -> Regions:
+    """Two views; in both, number 1 is a large square and number 2 a small one inside of it."""
+    labels = np.zeros((200, 300), np.uint16)
+    labels[20:180, 20:180], labels[60:90, 60:90] = 1, 2
+    return regions_from_label_maps([labels, labels[:, ::-1]])
+
+
+def test_colours_differ() -> None:
+    colors = [instance_color(instance) for instance in range(40)]
+    assert len(set(colors)) == 40
+    assert instance_color(-1) == UNMATCHED
+    assert UNMATCHED not in colors
+    assert all(0 <= channel <= 255 for color in colors for channel in color)
+    gaps = [np.abs(np.subtract(one, other)).max() for one, other in pairwise(colors)]
+    assert min(gaps) > 60  # neighbouring numbers
+
+
+def test_an_instance_has_one_colour_in_every_view(regions: Regions) -> None:
+    ids = torch.tensor([4, 0, 4, 0])
+    first, second = (draw_overlay(GREY, regions, ids, view) for view in (0, 1))
+    tint = (0.45 * 90 + 0.55 * np.array(instance_color(4))).astype(np.uint8)
+    assert (first[30:50, 30:50] == tint).all()
+    assert (second[30:50, 250:270] == tint).all()
+    assert (first[:, 190:] == 90).all()  # outside nothing changes
+    assert (GREY == 90).all()
+
+
+def test_the_small_one_is_on_top(regions: Regions) -> None:
+    labels = np.zeros((200, 300), np.uint16)
+    labels[20:180, 20:180] = 1
+    below = regions_from_label_maps([labels])
+    both = Regions(
+        torch.zeros(2, dtype=torch.int64),
+        torch.cat((regions.boxes[1:2], below.boxes)),
+        torch.cat((regions.crop(1).flatten(), below.crops)),
+        1,
+        torch.tensor([1, 2]),
+    )
+    painted = draw_overlay(GREY, both, torch.tensor([0, 1]), 0)
+    small = 0.45 * 90 + 0.55 * np.array(instance_color(0))
+    assert np.abs(painted[62:64, 62:64] - small).max() <= 1
+
+
+def test_unmatched_regions_are_grey_and_without_number(regions: Regions) -> None:
+    painted = draw_overlay(GREY, regions, torch.tensor([-1, -1, 0, 0]), 0)
+    assert (painted[..., 0] == painted[..., 1]).all()
+    assert (painted[..., 1] == painted[..., 2]).all()
+    assert painted.max() == UNMATCHED[0]
+    numbered = draw_overlay(GREY, regions, torch.tensor([-1, -1, 0, 0]), 1)
+    assert numbered.max() == 255  # the white rim of a number
+
+
+def test_large_photos_are_scaled_down() -> None:
+    labels = np.zeros((1000, 4000), np.uint16)
+    labels[400:600, 1000:1400] = 1
+    photo = np.full((1000, 4000, 3), 90, np.uint8)
+    painted = draw_overlay(photo, regions_from_label_maps([labels]), torch.tensor([0]), 0)
+    assert painted.shape == (400, MAX_SIDE, 3)
+    tint = (0.45 * 90 + 0.55 * np.array(instance_color(0))).astype(np.uint8)
+    assert (painted[165:170, 405:410] == tint).all()
+
+
+def test_a_view_without_regions_is_the_photo(regions: Regions) -> None:
+    nothing = regions.select(regions.view_index == 1)
+    np.testing.assert_array_equal(draw_overlay(GREY, nothing, torch.tensor([0, 1]), 0), GREY)
+
+
+@pytest.mark.parametrize(("count", "columns", "rows"), [(1, 1, 1), (2, 2, 1), (5, 4, 2), (12, 4, 3), (30, 6, 5)])
+def test_contact_sheet_holds_every_view(count: int, columns: int, rows: int) -> None:
+    overlays = [np.full((60, 120, 3), 10 + 5 * index, np.uint8) for index in range(count)]
+    sheet = draw_contact_sheet(overlays, [f"view {index}" for index in range(count)])
+    tile_height, tile_width = 240 + 30, TILE_WIDTH + 4
+    assert sheet.shape == (rows * tile_height, columns * tile_width, 3)
+    for index in range(count):
+        row, column = divmod(index, columns)
+        tile = sheet[row * tile_height : (row + 1) * tile_height, column * tile_width : (column + 1) * tile_width]
+        assert (tile[100:200, 100:200] == 10 + 5 * index).all()
+        assert tile[:20].min() < 128  # the name
+
+
+def test_contact_sheet_of_odd_sizes() -> None:
+    overlays = [np.zeros(shape, np.uint8) for shape in ((400, 100, 3), (100, 400, 3), (1, 1600, 3))]
+    sheet = draw_contact_sheet(overlays, ["tall", "blatt grün", ""])
+    assert sheet.shape == (1920 + 30, 3 * (TILE_WIDTH + 4), 3)
+    blue, green, red = cv2.split(sheet[1000:, TILE_WIDTH + 10 :])
+    assert min(blue.min(), green.min(), red.min()) == 255  # filled up with white
+
+
+def test_unsure_matches_are_marked(regions: Regions) -> None:
+    ids = torch.tensor([0, 1, 0, 1])
+    plain = draw_overlay(GREY, regions, ids, 0)
+    sure = draw_overlay(GREY, regions, ids, 0, torch.tensor([0.5, 0.9, 0.9, 0.9]))
+    unsure = draw_overlay(GREY, regions, ids, 0, torch.tensor([0.4, 0.9, 0.9, 0.9]))
+    np.testing.assert_array_equal(sure, plain)
+    assert (unsure != plain).any()

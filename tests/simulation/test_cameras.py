@@ -1,0 +1,67 @@
+"""Cameras around plants: what they see, and where they stand."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError
+from mvseg.simulation.cameras import arc_cameras
+from mvseg.simulation.growth import Plant, grow_plant
+
+
+@pytest.fixture(scope="module")
+def plant() -> Plant:
+    return grow_plant("ovate", 12, seed=2)
+
+
+@pytest.mark.parametrize("size", [(480, 480), (320, 200), (100, 300)])
+def test_arc_holds_the_plant_and_fills_the_frame(plant: Plant, size: tuple[int, int]) -> None:
+    cameras = arc_cameras(5, plant, width=size[0], height=size[1])
+    points = torch.from_numpy(np.concatenate([leaf.vertices for leaf in plant.leaves]))
+    px, depth = cameras.project(points)
+    assert (depth > 0).all()
+    assert (px > 0).all()
+    assert (px < torch.tensor(size)).all()
+    reach = ((px - torch.tensor(size) / 2).abs() / (torch.tensor(size) / 2)).amax().item()
+    assert 0.7 < reach < 0.95
+
+
+def test_arc_spans_its_angle_at_its_elevations_around_one_point(plant: Plant) -> None:
+    cameras = arc_cameras(5, plant, start_deg=30)
+    center = torch.linalg.lstsq(
+        cameras.R[:, :2].reshape(-1, 3), -cameras.t[:, :2].reshape(-1, 1)
+    ).solution.ravel()  # all optical axes meet here
+    offset = cameras.centers - center
+    assert torch.allclose(offset.norm(dim=1), offset.norm(dim=1)[:1].expand(5))
+    azimuth = np.unwrap(torch.atan2(offset[:, 1], offset[:, 0]).numpy())
+    assert np.allclose(np.degrees(azimuth - azimuth[0]), [0, 50, 100, 150, 200])
+    assert np.degrees(azimuth[0]) == pytest.approx(30)
+    elevation = torch.asin(offset[:, 2] / offset.norm(dim=1))
+    assert np.allclose(np.degrees(elevation.numpy()), [20, 50, 20, 50, 20])
+    assert (cameras.R[:, 1, 2] < 0).all()  # upright: image down is world down
+
+
+def test_ring_has_no_camera_twice_and_one_view_is_enough(plant: Plant) -> None:
+    ring = arc_cameras(4, plant, span_deg=360, elevations_deg=(0.0,))
+    gaps = torch.cdist(ring.centers, ring.centers) + 1e9 * torch.eye(4, dtype=torch.float64)
+    assert gaps.min() == pytest.approx(gaps[0, 1].item())
+    assert len(arc_cameras(1, plant)) == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"num_views": 0}, "0 views"),
+        ({"span_deg": 0.0}, "spans 0"),
+        ({"span_deg": 361.0}, "spans 361"),
+        ({"elevations_deg": ()}, "elevations"),
+        ({"elevations_deg": (90.0,)}, "elevations"),
+    ],
+)
+def test_impossible_arcs_are_refused(plant: Plant, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        arc_cameras(**{"num_views": 3, "plant": plant, **changes})

@@ -1,0 +1,101 @@
+"""Grown plants: sound meshes of every family, and nothing left to chance."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from embreex.mesh_construction import TriangleMesh
+from embreex.rtcore_scene import EmbreeScene
+
+from mvseg.errors import InputError
+from mvseg.simulation.growth import FAMILIES, Plant, grow_plant, grow_shoots
+
+
+def share_of_crossing_leaves(plant: Plant) -> float:
+    """Leaves of which more than one mesh edge in fifty passes through another leaf."""
+    starts = np.cumsum([0] + [len(leaf.vertices) for leaf in plant.leaves])
+    faces = np.concatenate([leaf.faces + start for leaf, start in zip(plant.leaves, starts[:-1], strict=True)])
+    owner = np.repeat([leaf.leaf_id for leaf in plant.leaves], [len(leaf.faces) for leaf in plant.leaves])
+    scene = EmbreeScene(robust=True)
+    vertices = np.concatenate([leaf.vertices for leaf in plant.leaves]).astype(np.float32)
+    TriangleMesh(scene, vertices, faces.astype(np.int32))
+    crossing = 0
+    for leaf in plant.leaves:
+        start, end = leaf.vertices[leaf.faces[:, 0]], leaf.vertices[leaf.faces[:, 1]]
+        found = scene.run(start.astype(np.float32), (end - start).astype(np.float32), output=True)
+        is_hit = (found["primID"] >= 0) & (found["tfar"] < 1)
+        crossing += np.mean(is_hit & (owner[found["primID"]] != leaf.leaf_id)) > 0.02
+    return crossing / len(plant.leaves)
+
+
+@pytest.mark.parametrize("num_leaves", [1, 7, 32, 64])
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_family_grows_sound_meshes(family: str, num_leaves: int) -> None:
+    plant = grow_plant(family, num_leaves, seed=3)
+    assert [leaf.leaf_id for leaf in plant.leaves] == list(range(1, num_leaves + 1))
+    for leaf in plant.leaves:
+        assert leaf.faces.dtype == np.int32
+        assert leaf.vertices.dtype == np.float64
+        assert np.isfinite(leaf.vertices).all()
+        assert leaf.vertices.shape[0] == leaf.uv.shape[0] == leaf.faces.max() + 1
+        mesh = trimesh.Trimesh(leaf.vertices, leaf.faces, process=False)
+        assert mesh.area_faces.min() > 5e-4  # mm^2; above what float32 coordinates in a PLY file blur
+        assert mesh.area == pytest.approx(leaf.area)
+        assert 0.04 < leaf.width / leaf.length < 1.1
+    ground = min(part.vertices[:, 2].min() for part in plant.parts)
+    assert min(leaf.vertices[:, 2].min() for leaf in plant.leaves) > ground
+    for part in plant.parts:
+        assert np.isfinite(part.vertices).all()
+        assert trimesh.Trimesh(part.vertices, part.faces, process=False).area_faces.min() > 0
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_blades_seldom_cut_through_each_other(family: str) -> None:
+    assert np.mean([share_of_crossing_leaves(grow_plant(family, 32, seed)) for seed in range(3)]) < 0.12
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_plants_have_the_size_of_plants(family: str) -> None:
+    tops = [max(leaf.vertices[:, 2].max() for leaf in grow_plant(family, 16, seed).leaves) for seed in range(4)]
+    assert min(tops) > 20
+    assert max(tops) < 900
+
+
+def test_leggy_stems_are_bare() -> None:
+    lowest = {}
+    for family in ("leggy", "ovate"):
+        shoots = [grow_shoots(8, FAMILIES[family], np.random.default_rng(seed))[1] for seed in range(20)]
+        lowest[family] = np.median([nodes[0].point[2] for nodes in shoots])
+    assert lowest["leggy"] > 2 * lowest["ovate"]
+
+
+def flatten(plant: Plant) -> bytes:
+    meshes = [(leaf.vertices, leaf.faces) for leaf in plant.leaves]
+    meshes += [(part.vertices, part.faces) for part in plant.parts]
+    return b"".join(array.tobytes() for mesh in meshes for array in mesh)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_the_seed_decides_everything(family: str) -> None:
+    assert flatten(grow_plant(family, 9, 5)) == flatten(grow_plant(family, 9, 5))
+    assert flatten(grow_plant(family, 9, 5)) != flatten(grow_plant(family, 9, 6))
+
+
+def test_leaves_of_one_plant_differ() -> None:
+    leaves = grow_plant("ovate", 12, 0).leaves
+    assert len({round(leaf.area, 6) for leaf in leaves}) == 12
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("cactus", 3, 0), "unknown plant family 'cactus'"),
+        (("ovate", 0, 0), "0 leaves"),
+        (("ovate", 65, 0), "65 leaves"),
+        (("ovate", 3, -1), "seed is -1"),
+    ],
+)
+def test_wrong_wishes_are_named(arguments: tuple[str, int, int], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        grow_plant(*arguments)

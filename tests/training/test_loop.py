@@ -1,0 +1,307 @@
+"""Training runs: what they write, that nothing changes with processes, workers or kills, and how they fail."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import logging
+import math
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import yaml  # type: ignore[import-untyped]
+
+import mvseg.training.loop
+from mvseg.detectors.mask_rcnn import build_detector
+from mvseg.errors import InputError
+from mvseg.training.loop import TrainConfig, best_epoch, train
+from mvseg.training.processes import Processes
+from tiny_training import build_tiny, load_weights, make_config, parse_config, write_photos
+
+TESTS = Path(__file__).parent.parent
+
+
+@pytest.fixture(scope="module")
+def leaves(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """30 photos: 24 to train on, 6 to validate."""
+    folder = tmp_path_factory.mktemp("leaves")
+    write_photos(folder, 30)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def finished(leaves: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The output of a run that nothing disturbed."""
+    output = tmp_path_factory.mktemp("finished")
+    train(make_config(leaves, output), build_tiny())
+    return output
+
+
+def read_log(output: Path) -> list[dict[str, float]]:
+    return [json.loads(line) for line in (output / "log.jsonl").read_text().splitlines()]
+
+
+def read_metrics(output: Path) -> dict[str, Any]:
+    """metrics.json without the times."""
+    metrics = json.loads((output / "metrics.json").read_text())
+    for record in (*metrics["epochs"], metrics["best"]):
+        del record["seconds"]
+    return metrics
+
+
+def run_script(*arguments: str) -> subprocess.CompletedProcess[str]:
+    paths = [str(TESTS.parent), str(TESTS), os.environ.get("PYTHONPATH", "")]
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(paths), "OMP_NUM_THREADS": "1"}
+    return subprocess.run([sys.executable, *arguments], env=environment, capture_output=True, text=True, timeout=120)
+
+
+# --- a run and its files
+
+
+def test_a_run_learns_and_writes_its_files(finished: Path, leaves: Path) -> None:
+    metrics, log = read_metrics(finished), read_log(finished)
+    assert [record["step"] for record in log] == list(range(1, 13))
+    assert metrics["epochs"][1]["loss"] < metrics["epochs"][0]["loss"]
+    assert metrics["finished"]
+    assert (metrics["num_training_samples"], metrics["num_validation_samples"]) == (24, 6)
+    first = metrics["epochs"][0]
+    assert first["loss"] == pytest.approx(np.mean([record["loss"] for record in log[:6]]))
+    assert first["loss"] == pytest.approx(sum(value for name, value in first.items() if name.startswith("loss_")))
+    assert 0 <= first["mask_AP"] <= first["mask_AP50"] <= 1
+    config = yaml.safe_load((finished / "config.yaml").read_text())
+    assert config["photos"] == str(leaves / "photos")
+    assert config["scale_range"] == [0.6, 1.6]
+    assert list(config) == [field.name for field in dataclasses.fields(TrainConfig)]
+
+
+def test_the_export_is_the_average_of_the_best_epoch(leaves: Path, finished: Path) -> None:
+    checkpoint = torch.load(finished / "checkpoint.pt", weights_only=True)
+    exported = load_weights(finished / "model.safetensors")
+    is_last_best = read_metrics(finished)["best_epoch"] == 1
+    same = all(torch.equal(exported[key], value) for key, value in checkpoint["ema"].items())
+    assert same == is_last_best
+    assert any(not torch.equal(exported[key], value) for key, value in checkpoint["model"].items())
+
+
+def test_a_run_leaves_the_callers_generator_alone(leaves: Path, tmp_path: Path) -> None:
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    torch.manual_seed(5)
+    train(make_config(leaves, tmp_path, epochs=1, batch_size=24, hold_out_every=0), build_tiny())
+    assert torch.equal(torch.rand(3), expected)
+
+
+def test_without_validation_the_last_epoch_is_exported(leaves: Path, tmp_path: Path) -> None:
+    config = make_config(leaves, tmp_path, hold_out_every=0, batch_size=10, ema_decay=0.0, optimizer="sgd")
+    train(config, build_tiny())
+    checkpoint = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    exported = load_weights(tmp_path / "model.safetensors")
+    assert all(torch.equal(exported[key], value) for key, value in checkpoint["model"].items())
+    assert "mask_AP" not in read_metrics(tmp_path)["best"]
+
+
+def test_best_epoch() -> None:
+    assert best_epoch([{"mask_AP": 0.1}, {"mask_AP": 0.3}, {"mask_AP": 0.3}]) == 1
+    assert best_epoch([{}, {}]) == 1
+
+
+def test_bf16_on_the_cpu_is_close_to_fp32(leaves: Path, tmp_path: Path, finished: Path) -> None:
+    config = make_config(leaves, tmp_path, precision="bf16", epochs=1, hold_out_every=0)
+    train(dataclasses.replace(config, hold_out_every=5, epochs=2), build_tiny())
+    ours, exact = read_log(tmp_path)[0]["loss"], read_log(finished)[0]["loss"]
+    assert ours != exact
+    assert ours == pytest.approx(exact, rel=0.05)
+
+
+def test_a_shipped_architecture_trains_and_its_export_loads(tmp_path: Path) -> None:
+    write_photos(tmp_path, 4)
+    config = make_config(tmp_path, tmp_path / "out", arch="mobilenet_v3_large_fpn", epochs=1, hold_out_every=0)
+    train(dataclasses.replace(config, ema_decay=0.0))
+    weights = str(tmp_path / "out" / "model.safetensors")
+    loaded = build_detector("mobilenet_v3_large_fpn", 2, weights)
+    assert loaded.transform.max_size == 64
+    expected = torch.load(tmp_path / "out" / "checkpoint.pt", weights_only=True)["model"]
+    assert all(torch.equal(value, expected[key]) for key, value in loaded.state_dict().items())
+
+
+# --- laws
+
+
+def test_two_processes_do_what_one_does(leaves: Path, tmp_path: Path, finished: Path) -> None:
+    """The same losses in every step, the same weights and AP; one process does two forward passes where two do one."""
+    script = "from tiny_training import *; train(make_config(Path(sys.argv[1]), Path(sys.argv[2])), build_tiny())"
+    (tmp_path / "run.py").write_text(script)
+    launch = ("-m", "torch.distributed.run", "--standalone", "--nproc_per_node=2", str(tmp_path / "run.py"))
+    out = tmp_path / "out"
+    result = run_script(*launch, str(leaves), str(out))
+    assert result.returncode == 0, result.stderr
+    for ours, theirs in zip(read_log(out), read_log(finished), strict=True):
+        assert ours == pytest.approx(theirs, rel=1e-5)
+    for key, value in load_weights(finished / "model.safetensors").items():
+        torch.testing.assert_close(load_weights(out / "model.safetensors")[key], value, rtol=1e-4, atol=1e-6)
+    for ours, theirs in zip(read_metrics(out)["epochs"], read_metrics(finished)["epochs"], strict=True):
+        assert ours == pytest.approx(theirs, rel=1e-4)
+
+
+def test_a_killed_run_ends_with_the_same_bits(leaves: Path, tmp_path: Path, finished: Path) -> None:
+    """SIGKILL between checkpoints, while one is half written, and in an evaluation; with and without workers."""
+    for moment, num_workers in (("in step 4", "2"), ("in checkpoint 2", "0"), ("in evaluation 1", "1")):
+        result = run_script(str(TESTS / "tiny_training.py"), str(leaves), str(tmp_path), moment, num_workers)
+        assert result.returncode == -9, result.stderr
+    assert not (tmp_path / "metrics.json").exists()
+    train(make_config(leaves, tmp_path, resume=True), build_tiny())
+    assert read_log(tmp_path) == read_log(finished)
+    assert read_metrics(tmp_path) == read_metrics(finished)
+    expected = torch.load(finished / "checkpoint.pt", weights_only=True)
+    ours = torch.load(tmp_path / "checkpoint.pt", weights_only=True)
+    for part in ("model", "ema"):
+        assert all(torch.equal(value, expected[part][key]) for key, value in ours[part].items())
+    exported = load_weights(tmp_path / "model.safetensors")
+    assert all(torch.equal(exported[key], value) for key, value in load_weights(finished / "model.safetensors").items())
+
+
+def test_resuming_a_finished_run_changes_nothing(leaves: Path, tmp_path: Path) -> None:
+    config = make_config(leaves, tmp_path, epochs=1, batch_size=24, images_per_forward=12)
+    train(config, build_tiny())
+    before = (tmp_path / "checkpoint.pt").read_bytes()
+    train(dataclasses.replace(config, resume=True), build_tiny())
+    assert (tmp_path / "checkpoint.pt").read_bytes() == before
+
+
+# --- failures
+
+
+def test_a_loss_that_is_not_finite_names_its_photos(leaves: Path, tmp_path: Path) -> None:
+    config = make_config(leaves, tmp_path, optimizer="sgd", lr=1e30, clip_norm=0.0, warmup_steps=0)
+    with pytest.raises(InputError, match=r"(loss|gradient) of step \d+ .* is not finite on leaf_\d+\.png, leaf_"):
+        train(config, build_tiny())
+
+
+def test_a_gradient_that_is_not_finite_names_the_batch(leaves: Path, tmp_path: Path) -> None:
+    model = build_tiny()
+    model.backbone[0].weight.register_hook(lambda gradient: gradient * math.inf)
+    with pytest.raises(InputError, match=r"gradient of step 0 \(epoch 1\) is not finite on (leaf_\d+\.png(, )?){4}:"):
+        train(make_config(leaves, tmp_path), model)
+
+
+def test_broken_samples_stop_the_start_or_are_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    photos, labels = write_photos(tmp_path, 8)
+    (photos / "leaf_3.png").write_bytes(b"no image")
+    (labels / "leaf_6.png").unlink()
+    config = make_config(tmp_path, tmp_path / "out", hold_out_every=4, epochs=1)
+    with pytest.raises(InputError, match=r"2 of 6 training samples are broken \(leaf_3.png: .*; leaf_6.png: "):
+        train(config, build_tiny())
+    assert not (tmp_path / "out").exists()
+    with caplog.at_level(logging.INFO):
+        train(dataclasses.replace(config, skip_broken=True), build_tiny())
+    assert "4 samples to train on, 2 to validate, 2 skipped" in caplog.text
+    assert len((tmp_path / "out" / "broken_samples.txt").read_text().splitlines()) == 2
+
+
+def test_another_run_is_not_overwritten(leaves: Path, finished: Path) -> None:
+    with pytest.raises(InputError, match="holds the checkpoint of an earlier run, expected --resume true"):
+        train(make_config(leaves, finished), build_tiny())
+    with pytest.raises(InputError, match=r"made with another lr \(0.02, now 0.5\)"):
+        train(make_config(leaves, finished, resume=True, lr=0.5), build_tiny())
+
+
+def test_a_folder_of_other_things_is_left_alone_and_a_failed_start_leaves_none(leaves: Path, tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("precious")
+    with pytest.raises(InputError, match="holds files that are no training run"):
+        train(make_config(leaves, tmp_path / "mine"), build_tiny())
+    assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
+    with pytest.raises(InputError, match="leaf-slimm"):
+        train(make_config(leaves, tmp_path / "out", weights="leaf-slimm"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_run_killed_while_it_wrote_its_first_file_goes_on(leaves: Path, tmp_path: Path) -> None:
+    (tmp_path / "config.yaml.partial").write_text("")
+    train(make_config(leaves, tmp_path, resume=True, epochs=1, batch_size=24), build_tiny())
+    assert (tmp_path / "model.safetensors").is_file()
+
+
+def test_a_run_does_not_go_on_with_other_samples(tmp_path: Path) -> None:
+    write_photos(tmp_path, 5)
+    config = make_config(tmp_path, tmp_path / "out", epochs=1, hold_out_every=0)
+    train(config, build_tiny())
+    for folder in ("photos", "labels"):
+        (tmp_path / folder / "leaf_4.png").rename(tmp_path / folder / "leaf_9.png")
+    with pytest.raises(InputError, match="made with other training samples"):
+        train(dataclasses.replace(config, resume=True), build_tiny())
+    (tmp_path / "out" / "checkpoint.pt").write_bytes(b"torn")
+    with pytest.raises(InputError, match="is not a checkpoint of a training run"):
+        train(dataclasses.replace(config, resume=True), build_tiny())
+
+
+def test_processes_must_share_the_chunks_evenly(
+    leaves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @contextmanager
+    def three(device: str) -> Iterator[Processes]:
+        yield Processes(0, 3, torch.device(device))
+
+    monkeypatch.setattr(mvseg.training.loop, "join_processes", three)
+    with pytest.raises(InputError, match=r"is 2, expected a multiple of the number of processes \(3\)"):
+        train(make_config(leaves, tmp_path), build_tiny())
+
+
+def test_a_device_that_is_not_there(leaves: Path, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="device 'tpu'"):
+        train(make_config(leaves, tmp_path, device="tpu"), build_tiny())
+
+
+def test_the_written_config_starts_the_same_run(finished: Path, leaves: Path) -> None:
+    assert parse_config(finished / "config.yaml") == make_config(leaves, finished)
+
+
+def test_validation_set_of_other_categories(leaves: Path, tmp_path: Path) -> None:
+    image = {"id": 0, "file_name": "leaf_1.png", "width": 64, "height": 64}
+    coco = {"images": [image], "annotations": [], "categories": [{"id": 1, "name": "fruit"}]}
+    (tmp_path / "val.json").write_text(json.dumps(coco))
+    config = make_config(
+        leaves, tmp_path / "out", hold_out_every=0, val_photos=leaves / "photos", val_labels=tmp_path / "val.json"
+    )
+    with pytest.raises(InputError, match="has categories"):
+        train(config, build_tiny())
+
+
+# --- files
+
+
+def test_tensorboard_is_optional(
+    leaves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    with caplog.at_level(logging.INFO):
+        train(make_config(leaves, tmp_path, epochs=1, batch_size=24), build_tiny())
+    assert caplog.text.count("tensorboard is not installed") == 1
+    assert not (tmp_path / "tensorboard").exists()
+
+
+def test_tensorboard_log(finished: Path) -> None:
+    pytest.importorskip("tensorboard")
+    assert list((finished / "tensorboard").glob("events.*"))
+
+
+# --- real plants
+
+
+@pytest.mark.shared_data
+def test_a_few_steps_on_real_rosettes(shared_data: Path, tmp_path: Path) -> None:
+    shared = shared_data / "rosettes-cvppp-a1"
+    config = make_config(Path(), tmp_path, hold_out_every=10, batch_size=6, epochs=1, image_size=128, ema_decay=0.0)
+    train(dataclasses.replace(config, photos=shared / "images", labels=shared / "labels"), build_tiny())
+    metrics, losses = read_metrics(tmp_path), [record["loss"] for record in read_log(tmp_path)]
+    assert (metrics["num_training_samples"], metrics["num_validation_samples"]) == (90, 10)
+    assert np.mean(losses[-5:]) < np.mean(losses[:5]) - 0.05
+    assert metrics["best"]["mask_AP"] is not None
