@@ -18,7 +18,7 @@ import torch
 ROOT = Path(__file__).parent.parent
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
 
-from mvseg.cli import DEMO_SCENE  # noqa: E402
+from mvseg.demo import demo_scene  # noqa: E402
 from mvseg.formats.scene_folder import load_masks, load_scene  # noqa: E402
 from mvseg.matching.affinity import region_affinity  # noqa: E402
 from mvseg.regions import regions_from_label_maps  # noqa: E402
@@ -50,8 +50,8 @@ def measure_speed(num_senders: int) -> dict[str, float]:
 
 
 def measure_agreement() -> dict[str, float]:
-    scene = load_scene(DEMO_SCENE)
-    regions = load_masks(scene, DEMO_SCENE / "masks")
+    scene = load_scene(demo_scene())
+    regions = load_masks(scene, demo_scene() / "masks")
     drawn = torch.stack([affinity_reference(regions, scene.cameras, 200, seed) for seed in range(4)])
     drawn = (drawn + drawn.mT) / 2
     pairs = regions.view_index[:, None] != regions.view_index

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from matching import load_maps, true_ids
+from matching import load_maps
+from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.regions import regions_from_label_maps
@@ -41,7 +42,7 @@ def score_scene(spec: SceneSpec, cache: Path) -> np.ndarray:
         regions = regions_from_label_maps(list(maps))
         found = match_nview(regions, cameras, region_affinity(regions, cameras))
         ids = found.instance_ids.numpy()
-        right = right_regions(ids, true_ids(regions, true).numpy())
+        right = right_regions(ids, shown_instances(regions, true, count_background=False).numpy())
         rows.append(np.stack((np.full(len(ids), spec.num_views), found.match_scores.numpy(), right), 1)[ids >= 0])
     return np.concatenate(rows)
 

@@ -26,6 +26,7 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.nview.cluster_scores import Costs
 from mvseg.matching.nview.match_nview import match_nview
@@ -104,16 +105,6 @@ def load_maps(spec: SceneSpec, cache: Path) -> tuple[Maps, Maps, Cameras]:
         return saved["true"], saved["degraded"], cameras
 
 
-def true_ids(regions: Regions, truth: Maps) -> torch.Tensor:
-    """(D,) the leaf that each region shows most of; the background that an outgrown mask shows does not count."""
-    height, width = truth.shape[1:]
-    ids = []
-    for n, view in enumerate(regions.view_index.tolist()):
-        shown = np.bincount(truth[view][regions.mask(n, width, height).numpy()], minlength=2)
-        ids.append(int(shown[1:].argmax()) + 1)
-    return torch.tensor(ids)
-
-
 def run_scene(spec: SceneSpec, cache: Path, methods: Iterable[str], masks: Iterable[str]) -> list[dict[str, Any]]:
     """One record per kind of masks and method."""
     torch.set_num_threads(1)
@@ -121,7 +112,7 @@ def run_scene(spec: SceneSpec, cache: Path, methods: Iterable[str], masks: Itera
     records = []
     for kind in masks:
         regions = regions_from_label_maps(list(true if kind == "true" else degraded))
-        truth = true_ids(regions, true)
+        truth = shown_instances(regions, true, count_background=False)
         start = time.perf_counter()
         affinity = region_affinity(regions, cameras)
         weights_s = time.perf_counter() - start

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import csc_array
 
-from matching import load_maps, true_ids
+from matching import load_maps
 from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.cluster_scores import Costs, nothing_known, own_scores, partition_value
 from mvseg.matching.nview.label_rows import RowTable, em_affinities, row_table
@@ -88,7 +89,7 @@ def judge_scene(spec: SceneSpec, cache: Path, masks: str) -> tuple[int, int, lis
     torch.set_num_threads(1)
     true, degraded, cameras = load_maps(spec, cache)
     regions = regions_from_label_maps(list(true if masks == "true" else degraded))
-    truth = true_ids(regions, true)
+    truth = shown_instances(regions, true, count_background=False)
     affinity, costs = region_affinity(regions, cameras), view_costs(len(cameras), Costs())
     W, table = affinity.to_dense().double().numpy(), row_table(regions, cameras)
     pairwise = one_per_view_clusters(affinity, regions.view_index, len(cameras)).numpy()

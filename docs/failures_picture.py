@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from mvseg import load_masks, load_scene, match_regions
-from mvseg.cli import DEMO_SCENE
+from mvseg.demo import demo_scene
 from mvseg.formats.photos import read_photo
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.overlay import draw_overlay
@@ -57,8 +57,8 @@ def draw_failures(scene: Scene, truth: list[np.ndarray], seed: int, shown: int) 
 
 
 def main() -> None:
-    scene = load_scene(DEMO_SCENE)
-    truth = load_masks(scene, DEMO_SCENE / "truth")
+    scene = load_scene(demo_scene())
+    truth = load_masks(scene, demo_scene() / "truth")
     maps = [
         truth.label_map(view, truth.labels, *size).numpy() for view, size in enumerate(scene.cameras.sizes.tolist())
     ]

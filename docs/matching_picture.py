@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from mvseg import epipolar_map, load_masks, load_scene, match_regions
-from mvseg.cli import DEMO_SCENE
+from mvseg.demo import demo_scene
 from mvseg.formats.photos import read_photo
 from mvseg.matching.nview.label_rows import row_table
 from mvseg.results.overlay import draw_overlay
@@ -32,8 +32,8 @@ def caption(image: np.ndarray, text: str) -> np.ndarray:
 
 
 def main() -> None:
-    scene = load_scene(DEMO_SCENE)
-    regions, cameras = load_masks(scene, DEMO_SCENE / "masks"), scene.cameras
+    scene = load_scene(demo_scene())
+    regions, cameras = load_masks(scene, demo_scene() / "masks"), scene.cameras
     matching = match_regions(regions, cameras)
     table = row_table(regions, cameras)
     width, height = cameras.sizes[SOURCE].tolist()

@@ -11,17 +11,18 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from mvseg._version import __version__
 
 if TYPE_CHECKING:
     from mvseg.config import DetectConfig as DetectConfig
     from mvseg.config import MatchConfig as MatchConfig
     from mvseg.config import ReconstructConfig as ReconstructConfig
+    from mvseg.demo import demo_scene as demo_scene
     from mvseg.detectors.zoo import load_detector as load_detector
     from mvseg.errors import InputError as InputError
     from mvseg.errors import InputWarning as InputWarning
     from mvseg.evaluation.id_metrics import matching_metrics as matching_metrics
-    from mvseg.evaluation.id_metrics import shape_distance as shape_distance
+    from mvseg.evaluation.shape_distance import shape_distance as shape_distance
     from mvseg.formats.photos import load_photos as load_photos
     from mvseg.formats.scene_folder import load_masks as load_masks
     from mvseg.formats.scene_folder import load_scene as load_scene
@@ -45,6 +46,7 @@ if TYPE_CHECKING:
 # The public names, by room.
 _HOME = {
     "errors": ("InputError", "InputWarning"),
+    "demo": ("demo_scene",),
     "scene": ("Cameras", "Scene"),
     "regions": ("Regions", "regions_from_label_maps"),
     "formats.scene_folder": ("load_masks", "load_scene"),
@@ -58,7 +60,8 @@ _HOME = {
     "reconstruction.voxels": ("reconstruct_instances",),
     "multiview.nms": ("EpipolarAssignment", "cluster_aware_nms"),
     "multiview.mask_rcnn": ("MultiViewMaskRCNN",),
-    "evaluation.id_metrics": ("matching_metrics", "shape_distance"),
+    "evaluation.id_metrics": ("matching_metrics",),
+    "evaluation.shape_distance": ("shape_distance",),
     "pipeline": ("run_scene",),
 }
 __all__ = ["__version__", *(name for names in _HOME.values() for name in names)]

@@ -10,7 +10,6 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -18,10 +17,10 @@ from jsonargparse import ArgumentParser, Namespace
 
 import mvseg
 from mvseg.config import DetectConfig, MatchConfig, ReconstructConfig
+from mvseg.demo import demo_scene
 from mvseg.errors import InputError, InputWarning
 from mvseg.training.config import TrainConfig
 
-DEMO_SCENE = Path(str(files("mvseg") / "demo_plant"))
 DEFAULT_OUT = Path("results")
 BAD_INPUT, INTERRUPTED = 2, 130
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
@@ -65,7 +64,7 @@ def build_parser() -> ArgumentParser:
     verbs = parser.add_subcommands(dest="verb")
 
     infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
-    infer.add_argument("scene", nargs="?", type=Path, default=DEMO_SCENE, help="scene folder (the shipped one)")
+    infer.add_argument("scene", nargs="?", type=Path, default=demo_scene(), help="scene folder (the shipped one)")
     _add_options(infer, masks=None)
     infer.add_class_arguments(DetectConfig, "detect")
     infer.add_class_arguments(ReconstructConfig, "reconstruct")

@@ -1,4 +1,4 @@
-"""Stage 2: the instance masks of all views of a scene, flat, as box crops."""
+"""The instance masks of all views of a scene, flat, as box crops. Boxes of masks are made here and nowhere else."""
 
 from __future__ import annotations
 
@@ -157,6 +157,27 @@ class Regions:
             x1, y1, x2, y2 = self.boxes[index].tolist()
             frame[y1:y2, x1:x2][self.crop(index)] = values[index]
         return frame
+
+
+def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
+    """x1, y1, x2, y2 (half-open) of the pixels of a mask (h, w), which must have some."""
+    x1, y1, x2, y2 = masks_to_boxes(mask[None])[0].tolist()
+    return x1, y1, x2, y2
+
+
+def masks_to_boxes(masks: Tensor) -> Tensor:
+    """(N, 4) int64 xyxy, half-open, of (N, H, W) masks; all 0 for a mask without pixels.
+
+    torchvision's function of this name gives boxes that end on the last pixel, and wants a pixel in every mask.
+    """
+    ends = []
+    for axis in (1, 2):  # over the rows, for x; over the columns, for y
+        is_occupied = masks.bool().any(axis)
+        first = is_occupied.int().argmax(1)
+        last = is_occupied.shape[1] - is_occupied.flip(1).int().argmax(1)
+        ends.append((first, torch.where(is_occupied.any(1), last, 0)))
+    (x1, x2), (y1, y2) = ends
+    return torch.stack((x1, y1, x2, y2), 1)
 
 
 def regions_from_label_maps(label_maps: Sequence[np.ndarray]) -> Regions:

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvseg.cli import DEMO_SCENE
-from mvseg.evaluation.id_metrics import region_truth
+from mvseg import demo
+from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import Regions
@@ -21,27 +21,25 @@ torch.set_num_threads(1)  # deterministic sums, and no spinning beside other tes
 
 @pytest.fixture(scope="session")
 def demo_scene() -> Scene:
-    return load_scene(DEMO_SCENE)
+    return load_scene(demo.demo_scene())
 
 
 @pytest.fixture(scope="session")
 def demo_regions(demo_scene: Scene) -> Regions:
-    return load_masks(demo_scene, DEMO_SCENE / "masks")
+    return load_masks(demo_scene, demo.demo_scene() / "masks")
 
 
 @pytest.fixture(scope="session")
 def demo_truth(demo_scene: Scene, demo_regions: Regions) -> torch.Tensor:
     """(D,) true leaf of each region of the shipped scene."""
-    return true_ids(demo_scene, demo_regions, DEMO_SCENE / "truth")
+    return true_ids(demo_scene, demo_regions, demo.demo_scene() / "truth")
 
 
 def true_ids(scene: Scene, regions: Regions, truth: Path) -> torch.Tensor:
-    ids = []
-    for index, view in enumerate(regions.view_index.tolist()):
-        width, height = scene.cameras.sizes[view].tolist()
-        labels = read_label_png(truth / f"{scene.views[view].name}.png", width, height)
-        ids.append(region_truth(labels, regions.mask(index, width, height).numpy()))
-    return torch.tensor(ids)
+    """(D,) true leaf of each region, from a folder of label PNGs."""
+    sizes = scene.cameras.sizes.tolist()
+    maps = [read_label_png(truth / f"{view.name}.png", *size) for view, size in zip(scene.views, sizes, strict=True)]
+    return shown_instances(regions, maps)
 
 
 @pytest.fixture(scope="session")

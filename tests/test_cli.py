@@ -19,8 +19,9 @@ import pytest
 import trimesh
 
 import mvseg
-from mvseg.cli import DEMO_SCENE, main
+from mvseg.cli import main
 from mvseg.config import DetectConfig
+from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.matching.match_regions import Matching, match_regions
@@ -71,7 +72,7 @@ def test_demo_finds_every_leaf(demo: Path) -> None:
     leaf_of_label: dict[int, set[int]] = {}
     for name in views:
         labels = read_label_png(demo / "labels" / name, 640, 480)
-        truth = read_label_png(DEMO_SCENE / "truth" / name, 640, 480)
+        truth = read_label_png(demo_scene() / "truth" / name, 640, 480)
         np.testing.assert_array_equal(labels > 0, truth > 0)
         for label in np.unique(labels)[1:].tolist():
             leaf_of_label.setdefault(label, set()).update(np.unique(truth[labels == label]).tolist())
@@ -80,11 +81,11 @@ def test_demo_finds_every_leaf(demo: Path) -> None:
 
 
 def test_demo_shapes_hold_the_true_leaves(demo: Path) -> None:
-    labels, truth = (read_label_png(path / "000.png", 640, 480) for path in (demo / "labels", DEMO_SCENE / "truth"))
+    labels, truth = (read_label_png(path / "000.png", 640, 480) for path in (demo / "labels", demo_scene() / "truth"))
     for label in np.unique(labels)[1:].tolist():
         leaf = int(truth[labels == label][0])
         shape = trimesh.load_mesh(demo / "leaves" / f"leaf_{label:03d}.ply")
-        true = trimesh.load_mesh(DEMO_SCENE / "truth" / "leaves" / f"leaf_{leaf:03d}.ply")
+        true = trimesh.load_mesh(demo_scene() / "truth" / "leaves" / f"leaf_{leaf:03d}.ply")
         size = np.linalg.norm(true.extents)
         assert np.abs(shape.bounds.mean(0) - true.bounds.mean(0)).max() < 0.2 * size
     scene = trimesh.load_scene(demo / "scene.glb")
@@ -92,7 +93,7 @@ def test_demo_shapes_hold_the_true_leaves(demo: Path) -> None:
 
 
 def test_demo_evaluates_to_one(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["eval", str(demo), "--truth", str(DEMO_SCENE / "truth")]) == 0
+    assert main(["eval", str(demo), "--truth", str(demo_scene() / "truth")]) == 0
     printed = dict(line.split() for line in capsys.readouterr().out.splitlines())
     metrics = json.loads((demo / "metrics.json").read_text())
     assert printed.keys() == metrics.keys()
@@ -113,7 +114,7 @@ def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert any(path.endswith("weights.safetensors") for path in run["inputs"])
     assert run["counts"]["regions"] == len(found)
     capsys.readouterr()
-    assert main(["eval", str(out), "--truth", str(DEMO_SCENE / "truth")]) == 0
+    assert main(["eval", str(out), "--truth", str(demo_scene() / "truth")]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["num_regions"] >= 85  # of 108 visible leaves
     assert metrics["ari"] >= 0.85
@@ -620,10 +621,10 @@ def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytes
 
 def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Two touching leaves of the shipped plant share a mask; in the result their pixels have both ids again."""
-    shutil.copytree(DEMO_SCENE / "masks", tmp_path / "masks")
-    true = read_label_png(DEMO_SCENE / "masks" / "003.png", 640, 480)
+    shutil.copytree(demo_scene() / "masks", tmp_path / "masks")
+    true = read_label_png(demo_scene() / "masks" / "003.png", 640, 480)
     write_label_png(tmp_path / "masks" / "003.png", np.where(true == 10, 1, true))
-    arguments = ["match", str(DEMO_SCENE), "--masks", str(tmp_path / "masks"), "--quiet", "--out", str(tmp_path)]
+    arguments = ["match", str(demo_scene()), "--masks", str(tmp_path / "masks"), "--quiet", "--out", str(tmp_path)]
     assert main([*arguments, "--match.split_merged", "true"]) == 0
     assert "12 instances from 108 masks" in capsys.readouterr().out
     labels = read_label_png(tmp_path / "demo_plant" / "labels" / "003.png", 640, 480)

@@ -19,9 +19,11 @@ PACKAGE = ROOT / "mvseg"
 # A module imports only from those before it in this list; a folder stands for its files.
 ORDER = [
     "errors",
+    "_version",
     "config",
     "scene",
     "regions",
+    "demo",
     "formats",
     "detectors",
     "matching",

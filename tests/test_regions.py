@@ -3,9 +3,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+import torchvision
 
 from mvseg.errors import InputError
-from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps
+from mvseg.regions import IGNORE_LABEL, Regions, mask_box, masks_to_boxes, regions_from_label_maps
 
 
 def random_maps(seed: int = 0) -> list[np.ndarray]:
@@ -93,3 +94,14 @@ def test_inconsistent_regions_are_refused(change: dict, message: str) -> None:
     Regions(**fields)
     with pytest.raises(InputError, match=message):
         Regions(**(fields | change))
+
+
+def test_boxes_of_masks_are_torchvisions_but_half_open() -> None:
+    generator = torch.Generator().manual_seed(0)
+    masks = torch.rand(20, 9, 12, generator=generator) < 0.05
+    masks = masks[masks.flatten(1).any(1)]
+    boxes = masks_to_boxes(masks)
+    assert boxes.tolist() == (torchvision.ops.masks_to_boxes(masks).long() + torch.tensor([0, 0, 1, 1])).tolist()
+    assert mask_box(masks[3]) == tuple(boxes[3].tolist())
+    assert masks_to_boxes(torch.zeros(1, 4, 5)).tolist() == [[0, 0, 0, 0]]
+    assert masks_to_boxes(torch.zeros(0, 4, 5)).shape == (0, 4)

@@ -10,13 +10,13 @@ from torch import Tensor
 
 from benchmarks.paper_tables.cells import Cell
 from mvseg.config import DetectConfig
+from mvseg.evaluation.truth import shown_instances, tied_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks
-from mvseg.regions import IGNORE_LABEL, Regions, regions_from_label_maps, stack_regions
+from mvseg.regions import IGNORE_LABEL, Regions, mask_box, regions_from_label_maps, stack_regions
 from mvseg.simulation.faults import Faults, degrade_labels
 
 MIN_PIXELS = 30  # of a detected mask; true and degraded masks have as many
-MIN_IOU = 0.5  # with a true mask, for a detection to count as that leaf
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,8 +63,7 @@ def detected_masks(cell: Cell, detector: str) -> Masks:
                 mask = soft > 0.5
                 if score < DetectConfig.min_score or int(mask.sum()) < MIN_PIXELS:
                     continue
-                rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
-                x1, y1, x2, y2 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+                x1, y1, x2, y2 = mask_box(mask)
                 view_index.append(view)
                 boxes.append((x1, y1, x2, y2))
                 crops.append(mask[y1:y2, x1:x2].flatten())
@@ -73,35 +72,14 @@ def detected_masks(cell: Cell, detector: str) -> Masks:
 
 
 def most_shown(regions: Regions, truth: tuple[np.ndarray, ...]) -> Tensor:
-    """(D,) int64: the leaf that each region shows most of, 0 when it shows none.
-
-    The background that an outgrown mask shows does not count. Regions that mostly show ignored pixels get 0.
-    """
-    ids = []
-    for index, (view, x1, y1, x2, y2) in enumerate(places(regions)):
-        shown = np.bincount(truth[view][y1:y2, x1:x2][regions.crop(index).numpy()], minlength=2)
-        best = int(shown[1:].argmax()) + 1
-        ids.append(best if shown[best] and best != IGNORE_LABEL else 0)
-    return torch.tensor(ids, dtype=torch.int64)
+    """(D,) int64: the leaf that each region shows most of, 0 when it shows none or mostly ignored pixels."""
+    shown = shown_instances(regions, truth, count_background=False)
+    return torch.where(shown == IGNORE_LABEL, 0, shown)
 
 
 def tie_detections(regions: Regions, truth: tuple[np.ndarray, ...]) -> Masks:
     """Tie each detection to the leaf in whose true mask it has its best IoU, if that is 0.5 or more."""
-    ids, found = [], set()
-    sizes = [np.bincount(labels.ravel(), minlength=2) for labels in truth]
-    for index, (view, x1, y1, x2, y2) in enumerate(places(regions)):
-        mask = regions.crop(index).numpy()
-        both = np.bincount(truth[view][y1:y2, x1:x2][mask], minlength=len(sizes[view]))
-        iou = both / np.maximum(sizes[view] + mask.sum() - both, 1)
-        iou[[0, *range(IGNORE_LABEL, len(iou))]] = 0
-        best = int(iou.argmax())
-        ids.append(best if iou[best] >= MIN_IOU else 0)
-        found.add((view, ids[-1]))
-    num_true = sum(int((size[1:IGNORE_LABEL] > 0).sum()) for size in sizes)
-    num_found = sum(leaf > 0 for _, leaf in found)
-    return Masks(regions, torch.tensor(ids, dtype=torch.int64), num_true - num_found)
-
-
-def places(regions: Regions) -> list[list[int]]:
-    """D lists: the view and the box (x1, y1, x2, y2) of each region."""
-    return torch.cat((regions.view_index[:, None], regions.boxes), 1).tolist()
+    ids = tied_instances(regions, truth)
+    found = set(zip(regions.view_index.tolist(), ids.tolist(), strict=True))
+    num_true = sum(len(set(np.unique(labels)) - {0, IGNORE_LABEL}) for labels in truth)
+    return Masks(regions, ids, num_true - sum(leaf > 0 for _, leaf in found))

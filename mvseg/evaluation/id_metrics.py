@@ -1,4 +1,4 @@
-"""Stage 10: how good are the ids (Eq. 8, e_k, ARI, pairs) and the shapes (d of Sec. 4.3)?
+"""How good are the ids: s_match (Eq. 8), e_k, ARI, pairs.
 
 Ids are compared as partitions: their numbers mean nothing. A region that is matched to nothing (-1) counts as a cluster
 of its own. Always read s_match together with the others: all regions on their own score s_match = 1.
@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 from sklearn.metrics import adjusted_rand_score
 from sklearn.metrics.cluster import contingency_matrix, pair_confusion_matrix
 from torch import Tensor
@@ -80,35 +79,3 @@ def _split_unmatched(instance_ids: Tensor) -> np.ndarray:
     alone = ids < 0
     ids[alone] = max(int(ids.max(initial=-1)), -1) + 1 + np.arange(alone.sum())
     return ids
-
-
-def shape_distance(points: Tensor, truth: Tensor) -> float:
-    """d(I, T) of Sec. 4.3: mean of the two mean nearest-neighbour distances between two point sets.
-
-    Args:
-        points: (P, 3) reconstructed points.
-        truth: (Q, 3) true points.
-
-    Returns:
-        The distance in world units (the paper divides it by the mean leaf length); NaN when a set is empty.
-    """
-    if not len(points) or not len(truth):
-        return float("nan")
-    first, second = points.double().cpu().numpy(), truth.double().cpu().numpy()
-    there = cKDTree(second).query(first)[0].mean()
-    back = cKDTree(first).query(second)[0].mean()
-    return float((there + back) / 2)
-
-
-def region_truth(truth: np.ndarray, mask: np.ndarray) -> int:
-    """The true id of one region: the most frequent true label under its mask.
-
-    Args:
-        truth: (H, W) integers: 0 = no instance, 65535 = ignore.
-        mask: (H, W), not 0 inside the region.
-
-    Returns:
-        The label; 0 for a region that mostly covers no instance (or nothing at all), 65535 for one mostly ignored.
-    """
-    counts = np.bincount(truth[mask != 0].ravel(), minlength=1)
-    return int(counts.argmax())

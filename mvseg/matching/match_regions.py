@@ -15,7 +15,7 @@ from mvseg.matching.epipolar import is_coincident
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.symnmf import cluster_affinity
-from mvseg.regions import Regions, stack_regions
+from mvseg.regions import Regions, mask_box, stack_regions
 from mvseg.scene import Cameras
 
 
@@ -139,7 +139,7 @@ def split_merged(regions: Regions, matching: Matching) -> tuple[Regions, Matchin
         if not all(bool(half.any()) for _, half in halves):
             halves = [(own, mask)]
         for instance, half in halves:
-            x1, y1, x2, y2 = _extent(half) if len(halves) > 1 else (0, 0, mask.shape[1], mask.shape[0])
+            x1, y1, x2, y2 = mask_box(half) if len(halves) > 1 else (0, 0, mask.shape[1], mask.shape[0])
             source.append(region)
             boxes.append((box[0] + x1, box[1] + y1, box[0] + x2, box[1] + y2))
             crops.append(half[y1:y2, x1:x2].flatten().cpu())
@@ -154,12 +154,6 @@ def split_merged(regions: Regions, matching: Matching) -> tuple[Regions, Matchin
         merged_parts=(),
     )
     return stack_regions(views, boxes, crops, labels, regions.num_views).to(regions.device), matched, index
-
-
-def _extent(mask: Tensor) -> tuple[int, int, int, int]:
-    """x1, y1, x2, y2 of the pixels of a mask (h, w) that has some."""
-    rows, columns = mask.any(1).nonzero()[:, 0], mask.any(0).nonzero()[:, 0]
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
 def choose_method(config: MatchConfig) -> str:

@@ -22,7 +22,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.evaluation.id_metrics import region_truth
+from mvseg.evaluation.truth import shown_instance
 from mvseg.formats.coco import Rle, decode_rle, encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.json_file import Pixels, read_json
@@ -263,6 +263,6 @@ def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
             mask = decode_rle(one.segmentation.counts, image.width, image.height)
         except InputError as error:
             raise InputError(f"{path}: annotations[{index}]: {error}") from None
-        true.append(region_truth(labels[image.id], mask))
+        true.append(shown_instance(labels[image.id], mask))
     ids = [one.instance_id for one in content.annotations]
     return torch.tensor(ids, dtype=torch.int64), torch.tensor(true, dtype=torch.int64)

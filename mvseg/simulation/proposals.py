@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mvseg.multiview.mask_rcnn import Proposals
-from mvseg.regions import regions_from_label_maps, stack_regions
+from mvseg.regions import mask_box, regions_from_label_maps, stack_regions
 
 
 def simulate_proposals(
@@ -47,8 +47,7 @@ def simulate_proposals(
             moved = _move_mask(mask, truth.boxes[index].numpy(), error, int(rng.integers(-2, 3)))
             if not moved.any():
                 continue
-            rows, columns = np.nonzero(moved.any(1))[0], np.nonzero(moved.any(0))[0]
-            x1, y1, x2, y2 = int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
+            x1, y1, x2, y2 = mask_box(torch.from_numpy(moved))
             view_index.append(view)
             boxes.append((x1, y1, x2, y2))
             crops.append(torch.from_numpy(moved[y1:y2, x1:x2].copy()).flatten())

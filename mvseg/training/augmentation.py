@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 from torchvision import tv_tensors
-from torchvision.ops import masks_to_boxes
 from torchvision.transforms import v2
 
+from mvseg.regions import masks_to_boxes
 from mvseg.training.config import Orientation
 from mvseg.training.data import LabelledPhoto, SampleList, read_sample
 
@@ -158,9 +158,7 @@ def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_
     masks = torch.zeros((len(kept), *layers.shape[1:]), dtype=torch.bool)
     for layer in layers:
         masks |= layer == kept[:, None, None] + 1
-    # torchvision's boxes end on the last pixel, ours after it
-    boxes = masks_to_boxes(masks).float() + torch.tensor([0.0, 0.0, 1.0, 1.0])
-    return {"boxes": boxes, "labels": classes[kept], "masks": masks.to(torch.uint8)}
+    return {"boxes": masks_to_boxes(masks).float(), "labels": classes[kept], "masks": masks.to(torch.uint8)}
 
 
 # --- the order of an epoch

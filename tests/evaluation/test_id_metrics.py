@@ -1,13 +1,11 @@
 from __future__ import annotations
 
-import math
-
 import numpy as np
 import pytest
 import torch
 
 from mvseg.errors import InputError
-from mvseg.evaluation.id_metrics import matching_metrics, region_truth, shape_distance
+from mvseg.evaluation.id_metrics import matching_metrics
 
 
 def test_eq_8_by_hand() -> None:
@@ -55,23 +53,3 @@ def test_degenerate_cases() -> None:
     assert (alone.pair_precision, alone.pair_recall, alone.pair_f1) == (1, 1, 1)
     with pytest.raises(InputError, match="estimated ids"):
         matching_metrics(torch.tensor([0]), torch.tensor([0, 1]))
-
-
-def test_shape_distance_agrees_with_a_loop_and_scales() -> None:
-    generator = torch.Generator().manual_seed(0)
-    first, second = torch.randn(30, 3, generator=generator), torch.randn(20, 3, generator=generator)
-    apart = torch.cdist(first, second)
-    expected = float((apart.min(1)[0].mean() + apart.min(0)[0].mean()) / 2)
-    assert shape_distance(first, second) == pytest.approx(expected, rel=1e-5)
-    assert shape_distance(second, first) == pytest.approx(expected, rel=1e-5)
-    assert shape_distance(10 * first, 10 * second) == pytest.approx(10 * expected, rel=1e-5)
-    assert shape_distance(first, first) == 0
-    assert math.isnan(shape_distance(first, torch.zeros(0, 3)))
-
-
-def test_truth_of_a_region_is_the_label_under_most_of_it() -> None:
-    truth = np.array([[0, 0, 3, 3], [0, 65535, 65535, 3]], np.uint16)
-    assert region_truth(truth, np.array([[0, 1, 1, 1], [0, 0, 0, 0]])) == 3
-    assert region_truth(truth, np.array([[1, 1, 1, 0], [0, 0, 0, 0]])) == 0
-    assert region_truth(truth, np.array([[0, 0, 0, 0], [0, 1, 1, 1]])) == 65535
-    assert region_truth(truth, np.zeros((2, 4))) == 0
