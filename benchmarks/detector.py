@@ -24,12 +24,13 @@ import torch
 import trimesh
 from tqdm import tqdm
 
-from mvseg.config import DetectConfig
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN, Proposals
+from mvseg.multiview.config import DetectConfig
+from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
+from mvseg.multiview.proposals import Proposals
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.average_precision import annotate_truth, average_precision, describe_mask, detect_and_label

@@ -28,7 +28,7 @@ from embreex.rtcore_scene import EmbreeScene
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import Affinity, region_affinity
-from mvseg.matching.nview.cluster_scores import Costs
+from mvseg.matching.nview.config import Gains, NViewConfig, RowCosts, Thresholds
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.symnmf import cluster_affinity
@@ -51,20 +51,22 @@ def one_per_view_ids(regions: Regions, cameras: Cameras, affinity: Affinity) -> 
     return one_per_view_clusters(affinity, regions.view_index, len(cameras))
 
 
-def nview_ids(regions: Regions, cameras: Cameras, affinity: Affinity, *, costs: Costs | None = None) -> torch.Tensor:
-    return match_nview(regions, cameras, affinity, costs=costs).instance_ids
+def nview_ids(
+    regions: Regions, cameras: Cameras, affinity: Affinity, *, config: NViewConfig = NViewConfig()
+) -> torch.Tensor:
+    return match_nview(regions, cameras, affinity, config=config).instance_ids
 
 
 METHODS: dict[str, Method] = {"symnmf": symnmf_ids, "one-per-view": one_per_view_ids, "nview": nview_ids}
 ABLATIONS = {
-    "no weights": Costs(weight=0, weight_few=0),
-    "no landing": Costs(landing=0),
-    "missed=absent": Costs(absent=Costs.missing),
-    "hidden is free": Costs(hidden=0),
-    "pieces alone": Costs(piece_landing=math.inf),
-    "few views kept": Costs(few_landing=math.inf),
+    "no weights": NViewConfig(gains=Gains(weight=0, weight_few=0)),
+    "no landing": NViewConfig(gains=Gains(landing=0)),
+    "missed=absent": NViewConfig(costs=RowCosts(absent=RowCosts.missing)),
+    "hidden is free": NViewConfig(costs=RowCosts(hidden=0)),
+    "pieces alone": NViewConfig(thresholds=Thresholds(piece_landing=math.inf)),
+    "few views kept": NViewConfig(thresholds=Thresholds(few_landing=math.inf)),
 }
-METHODS |= {name: partial(nview_ids, costs=costs) for name, costs in ABLATIONS.items()}
+METHODS |= {name: partial(nview_ids, config=config) for name, config in ABLATIONS.items()}
 
 
 def visible_ids(plant: Plant, cameras: Cameras) -> Maps:

@@ -13,9 +13,10 @@ import json
 import torch
 import torchvision
 
-from mvseg.config import MatchConfig
-from mvseg.multiview.mask_rcnn import Proposals, match_proposals
+from mvseg.matching.config import MatchConfig
+from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.nms import cluster_aware_nms
+from mvseg.multiview.proposals import Proposals
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.dataset import drop_small

@@ -24,10 +24,13 @@ from matching import load_maps
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.nview.cluster_scores import Costs, nothing_known, own_scores, partition_value
-from mvseg.matching.nview.label_rows import RowTable, em_affinities, row_table
-from mvseg.matching.nview.match_nview import refine, search, view_costs, weight_evidence
-from mvseg.matching.one_per_view import dense_ids, link_average, one_per_view_clusters
+from mvseg.matching.nview.cluster_scores import ClusterScores
+from mvseg.matching.nview.config import NViewConfig
+from mvseg.matching.nview.label_rows import row_table
+from mvseg.matching.nview.search import refine, search
+from mvseg.matching.nview.soft_start import em_affinities
+from mvseg.matching.one_per_view import ViewGraph, link_average, one_per_view_clusters
+from mvseg.partition import renumber, separate_unmatched
 from mvseg.regions import regions_from_label_maps
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes
 
@@ -37,51 +40,52 @@ STARTS = [(iteration, stop) for iteration in (1, 5) for stop in (0.1, 0.2, 0.3, 
 ROUNDS = 3  # of set packing and refinement
 
 
-def value_clusters(table: RowTable, W: Floats, clusters: list[Ints], costs: Costs) -> Floats:
-    """What each cluster is worth in a partition, see `partition_value`: that depends on its own members only."""
-    evidence = weight_evidence(W) * (table.view_index[:, None] != table.view_index)
+def value_clusters(scores: ClusterScores, clusters: list[Ints]) -> Floats:
+    """What each cluster is worth in a partition, see `ClusterScores.value`: that depends on its own members only."""
+    views = scores.table.view_index
+    evidence = scores.evidence * (views[:, None] != views)
     values, left = np.zeros(len(clusters)), list(range(len(clusters)))
     while left:  # disjoint ones are looked at together
-        ids, chosen = np.full(len(W), -1), []
+        numbers, chosen = np.full(len(views), -1), []
         for number in left:
-            if (ids[clusters[number]] < 0).all():
-                ids[clusters[number]] = number
+            if (numbers[clusters[number]] < 0).all():
+                numbers[clusters[number]] = number
                 chosen.append(number)
-        scores = own_scores(table, dense_ids(np.where(ids < 0, len(clusters) + np.arange(len(ids)), ids)), costs)
+        own = scores.own(renumber(separate_unmatched(numbers)))
         for number in chosen:
             members = clusters[number]
-            pairs = costs.pair_factor(table.num_views) * evidence[np.ix_(members, members)].sum() / 2
-            values[number] = scores[members].sum() + pairs
+            pairs = scores.pair_factor * evidence[np.ix_(members, members)].sum() / 2
+            values[number] = own[members].sum() + pairs
         left = [number for number in left if number not in set(chosen)]
     return values
 
 
-def search_more(table: RowTable, W: Floats, costs: Costs, parts: list[Ints]) -> Ints:
+def search_more(scores: ClusterScores, parts: list[Ints]) -> Ints:
     """The best of some partitions and of what eight starts and set packing lead to."""
-    known, history, evidence = nothing_known(), em_affinities(table), weight_evidence(W)
-    parts = [refine(table, W, ids, costs, join_pieces=True, known=known) for ids in parts] + parts
+    history = em_affinities(scores.table)
+    parts = [refine(scores, clusters, join_pieces=True) for clusters in parts] + parts
     for iteration, stop in STARTS:
-        ids = link_average(history[iteration], table.view_index, table.num_views, stop)
-        for join in (False, True):
-            ids = refine(table, W, ids, costs, join_pieces=join, known=known)
-            parts.append(ids)
+        clusters = link_average(ViewGraph(history[iteration], scores.table.view_index, scores.table.num_views), stop)
+        for join_pieces in (False, True):
+            clusters = refine(scores, clusters, join_pieces=join_pieces)
+            parts.append(clusters)
     for _ in range(ROUNDS):
-        parts.append(pack(table, W, [np.frombuffer(key, np.int64) for key in known.landings], costs))
-        parts.append(refine(table, W, parts[-1], costs, join_pieces=True, known=known))
-    return max(parts, key=lambda ids: partition_value(table, evidence, ids, costs))
+        parts.append(pack(scores))
+        parts.append(refine(scores, parts[-1], join_pieces=True))
+    return max(parts, key=scores.value)
 
 
-def pack(table: RowTable, W: Floats, pool: list[Ints], costs: Costs) -> Ints:
-    """The disjoint clusters of a pool that are worth most together; other regions are alone."""
-    pool = [members for members in pool if len(members) > 1]
-    values = value_clusters(table, W, pool, costs)
+def pack(scores: ClusterScores) -> Ints:
+    """The disjoint clusters that are worth most together, of all that were ever scored; other regions are alone."""
+    pool = [members for members in scores.landed_clusters() if len(members) > 1]
+    values, num_regions = value_clusters(scores, pool), len(scores.table.view_index)
     owner = np.repeat(np.arange(len(pool)), [len(members) for members in pool])
-    holds = csc_array((np.ones(len(owner)), (np.concatenate(pool), owner)), shape=(len(W), len(pool)))
+    holds = csc_array((np.ones(len(owner)), (np.concatenate(pool), owner)), shape=(num_regions, len(pool)))
     best = milp(-values, constraints=LinearConstraint(holds, ub=1), integrality=1, bounds=Bounds(0, 1))
-    ids = len(pool) + np.arange(len(W))
+    clusters = np.full(num_regions, -1)
     for number in np.flatnonzero(best.x > 0.5).tolist():
-        ids[pool[number]] = number
-    return dense_ids(ids)
+        clusters[pool[number]] = number
+    return renumber(separate_unmatched(clusters))
 
 
 def judge_scene(spec: SceneSpec, cache: Path, masks: str) -> tuple[int, int, list[float]]:
@@ -90,17 +94,17 @@ def judge_scene(spec: SceneSpec, cache: Path, masks: str) -> tuple[int, int, lis
     true, degraded, cameras = load_maps(spec, cache)
     regions = regions_from_label_maps(list(true if masks == "true" else degraded))
     truth = shown_instances(regions, true, count_background=False)
-    affinity, costs = region_affinity(regions, cameras), view_costs(len(cameras), Costs())
-    W, table = affinity.to_dense().double().numpy(), row_table(regions, cameras)
-    pairwise = one_per_view_clusters(affinity, regions.view_index, len(cameras)).numpy()
-    pairwise = dense_ids(np.where(pairwise >= 0, pairwise, len(pairwise) + np.arange(len(pairwise))))
-    found = search(table, W, costs, pairwise)
-    more = search_more(table, W, costs, [pairwise, found])
-    refined = refine(table, W, dense_ids(truth.numpy()), costs, join_pieces=True)
+    true_clusters = renumber(truth.numpy())
+    affinity, num_views = region_affinity(regions, cameras), len(cameras)
+    graph = ViewGraph(affinity.to_dense().double().numpy(), regions.view_index.numpy(), num_views)
+    scores = ClusterScores(row_table(regions, cameras), graph, NViewConfig().for_views(num_views))
+    pairwise = renumber(separate_unmatched(one_per_view_clusters(affinity, regions.view_index, num_views).numpy()))
+    found = search(scores, pairwise)
+    more = search_more(ClusterScores(scores.table, graph, scores.config), [pairwise, found])
+    refined = refine(scores, true_clusters, join_pieces=True)
     figures: list[float] = []
-    for ids in (found, more, refined, dense_ids(truth.numpy())):
-        ari = matching_metrics(torch.from_numpy(ids), truth).ari
-        figures += [ari, partition_value(table, weight_evidence(W), ids, costs)]
+    for clusters in (found, more, refined, true_clusters):
+        figures += [matching_metrics(torch.from_numpy(clusters), truth).ari, scores.value(clusters)]
     return spec.num_leaves, spec.num_views, figures
 
 

@@ -12,7 +12,8 @@ import time
 
 import torch
 
-from mvseg.multiview.mask_rcnn import gather_proposals, match_proposals
+from mvseg.multiview.loop import match_proposals
+from mvseg.multiview.proposals import gather_proposals
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import grow_plant
 

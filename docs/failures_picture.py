@@ -40,12 +40,12 @@ def draw_failures(scene: Scene, truth: list[np.ndarray], seed: int, shown: int) 
     regions = regions_from_label_maps(maps)
     matching, leaf = match_regions(regions, scene.cameras), most_shown(regions, truth)
     ids = matching.instance_ids
-    main = torch.stack([leaf[ids == k].mode().values for k in range(matching.num_instances)])
-    wrong = (ids < 0) | (main[ids.clamp(min=0)] != leaf)
+    main = torch.stack([leaf[ids == k].mode().values for k in range(1, matching.num_instances + 1)])
+    wrong = (ids < 0) | (main[ids.clamp(min=1) - 1] != leaf)
     failures = torch.bincount(regions.view_index[wrong], minlength=len(truth))
     tiles = []
     for view in failures.argsort(descending=True, stable=True)[:shown].sort().values.tolist():
-        overlay = draw_overlay(read_photo(scene, view), regions, ids, view, matching.match_scores)
+        overlay = draw_overlay(read_photo(scene, view), regions, matching, view=view)
         height, width = overlay.shape[:2]
         for n in ((regions.view_index == view) & wrong).nonzero()[:, 0].tolist():
             mask = regions.mask(n, *scene.cameras.sizes[view].tolist()).numpy().astype(np.uint8)
@@ -60,7 +60,7 @@ def main() -> None:
     scene = load_scene(demo_scene())
     truth = load_masks(scene, demo_scene() / "truth")
     maps = [
-        truth.label_map(view, truth.labels, *size).numpy() for view, size in enumerate(scene.cameras.sizes.tolist())
+        truth.label_map(view, truth.labels, size).numpy() for view, size in enumerate(scene.cameras.sizes.tolist())
     ]
     some = [1, 4, 7]
     three = Scene(scene.name, tuple(scene.views[view] for view in some), scene.cameras[some], scene.unit)

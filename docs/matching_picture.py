@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -58,7 +59,7 @@ def main() -> None:
     agree = (np.isin(table.labels[on_ray], np.flatnonzero(members.numpy()))).sum(1)
     for view in OTHERS:
         canvas = photos[view].copy()
-        band = epipolar_map(regions.select(torch.tensor([leaf])), cameras, view, xy).reshape(height, width) > 0
+        band = epipolar_map(regions.select(torch.tensor([leaf])), cameras, view=view, xy=xy).reshape(height, width) > 0
         canvas[band] = 0.5 * canvas[band] + 0.5 * np.array(BLUE)
         for other in ((regions.view_index == view).nonzero()[:, 0]).tolist():
             color = ORANGE if members[other] else WHITE
@@ -77,15 +78,13 @@ def main() -> None:
         cv2.circle(canvas, tuple(spots[agree.argmax()].tolist()), 8, ORANGE, -1)
         rays.append(caption(canvas, f"view {view}: its rows, dots on the ray"))
 
-    cluster = epipolar_map(regions.select(members), cameras, SOURCE, xy).reshape(height, width, 1).numpy()
+    cluster = epipolar_map(regions.select(members), cameras, view=SOURCE, xy=xy).reshape(height, width, 1).numpy()
     heat = cv2.cvtColor(cv2.applyColorMap((cluster * 255).astype(np.uint8), cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     outline(heat, regions.mask(leaf, width, height), WHITE, 1)
     last = [caption(heat, f"view {SOURCE}: the map of its cluster")]
-    ids = torch.where(members, matching.instance_ids, -1)
-    last += [
-        caption(draw_overlay(photos[view], regions, ids, view, matching.match_scores), f"view {view}: its cluster")
-        for view in OTHERS
-    ]
+    only = replace(matching, instance_ids=torch.where(members, matching.instance_ids, -1))
+    for view in OTHERS:
+        last.append(caption(draw_overlay(photos[view], regions, only, view=view), f"view {view}: its cluster"))
     image = np.concatenate([np.concatenate(row, 1) for row in (bands, rays, last)])
     image = cv2.resize(image, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(DOCS / "matching.jpg"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])

@@ -14,9 +14,7 @@ from typing import TYPE_CHECKING, Any
 from mvseg._version import __version__
 
 if TYPE_CHECKING:
-    from mvseg.config import DetectConfig as DetectConfig
-    from mvseg.config import MatchConfig as MatchConfig
-    from mvseg.config import ReconstructConfig as ReconstructConfig
+    from mvseg.config import RunConfig as RunConfig
     from mvseg.demo import demo_scene as demo_scene
     from mvseg.detectors.zoo import load_detector as load_detector
     from mvseg.errors import InputError as InputError
@@ -28,15 +26,19 @@ if TYPE_CHECKING:
     from mvseg.formats.scene_folder import load_scene as load_scene
     from mvseg.matching.affinity import Affinity as Affinity
     from mvseg.matching.affinity import region_affinity as region_affinity
+    from mvseg.matching.config import MatchConfig as MatchConfig
     from mvseg.matching.epipolar import epipolar_map as epipolar_map
-    from mvseg.matching.match_regions import Matching as Matching
     from mvseg.matching.match_regions import match_regions as match_regions
-    from mvseg.matching.match_regions import split_merged as split_merged
+    from mvseg.matching.result import Matching as Matching
+    from mvseg.matching.result import MergedMask as MergedMask
+    from mvseg.matching.split_merged import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
+    from mvseg.multiview.assignment import EpipolarAssignment as EpipolarAssignment
+    from mvseg.multiview.config import DetectConfig as DetectConfig
     from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN as MultiViewMaskRCNN
-    from mvseg.multiview.nms import EpipolarAssignment as EpipolarAssignment
     from mvseg.multiview.nms import cluster_aware_nms as cluster_aware_nms
     from mvseg.pipeline import run_scene as run_scene
+    from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig
     from mvseg.reconstruction.voxels import reconstruct_instances as reconstruct_instances
     from mvseg.regions import Regions as Regions
     from mvseg.regions import regions_from_label_maps as regions_from_label_maps
@@ -46,22 +48,28 @@ if TYPE_CHECKING:
 # The public names, by room.
 _HOME = {
     "errors": ("InputError", "InputWarning"),
-    "demo": ("demo_scene",),
     "scene": ("Cameras", "Scene"),
     "regions": ("Regions", "regions_from_label_maps"),
+    "demo": ("demo_scene",),
     "formats.scene_folder": ("load_masks", "load_scene"),
     "formats.photos": ("load_photos",),
-    "config": ("DetectConfig", "MatchConfig", "ReconstructConfig"),
+    "detectors.zoo": ("load_detector",),
+    "matching.config": ("MatchConfig",),
     "matching.epipolar": ("epipolar_map",),
     "matching.affinity": ("Affinity", "region_affinity"),
     "matching.symnmf": ("cluster_affinity",),
-    "matching.match_regions": ("Matching", "match_regions", "split_merged"),
-    "detectors.zoo": ("load_detector",),
+    "matching.match_regions": ("match_regions",),
+    "matching.result": ("Matching", "MergedMask"),
+    "matching.split_merged": ("split_merged",),
+    "reconstruction.config": ("ReconstructConfig",),
     "reconstruction.voxels": ("reconstruct_instances",),
-    "multiview.nms": ("EpipolarAssignment", "cluster_aware_nms"),
+    "multiview.config": ("DetectConfig",),
+    "multiview.assignment": ("EpipolarAssignment",),
+    "multiview.nms": ("cluster_aware_nms",),
     "multiview.mask_rcnn": ("MultiViewMaskRCNN",),
     "evaluation.id_metrics": ("matching_metrics",),
     "evaluation.shape_distance": ("shape_distance",),
+    "config": ("RunConfig",),
     "pipeline": ("run_scene",),
 }
 __all__ = ["__version__", *(name for names in _HOME.values() for name in names)]

@@ -15,10 +15,13 @@ from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-import mvseg
-from mvseg.config import DetectConfig, MatchConfig, ReconstructConfig
+from mvseg._version import __version__
+from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError, InputWarning
+from mvseg.matching.config import MatchConfig
+from mvseg.multiview.config import DetectConfig
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.training.config import TrainConfig
 
 DEFAULT_OUT = Path("results")
@@ -60,7 +63,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def build_parser() -> ArgumentParser:
     """The parser of all verbs; its errors are raised, not printed."""
-    parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=mvseg.__version__)
+    parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__)
     verbs = parser.add_subcommands(dest="verb")
 
     infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
@@ -110,12 +113,19 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
     )
     parser.add_argument("--out", type=Path | None, help="folder for the result, or the results (under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that seem to cover two instances")
     parser.add_class_arguments(MatchConfig, "match")
 
 
 def _infer(args: Namespace) -> int:
     out = args.out or DEFAULT_OUT / args.scene.resolve().name
-    _run(args.scene, args.masks, out, args, ReconstructConfig(**vars(args.reconstruct)))
+    config = RunConfig(
+        detect=DetectConfig(**vars(args.detect)),
+        match=MatchConfig(**vars(args.match)),
+        reconstruct=ReconstructConfig(**vars(args.reconstruct)),
+        split_merged=args.split_merged,
+    )
+    _run(args.scene, args.masks, out, config=config, quiet=args.quiet)
     return 0
 
 
@@ -127,40 +137,38 @@ def _match(args: Namespace) -> int:
     if args.masks is None:
         raise InputError("masks is null, expected the masks to match; mvseg infer finds them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
+    config = RunConfig(match=MatchConfig(**vars(args.match)), reconstruct=None, split_merged=args.split_merged)
     for scene, name in zip(args.scenes, names, strict=True):
         try:
-            _run(scene, args.masks, out / name, args, None)
+            _run(scene, args.masks, out / name, config=config, quiet=args.quiet)
         except InputError as error:  # the other scenes still get their results
             code = _complain(error)
     return code
 
 
-def _run(scene: Path, masks: Path | None, out: Path, args: Namespace, reconstruct: ReconstructConfig | None) -> None:
+def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet: bool) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
-    from mvseg.pipeline import describe_run, run_scene  # keeps --help and wrong options quick
+    from mvseg.pipeline import run_scene  # keeps --help and wrong options quick
     from mvseg.results.folder import check_out, save_result
+    from mvseg.results.provenance import describe_run
 
     check_out(out)
     replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
     masks = None if masks is None else _find_masks(scene, masks)
-    detect = DetectConfig(**vars(args.detect)) if masks is None else None
-    ignored = masks is not None and "detect" in args and DetectConfig(**vars(args.detect)) != DetectConfig()
-    match = MatchConfig(**vars(args.match))
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        if ignored:
+        if masks is not None and config.detect != DetectConfig():
             warnings.warn("the detect options do nothing: masks are given", InputWarning, stacklevel=1)
-        result = run_scene(scene, masks, match, reconstruct, detect=detect, progress=not args.quiet)
-    # each matching of a detector's loop may remark the same
-    remarks = list(dict.fromkeys(str(one.message) for one in caught if issubclass(one.category, InputWarning)))
-    for other in (one for one in caught if not issubclass(one.category, InputWarning)):
+        result = run_scene(scene, masks, config, progress=not quiet)
+    # each matching of a detector's loop may repeat a warning
+    remarks = list(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning)))
+    for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
     for remark in remarks:
         print(f"mvseg: warning: {remark}", file=sys.stderr)
-    config: dict[str, Any] = {"scene": str(scene), "masks": masks and str(masks), "out": str(out)}
-    stages = {"detect": detect, "match": match, "reconstruct": reconstruct}
-    config |= {name: dataclasses.asdict(stage) for name, stage in stages.items() if stage is not None}
-    save_result(result, out, describe_run(result, masks, config, remarks), progress=not args.quiet)
+    run = describe_run(result, masks, config, remarks=remarks)
+    run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
+    save_result(result, out, run, progress=not quiet)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     print(f"{out}: {result.matching.num_instances} instances from {num_masks} masks in {num_views} views{replaces}")
 
@@ -176,7 +184,7 @@ def _find_masks(scene: Path, masks: Path) -> Path:
 def _eval(args: Namespace) -> int:
     from mvseg.evaluation.id_metrics import matching_metrics
     from mvseg.regions import IGNORE_LABEL
-    from mvseg.results.folder import read_instances
+    from mvseg.results.read import read_instances
 
     ids, true = read_instances(args.result, args.truth)
     judged = (true != 0) & (true != IGNORE_LABEL)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -65,7 +65,7 @@ class Regions:
         view_index, boxes, crops, labels = (
             field.to(device) for field in (self.view_index, self.boxes, self.crops, self.labels)
         )
-        return Regions(view_index, boxes, crops, self.num_views, labels)
+        return replace(self, view_index=view_index, boxes=boxes, crops=crops, labels=labels)
 
     @property
     def crop_sizes(self) -> Tensor:
@@ -108,7 +108,8 @@ class Regions:
         keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
         parts = self.crops.split(self.crop_sizes.prod(1).tolist())
         crops = torch.cat([parts[number] for number in keep.tolist()]) if len(keep) else self.crops[:0]
-        return Regions(self.view_index[keep], self.boxes[keep], crops, self.num_views, self.labels[keep])
+        view_index, boxes, labels = self.view_index[keep], self.boxes[keep], self.labels[keep]
+        return replace(self, view_index=view_index, boxes=boxes, crops=crops, labels=labels)
 
     def pixels(self, max_per_region: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
         """Centres of the mask pixels.
@@ -138,22 +139,21 @@ class Regions:
         weight = (self.areas / count).float()[owner]
         return torch.stack((column, row), 1).float() + 0.5, owner, weight
 
-    def label_map(self, view: int, values: Tensor, width: int, height: int) -> Tensor:
+    def label_map(self, view: int, values: Tensor, size: Sequence[int]) -> Tensor:
         """Paint the regions of one view into one frame.
 
         Args:
             view: view index.
-            values: (D,) int64, what to paint for each region; regions with value 0 are left out.
-            width: of the frame, pixels.
-            height: of the frame, pixels.
+            values: (D,) int64, what to paint for each region; regions with value 0 or less are left out.
+            size: width and height of the frame, pixels.
 
         Returns:
             (height, width) int64, 0 where no region is. Where regions overlap the smaller one is on top.
         """
-        frame = torch.zeros(height, width, dtype=torch.int64, device=self.device)
+        frame = torch.zeros(size[1], size[0], dtype=torch.int64, device=self.device)
         members = (self.view_index == view).nonzero()[:, 0]
         members = members[self.areas[members].argsort(descending=True, stable=True)]
-        for index in members[values[members] != 0].tolist():
+        for index in members[values[members] > 0].tolist():
             x1, y1, x2, y2 = self.boxes[index].tolist()
             frame[y1:y2, x1:x2][self.crop(index)] = values[index]
         return frame
@@ -202,21 +202,22 @@ def regions_from_label_maps(label_maps: Sequence[np.ndarray]) -> Regions:
             boxes.append((columns.start, rows.start, columns.stop, rows.stop))
             crops.append(torch.from_numpy(dense.reshape(label_map.shape)[place] == rank).flatten())
             labels.append(number)
-    return stack_regions(view_index, boxes, crops, labels, len(label_maps))
+    return stack_regions(view_index, boxes, crops, labels=labels, num_views=len(label_maps))
 
 
 def stack_regions(
-    view_index: list[int],
-    boxes: list[tuple[int, int, int, int]],
-    crops: list[Tensor],
-    labels: list[int],
+    view_index: Sequence[int],
+    boxes: Sequence[tuple[int, int, int, int]],
+    crops: Sequence[Tensor],
+    *,
+    labels: Sequence[int],
     num_views: int,
 ) -> Regions:
-    """Regions from one entry per region: see `Regions`; `crops` are flat bool tensors. All lists may be empty."""
+    """Regions from one entry per region: see `Regions`; `crops` are flat bool tensors. All sequences may be empty."""
     return Regions(
-        torch.tensor(view_index, dtype=torch.int64),
-        torch.tensor(boxes, dtype=torch.int64).reshape(-1, 4),
-        torch.cat(crops) if crops else torch.zeros(0, dtype=torch.bool),
-        num_views,
-        torch.tensor(labels, dtype=torch.int64),
+        view_index=torch.tensor(view_index, dtype=torch.int64),
+        boxes=torch.tensor(boxes, dtype=torch.int64).reshape(-1, 4),
+        crops=torch.cat(list(crops)) if len(crops) else torch.zeros(0, dtype=torch.bool),
+        num_views=num_views,
+        labels=torch.tensor(labels, dtype=torch.int64),
     )

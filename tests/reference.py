@@ -108,6 +108,37 @@ def factorise_reference(W: np.ndarray, H: np.ndarray, num_iterations: int) -> np
     return H
 
 
+def link_average_reference(W: np.ndarray, views: np.ndarray, stop: float) -> np.ndarray:
+    """(D,) average linkage that never joins two regions of one view, one join at a time; numbers with gaps."""
+    num = len(W)
+    ids = np.arange(num)
+    if num < 2:
+        return ids
+    total, size = W.copy(), np.ones(num)
+    has_view = np.zeros((num, int(views.max()) + 1), bool)
+    has_view[ids, views] = True
+    mean = np.where(views[:, None] == views, -1.0, W)
+    best = mean.max(1)
+    while True:
+        a = int(best.argmax())
+        if best[a] < stop or best[a] <= 0:
+            return ids
+        b = int(mean[a].argmax())
+        ids[ids == b] = a
+        has_view[a] |= has_view[b]
+        total[a] += total[b]
+        total[:, a] = total[a]
+        size[a] += size[b]
+        size[b] = 0
+        may_join = (size > 0) & ~(has_view & has_view[a]).any(1)
+        row = np.where(may_join, total[a] / np.maximum(size[a] * size, 1), -1.0)
+        stale = (mean[:, a] >= best) | (mean[:, b] >= best)
+        mean[a], mean[:, a], mean[b], mean[:, b] = row, row, -1.0, -1.0
+        best = np.maximum(best, row)
+        stale[[a, b]] = True
+        best[stale] = mean[stale].max(1)
+
+
 def cluster_aware_nms_reference(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float) -> list[int]:
     """Greedy suppression, one pair at a time; pairs of different groups are left alone."""
     kept: list[int] = []
@@ -134,7 +165,7 @@ def confirmed_reference(
     for box in range(len(boxes)):
         rivals = [one for one in stays if (groups[one] == groups[box]).all()]
         over = [one for one in rivals if float(box_iou(boxes[[one]], boxes[[box]])) > iou_threshold]
-        is_sure = ids[box] >= 0 and scores[box] >= min_score
+        is_sure = ids[box] > 0 and scores[box] >= min_score
         if all(is_sure and ids[one] != ids[box] for one in over):
             stays.append(box)
     return [box in stays for box in range(len(boxes))]

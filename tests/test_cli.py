@@ -20,11 +20,12 @@ import trimesh
 
 import mvseg
 from mvseg.cli import main
-from mvseg.config import DetectConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.formats.label_png import read_label_png, write_label_png
-from mvseg.matching.match_regions import Matching, match_regions
+from mvseg.matching.match_regions import match_regions
+from mvseg.matching.result import Matching
+from mvseg.multiview.config import DetectConfig
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent
@@ -148,8 +149,8 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "search_range": None,
             "num_restarts": 2,
             "seed": 9,
-            "split_merged": False,
         },
+        "split_merged": False,
         "reconstruct": {"threshold": 0.4, "seen_share": 0.8, "voxel_size": 1.5, "voxel_budget": 250_000},
     }
     assert run["mvseg"] == mvseg.__version__
@@ -611,7 +612,7 @@ def test_simulate_says_what_it_needs(
 
 
 def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def stop(*_: object) -> None:
+    def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     monkeypatch.setattr("mvseg.cli._run", stop)
@@ -625,7 +626,7 @@ def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.Capt
     true = read_label_png(demo_scene() / "masks" / "003.png", 640, 480)
     write_label_png(tmp_path / "masks" / "003.png", np.where(true == 10, 1, true))
     arguments = ["match", str(demo_scene()), "--masks", str(tmp_path / "masks"), "--quiet", "--out", str(tmp_path)]
-    assert main([*arguments, "--match.split_merged", "true"]) == 0
+    assert main([*arguments, "--split_merged", "true"]) == 0
     assert "12 instances from 108 masks" in capsys.readouterr().out
     labels = read_label_png(tmp_path / "demo_plant" / "labels" / "003.png", 640, 480)
     first, second = (np.bincount(labels[true == leaf]).argmax() for leaf in (1, 10))

@@ -24,10 +24,11 @@ from benchmarks.paper_tables.methods import METHODS, PRINTED  # noqa: E402
 from benchmarks.paper_tables.number_of_leaves import DEFAULT, RULES, score_numbers  # noqa: E402
 from benchmarks.paper_tables.shape_error import measure_points, measure_shares, unite  # noqa: E402
 from benchmarks.paper_tables.workers import start_process  # noqa: E402
-from mvseg.config import DetectConfig, MatchConfig  # noqa: E402
 from mvseg.evaluation.id_metrics import matching_metrics  # noqa: E402
 from mvseg.evaluation.shape_distance import shape_distance  # noqa: E402
+from mvseg.matching.config import MatchConfig  # noqa: E402
 from mvseg.matching.match_regions import match_regions  # noqa: E402
+from mvseg.multiview.config import DetectConfig  # noqa: E402
 from mvseg.regions import regions_from_label_maps  # noqa: E402
 from mvseg.simulation.dataset import list_scenes  # noqa: E402
 

@@ -22,7 +22,7 @@ def test_label_maps_make_the_round_trip() -> None:
     regions = regions_from_label_maps(maps)
     assert regions.num_per_view.tolist() == [3, 0, 3]
     for view, labels in enumerate(maps):
-        painted = regions.label_map(view, regions.labels, labels.shape[1], labels.shape[0])
+        painted = regions.label_map(view, regions.labels, labels.shape[::-1])
         np.testing.assert_array_equal(painted.numpy(), np.where(labels == IGNORE_LABEL, 0, labels))
 
 
@@ -69,7 +69,7 @@ def test_overlapping_regions_are_painted_small_on_top() -> None:
     big, small = torch.ones(16, dtype=torch.bool), torch.ones(4, dtype=torch.bool)
     boxes = torch.tensor([[1, 1, 3, 3], [0, 0, 4, 4]])
     regions = Regions(torch.tensor([0, 0]), boxes, torch.cat((small, big)), 1, torch.tensor([1, 2]))
-    painted = regions.label_map(0, torch.tensor([7, 9]), 5, 4)
+    painted = regions.label_map(0, torch.tensor([7, 9]), (5, 4))
     assert painted[1:3, 1:3].unique().tolist() == [7]
     assert (painted == 9).sum() == 12
 

@@ -11,12 +11,13 @@ import pytest
 import torch
 
 from conftest import true_ids
-from mvseg.config import MatchConfig, ReconstructConfig
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.matching.config import MatchConfig
 from mvseg.matching.match_regions import match_regions
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import back_project
 
 pytestmark = pytest.mark.shared_data
@@ -44,8 +45,8 @@ def test_maize_is_one_plant_of_its_height(shared_data: Path) -> None:
         regions = load_masks(scene, folder / "silhouettes")
     assert len(regions) == 12
     matching = match_regions(regions, scene.cameras)
-    assert matching.instance_ids.unique().tolist() == [0]
-    grid = back_project(regions, scene.cameras, ReconstructConfig(voxel_budget=400_000))
+    assert matching.instance_ids.unique().tolist() == [1]
+    grid = back_project(regions, scene.cameras, config=ReconstructConfig(voxel_budget=400_000))
     assert grid is not None
     extent = grid.points.amax(0) - grid.points.amin(0)
     assert 1100 < float(extent[2]) < 1300

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.paper_tables.cells import Cell
-from mvseg.config import DetectConfig
 from mvseg.evaluation.truth import shown_instances, tied_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks
+from mvseg.multiview.config import DetectConfig
 from mvseg.regions import IGNORE_LABEL, Regions, mask_box, regions_from_label_maps, stack_regions
 from mvseg.simulation.faults import Faults, degrade_labels
 
@@ -67,7 +67,7 @@ def detected_masks(cell: Cell, detector: str) -> Masks:
                 view_index.append(view)
                 boxes.append((x1, y1, x2, y2))
                 crops.append(mask[y1:y2, x1:x2].flatten())
-    regions = stack_regions(view_index, boxes, crops, list(range(len(crops))), len(cell.truth))
+    regions = stack_regions(view_index, boxes, crops, labels=range(len(crops)), num_views=len(cell.truth))
     return tie_detections(regions, cell.truth)
 
 

@@ -15,10 +15,11 @@ from benchmarks.paper_tables.masks import Masks
 from mvseg.baselines.mvs import match_mvs
 from mvseg.baselines.points import match_points
 from mvseg.baselines.sparse import match_sparse
-from mvseg.config import MatchConfig
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
-from mvseg.matching.match_regions import Matching, match_regions
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.match_regions import match_regions
+from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 
 Method = Callable[[Regions, Cell, Path], Matching]

@@ -11,7 +11,7 @@ from benchmarks.paper_tables.cells import Cell, Record
 from benchmarks.paper_tables.masks import Masks
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.symnmf import factorise, renumber, size_spread
+from mvseg.matching.symnmf import factorise, size_spread
 
 KS_AT_ONCE = 8
 DEFAULT = "[m, 2 m]"
@@ -46,7 +46,7 @@ def score_numbers(cell: Cell, masks: Masks) -> Record:
     chosen[RULES[-1]] = min(ks, key=lambda k: (spread[k] / k**0.5, k))
     record: Record = {}
     for name, k in chosen.items():
-        found = matching_metrics(renumber(partitions[k])[judged], masks.true_ids[judged])
+        found = matching_metrics(partitions[k][judged], masks.true_ids[judged])
         record[name] = {"s_match": found.s_match, "e_k": found.e_k, "ari": found.ari, "f1": found.pair_f1, "k": k}
     return record
 

@@ -23,9 +23,10 @@ from benchmarks.paper_tables.shape_error import (
     unite,
 )
 from mvseg.baselines.semantic import reconstruct_semantic
-from mvseg.config import MatchConfig, ReconstructConfig
 from mvseg.errors import InputError, InputWarning
+from mvseg.matching.config import MatchConfig
 from mvseg.matching.match_regions import match_regions
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import VoxelGrid, back_project, reconstruct_instances
 
 VOXELS_PER_LEAF = 50  # along the mean length of a leaf
@@ -51,7 +52,7 @@ def carve(cell: Cell, masks: Masks, members: tuple[int, ...], threshold: float, 
     regions = masks.regions.select(torch.tensor(members))
     with warnings.catch_warnings():  # an instance without a shape is part of the error that is measured
         warnings.simplefilter("ignore", InputWarning)
-        return back_project(regions, cell.scene.cameras, ReconstructConfig(threshold=threshold, voxel_size=size))
+        return back_project(regions, cell.scene.cameras, config=ReconstructConfig(threshold=threshold, voxel_size=size))
 
 
 def members_of(ids: Tensor) -> dict[int, tuple[int, ...]]:
@@ -84,17 +85,10 @@ def measure_hidden(cell: Cell, masks: Masks, ids: Tensor) -> Record:
         config = ReconstructConfig(threshold=PAPER_THRESHOLD, seen_share=share, voxel_size=size)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)
-            grids = reconstruct_instances(masks.regions, ids, cell.scene.cameras, config).values()
+            grids = reconstruct_instances(masks.regions, ids, cell.scene.cameras, config=config).values()
         points = unite([(grid.points, torch.ones(int(grid.occupied.sum()))) for grid in grids], size)[0]
         record[f"{share:g}"] = measure_points(points, truth, length)
     return {"shapes": len(grids)} | record
-
-
-def instance_maps(cell: Cell, masks: Masks, ids: Tensor) -> list[Tensor]:
-    """V maps (H, W) int64: instance + 1, 0 = no mask, -1 = a mask without an instance."""
-    values = torch.where(ids >= 0, ids + 1, -1)
-    sizes = cell.scene.cameras.sizes.tolist()
-    return [masks.regions.label_map(view, values, *size) for view, size in enumerate(sizes)]
 
 
 def look_up(cell: Cell, maps: list[Tensor], points: Tensor) -> Iterator[Tensor]:
@@ -124,7 +118,8 @@ def dense_on_leaves(cell: Cell, masks: Masked, cache: Path) -> Record:
     """The points of stereo that lie in some true mask of more than half of the views."""
     points = dense_points(cell, cache)
     own = masks("true")
-    maps = instance_maps(cell, own, own.true_ids)
+    sizes = cell.scene.cameras.sizes.tolist()
+    maps = [own.regions.label_map(view, own.true_ids, size) for view, size in enumerate(sizes)]
     shown = torch.stack([labels > 0 for labels in look_up(cell, maps, points.positions)]).double().mean(0)
     on_leaves = points.positions[shown > PAPER_THRESHOLD].numpy()
     return {"by": f"mvs ({points.backend})", "0.5": measure_points(on_leaves, *true_leaves(cell))}

@@ -6,25 +6,26 @@ import torch
 from torch import Tensor
 
 from mvseg.baselines.dense_points import DensePoints
-from mvseg.baselines.ties import check_views, cluster_ties, tie_graph
-from mvseg.config import MatchConfig
+from mvseg.baselines.ties import tie_graph
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.match_regions import Matching
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.match_regions import check_views, match_graph
+from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 
 NEAREST_SHARE = 0.1  # of the points in a region, whose centroid stands for it
 
 
-def match_mvs(regions: Regions, scene: Scene, points: DensePoints, config: MatchConfig | None = None) -> Matching:
+def match_mvs(regions: Regions, scene: Scene, points: DensePoints, config: MatchConfig = MatchConfig()) -> Matching:
     """Match regions by dense points (Sec. 4.2, "MVS-based matching").
 
     Args:
         regions: D regions in V views.
         scene: V >= 2 cameras.
         points: of the scene, in the world frame of its cameras.
-        config: see `cluster_ties`; None for the defaults.
+        config: see `match_graph`.
 
     Returns:
         The matching, method "mvs (<backend of the points>)". Regions without a point in them are tied only by what
@@ -34,12 +35,12 @@ def match_mvs(regions: Regions, scene: Scene, points: DensePoints, config: Match
         InputError: no points at all ("N/A" in the paper's tables), fewer than two views, or regions and cameras of
             different numbers of views.
     """
-    check_views(regions, scene)
+    check_views(regions, scene.cameras)
     if not len(points.positions):
         raise InputError(f"multi-view stereo ({points.backend}) found no points in scene '{scene.name}': no matching")
     cameras = scene.cameras.to(regions.device)
     graph = projection_graph(regions, cameras, points.positions.to(regions.device))
-    return cluster_ties(graph, regions, config, f"mvs ({points.backend})")
+    return match_graph(graph, regions, config, method=f"mvs ({points.backend})")
 
 
 def projection_graph(regions: Regions, cameras: Cameras, points: Tensor) -> Affinity:
@@ -56,7 +57,7 @@ def projection_graph(regions: Regions, cameras: Cameras, points: Tensor) -> Affi
     ties = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)]
     for view in range(len(cameras)):
         width, height = cameras.sizes[view].tolist()
-        frame = regions.label_map(view, number + 1, width, height)
+        frame = regions.label_map(view, number + 1, (width, height))
         is_inside = (depth[view] > 0) & (pixels[view] >= 0).all(1) & (pixels[view] < cameras.sizes[view]).all(1)
         senders = number[is_inside & (regions.view_index != view)]
         column, row = pixels[view, senders].long().unbind(1)

@@ -5,24 +5,25 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from mvseg.baselines.ties import check_views, cluster_ties, tie_graph
-from mvseg.config import MatchConfig
+from mvseg.baselines.ties import tie_graph
 from mvseg.matching.affinity import Affinity
+from mvseg.matching.config import MatchConfig
 from mvseg.matching.epipolar import is_coincident
-from mvseg.matching.match_regions import Matching
+from mvseg.matching.match_regions import check_views, match_graph
+from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 
 PARALLEL = 1e-12  # squared sine of the angle of two rays below which they have no nearest points
 
 
-def match_points(regions: Regions, scene: Scene, config: MatchConfig | None = None) -> Matching:
+def match_points(regions: Regions, scene: Scene, config: MatchConfig = MatchConfig()) -> Matching:
     """Match regions by the rays through their centroids (Sec. 4.2, "Point-based matching").
 
     Args:
         regions: D regions in V views.
         scene: V >= 2 cameras; the photos are not looked at.
-        config: see `cluster_ties`; None for the defaults.
+        config: see `match_graph`.
 
     Returns:
         The matching, method "points".
@@ -30,8 +31,8 @@ def match_points(regions: Regions, scene: Scene, config: MatchConfig | None = No
     Raises:
         InputError: fewer than two views, or regions and cameras of different numbers of views.
     """
-    check_views(regions, scene)
-    return cluster_ties(nearest_ray_graph(regions, scene.cameras.to(regions.device)), regions, config, "points")
+    check_views(regions, scene.cameras)
+    return match_graph(nearest_ray_graph(regions, scene.cameras.to(regions.device)), regions, config, method="points")
 
 
 def nearest_ray_graph(regions: Regions, cameras: Cameras) -> Affinity:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from mvseg.config import ReconstructConfig
 from mvseg.errors import InputError
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import VoxelGrid, back_project
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 
-def reconstruct_semantic(regions: Regions, scene: Scene, config: ReconstructConfig | None = None) -> VoxelGrid | None:
+def reconstruct_semantic(
+    regions: Regions, scene: Scene, config: ReconstructConfig = ReconstructConfig()
+) -> VoxelGrid | None:
     """The voxels of all leaves as one thing: "we unified the silhouettes of all leaves" (Sec. 4.3).
 
     A voxel is occupied when more than the threshold's share of the views that show any leaf have a mask there. Give a
@@ -18,7 +20,7 @@ def reconstruct_semantic(regions: Regions, scene: Scene, config: ReconstructConf
     Args:
         regions: D regions; ids are not needed.
         scene: V cameras.
-        config: threshold, voxel size (world units) or voxel budget; None for the defaults.
+        config: threshold, voxel size (world units) or voxel budget.
 
     Returns:
         The grid, None when fewer than two views show anything or no point has enough votes.
@@ -29,4 +31,4 @@ def reconstruct_semantic(regions: Regions, scene: Scene, config: ReconstructConf
     if len(scene.cameras) != regions.num_views:
         message = f"regions of {regions.num_views} views with {len(scene.cameras)} cameras"
         raise InputError(f"{message}, expected as many of each")
-    return back_project(regions, scene.cameras, config)
+    return back_project(regions, scene.cameras, config=config)

@@ -10,11 +10,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.baselines.ties import check_views, cluster_ties, tie_graph
-from mvseg.config import MatchConfig
+from mvseg.baselines.ties import tie_graph
 from mvseg.formats.photos import read_photo
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.match_regions import Matching
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.match_regions import check_views, match_graph
+from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 
@@ -35,7 +36,7 @@ class Keypoints:
     descriptors: Tensor
 
 
-def match_sparse(regions: Regions, scene: Scene, config: MatchConfig | None = None) -> Matching:
+def match_sparse(regions: Regions, scene: Scene, config: MatchConfig = MatchConfig()) -> Matching:
     """Match regions by the keypoints that they share (Sec. 4.2, "sparse feature correspondences").
 
     The paper's AKAZE is used where OpenCV has it: 4.x, or 5 with its contributed modules. Plain OpenCV 5 has only
@@ -44,7 +45,7 @@ def match_sparse(regions: Regions, scene: Scene, config: MatchConfig | None = No
     Args:
         regions: D regions in V views.
         scene: V >= 2 cameras with their photos.
-        config: see `cluster_ties`; None for the defaults.
+        config: see `match_graph`.
 
     Returns:
         The matching, method "sparse (akaze)" or "sparse (sift)". Regions that share no keypoint with any are -1.
@@ -53,10 +54,10 @@ def match_sparse(regions: Regions, scene: Scene, config: MatchConfig | None = No
         InputError: fewer than two views, regions and cameras of different numbers of views, or a photo that is missing
             or broken.
     """
-    check_views(regions, scene)
+    check_views(regions, scene.cameras)
     detector, name = keypoint_detector()
     keypoints = [find_keypoints(read_photo(scene, view), detector) for view in range(len(scene.views))]
-    return cluster_ties(keypoint_graph(regions, scene, keypoints), regions, config, f"sparse ({name})")
+    return match_graph(keypoint_graph(regions, scene, keypoints), regions, config, method=f"sparse ({name})")
 
 
 def keypoint_detector() -> tuple[Any, str]:
@@ -127,6 +128,6 @@ def keypoint_owner(regions: Regions, scene: Scene, view: int, keypoints: Keypoin
     """(P,) int64: the region that each keypoint of a view lies in, -1 for none."""
     width, height = scene.cameras.sizes[view].tolist()
     numbers = torch.arange(1, len(regions) + 1, device=regions.device)
-    frame = regions.label_map(view, numbers, width, height).cpu()
+    frame = regions.label_map(view, numbers, (width, height)).cpu()
     column, row = keypoints.xy.long().unbind(1)
     return frame[row.clamp(0, height - 1), column.clamp(0, width - 1)] - 1

@@ -9,11 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from sklearn.metrics import adjusted_rand_score
-from sklearn.metrics.cluster import contingency_matrix, pair_confusion_matrix
 from torch import Tensor
 
 from mvseg.errors import InputError
+from mvseg.partition import separate_unmatched
 
 
 @dataclass(frozen=True)
@@ -53,29 +52,47 @@ def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
     """
     if instance_ids.shape != true_ids.shape or instance_ids.ndim != 1:
         raise InputError(f"{tuple(instance_ids.shape)} estimated ids with {tuple(true_ids.shape)} true ones")
-    estimated, true = _split_unmatched(instance_ids), true_ids.cpu().numpy()
+    estimated, true = separate_unmatched(instance_ids.cpu().numpy()), true_ids.cpu().numpy()
     if not len(true):
-        return MatchingMetrics(1.0, 0, 1.0, 1.0, 1.0, 1.0, 0, 0, 0)
-    table = contingency_matrix(true, estimated)
-    (_, false_pairs), (missed_pairs, true_pairs) = pair_confusion_matrix(true, estimated).tolist()
-    precision = true_pairs / (true_pairs + false_pairs) if true_pairs + false_pairs else 1.0
-    recall = true_pairs / (true_pairs + missed_pairs) if true_pairs + missed_pairs else 1.0
-    num_true, num_estimated = table.shape
+        return MatchingMetrics(
+            s_match=1.0,
+            e_k=0,
+            ari=1.0,
+            pair_precision=1.0,
+            pair_recall=1.0,
+            pair_f1=1.0,
+            num_regions=0,
+            num_estimated=0,
+            num_true=0,
+        )
+    table = contingency_table(true, estimated)
+    both, true_pairs, estimated_pairs = (count_pairs(sizes) for sizes in (table, table.sum(1), table.sum(0)))
+    precision = both / estimated_pairs if estimated_pairs else 1.0
+    recall = both / true_pairs if true_pairs else 1.0
+    # Hubert and Arabie (1985): pairs in both, less what chance gives, over the largest that it could be
+    by_chance = true_pairs * estimated_pairs / max(count_pairs(np.array([len(true)])), 1)
+    largest = (true_pairs + estimated_pairs) / 2
     return MatchingMetrics(
         s_match=float(table.max(0).sum() / len(true)),
-        e_k=abs(num_estimated - num_true),
-        ari=float(adjusted_rand_score(true, estimated)),
+        e_k=abs(table.shape[1] - table.shape[0]),
+        ari=1.0 if largest == by_chance else (both - by_chance) / (largest - by_chance),
         pair_precision=precision,
         pair_recall=recall,
         pair_f1=2 * precision * recall / (precision + recall) if precision + recall else 0.0,
         num_regions=len(true),
-        num_estimated=num_estimated,
-        num_true=num_true,
+        num_estimated=table.shape[1],
+        num_true=table.shape[0],
     )
 
 
-def _split_unmatched(instance_ids: Tensor) -> np.ndarray:
-    ids = instance_ids.cpu().numpy().copy()
-    alone = ids < 0
-    ids[alone] = max(int(ids.max(initial=-1)), -1) + 1 + np.arange(alone.sum())
-    return ids
+def contingency_table(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """(J, K) int64: how many of D elements have the j-th smallest label of the one and the k-th of the other (D,)."""
+    rows, row = np.unique(first, return_inverse=True)
+    columns, column = np.unique(second, return_inverse=True)
+    counts = np.bincount(row * len(columns) + column, minlength=len(rows) * len(columns))
+    return counts.reshape(len(rows), len(columns))
+
+
+def count_pairs(sizes: np.ndarray) -> int:
+    """How many pairs of elements share a group, by the groups' sizes."""
+    return int((sizes * (sizes - 1) // 2).sum())

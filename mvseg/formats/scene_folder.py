@@ -87,4 +87,4 @@ def _regions_from_coco(scene: Scene, path: Path) -> Regions:
             if len(crop):
                 parts.append((view, tuple(crop.boxes[0].tolist()), crop.crops, label))
     view_index, boxes, crops, labels = (list(column) for column in zip(*parts, strict=True)) if parts else ([],) * 4
-    return stack_regions(view_index, boxes, crops, labels, len(scene.views))
+    return stack_regions(view_index, boxes, crops, labels=labels, num_views=len(scene.views))

@@ -1,1 +1,40 @@
-"""Region matching: masks and cameras in, instance ids out."""
+"""Region matching: masks and cameras in, instance ids out.
+
+    from mvseg.matching import MatchConfig, match_regions
+
+The public names of this room; they are imported when they are first used.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mvseg.matching.affinity import Affinity as Affinity
+    from mvseg.matching.affinity import region_affinity as region_affinity
+    from mvseg.matching.config import MatchConfig as MatchConfig
+    from mvseg.matching.epipolar import epipolar_map as epipolar_map
+    from mvseg.matching.match_regions import match_regions as match_regions
+    from mvseg.matching.result import Matching as Matching
+    from mvseg.matching.result import MergedMask as MergedMask
+    from mvseg.matching.split_merged import split_merged as split_merged
+    from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
+
+_HOME = {
+    "config": ("MatchConfig",),
+    "epipolar": ("epipolar_map",),
+    "affinity": ("Affinity", "region_affinity"),
+    "symnmf": ("cluster_affinity",),
+    "match_regions": ("match_regions",),
+    "result": ("Matching", "MergedMask"),
+    "split_merged": ("split_merged",),
+}
+__all__ = [name for names in _HOME.values() for name in names]
+
+
+def __getattr__(name: str) -> Any:
+    for module, names in _HOME.items():
+        if name in names:
+            return getattr(import_module(f"mvseg.matching.{module}"), name)
+    raise AttributeError(f"module 'mvseg.matching' has no attribute '{name}'")

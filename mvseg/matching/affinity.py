@@ -1,8 +1,8 @@
-"""Stage 4: the weighted graph of regions (Eq. 3)."""
+"""The weighted graph of regions (Eq. 3)."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -59,9 +59,9 @@ def region_affinity(
         lines = pair.counts if senders is None else _line_counts(pair, senders[i], senders[j])
         forth, back = pairwise_affinity(pair.bins, pair.counts, lines)
         mean = (forth + back.T) / 2
-        place = mean.nonzero()
-        edges.append(torch.stack((members[i][place[:, 0]], members[j][place[:, 1]]), 1).sort(1).values)
-        weights.append(mean[place[:, 0], place[:, 1]])
+        first, second = mean.nonzero().unbind(1)
+        edges.append(torch.stack((members[i][first], members[j][second]), 1).sort(1).values)
+        weights.append(mean[first, second])
     empty = torch.zeros(0, device=regions.device)
     return Affinity(torch.cat(edges), torch.cat([empty, *weights]), len(regions))
 
@@ -79,11 +79,11 @@ def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Te
     Returns:
         w(i -> j) (N, M) and w(j -> i) (M, N), float32 in [0, 1].
     """
-    forth = _directed(lines[0], pixels[1], bins.band_radius(0), bins.half_line[1])
-    return forth, _directed(lines[1], pixels[0], bins.band_radius(1), bins.half_line[0])
+    forth = _directed(lines[0], pixels[1], band_radius=bins.band_radius(0), half_line=bins.half_line[1])
+    return forth, _directed(lines[1], pixels[0], band_radius=bins.band_radius(1), half_line=bins.half_line[0])
 
 
-def _directed(lines: Tensor, pixels: Tensor, band_radius: int, half_line: int) -> Tensor:
+def _directed(lines: Tensor, pixels: Tensor, *, band_radius: int, half_line: int) -> Tensor:
     """(N, M) affinity from (N, B) line counts and (M, B) pixel counts."""
     covered = dilate(lines > 0, band_radius) @ pixels.T / pixels.sum(1).clamp(min=1)
     passing = lines @ dilate(pixels > 0, half_line).T / lines.sum(1, keepdim=True).clamp(min=1)
@@ -106,6 +106,6 @@ def _draw_points(samples: list[Samples], num_points: int, seed: int) -> list[Sam
         draw = torch.rand(sample.num_regions, num_points, generator=generator).to(sample.xy.device)
         order = sample.owner.argsort(stable=True)
         picks = order[(first[:, None] + (draw * counts[:, None]).long()).flatten()]
-        owner = sample.owner[picks]
-        drawn.append(Samples(sample.xy[picks], owner, torch.ones_like(sample.weight[picks]), sample.num_regions))
+        ones = torch.ones_like(sample.weight[picks])
+        drawn.append(replace(sample, xy=sample.xy[picks], owner=sample.owner[picks], weight=ones))
     return drawn

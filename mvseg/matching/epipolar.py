@@ -1,4 +1,4 @@
-"""Stage 3: the epipolar pencil of two cameras (Eqs. 1, 2 and 4), without drawing a line.
+"""The epipolar pencil of two cameras (Eqs. 1, 2 and 4), without drawing a line.
 
 Two cameras and their baseline b span a pencil of half-planes bounded by b. A pixel of either image lies in exactly one
 of them, and that half-plane is all that epipolar geometry knows about the pixel: its epipolar line in the other image
@@ -57,7 +57,10 @@ def view_samples(regions: Regions, max_per_region: int | None = None) -> tuple[l
         V `Samples`, and V int64 tensors with the indices in `regions` that the owners of a view stand for.
     """
     members = [(regions.view_index == view).nonzero()[:, 0] for view in range(regions.num_views)]
-    samples = [Samples(*regions.select(nodes).pixels(max_per_region), len(nodes)) for nodes in members]
+    samples = []
+    for nodes in members:
+        xy, owner, weight = regions.select(nodes).pixels(max_per_region)
+        samples.append(Samples(xy=xy, owner=owner, weight=weight, num_regions=len(nodes)))
     return samples, members
 
 
@@ -101,9 +104,8 @@ class Pencil:
 
     def _plane(self, side: int, xy: Tensor) -> tuple[Tensor, Tensor]:
         u, v = xy.unbind(1)
-        first, second = self.plane_from_px[
-            side
-        ].tolist()  # numbers: a product of (P, 2) with (2, 2) is ten times slower
+        # plain numbers: a product of (P, 2) with (2, 2) is ten times slower
+        first, second = self.plane_from_px[side].tolist()
         x = u * first[0] + v * first[1] + first[2]
         y = u * second[0] + v * second[1] + second[2]
         return x, y
@@ -192,7 +194,13 @@ def choose_bins(pencil: Pencil, xy: tuple[Tensor, Tensor], angles: tuple[Tensor,
     per_unit = num_bins / max(high - low, 1e-12) * (1 - 1e-6)
     half_line = [max(1, min(num_bins, round(LINE_PX / 2 * pitch * per_unit))) for pitch in pitches]
     half_pixel = [max(1, min(num_bins, ceil(pitch / 2 * per_unit))) for pitch in pitches]
-    return Bins(low, per_unit, num_bins, (half_line[0], half_line[1]), (half_pixel[0], half_pixel[1]))
+    return Bins(
+        low=low,
+        per_unit=per_unit,
+        num_bins=num_bins,
+        half_line=(half_line[0], half_line[1]),
+        half_pixel=(half_pixel[0], half_pixel[1]),
+    )
 
 
 def bin_histogram(bins: Bins, angles: Tensor, samples: Samples) -> Tensor:
@@ -235,7 +243,7 @@ def binned_pairs(samples: Sequence[Samples], cameras: Cameras, *, progress: bool
         angles = pencil.angles(0, samples[i].xy), pencil.angles(1, samples[j].xy)
         bins = choose_bins(pencil, (samples[i].xy, samples[j].xy), angles)
         counts = bin_histogram(bins, angles[0], samples[i]), bin_histogram(bins, angles[1], samples[j])
-        yield BinnedPair(i, j, pencil, bins, counts)
+        yield BinnedPair(i=i, j=j, pencil=pencil, bins=bins, counts=counts)
 
 
 def dilate(occupied: Tensor, radius: int) -> Tensor:
@@ -246,7 +254,7 @@ def dilate(occupied: Tensor, radius: int) -> Tensor:
     return (total[:, 2 * radius + 1 :] > total[:, :num_bins]).float()
 
 
-def epipolar_bands(regions: Regions, cameras: Cameras, view: int, xy: Tensor) -> Tensor:
+def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:
     """Which pixels of a view lie in the epipolar band of which region (Eq. 2).
 
     Args:
@@ -274,7 +282,7 @@ def epipolar_bands(regions: Regions, cameras: Cameras, view: int, xy: Tensor) ->
     return bands
 
 
-def epipolar_map(regions: Regions, cameras: Cameras, view: int, xy: Tensor) -> Tensor:
+def epipolar_map(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:
     """The epipolar map of one cluster (Eq. 4): the mean of its bands.
 
     Args:
@@ -287,4 +295,4 @@ def epipolar_map(regions: Regions, cameras: Cameras, view: int, xy: Tensor) -> T
         (P,) float32 in [0, 1]; zeros when no member lies in another view.
     """
     projectable = ~is_coincident(cameras.to(regions.device))[view][regions.view_index]
-    return epipolar_bands(regions, cameras, view, xy).sum(0) / projectable.sum().clamp(min=1)
+    return epipolar_bands(regions, cameras, view=view, xy=xy).sum(0) / projectable.sum().clamp(min=1)

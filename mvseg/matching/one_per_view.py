@@ -1,33 +1,56 @@
-"""Stage 5a: clusters with at most one region per view, from the epipolar weights alone.
+"""Clusters with at most one region per view, from the epipolar weights alone.
 
-An instance has one mask in a view. SymNMF cannot know that; agglomeration that never joins two regions of one view, and
-then one assignment problem per view (permutation synchronisation by projected power iteration, Chen and Candes 2016,
-with the Hungarian method as the projection), can. The number of clusters comes out by itself.
+An instance has one mask in a view. SymNMF cannot know that. Average linkage that never joins two regions of one view
+can, and then one assignment problem per view (permutation synchronisation by projected power iteration, Chen and Candes
+2016, with the Hungarian method as the projection). The number of clusters is a result.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-import torch
 from numpy.typing import NDArray
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import squareform
 from torch import Tensor
 
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.symnmf import renumber
+from mvseg.partition import drop_singletons, number_instances, renumber
 
 STOP = 0.2  # mean weight below which two clusters are not joined
-ALONE = 0.1  # what it is worth to a region to be in no cluster, in units of the mean weight to a cluster's V - 1 others
+ALONE = 0.1  # gain of a region in no cluster, in units of the mean weight to a cluster's V - 1 others
 MAX_SWEEPS = 20
+FORBIDDEN = 1e9  # distance of two regions of one view: no mean that contains it is ever small enough
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
+@dataclass(frozen=True, eq=False)
+class ViewGraph:
+    """A graph of D regions as a matrix, with the view of each region.
+
+    Attributes:
+        weights: (D, D) symmetric, >= 0.
+        view_index: (D,) int64 in [0, V).
+        num_views: V.
+    """
+
+    weights: Floats
+    view_index: Ints
+    num_views: int
+
+    def select(self, index: Ints) -> ViewGraph:
+        """The graph of some regions."""
+        return ViewGraph(self.weights[np.ix_(index, index)], self.view_index[index], self.num_views)
+
+
 def one_per_view_clusters(affinity: Affinity, view_index: Tensor, num_views: int) -> Tensor:
     """Cluster the graph so that no cluster holds two regions of one view.
 
-    Average-linkage agglomeration, then sweeps of one assignment problem per view until nothing changes.
+    Average linkage, then sweeps of one assignment problem per view until nothing changes.
 
     Args:
         affinity: the graph of D regions.
@@ -35,57 +58,37 @@ def one_per_view_clusters(affinity: Affinity, view_index: Tensor, num_views: int
         num_views: V.
 
     Returns:
-        (D,) int64 in [0, K), clusters numbered in the order of their first region; -1 for a region that is alone in its
-        cluster. The partition does not depend on the order of views and regions unless weights tie.
+        (D,) int64 instance ids in [1, K], numbered in the order of their first region; -1 for a region that is alone in
+        its cluster. The partition does not depend on the order of views and regions unless weights tie.
     """
-    W = affinity.to_dense().cpu().double().numpy()
-    views = view_index.cpu().numpy()
-    ids = power_iteration(W, views, num_views, link_average(W, views, num_views))
-    return renumber(drop_singletons(ids)).to(view_index.device)
+    weights = affinity.to_dense().cpu().double().numpy()
+    graph = ViewGraph(weights, view_index.cpu().numpy(), num_views)
+    clusters = power_iteration(graph, link_average(graph))
+    return number_instances(drop_singletons(clusters)).to(view_index.device)
 
 
-def link_average(W: Floats, views: Ints, num_views: int, stop: float = STOP) -> Ints:
-    """Average linkage under the constraint that clusters that share a view are never joined.
+def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
+    """Average linkage in which clusters that share a view are never joined.
 
     Args:
-        W: (D, D) symmetric weights >= 0.
-        views: (D,) view of each region.
-        num_views: V.
-        stop: no pair of clusters with a smaller mean weight is joined.
+        graph: of D regions.
+        stop: two clusters with a smaller mean weight, or with none, are not joined.
 
     Returns:
-        (D,) cluster of each region, numbers with gaps.
+        (D,) cluster of each region in [0, K), numbered by their first region.
     """
-    num = len(W)
-    ids = np.arange(num)
-    if num < 2:
-        return ids
-    total, size = W.copy(), np.ones(num)
-    has_view = np.zeros((num, num_views), bool)
-    has_view[ids, views] = True
-    mean = np.where(views[:, None] == views, -1.0, W)
-    best = mean.max(1)
-    while True:
-        a = int(best.argmax())
-        if best[a] < stop or best[a] <= 0:
-            return ids
-        b = int(mean[a].argmax())
-        ids[ids == b] = a
-        has_view[a] |= has_view[b]
-        total[a] += total[b]
-        total[:, a] = total[a]
-        size[a] += size[b]
-        size[b] = 0
-        may_join = (size > 0) & ~(has_view & has_view[a]).any(1)
-        row = np.where(may_join, total[a] / np.maximum(size[a] * size, 1), -1.0)
-        stale = (mean[:, a] >= best) | (mean[:, b] >= best)
-        mean[a], mean[:, a], mean[b], mean[:, b] = row, row, -1.0, -1.0
-        best = np.maximum(best, row)
-        stale[[a, b]] = True
-        best[stale] = mean[stale].max(1)
+    if len(graph.weights) < 2:
+        return np.arange(len(graph.weights))
+    is_same_view = graph.view_index[:, None] == graph.view_index
+    farthest = graph.weights.max(initial=1.0)  # the distance of two regions without an edge
+    distance = np.where(is_same_view, FORBIDDEN, farthest - graph.weights)
+    np.fill_diagonal(distance, 0)
+    tree = linkage(squareform(distance, checks=False), "average")
+    longest = min(farthest - stop, np.nextafter(farthest, 0))
+    return renumber(fcluster(tree, longest, "distance").astype(np.int64))
 
 
-def power_iteration(W: Floats, views: Ints, num_views: int, ids: Ints, alone: float = ALONE) -> Ints:
+def power_iteration(graph: ViewGraph, clusters: Ints, *, alone: float = ALONE) -> Ints:
     """Re-assign the regions of one view after another to the clusters of the others, one to one.
 
     The gain of a region from a cluster is its summed weight to the members, divided by V - 1; a region may also stay
@@ -94,25 +97,25 @@ def power_iteration(W: Floats, views: Ints, num_views: int, ids: Ints, alone: fl
     Returns:
         (D,) cluster of each region in [0, K), regions that stay alone included.
     """
-    order = view_order(W, views, num_views)
+    order = view_order(graph)
     for _ in range(MAX_SWEEPS):
-        before = dense_ids(ids)
-        ids = before
+        before = renumber(clusters)
+        clusters = before
         for view in order:
-            here = np.flatnonzero(views == view)
-            rest = np.where(views == view, -1, ids)
+            here = np.flatnonzero(graph.view_index == view)
+            rest = np.where(graph.view_index == view, -1, clusters)
             kept, rest[rest >= 0] = np.unique(rest[rest >= 0], return_inverse=True)
-            members = np.zeros((len(W), len(kept)))
+            members = np.zeros((len(rest), len(kept)))
             members[rest >= 0, rest[rest >= 0]] = 1
-            gain = W[here] @ members / max(num_views - 1, 1)
+            gain = graph.weights[here] @ members / max(graph.num_views - 1, 1)
             rest[here] = assign_one_to_one(gain, alone)
-            ids = rest
-        if (dense_ids(ids) == before).all():
+            clusters = rest
+        if (renumber(clusters) == before).all():
             break
-    return dense_ids(ids)
+    return renumber(clusters)
 
 
-def join_alone(W: Floats, views: Ints, num_views: int, ids: Ints, stop: float) -> Ints:
+def join_alone(graph: ViewGraph, clusters: Ints, *, stop: float) -> Ints:
     """Give regions that are alone a second chance by their weights only.
 
     They are linked with each other (average linkage), and those still alone join the cluster of largest mean weight
@@ -121,19 +124,19 @@ def join_alone(W: Floats, views: Ints, num_views: int, ids: Ints, stop: float) -
     Returns:
         (D,) cluster of each region in [0, K).
     """
-    ids = ids.copy()
-    alone = np.flatnonzero(np.bincount(ids, minlength=1)[ids] == 1)
-    linked = link_average(W[np.ix_(alone, alone)], views[alone], num_views, stop)
-    ids[alone] = ids.max(initial=0) + 1 + linked
-    for region in alone[np.argsort(-W[alone].max(1, initial=0), kind="stable")].tolist():
-        ids = dense_ids(ids)
-        sizes = np.bincount(ids)
-        taken = np.unique(ids[views == views[region]])
-        mean = np.bincount(ids, W[region]) / sizes
+    clusters = clusters.copy()
+    alone = np.flatnonzero(np.bincount(clusters, minlength=1)[clusters] == 1)
+    clusters[alone] = clusters.max(initial=0) + 1 + link_average(graph.select(alone), stop)
+    best_weight = graph.weights[np.ix_(alone, alone)].max(1, initial=0)
+    for region in alone[np.argsort(-best_weight, kind="stable")].tolist():
+        clusters = renumber(clusters)
+        sizes = np.bincount(clusters)
+        taken = np.unique(clusters[graph.view_index == graph.view_index[region]])
+        mean = np.bincount(clusters, graph.weights[region]) / sizes
         mean[taken] = -1
-        if sizes[ids[region]] == 1 and mean.max() >= stop:
-            ids[region] = mean.argmax()
-    return dense_ids(ids)
+        if sizes[clusters[region]] == 1 and mean.max() >= stop:
+            clusters[region] = mean.argmax()
+    return renumber(clusters)
 
 
 def assign_one_to_one(gain: Floats, alone: float) -> Ints:
@@ -157,18 +160,7 @@ def assign_one_to_one(gain: Floats, alone: float) -> Ints:
     return chosen
 
 
-def view_order(W: Floats, views: Ints, num_views: int) -> Ints:
+def view_order(graph: ViewGraph) -> Ints:
     """(V,) views by decreasing total weight of their regions: an order that does not depend on their numbers."""
-    return np.argsort(-np.bincount(views, weights=W.sum(1), minlength=num_views), kind="stable")
-
-
-def dense_ids(ids: Ints) -> Ints:
-    """The same partition numbered from 0 in the order of the first members."""
-    _, first, inverse = np.unique(ids, return_index=True, return_inverse=True)
-    return first.argsort().argsort()[inverse].astype(np.int64)
-
-
-def drop_singletons(ids: Ints) -> Tensor:
-    """(D,) int64 ids >= 0 with -1 for the only member of its cluster."""
-    sizes = np.bincount(ids, minlength=1)
-    return torch.from_numpy(np.where(sizes[ids] > 1, ids, -1))
+    totals = np.bincount(graph.view_index, weights=graph.weights.sum(1), minlength=graph.num_views)
+    return np.argsort(-totals, kind="stable")

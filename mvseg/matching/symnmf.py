@@ -1,4 +1,4 @@
-"""Stage 5: graph clustering by symmetric NMF, and the number of clusters by Eq. 7, as in the paper (Sec. 3.1, 3.4).
+"""Graph clustering by symmetric NMF, and the number of clusters by Eq. 7, as in the paper (Sec. 3.1, 3.4).
 
 The paper does not state the range in which Eq. 7 looks for |k|, and that range decides everything: Eq. 7 is 0 for every
 partition in equal parts, so that k = 1, k = |V| and, where all leaves are seen in all views, any merging into equal
@@ -17,6 +17,7 @@ from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
+from mvseg.partition import number_instances
 
 KS_AT_ONCE = 8
 DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
@@ -27,8 +28,8 @@ class Clustering:
     """Instance ids of the regions.
 
     Attributes:
-        instance_ids: (D,) int64 in [0, K), or -1 for a region that is tied to no other. Clusters are numbered in the
-            order of their first region; none is empty.
+        instance_ids: (D,) int64 in [1, K], or -1 for a region without an edge. Instances are numbered in the order of
+            their first region; none is empty.
         num_clusters: the |k| asked of the factorisation; K is smaller where SymNMF left a cluster empty.
         criterion: {k: value of Eq. 7} for each k that was tried.
     """
@@ -90,7 +91,8 @@ def cluster_affinity(
             bar.update(len(ks))
     best = min(criterion, key=lambda k: (criterion[k], k))
     labels[tied] = candidates[best]
-    return Clustering(renumber(labels), best, criterion)
+    ids = number_instances(labels.cpu().numpy()).to(labels.device)
+    return Clustering(instance_ids=ids, num_clusters=best, criterion=criterion)
 
 
 def factorise(
@@ -131,14 +133,3 @@ def size_spread(labels: Tensor, k: int) -> float:
     """Eq. 7: root of the sum (as printed, no mean) of squared deviations of the k cluster sizes from their mean."""
     sizes = torch.bincount(labels, minlength=k).double()
     return float((sizes - sizes.mean()).square().sum().sqrt())
-
-
-def renumber(labels: Tensor | Sequence[int]) -> Tensor:
-    """(D,) int64: the same partition, clusters numbered from 0 in the order of their first member; -1 stays -1."""
-    labels = torch.as_tensor(labels)
-    values, inverse = labels.unique(return_inverse=True)
-    order = torch.arange(len(labels), device=labels.device)
-    first = torch.full((len(values),), len(labels), device=labels.device).scatter_reduce(0, inverse, order, "amin")
-    first[values < 0] = -1  # unmatched regions rank before all clusters, and get -1
-    rank = first.argsort().argsort() - int((values < 0).any())
-    return rank[inverse]

@@ -1,4 +1,4 @@
-"""Stage 8: back-projection of each cluster into voxels (Eq. 6), and from voxels to points and a mesh."""
+"""Back-projection of each instance into voxels (Eq. 6), and from voxels to points and a mesh."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from skimage.measure import marching_cubes
 from torch import Tensor
 from tqdm import tqdm
 
-from mvseg.config import ReconstructConfig
 from mvseg.errors import InputError, InputWarning
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -75,8 +75,8 @@ def reconstruct_instances(
     regions: Regions,
     instance_ids: Tensor,
     cameras: Cameras,
-    config: ReconstructConfig | None = None,
     *,
+    config: ReconstructConfig = ReconstructConfig(),
     progress: bool = False,
 ) -> dict[int, VoxelGrid]:
     """Back-project every instance that is seen in at least two views.
@@ -85,39 +85,42 @@ def reconstruct_instances(
 
     Args:
         regions: D regions.
-        instance_ids: (D,) int64, -1 = no instance.
+        instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
-        config: how; None for the defaults.
+        config: how.
         progress: show a progress bar over the instances.
 
     Returns:
         {instance id: grid}. Instances seen in one view only are left out: they have no bounded shape. So are, with an
-        InputWarning (which counts instances from 1, as files do), those in which no point has enough votes.
+        InputWarning, those in which no point has enough votes.
 
     Raises:
         InputError: as many ids as regions are expected; see also `back_project`.
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
-    config = config or ReconstructConfig()
     shapes, free = {}, None
     if config.seen_share > 0:
         ones = torch.ones_like(instance_ids)
-        free = [regions.label_map(view, ones, *size) == 0 for view, size in enumerate(cameras.sizes.tolist())]
-    instances = instance_ids[instance_ids >= 0].unique().tolist()
+        free = [regions.label_map(view, ones, size) == 0 for view, size in enumerate(cameras.sizes.tolist())]
+    instances = instance_ids[instance_ids > 0].unique().tolist()
     for instance in tqdm(instances, desc="back-projection", unit="instance", disable=not progress):
         members = regions.select(instance_ids == instance)
-        grid = back_project(members, cameras, config, free)
+        grid = back_project(members, cameras, config=config, free=free)
         if grid is not None and grid.occupied.any():
             shapes[instance] = grid
         elif len(members.view_index.unique()) > 1:
-            message = f"instance {instance + 1} has no shape: its {len(members)} masks agree on no point"
+            message = f"instance {instance} has no shape: its {len(members)} masks agree on no point"
             warnings.warn(message, InputWarning, stacklevel=2)
     return shapes
 
 
 def back_project(
-    members: Regions, cameras: Cameras, config: ReconstructConfig | None = None, free: list[Tensor] | None = None
+    members: Regions,
+    cameras: Cameras,
+    *,
+    config: ReconstructConfig = ReconstructConfig(),
+    free: list[Tensor] | None = None,
 ) -> VoxelGrid | None:
     """The voxels of one instance from all of its masks (Eq. 6), in a bounding box of its own.
 
@@ -139,7 +142,6 @@ def back_project(
     Raises:
         InputError: a voxel size that asks for more than 2e8 voxels.
     """
-    config = config or ReconstructConfig()
     cameras = cameras.to(members.device)
     views = members.view_index[members.areas > 0].unique().tolist()
     masks = [_ViewMask.union(members, view, cameras) for view in views]
@@ -157,8 +159,10 @@ def back_project(
         raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {MAX_VOXELS}")
     axes = [(first[a] + 0.5 + torch.arange(int(shape[a])).to(low)) * size for a in range(3)]
     around = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
-    votes = _share_of_masks(masks, axes, around, config.seen_share)
-    return VoxelGrid(first * size, size, votes, len(masks), config.threshold)
+    votes = _share_of_masks(masks, axes, free=around, seen_share=config.seen_share)
+    return VoxelGrid(
+        origin=first * size, voxel_size=size, votes=votes, num_views=len(masks), threshold=config.threshold
+    )
 
 
 @dataclass(frozen=True, eq=False)
@@ -190,7 +194,15 @@ class _ViewMask:
         corners = torch.tensor([[u, v, 1.0] for u in (x1, x2) for v in (y1, y2)]).to(K)
         slant = float(torch.linalg.vector_norm(corners @ torch.linalg.inv(K).T, dim=1).max())
         focal = float(K.diagonal()[:2].max())
-        return _ViewMask(mask, (x1, y1), px_from_world, focal, slant, cameras.centers[view], ray)
+        return _ViewMask(
+            mask=mask,
+            corner=(x1, y1),
+            px_from_world=px_from_world,
+            focal=focal,
+            slant=slant,
+            center=cameras.centers[view],
+            ray=ray,
+        )
 
     def contains(self, axes: list[Tensor]) -> Tensor:
         """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask?"""
@@ -238,7 +250,9 @@ class _ViewMask:
         return torch.where(depth > reach, count > 0, beside)
 
 
-def _share_of_masks(masks: list[_ViewMask], axes: list[Tensor], free: list[Tensor] | None, seen_share: float) -> Tensor:
+def _share_of_masks(
+    masks: list[_ViewMask], axes: list[Tensor], *, free: list[Tensor] | None, seen_share: float
+) -> Tensor:
     """(X, Y, Z) float32: I_k (Eq. 6) on a grid, a slab at a time to bound the memory.
 
     With `free`, one map (H, W) bool per mask, it is 0 where not more than `seen_share` of the views whose pixel is in
@@ -265,7 +279,7 @@ def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Ten
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
     A cube about the point nearest to all centroid rays, twice as far as the farthest camera, is halved again and again;
-    cells in which no point can exceed the threshold are dropped, until the box of the rest is `SEARCH_CELLS` cells
+    cells in which no point can exceed the threshold are discarded, until the box of the rest is `SEARCH_CELLS` cells
     long and hardly shrinks any more. Cells are judged by balls about them, so nothing is lost, however thin. None when
     no cell is left. Masks of nearly parallel views may have no bounded common part: it is cut off at the cube.
     """

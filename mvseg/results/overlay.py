@@ -8,38 +8,34 @@ from collections.abc import Sequence
 
 import cv2
 import numpy as np
-from torch import Tensor
 
+from mvseg.matching.result import SURE, Matching
 from mvseg.regions import Regions
 
 MAX_SIDE = 1600  # pixels of an overlay's longer side
 TILE_WIDTH = 480
 UNMATCHED = (150, 150, 150)
-UNSURE = 0.5  # match scores below this are marked
 
 
 def instance_color(instance: int) -> tuple[int, int, int]:
     """RGB (0 to 255) of an instance; neighbouring numbers get distant hues. Grey for -1."""
-    if instance < 0:
+    if instance < 1:
         return UNMATCHED
-    hue = (0.08 + instance * 0.6180339887) % 1.0
-    saturation, value = ((0.85, 1.0), (0.55, 1.0), (0.9, 0.72))[instance // 8 % 3]
+    hue = (0.08 + (instance - 1) * 0.6180339887) % 1.0
+    saturation, value = ((0.85, 1.0), (0.55, 1.0), (0.9, 0.72))[(instance - 1) // 8 % 3]
     red, green, blue = colorsys.hsv_to_rgb(hue, saturation, value)
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def draw_overlay(
-    photo: np.ndarray, regions: Regions, instance_ids: Tensor, view: int, match_scores: Tensor | None = None
-) -> np.ndarray:
+def draw_overlay(photo: np.ndarray, regions: Regions, matching: Matching, *, view: int) -> np.ndarray:
     """Tint the regions of one view in the colours of their instances, with outline and number.
 
     Args:
         photo: (H, W, 3) uint8 RGB, undistorted.
         regions: D regions.
-        instance_ids: (D,) int64, -1 = matched to nothing (grey, no number). Numbers are drawn as in the result's
-            files: id + 1.
+        matching: of the regions. One that is matched to nothing is grey and has no number; the number of one whose
+            match score is below 0.5 gets a question mark.
         view: index of the view.
-        match_scores: (D,) in [0, 1]; a number with a score below 0.5 gets a question mark.
 
     Returns:
         uint8 RGB, scaled down so that the longer side has at most 1600 pixels.
@@ -52,21 +48,21 @@ def draw_overlay(
     members = (regions.view_index == view).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]  # small ones on top
     for index in members.tolist():
-        instance = int(instance_ids[index])
+        instance = int(matching.instance_ids[index])
         mask = regions.mask(index, width, height).cpu().numpy().astype(np.uint8)
         mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
         color = instance_color(instance)
         painted[mask > 0] = 0.45 * canvas[mask > 0] + 0.55 * np.array(color)
         outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(painted, outlines, -1, color, max(1, round(max(size) / 600)))
-        if instance >= 0 and mask.any():
+        if instance > 0 and mask.any():
             # The number goes to the thickest place of the mask, which is always inside it.
             depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
             row, column = np.unravel_index(depth.argmax(), depth.shape)
-            doubt = "?" if match_scores is not None and match_scores[index] < UNSURE else ""
-            labels.append((f"{instance + 1}{doubt}", (int(column), int(row))))
+            doubt = "?" if matching.match_scores[index] < SURE else ""
+            labels.append((f"{instance}{doubt}", (int(column), int(row))))
     for text, center in labels:
-        _write(painted, text, center, max(size) / 1100)
+        _write(painted, text, center, scale=max(size) / 1100)
     return painted
 
 
@@ -89,10 +85,10 @@ def draw_contact_sheet(overlays: Sequence[np.ndarray], names: Sequence[str]) -> 
     return np.concatenate(rows)
 
 
-def _write(canvas: np.ndarray, text: str, center: tuple[int, int], scale: float) -> None:
+def _write(canvas: np.ndarray, text: str, center: tuple[int, int], *, scale: float) -> None:
     scale = max(0.35, scale)
     (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    place = (center[0] - width // 2, center[1] + height // 2)
+    corner = (center[0] - width // 2, center[1] + height // 2)
     thick = max(1, round(2 * scale))
-    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 3 * thick, cv2.LINE_AA)
-    cv2.putText(canvas, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick, cv2.LINE_AA)
+    cv2.putText(canvas, text, corner, cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 3 * thick, cv2.LINE_AA)
+    cv2.putText(canvas, text, corner, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick, cv2.LINE_AA)

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.multiview.mask_rcnn import Proposals
+from mvseg.multiview.proposals import Proposals
 from mvseg.regions import mask_box, regions_from_label_maps, stack_regions
 
 
@@ -54,7 +54,7 @@ def simulate_proposals(
             quality = float(np.exp(-np.square(error).sum() / (4 * jitter**2)))
             scores.append(0.2 + 0.4 * prominence + 0.3 * quality + 0.1 * rng.random())
             labels.append(int(truth.labels[index]))
-    regions = stack_regions(view_index, boxes, crops, labels, len(label_maps))
+    regions = stack_regions(view_index, boxes, crops, labels=labels, num_views=len(label_maps))
     classes = torch.ones(len(regions), dtype=torch.int64)
     return Proposals(regions, regions.boxes.float(), torch.tensor(scores), classes), regions.labels
 

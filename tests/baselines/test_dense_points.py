@@ -43,7 +43,7 @@ def photos(leafy: LeafyScene) -> list[np.ndarray]:
 
 def true_depths(leafy: LeafyScene) -> list[np.ndarray]:
     """Of the leaves alone: their surfaces are known as meshes."""
-    maps = [leafy.regions.label_map(view, leafy.regions.labels, 320, 320).numpy() for view in range(10)]
+    maps = [leafy.regions.label_map(view, leafy.regions.labels, (320, 320)).numpy() for view in range(10)]
     return [np.where(labels > 0, depth, 0).astype(np.float32) for labels, depth in zip(maps, leafy.depths, strict=True)]
 
 

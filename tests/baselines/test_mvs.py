@@ -8,8 +8,8 @@ from sklearn.metrics import adjusted_rand_score
 
 from mvseg.baselines.dense_points import DensePoints
 from mvseg.baselines.mvs import match_mvs, projection_graph, region_points
-from mvseg.config import MatchConfig
 from mvseg.errors import InputError
+from mvseg.matching.config import MatchConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from reference import region_points_reference

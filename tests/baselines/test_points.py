@@ -8,9 +8,9 @@ import torch
 from sklearn.metrics import adjusted_rand_score
 
 from mvseg.baselines.points import centroid_rays, match_points, nearest_ray_graph, pairwise_ray_distance
-from mvseg.config import MatchConfig
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
+from mvseg.matching.config import MatchConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from reference import ray_distance_reference

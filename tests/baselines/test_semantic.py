@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from mvseg.baselines.semantic import reconstruct_semantic
-from mvseg.config import ReconstructConfig
 from mvseg.errors import InputError
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from reference import back_project_reference

@@ -18,10 +18,10 @@ from mvseg.baselines.sparse import (
     match_keypoints,
     match_sparse,
 )
-from mvseg.config import MatchConfig
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import read_photo
+from mvseg.matching.config import MatchConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
 from reference import match_keypoints_reference

@@ -36,7 +36,7 @@ def level_arc(num_views: int, step_deg: float) -> Cameras:
 def test_depths_of_leaves_are_right(leafy: LeafyScene) -> None:
     photos = [cv2.cvtColor(read_photo(leafy.scene, view), cv2.COLOR_RGB2GRAY) for view in range(3)]
     for view, (depth, true) in enumerate(zip(sgbm_depths(photos, leafy.scene.cameras), leafy.depths, strict=True)):
-        labels = leafy.regions.label_map(view, leafy.regions.labels, 320, 320).numpy()
+        labels = leafy.regions.label_map(view, leafy.regions.labels, (320, 320)).numpy()
         inside = cv2.erode((labels > 0).astype(np.uint8), np.ones((5, 5))) > 0
         found = inside & (depth > 0)
         error = np.abs(depth[found] / true[found] - 1)

@@ -3,9 +3,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from sklearn.metrics import adjusted_rand_score
+from sklearn.metrics.cluster import contingency_matrix
 
 from mvseg.errors import InputError
-from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.evaluation.id_metrics import contingency_table, matching_metrics
 
 
 def test_eq_8_by_hand() -> None:
@@ -29,6 +31,15 @@ def test_pairs_agree_with_a_loop() -> None:
     assert metrics.pair_precision == pytest.approx(both / together)
     assert metrics.pair_recall == pytest.approx(both / tied)
     assert metrics.pair_f1 == pytest.approx(2 * both / (together + tied))
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_ari_and_contingencies_are_scikit_learns(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    estimated, true = generator.integers(0, 1 + seed, 30), generator.integers(3, 7, 30)
+    metrics = matching_metrics(torch.from_numpy(estimated), torch.from_numpy(true))
+    assert metrics.ari == pytest.approx(adjusted_rand_score(true, estimated), abs=1e-12)
+    np.testing.assert_array_equal(contingency_table(true, estimated), contingency_matrix(true, estimated))
 
 
 def test_numbers_mean_nothing() -> None:

@@ -34,7 +34,7 @@ def write_coco_masks(folder: Path, path: Path, num_views: int = 4) -> None:
 
 
 def union(regions: Regions, view: int) -> np.ndarray:
-    return regions.label_map(view, torch.ones(len(regions), dtype=torch.int64), WIDTH, HEIGHT).numpy() > 0
+    return regions.label_map(view, torch.ones(len(regions), dtype=torch.int64), (WIDTH, HEIGHT)).numpy() > 0
 
 
 def overlap(first: np.ndarray, second: np.ndarray) -> float:

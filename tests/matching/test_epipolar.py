@@ -154,7 +154,7 @@ def test_epipolar_map_agrees_with_drawn_lines(name: str) -> None:
     members = type(members)(members.view_index, members.boxes, members.crops, 3, members.labels)
     width, height = 320, 240
     v, u = torch.meshgrid(torch.arange(height) + 0.5, torch.arange(width) + 0.5, indexing="ij")
-    ours = epipolar_map(members, cameras, 2, torch.stack((u, v), -1).reshape(-1, 2)).reshape(height, width)
+    ours = epipolar_map(members, cameras, view=2, xy=torch.stack((u, v), -1).reshape(-1, 2)).reshape(height, width)
     drawn = epipolar_map_reference(members, cameras, 2)
     assert ours.unique().numel() >= 2
     inside_both = (ours.numpy() > 0) & (drawn > 0)
@@ -178,7 +178,7 @@ def test_bands_of_the_own_view_are_empty_and_true_matches_lie_in_each_others_ban
     for view in range(4):
         here = regions.select(regions.view_index == view)
         xy, owner, _ = here.pixels()
-        bands = epipolar_bands(regions, scene.cameras, view, xy)
+        bands = epipolar_bands(regions, scene.cameras, view=view, xy=xy)
         assert not bands[regions.view_index == view].any()
         for number, label in enumerate(here.labels.tolist()):
             same = bands[(regions.labels == label) & (regions.view_index != view)][:, owner == number]
@@ -189,8 +189,8 @@ def test_a_map_without_members_elsewhere_is_zero() -> None:
     scene = ball_scene(3, 3)
     alone = scene.regions.select(scene.regions.view_index == 0)
     xy = torch.tensor([[10.5, 10.5], [160.5, 120.5]])
-    assert epipolar_map(alone, scene.cameras, 0, xy).tolist() == [0.0, 0.0]
-    assert epipolar_map(alone, scene.cameras, 1, torch.zeros(0, 2)).shape == (0,)
+    assert epipolar_map(alone, scene.cameras, view=0, xy=xy).tolist() == [0.0, 0.0]
+    assert epipolar_map(alone, scene.cameras, view=1, xy=torch.zeros(0, 2)).shape == (0,)
 
 
 def test_an_arc_of_cameras_has_distinct_places() -> None:

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from sklearn.metrics import adjusted_rand_score
 
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.nview.cluster_scores import Costs
+from mvseg.matching.nview.cluster_scores import ClusterScores
+from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.label_rows import row_table
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.nview.merged_masks import second_part
-from mvseg.matching.one_per_view import dense_ids
+from mvseg.matching.one_per_view import ViewGraph
+from mvseg.partition import renumber
 from synthetic import ball_scene, merged_balls
 
 
@@ -20,12 +23,13 @@ def test_a_mask_that_covers_two_instances_is_found_and_no_other() -> None:
     rest = torch.arange(len(regions)) != region
     found = match_nview(regions, scene.cameras, region_affinity(regions, scene.cameras))
     assert adjusted_rand_score(found.instance_ids[rest], regions.labels[rest]) == 1
-    assert len(found.support) == 6
+    assert found.num_instances == 6
     instances = [int(found.instance_ids[rest][regions.labels[rest] == number][0]) for number in numbers]
-    assert found.merged[:, 0].tolist() == [region]
-    assert sorted(found.merged[0, 1:].tolist()) == sorted(instances)
-    assert found.merged[0, 1] == found.instance_ids[region]
-    assert found.merged_parts[0].shape == regions.crop(region).shape
+    (merged,) = found.merged
+    assert merged.region == region
+    assert sorted((merged.own, merged.other)) == sorted(instances)
+    assert merged.own == found.instance_ids[region]
+    assert merged.part.shape == regions.crop(region).shape
 
 
 def test_either_ball_is_the_part_that_the_true_image_shows() -> None:
@@ -35,11 +39,13 @@ def test_either_ball_is_the_part_that_the_true_image_shows() -> None:
     x1, y1, x2, y2 = regions.boxes[region].tolist()
     true = torch.from_numpy(scene.label_maps[int(regions.view_index[region])][y1:y2, x1:x2])
     mask, table = regions.crop(region), row_table(regions, scene.cameras)
+    no_weights = ViewGraph(np.zeros((len(regions), len(regions))), table.view_index, table.num_views)
+    scores = ClusterScores(table, no_weights, NViewConfig())
     for own, other in (numbers, numbers[::-1]):
         labels = regions.labels.clone()
         labels[region] = own
-        ids = dense_ids(labels.numpy())
-        second = int(ids[(labels == other).nonzero()[0, 0]])
-        part = second_part(regions, table, ids, region, second, Costs())
+        clusters = renumber(labels.numpy())
+        second = int(clusters[(labels == other).nonzero()[0, 0]])
+        part = second_part(scores, clusters, regions, region=region, second=second)
         assert not part[~mask].any()
         assert ((true == other) == part)[mask].double().mean() > 0.9

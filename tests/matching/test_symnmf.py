@@ -7,7 +7,7 @@ from sklearn.metrics import adjusted_rand_score
 
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.symnmf import cluster_affinity, factorise, renumber, size_spread
+from mvseg.matching.symnmf import cluster_affinity, factorise, size_spread
 from reference import factorise_reference
 
 
@@ -112,10 +112,3 @@ def test_eq_7_by_hand() -> None:
     assert size_spread(torch.tensor([0, 0, 1, 1]), 2) == 0
     assert size_spread(torch.tensor([0, 0, 0, 1]), 2) == pytest.approx(2**0.5)  # sizes 3, 1 about 2
     assert size_spread(torch.tensor([0, 0, 0]), 3) == pytest.approx(6**0.5)  # sizes 3, 0, 0 about 1
-
-
-def test_renumber_keeps_the_partition_and_counts_from_the_first() -> None:
-    assert renumber(torch.tensor([7, 7, 3, -1, 9, 3])).tolist() == [0, 0, 1, -1, 2, 1]
-    assert renumber(torch.tensor([-1, -1])).tolist() == [-1, -1]
-    once = renumber(torch.tensor([4, 2, 4, 0]))
-    assert torch.equal(renumber(once), once)

@@ -9,8 +9,10 @@ from torchvision.ops import box_iou
 
 from mvseg.detectors.mask_cut import decide_masks
 from mvseg.errors import InputError
-from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN, Proposals, gather_proposals, match_proposals
+from mvseg.multiview.loop import match_proposals
+from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.nms import cluster_aware_nms
+from mvseg.multiview.proposals import Proposals, gather_proposals
 from mvseg.regions import regions_from_label_maps
 from mvseg.simulation.proposals import simulate_proposals
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
@@ -103,7 +105,7 @@ def test_with_cameras_the_usual_dicts_and_ids() -> None:
         assert count <= 20
         assert (one["scores"].diff() <= 0).all()
         assert not one["boxes"].requires_grad
-    assert max(int(one["instance_ids"].max()) for one in found) >= 0
+    assert max(int(one["instance_ids"].max()) for one in found) >= 1
     classes: dict[int, set[int]] = {}
     for one in found:
         for instance, label in zip(one["instance_ids"].tolist(), one["labels"].tolist(), strict=True):
@@ -140,13 +142,12 @@ def test_boxes_that_the_other_views_do_not_confirm_go(monkeypatch: pytest.Monkey
     wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(), small_cameras()
     before, _ = wrapped.find_regions(images, cameras)
 
-    def refuse_first(boxes: torch.Tensor, *others: torch.Tensor, iou_threshold: float) -> torch.Tensor:
+    def refuse_first(boxes: torch.Tensor, *others: torch.Tensor, **options: object) -> torch.Tensor:
         return torch.arange(len(boxes)) > 0
 
-    monkeypatch.setattr("mvseg.multiview.mask_rcnn.confirmed", refuse_first)
+    monkeypatch.setattr("mvseg.multiview.loop.confirmed", refuse_first)
     after, matching = wrapped.find_regions(images, cameras)
-    confirm_all = lambda boxes, *others, iou_threshold: torch.ones(len(boxes)) > 0  # noqa: E731
-    monkeypatch.setattr("mvseg.multiview.mask_rcnn.confirmed", confirm_all)
+    monkeypatch.setattr("mvseg.multiview.loop.confirmed", lambda boxes, *_, **__: torch.ones(len(boxes)) > 0)
     unasked, _ = wrapped.find_regions(images, cameras)
     assert len(after.scores) == len(unasked.scores) - 1 == len(matching.instance_ids)
     assert len(before.scores) <= len(unasked.scores)
@@ -238,14 +239,15 @@ def test_classes_are_matched_apart_and_what_is_known_of_both_is_kept() -> None:
     assert matching.support is not None
     assert len(matching.support) == matching.num_instances == 6
     assert matching.residual_px == 1
-    for instance in range(6):
+    for instance in range(1, 7):
         (classes_of,) = {tuple(proposals.classes[keep][matching.instance_ids == instance].unique().tolist())}
         assert len(classes_of) == 1
-    ((region, own, other),) = matching.merged.tolist()
-    assert labels[region] == large
-    assert matching.instance_ids[region] == own
-    assert matching.merged_parts[0].shape == proposals.regions.crop(int(keep[region])).shape
-    assert {int(labels[matching.instance_ids == one].mode().values) for one in (own, other)} == {small, large}
+    (merged,) = matching.merged
+    assert labels[merged.region] == large
+    assert matching.instance_ids[merged.region] == merged.own
+    assert merged.part.shape == proposals.regions.crop(int(keep[merged.region])).shape
+    shown = [int(labels[matching.instance_ids == number].mode().values) for number in (merged.own, merged.other)]
+    assert sorted(shown) == sorted((small, large))
 
 
 def test_at_most_so_many_detections_per_view() -> None:
@@ -268,7 +270,7 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
         found = wrapped(some_images(), cameras=small_cameras())
         proposals, matching = wrapped.find_regions(some_images(), small_cameras())
     assert found[0]["match_scores"].dtype == torch.float32
-    assert max(int(one["instance_ids"].max()) for one in found) >= 0
+    assert max(int(one["instance_ids"].max()) for one in found) >= 1
     assert torch.equal(matching.match_scores, torch.cat([one["match_scores"] for one in found]))
     boxes = proposals.boxes[proposals.boxes > 16]
     assert not torch.equal(boxes, boxes.bfloat16().float())

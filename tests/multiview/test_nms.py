@@ -7,7 +7,8 @@ import torch
 import torchvision
 
 from mvseg.errors import InputError
-from mvseg.multiview.nms import EpipolarAssignment, cluster_aware_nms, confirmed, ruzicka_similarity
+from mvseg.multiview.assignment import EpipolarAssignment, ruzicka_similarity
+from mvseg.multiview.nms import cluster_aware_nms, confirmed
 from reference import cluster_aware_nms_reference, confirmed_reference, epipolar_map_reference, ruzicka_reference
 from synthetic import ball_scene
 
@@ -21,11 +22,11 @@ def random_boxes(count: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]
 
 def test_similarity_agrees_with_drawn_maps() -> None:
     scene = ball_scene(4, 4, seed=3, focal=200.0, width=160, height=120)
-    ids = scene.regions.labels - 1
-    similarity = ruzicka_similarity(scene.regions, scene.regions, ids, scene.cameras)
+    ids = scene.regions.labels
+    similarity = ruzicka_similarity(scene.regions, scene.regions, ids, cameras=scene.cameras)
     assert similarity.shape == (len(scene.regions), 4)
     for view in (0, 2):
-        maps = [epipolar_map_reference(scene.regions.select(ids == k), scene.cameras, view) for k in range(4)]
+        maps = [epipolar_map_reference(scene.regions.select(ids == k), scene.cameras, view) for k in range(1, 5)]
         for n in (scene.regions.view_index == view).nonzero()[:, 0].tolist():
             mask = scene.regions.mask(n, 160, 120).numpy()
             for k in range(4):
@@ -34,37 +35,39 @@ def test_similarity_agrees_with_drawn_maps() -> None:
 
 def test_thinned_masks_give_nearly_the_same_similarity() -> None:
     scene = ball_scene(6, 4, seed=3)
-    ids = scene.regions.labels - 1
-    exact = ruzicka_similarity(scene.regions, scene.regions, ids, scene.cameras)
-    thinned = ruzicka_similarity(scene.regions, scene.regions, ids, scene.cameras, max_pixels=256)
+    ids = scene.regions.labels
+    exact = ruzicka_similarity(scene.regions, scene.regions, ids, cameras=scene.cameras)
+    thinned = ruzicka_similarity(scene.regions, scene.regions, ids, cameras=scene.cameras, max_pixels=256)
     torch.testing.assert_close(thinned, exact, atol=0.02, rtol=0)
 
 
 def test_true_regions_are_assigned_to_their_own_cluster() -> None:
     scene = ball_scene(6, 5, seed=2)
-    clusters, similarity = EpipolarAssignment()(scene.regions, scene.regions, scene.regions.labels - 1, scene.cameras)
-    assert (clusters == scene.regions.labels - 1).float().mean() > 0.9
+    clusters, similarity = EpipolarAssignment()(
+        scene.regions, scene.regions, scene.regions.labels, cameras=scene.cameras
+    )
+    assert (clusters == scene.regions.labels).float().mean() > 0.9
     assert ((similarity > 0) & (similarity <= 1)).all()
 
 
 def test_the_clusters_may_be_numbered_in_any_way() -> None:
     scene = ball_scene(5, 4, seed=2)
     permutation = torch.tensor([3, 0, 4, 2, 1])
-    ids = scene.regions.labels - 1
-    similarity = ruzicka_similarity(scene.regions, scene.regions, ids, scene.cameras)
-    renamed = ruzicka_similarity(scene.regions, scene.regions, permutation[ids], scene.cameras)
+    ids = scene.regions.labels
+    similarity = ruzicka_similarity(scene.regions, scene.regions, ids, cameras=scene.cameras)
+    renamed = ruzicka_similarity(scene.regions, scene.regions, permutation[ids - 1] + 1, cameras=scene.cameras)
     torch.testing.assert_close(renamed[:, permutation], similarity, atol=1e-5, rtol=0)
 
 
 def test_unmatched_regions_make_no_map_and_no_cluster_means_no_assignment() -> None:
     scene = ball_scene(3, 3, seed=2)
     clusters, similarity = EpipolarAssignment()(
-        scene.regions, scene.regions, torch.full((len(scene.regions),), -1), scene.cameras
+        scene.regions, scene.regions, torch.full((len(scene.regions),), -1), cameras=scene.cameras
     )
     assert clusters.unique().tolist() == [-1]
     assert similarity.max() == 0
-    only_view_0 = torch.where(scene.regions.view_index == 0, 0, -1)
-    clusters, _ = EpipolarAssignment()(scene.regions, scene.regions, only_view_0, scene.cameras)
+    only_view_0 = torch.where(scene.regions.view_index == 0, 1, -1)
+    clusters, _ = EpipolarAssignment()(scene.regions, scene.regions, only_view_0, cameras=scene.cameras)
     assert (clusters[scene.regions.view_index == 0] == -1).all()  # its only member is in the same view
 
 
@@ -115,10 +118,10 @@ def test_an_overlap_is_settled_by_the_other_views() -> None:
     ids = torch.tensor([3, 3, 4, 5, -1, 3])
     scores = torch.tensor([0.2, 0.9, 0.9, 0.4, 0.0, 0.1])
     # the best; the same instance; surely another; not sure; nothing; alone in its view
-    assert confirmed(box, groups, ids, scores).tolist() == [True, False, True, False, False, True]
+    assert confirmed(box, groups, ids, match_scores=scores).tolist() == [True, False, True, False, False, True]
     apart = box + 20 * torch.arange(6)[:, None]
-    assert confirmed(apart, groups, ids, scores).all()
-    assert confirmed(box[:0], groups[:0], ids[:0], scores[:0]).shape == (0,)
+    assert confirmed(apart, groups, ids, match_scores=scores).all()
+    assert confirmed(box[:0], groups[:0], ids[:0], match_scores=scores[:0]).shape == (0,)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
@@ -126,9 +129,10 @@ def test_confirmed_agrees_with_a_loop(seed: int) -> None:
     boxes, scores = random_boxes(120, seed)
     generator = torch.Generator().manual_seed(seed)
     groups = torch.randint(2, (120, 2), generator=generator)
-    ids = torch.randint(-1, 9, (120,), generator=generator)
-    stays = confirmed(boxes, groups, ids, scores)
+    ids = torch.randint(0, 10, (120,), generator=generator)
+    ids[ids == 0] = -1
+    stays = confirmed(boxes, groups, ids, match_scores=scores)
     assert stays.tolist() == confirmed_reference(boxes, groups, ids, scores, 0.3, 0.5)
     assert 10 < stays.sum() < 110
-    again = confirmed(boxes[stays], groups[stays], ids[stays], scores[stays])
+    again = confirmed(boxes[stays], groups[stays], ids[stays], match_scores=scores[stays])
     assert again.all()  # idempotent

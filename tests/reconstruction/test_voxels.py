@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.config import ReconstructConfig
 from mvseg.errors import InputError, InputWarning
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import back_project, reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -37,12 +37,12 @@ def test_volume_of_what_cylinders_have_in_common(num_views: int, volume: float) 
     regions, cameras = ball_from(AXES[:num_views])
     errors = []
     for size in (0.2, 0.1, 0.05, 0.025):
-        grid = back_project(regions, cameras, ReconstructConfig(threshold=0.9, voxel_size=size))
+        grid = back_project(regions, cameras, config=ReconstructConfig(threshold=0.9, voxel_size=size))
         assert grid is not None
         errors.append(abs(grid.volume - volume) / volume)
     assert errors[-1] < 0.01
     assert errors[-1] < errors[0]
-    fine = back_project(regions, cameras, ReconstructConfig(threshold=0.9, voxel_size=0.05))
+    fine = back_project(regions, cameras, config=ReconstructConfig(threshold=0.9, voxel_size=0.05))
     assert fine is not None
     mesh = fine.mesh()
     assert mesh.is_watertight
@@ -55,8 +55,8 @@ def test_many_views_carve_the_ball_and_half_of_them_leave_more() -> None:
     directions = torch.nn.functional.normalize(torch.randn(24, 3, generator=generator), dim=1)
     regions, cameras = ball_from(directions.tolist())
     ball = 4 / 3 * math.pi
-    strict = back_project(regions, cameras, ReconstructConfig(threshold=0.97, voxel_size=0.04))
-    half = back_project(regions, cameras, ReconstructConfig(threshold=0.5, voxel_size=0.04))
+    strict = back_project(regions, cameras, config=ReconstructConfig(threshold=0.97, voxel_size=0.04))
+    half = back_project(regions, cameras, config=ReconstructConfig(threshold=0.5, voxel_size=0.04))
     assert strict is not None
     assert half is not None
     assert strict.volume == pytest.approx(ball, rel=0.12)
@@ -67,7 +67,7 @@ def test_many_views_carve_the_ball_and_half_of_them_leave_more() -> None:
 def test_votes_agree_with_points_projected_one_by_one() -> None:
     scene = ball_scene(3, 5, seed=2, focal=200.0, width=160, height=120)
     members = scene.regions.select(scene.regions.labels == 2)
-    grid = back_project(members, scene.cameras, ReconstructConfig(voxel_budget=4000))
+    grid = back_project(members, scene.cameras, config=ReconstructConfig(voxel_budget=4000))
     assert grid is not None
     index = torch.cartesian_prod(*(torch.arange(side) for side in grid.votes.shape))
     centers = grid.origin + grid.voxel_size * (index + 0.5)
@@ -80,9 +80,13 @@ def test_votes_agree_with_points_projected_one_by_one() -> None:
 def test_seen_share_agrees_with_points_projected_one_by_one() -> None:
     """It takes voxels away, none where another instance may hide the point, and changes no vote of the others."""
     scene = ball_scene(4, 6, seed=2, focal=200.0, width=160, height=120)
-    ids = scene.regions.labels - 1
-    plain = reconstruct_instances(scene.regions, ids, scene.cameras, ReconstructConfig(voxel_size=0.1, seen_share=0))
-    seen = reconstruct_instances(scene.regions, ids, scene.cameras, ReconstructConfig(voxel_size=0.1, seen_share=0.8))
+    ids = scene.regions.labels
+    plain, seen = (
+        reconstruct_instances(
+            scene.regions, ids, scene.cameras, config=ReconstructConfig(voxel_size=0.1, seen_share=share)
+        )
+        for share in (0, 0.8)
+    )
     removed = 0
     for instance, grid in seen.items():
         index = torch.cartesian_prod(*(torch.arange(side) for side in grid.votes.shape))
@@ -104,7 +108,7 @@ def test_what_stands_behind_something_is_not_carved_away() -> None:
         columns = np.nonzero(labels)[1]
         labels[:, : int(columns.mean())] = 2  # a wall in front of the left half
     regions = regions_from_label_maps(maps)
-    ids = torch.where(regions.labels == 1, 0, -1)
+    ids = torch.where(regions.labels == 1, 1, -1)
     ball = 4 / 3 * math.pi
     volumes = {}
     for name, config in {
@@ -112,7 +116,7 @@ def test_what_stands_behind_something_is_not_carved_away() -> None:
         "all masks": ReconstructConfig(voxel_size=0.08, seen_share=0, threshold=0.9),
         "seen": ReconstructConfig(voxel_size=0.08, seen_share=0.9),
     }.items():
-        volumes[name] = reconstruct_instances(regions, ids, cameras, config)[0].volume / ball
+        volumes[name] = reconstruct_instances(regions, ids, cameras, config=config)[1].volume / ball
     assert volumes["all masks"] < 0.8
     assert 0.98 < volumes["seen"] < volumes["paper"]
 
@@ -120,10 +124,10 @@ def test_what_stands_behind_something_is_not_carved_away() -> None:
 def test_without_free_pixels_the_paper_rule_is_left() -> None:
     regions, cameras = ball_from(AXES)
     nowhere = [torch.zeros(height, width, dtype=torch.bool) for width, height in cameras.sizes.tolist()]
-    paper = back_project(regions, cameras, ReconstructConfig(voxel_size=0.1, seen_share=0))
+    paper = back_project(regions, cameras, config=ReconstructConfig(voxel_size=0.1, seen_share=0))
     assert paper is not None
     for free in (None, nowhere):
-        grid = back_project(regions, cameras, ReconstructConfig(voxel_size=0.1, seen_share=0.9), free)
+        grid = back_project(regions, cameras, config=ReconstructConfig(voxel_size=0.1, seen_share=0.9), free=free)
         assert grid is not None
         assert torch.equal(grid.votes, paper.votes)
 
@@ -132,7 +136,7 @@ def test_the_box_holds_all_that_exceeds_the_threshold() -> None:
     """The found box against a search of ten times its volume."""
     scene = ball_scene(2, 6, seed=1, focal=200.0, width=160, height=120)
     members = scene.regions.select(scene.regions.labels == 1)
-    grid = back_project(members, scene.cameras, ReconstructConfig(voxel_budget=3000))
+    grid = back_project(members, scene.cameras, config=ReconstructConfig(voxel_budget=3000))
     assert grid is not None
     generator = torch.Generator().manual_seed(0)
     low, high = grid.origin, grid.origin + grid.voxel_size * torch.tensor(grid.votes.shape)
@@ -149,7 +153,7 @@ def test_thin_leaves_are_not_lost_by_the_search() -> None:
     maps = [np.zeros((320, 320), np.int64) for _ in range(2)]
     maps[0][159:161, 80:240] = 1
     maps[1][159:161, 80:240] = 1
-    grid = back_project(regions_from_label_maps(maps), cameras, ReconstructConfig(voxel_size=0.0125))
+    grid = back_project(regions_from_label_maps(maps), cameras, config=ReconstructConfig(voxel_size=0.0125))
     assert grid is not None
     assert grid.volume == pytest.approx(2 * 2 * 0.025, rel=0.15)
 
@@ -170,9 +174,9 @@ def test_a_moved_and_scaled_world_moves_and_scales_the_shape() -> None:
 def test_grids_of_one_voxel_size_share_their_lattice() -> None:
     scene = ball_scene(3, 5, seed=4)
     shapes = reconstruct_instances(
-        scene.regions, scene.regions.labels - 1, scene.cameras, ReconstructConfig(voxel_size=0.07)
+        scene.regions, scene.regions.labels, scene.cameras, config=ReconstructConfig(voxel_size=0.07)
     )
-    assert sorted(shapes) == [0, 1, 2]
+    assert sorted(shapes) == [1, 2, 3]
     for grid in shapes.values():
         steps = grid.origin / 0.07
         torch.testing.assert_close(steps, steps.round(), atol=1e-6, rtol=0)
@@ -180,11 +184,11 @@ def test_grids_of_one_voxel_size_share_their_lattice() -> None:
 
 def test_pieces_of_a_split_mask_vote_as_one() -> None:
     regions, cameras = ball_from(AXES)
-    maps = [regions.label_map(view, regions.labels, 320, 320).numpy() for view in range(3)]
+    maps = [regions.label_map(view, regions.labels, (320, 320)).numpy() for view in range(3)]
     maps[0][:, 160:] *= 2
     pieces = regions_from_label_maps(maps)
     assert len(pieces) == 4
-    whole, joined = (back_project(r, cameras, ReconstructConfig(voxel_size=0.1)) for r in (regions, pieces))
+    whole, joined = (back_project(r, cameras, config=ReconstructConfig(voxel_size=0.1)) for r in (regions, pieces))
     assert whole is not None
     assert joined is not None
     assert torch.equal(whole.votes, joined.votes)
@@ -193,27 +197,28 @@ def test_pieces_of_a_split_mask_vote_as_one() -> None:
 def test_what_has_no_bounded_shape_is_left_out() -> None:
     regions, cameras = ball_from(AXES)
     assert back_project(regions.select(torch.tensor([1])), cameras) is None
-    assert reconstruct_instances(regions, torch.tensor([0, -1, -1]), cameras) == {}
+    assert reconstruct_instances(regions, torch.tensor([1, -1, -1]), cameras) == {}
     maps = [np.zeros((320, 320), np.int64) for _ in range(2)]
     maps[0][0:20, 0:20] = 1  # two masks that look past each other
     maps[1][300:320, 0:20] = 1
     apart = regions_from_label_maps(maps)
     with pytest.warns(InputWarning, match="instance 1 has no shape"):
-        assert reconstruct_instances(apart, torch.tensor([0, 0]), cameras[:2]) == {}
+        assert reconstruct_instances(apart, torch.tensor([1, 1]), cameras[:2]) == {}
 
 
 def test_nearly_parallel_views_are_cut_not_lost() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0.01, 0]]))
     maps = render_balls(cameras, torch.zeros(1, 3).double(), torch.ones(1).double())
     with pytest.warns(InputWarning, match="cut off"):
-        grid = back_project(regions_from_label_maps(maps), cameras, ReconstructConfig(voxel_budget=20_000))
+        grid = back_project(regions_from_label_maps(maps), cameras, config=ReconstructConfig(voxel_budget=20_000))
     assert grid is not None
     assert 0 < grid.volume < 1e5
 
 
 def test_an_empty_grid_has_an_empty_mesh() -> None:
     regions, cameras = ball_from(AXES)
-    grid = back_project(regions, cameras, ReconstructConfig(voxel_size=8.0))  # one voxel, its centre beside the ball
+    # one voxel, its centre beside the ball
+    grid = back_project(regions, cameras, config=ReconstructConfig(voxel_size=8.0))
     assert grid is not None
     assert not grid.occupied.any()
     assert grid.volume == 0
@@ -223,7 +228,7 @@ def test_an_empty_grid_has_an_empty_mesh() -> None:
 def test_an_instance_without_a_voxel_is_left_out_and_warned_of() -> None:
     regions, cameras = ball_from(AXES)
     with pytest.warns(InputWarning, match="instance 1 has no shape"):
-        assert reconstruct_instances(regions, regions.labels - 1, cameras, ReconstructConfig(voxel_size=8.0)) == {}
+        assert reconstruct_instances(regions, regions.labels, cameras, config=ReconstructConfig(voxel_size=8.0)) == {}
 
 
 @pytest.mark.parametrize(
@@ -240,7 +245,7 @@ def test_an_instance_without_a_voxel_is_left_out_and_warned_of() -> None:
 def test_impossible_resolutions_are_refused(config: dict[str, float], message: str) -> None:
     regions, cameras = ball_from(AXES[:2])
     with pytest.raises(InputError, match=message):
-        back_project(regions, cameras, ReconstructConfig(**config))
+        back_project(regions, cameras, config=ReconstructConfig(**config))
 
 
 def test_a_minority_of_wrong_masks_does_not_cost_the_shape() -> None:
@@ -259,8 +264,8 @@ def test_masks_without_a_pixel_do_not_vote_and_ids_must_fit() -> None:
     nothing = torch.zeros_like(regions.crop(2)).flatten()
     crops = torch.cat((regions.crop(0).flatten(), regions.crop(1).flatten(), nothing))
     emptied = Regions(regions.view_index, regions.boxes, crops, 3, regions.labels)
-    grid = back_project(emptied, cameras, ReconstructConfig(voxel_size=0.1))
+    grid = back_project(emptied, cameras, config=ReconstructConfig(voxel_size=0.1))
     assert grid is not None
     assert grid.num_views == 2
     with pytest.raises(InputError, match="2 instance ids for 3 regions"):
-        reconstruct_instances(regions, torch.tensor([0, 0]), cameras)
+        reconstruct_instances(regions, torch.tensor([1, 1]), cameras)

@@ -14,16 +14,19 @@ import torch
 import trimesh
 
 import mvseg.results.folder
-from mvseg.config import ReconstructConfig
+from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.rig import opencv_lens
 from mvseg.formats.scene_folder import load_masks
-from mvseg.matching.match_regions import Matching
+from mvseg.matching.result import MergedMask
 from mvseg.pipeline import run_scene
-from mvseg.results.folder import Result, check_out, read_instances, save_result
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.results.folder import check_out, save_result
 from mvseg.results.overlay import instance_color
+from mvseg.results.read import read_instances
+from mvseg.results.result import Result
 from scene_folders import (
     BALLS,
     HEIGHT,
@@ -65,7 +68,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(plant: Path) -> Result:
-    return run_scene(plant, plant / "masks", reconstruct=ReconstructConfig(voxel_budget=8000))
+    return run_scene(plant, plant / "masks", RunConfig(reconstruct=ReconstructConfig(voxel_budget=8000)))
 
 
 @pytest.fixture(scope="module")
@@ -76,7 +79,7 @@ def saved(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def ids_only(result: Result) -> Result:
-    return Result(result.scene, result.regions, result.matching)
+    return replace(result, shapes=None)
 
 
 def files_below(folder: Path) -> set[str]:
@@ -103,8 +106,9 @@ class TestContent:
         assert list(saved.parent.iterdir()) == [saved]
 
     def test_what_the_matcher_is_unsure_of_is_said(self, result: Result, tmp_path: Path) -> None:
-        merged, support = torch.tensor([[3, 0, 2]]), torch.tensor([4, 3, 2])
-        matching = replace(result.matching, merged=merged, support=support, residual_px=2)
+        part = torch.zeros_like(result.regions.crop(3))
+        merged = (MergedMask(region=3, own=1, other=3, part=part),)
+        matching = replace(result.matching, merged=merged, support=torch.tensor([4, 3, 2]), residual_px=2)
         save_result(replace(result, matching=matching), tmp_path / "out", {})
         found = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         others = {index: one["other_instance_id"] for index, one in enumerate(found) if "other_instance_id" in one}
@@ -119,13 +123,13 @@ class TestContent:
         image = cv2.imread(str(saved / "labels" / "000.png"), cv2.IMREAD_UNCHANGED)
         assert (image.dtype, image.shape) == (np.uint16, (HEIGHT, WIDTH))
 
-    def test_labels_are_ids_plus_one_in_the_frame_of_the_photo(self, saved: Path, plant: Path, result: Result) -> None:
+    def test_labels_are_ids_in_the_frame_of_the_photo(self, saved: Path, plant: Path, result: Result) -> None:
         for view in range(4):
             labels = read_label_png(saved / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
             masks = read_label_png(plant / "masks" / f"{view:03d}.png", WIDTH, HEIGHT)
             expected = np.zeros_like(masks)
             for index in (result.regions.view_index == view).nonzero()[:, 0].tolist():
-                expected[masks == int(result.regions.labels[index])] = result.matching.instance_ids[index] + 1
+                expected[masks == int(result.regions.labels[index])] = result.matching.instance_ids[index]
             if view == DISTORTED:  # there and back through the lens
                 assert (labels != expected).mean() < 0.01
             else:
@@ -138,7 +142,7 @@ class TestContent:
         for index, one in enumerate(content["annotations"]):
             view = one["image_id"] - 1
             labels = read_label_png(saved / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
-            assert one["instance_id"] == result.matching.instance_ids[index] + 1
+            assert one["instance_id"] == result.matching.instance_ids[index]
             assert (labels == one["instance_id"]).sum() == one["area"]
             assert 0 < one["match_score"] <= 1
             assert one["source_label"] == result.regions.labels[index]
@@ -165,7 +169,7 @@ class TestContent:
             np.testing.assert_allclose(mesh.bounds, [low, high], atol=1.5)
             ball = label_of_balls(saved, plant)[0].index(leaf)
             np.testing.assert_allclose((np.array(low) + high) / 2, BALLS[ball], atol=2)
-            np.testing.assert_array_equal(mesh.visual.vertex_colors[0], [*instance_color(leaf - 1), 255])
+            np.testing.assert_array_equal(mesh.visual.vertex_colors[0], [*instance_color(leaf), 255])
 
     def test_pictures(self, saved: Path, plant: Path) -> None:
         for view in range(4):
@@ -197,9 +201,9 @@ class TestVariants:
 
     def test_unmatched_regions(self, result: Result, tmp_path: Path) -> None:
         ids = result.matching.instance_ids.clone()
-        ids[ids == 1] = -1
-        matching = Matching(ids, result.matching.match_scores, 3, "nview")
-        save_result(Result(result.scene, result.regions, matching), tmp_path / "out", {})
+        ids[ids == 2] = -1
+        matching = replace(result.matching, instance_ids=ids)
+        save_result(replace(result, matching=matching, shapes=None), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         assert [one["instance_id"] for one in annotations].count(-1) == 4
         assert {one["instance_id"] for one in annotations} == {-1, 1, 3}
@@ -208,8 +212,8 @@ class TestVariants:
 
     def test_an_instance_without_shape_has_a_row_but_no_mesh(self, result: Result, tmp_path: Path) -> None:
         assert result.shapes is not None
-        shapes = {instance: grid for instance, grid in result.shapes.items() if instance != 1}
-        save_result(Result(result.scene, result.regions, result.matching, shapes), tmp_path / "out", {})
+        shapes = {instance: grid for instance, grid in result.shapes.items() if instance != 2}
+        save_result(replace(result, shapes=shapes), tmp_path / "out", {})
         rows = read_rows(tmp_path / "out")
         assert [row["id"] for row in rows] == ["1", "2", "3"]
         assert [row["volume"] == "" for row in rows] == [False, True, False]
@@ -217,7 +221,7 @@ class TestVariants:
 
     def test_without_photos_overlays_are_drawn_on_grey(self, tmp_path: Path) -> None:
         plant = write_scene(tmp_path / "plant", images=False)
-        save_result(run_scene(plant, plant / "masks"), tmp_path / "out", {})
+        save_result(run_scene(plant, plant / "masks", RunConfig(reconstruct=None)), tmp_path / "out", {})
         assert files_below(tmp_path / "out") == IDS_FILES
         overlay = cv2.imread(str(tmp_path / "out" / "overlay" / "000.png"))
         assert overlay[0, 0].tolist() == [40, 40, 40]
@@ -230,7 +234,7 @@ class TestVariants:
             rig["views"][view]["file"] = f"images/{name}.jpg"
             write_image(plant / "masks" / f"{name}.png", draw_labels(*arc_pose(view, 4)))
         (plant / "cameras.json").write_text(json.dumps(rig))
-        result = run_scene(plant, plant / "masks")
+        result = run_scene(plant, plant / "masks", RunConfig(reconstruct=None))
         save_result(result, tmp_path / "out", {})
         for kind in ("labels", "overlay"):
             assert files_below(tmp_path / "out" / kind) == {f"{name}.png" for name in names}
@@ -247,13 +251,13 @@ class TestBrokenPhotos:
     def test_one_missing_photo(self, plant: Path, tmp_path: Path) -> None:
         (plant / "images" / "002.png").unlink()
         with pytest.raises(InputError, match=r"002\.png: the image of view 2 is missing"):
-            save_result(run_scene(plant, plant / "masks"), tmp_path / "out", {})
+            save_result(run_scene(plant, plant / "masks", RunConfig(reconstruct=None)), tmp_path / "out", {})
         assert [path.name for path in tmp_path.iterdir()] == ["plant"]
 
     def test_cut_photo(self, plant: Path, tmp_path: Path) -> None:
         cut_file(plant / "images" / "002.png", 0.8)
         with pytest.raises(InputError, match=r"002\.png: the image of view 2 cannot be read"):
-            save_result(run_scene(plant, plant / "masks"), tmp_path / "out", {})
+            save_result(run_scene(plant, plant / "masks", RunConfig(reconstruct=None)), tmp_path / "out", {})
         assert [path.name for path in tmp_path.iterdir()] == ["plant"]
 
 
@@ -270,11 +274,11 @@ class TestWholeOrNotAtAll:
     ) -> None:
         original, calls = getattr(mvseg.results.folder, writer), []
 
-        def fail_at_the_second_call(*args: object) -> object:
+        def fail_at_the_second_call(*args: object, **named: object) -> object:
             calls.append(args)
             if len(calls) == 2 or writer in ("draw_contact_sheet", "write_coco", "write_glb"):
                 raise error
-            return original(*args)
+            return original(*args, **named)
 
         monkeypatch.setattr(mvseg.results.folder, writer, fail_at_the_second_call)
         expected = InputError if isinstance(error, OSError) else type(error)
@@ -307,7 +311,7 @@ class TestWholeOrNotAtAll:
         rename = Path.rename
 
         def fail_into_place(self: Path, target: Path) -> Path:
-            if target == tmp_path / "out" and not self.name.endswith(".earlier"):
+            if target == tmp_path / "out" and ".earlier" not in self.name:
                 raise OSError(5, "Input/output error")
             return rename(self, target)
 

@@ -9,10 +9,20 @@ import numpy as np
 import pytest
 import torch
 
+from mvseg.matching.result import Matching
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.overlay import MAX_SIDE, TILE_WIDTH, UNMATCHED, draw_contact_sheet, draw_overlay, instance_color
 
 GREY = np.full((200, 300, 3), 90, np.uint8)
+
+
+def matching(ids: list[int], scores: list[float] | None = None) -> Matching:
+    return Matching(
+        instance_ids=torch.tensor(ids),
+        match_scores=torch.tensor(scores or [0.9] * len(ids)),
+        num_instances=max(ids),
+        method="nview",
+    )
 
 
 @pytest.fixture
@@ -24,7 +34,7 @@ def regions() -> Regions:
 
 
 def test_colours_differ() -> None:
-    colors = [instance_color(instance) for instance in range(40)]
+    colors = [instance_color(instance) for instance in range(1, 41)]
     assert len(set(colors)) == 40
     assert instance_color(-1) == UNMATCHED
     assert UNMATCHED not in colors
@@ -34,9 +44,9 @@ def test_colours_differ() -> None:
 
 
 def test_an_instance_has_one_colour_in_every_view(regions: Regions) -> None:
-    ids = torch.tensor([4, 0, 4, 0])
-    first, second = (draw_overlay(GREY, regions, ids, view) for view in (0, 1))
-    tint = (0.45 * 90 + 0.55 * np.array(instance_color(4))).astype(np.uint8)
+    ids = matching([5, 1, 5, 1])
+    first, second = (draw_overlay(GREY, regions, ids, view=view) for view in (0, 1))
+    tint = (0.45 * 90 + 0.55 * np.array(instance_color(5))).astype(np.uint8)
     assert (first[30:50, 30:50] == tint).all()
     assert (second[30:50, 250:270] == tint).all()
     assert (first[:, 190:] == 90).all()  # outside nothing changes
@@ -48,23 +58,23 @@ def test_the_small_one_is_on_top(regions: Regions) -> None:
     labels[20:180, 20:180] = 1
     below = regions_from_label_maps([labels])
     both = Regions(
-        torch.zeros(2, dtype=torch.int64),
-        torch.cat((regions.boxes[1:2], below.boxes)),
-        torch.cat((regions.crop(1).flatten(), below.crops)),
-        1,
-        torch.tensor([1, 2]),
+        view_index=torch.zeros(2, dtype=torch.int64),
+        boxes=torch.cat((regions.boxes[1:2], below.boxes)),
+        crops=torch.cat((regions.crop(1).flatten(), below.crops)),
+        num_views=1,
+        labels=torch.tensor([1, 2]),
     )
-    painted = draw_overlay(GREY, both, torch.tensor([0, 1]), 0)
-    small = 0.45 * 90 + 0.55 * np.array(instance_color(0))
+    painted = draw_overlay(GREY, both, matching([1, 2]), view=0)
+    small = 0.45 * 90 + 0.55 * np.array(instance_color(1))
     assert np.abs(painted[62:64, 62:64] - small).max() <= 1
 
 
 def test_unmatched_regions_are_grey_and_without_number(regions: Regions) -> None:
-    painted = draw_overlay(GREY, regions, torch.tensor([-1, -1, 0, 0]), 0)
+    painted = draw_overlay(GREY, regions, matching([-1, -1, 1, 1]), view=0)
     assert (painted[..., 0] == painted[..., 1]).all()
     assert (painted[..., 1] == painted[..., 2]).all()
     assert painted.max() == UNMATCHED[0]
-    numbered = draw_overlay(GREY, regions, torch.tensor([-1, -1, 0, 0]), 1)
+    numbered = draw_overlay(GREY, regions, matching([-1, -1, 1, 1]), view=1)
     assert numbered.max() == 255  # the white rim of a number
 
 
@@ -72,15 +82,15 @@ def test_large_photos_are_scaled_down() -> None:
     labels = np.zeros((1000, 4000), np.uint16)
     labels[400:600, 1000:1400] = 1
     photo = np.full((1000, 4000, 3), 90, np.uint8)
-    painted = draw_overlay(photo, regions_from_label_maps([labels]), torch.tensor([0]), 0)
+    painted = draw_overlay(photo, regions_from_label_maps([labels]), matching([1]), view=0)
     assert painted.shape == (400, MAX_SIDE, 3)
-    tint = (0.45 * 90 + 0.55 * np.array(instance_color(0))).astype(np.uint8)
+    tint = (0.45 * 90 + 0.55 * np.array(instance_color(1))).astype(np.uint8)
     assert (painted[165:170, 405:410] == tint).all()
 
 
 def test_a_view_without_regions_is_the_photo(regions: Regions) -> None:
     nothing = regions.select(regions.view_index == 1)
-    np.testing.assert_array_equal(draw_overlay(GREY, nothing, torch.tensor([0, 1]), 0), GREY)
+    np.testing.assert_array_equal(draw_overlay(GREY, nothing, matching([1, 2]), view=0), GREY)
 
 
 @pytest.mark.parametrize(("count", "columns", "rows"), [(1, 1, 1), (2, 2, 1), (5, 4, 2), (12, 4, 3), (30, 6, 5)])
@@ -105,9 +115,8 @@ def test_contact_sheet_of_odd_sizes() -> None:
 
 
 def test_unsure_matches_are_marked(regions: Regions) -> None:
-    ids = torch.tensor([0, 1, 0, 1])
-    plain = draw_overlay(GREY, regions, ids, 0)
-    sure = draw_overlay(GREY, regions, ids, 0, torch.tensor([0.5, 0.9, 0.9, 0.9]))
-    unsure = draw_overlay(GREY, regions, ids, 0, torch.tensor([0.4, 0.9, 0.9, 0.9]))
-    np.testing.assert_array_equal(sure, plain)
-    assert (unsure != plain).any()
+    sure, surer, unsure = (
+        draw_overlay(GREY, regions, matching([1, 2, 1, 2], [score, 0.9, 0.9, 0.9]), view=0) for score in (0.5, 0.9, 0.4)
+    )
+    np.testing.assert_array_equal(sure, surer)
+    assert (unsure != sure).any()

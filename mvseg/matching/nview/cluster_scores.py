@@ -1,287 +1,270 @@
-"""Stage 5c: how well clusters of regions explain what all views show.
+"""How well clusters of regions explain what all views show.
 
 A cluster explains a pixel of a region when some point of the pixel's ray shows members of the cluster in the other
-views: the rows of `rows.py`, so that neither a volume nor a surface is needed. A region's own view never counts for it.
+views: the rows of `label_rows.py`, so that neither a volume nor a surface is needed. A region's own view never counts
+for it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.label_rows import EMPTY, RowTable, run_starts
+from mvseg.matching.one_per_view import ViewGraph
+from mvseg.partition import members_of
+
+# Log-odds that two regions show one instance against their epipolar weight, on degraded masks of development plants.
+WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
+LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
+PRIOR, SPAN = 2.5, 6.0  # added to the log-odds; what divides them
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class Costs:
-    """What a view counts that does not show the cluster, when one that does counts 1; the other gains, and thresholds.
+@dataclass(frozen=True, eq=False)
+class ViewGains:
+    """What the N regions of one view gain from the K clusters that the other views form.
 
     Attributes:
-        missing: cost of no region there, although the cluster has one in this view.
-        absent: cost of no region there when the cluster has none in this view (its mask may be missed).
-        hidden: cost of the region of another cluster there; also the most that a pixel without any good row costs.
-        landing: gain of a region on which all best rows of a cluster land.
-        weight: gain of each region of a cluster whose epipolar weight exceeds 0.5 by 1, over V - 1; few views have
-            little else to go by, and there it is larger by `weight_few` / (V - 1).
-        weight_few: see `weight`.
-        alone: gain of a region in no cluster.
-        piece_landing: least landing on a left-over region that joins a cluster whose place is taken.
-        piece_score: least score of such a region, as a share of the score of the region that holds the place.
-        few: share of the views; clusters that no more of them show are doubted.
-        few_landing: least landing of a cluster on a region of such a one that it takes over.
-        merged_landing: least landing of a cluster on a region that it may share with another cluster.
-        merged_share: least share of the pixels of such a region that it alone explains.
+        clusters: (K,) int64, their numbers.
+        score: (N, K), S(n, c): see `ClusterScores.scores`.
+        landing: (N, K), share of the best rows of c that land on n.
+        total: (N, K), both and the epipolar evidence.
     """
 
-    missing: float = 0.7
-    absent: float = 0.3
-    hidden: float = 0.15
-    landing: float = 0.5
-    weight: float = 2.0
-    weight_few: float = 2.0
-    alone: float = 0.0
-    piece_landing: float = 0.05
-    piece_score: float = 0.5
-    few: float = 0.25
-    few_landing: float = 0.02
-    merged_landing: float = 0.25
-    merged_share: float = 0.2
-
-    def pair_factor(self, num_views: int) -> float:
-        """What an epipolar weight of 1.5 in place of 0.5 gains."""
-        others = max(num_views - 1, 1)
-        return (self.weight + self.weight_few / others) / others
+    clusters: Ints
+    score: Floats
+    landing: Floats
+    total: Floats
 
 
 @dataclass(frozen=True, eq=False)
-class Bounds:
-    """Where the views stand in a `RowTable`: (V + 1,) starts of their regions, pixels and rows."""
+class ClusterScores:
+    """Scores of any clusters of the D regions of one table.
 
-    regions: Ints
-    pixels: Ints
-    rows: Ints
-
-    def of(self, view: int) -> tuple[slice, slice, slice]:
-        """Regions, pixels and rows of one view."""
-        return (
-            slice(int(self.regions[view]), int(self.regions[view + 1])),
-            slice(int(self.pixels[view]), int(self.pixels[view + 1])),
-            slice(int(self.rows[view]), int(self.rows[view + 1])),
-        )
-
-
-def view_bounds(table: RowTable) -> Bounds:
-    """The bounds of all views of a table."""
-    numbers = np.arange(table.num_views + 1)
-    pixels = np.searchsorted(table.view_index[table.pixel_region], numbers)
-    return Bounds(np.searchsorted(table.view_index, numbers), pixels, np.searchsorted(table.pixel, pixels))
-
-
-@dataclass(frozen=True, eq=False)
-class Known:
-    """What was found out about clusters so far. It depends on nothing but their members, so that a cluster that stays
-    as it is need not be looked at again.
+    What is computed depends on nothing but the members of a cluster, so it is cached by members: while the search moves
+    some regions, clusters that stay as they are cost nothing.
 
     Attributes:
-        scores: by view and members in other views (their indices as bytes): (N,) float32, the scores of the view's
-            regions.
-        landings: by members: (D,) float32, where the cluster expects to be seen.
-        own: by the ids of all regions as bytes: (D,) scores of the regions in their own clusters.
+        table: rows of D regions, ordered by view.
+        graph: their epipolar weights.
+        config: costs, gains and thresholds for this number of views.
     """
 
-    scores: dict[tuple[int, bytes], Floats]
-    landings: dict[bytes, Floats]
-    own: dict[bytes, Floats]
+    table: RowTable
+    graph: ViewGraph
+    config: NViewConfig
+    _scores: dict[tuple[int, bytes], Floats] = field(default_factory=dict, init=False, repr=False)
+    _landings: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False)
+    _own: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False)
 
+    @cached_property
+    def evidence(self) -> Floats:
+        """(D, D) for (> 0) or against (< 0) each pair of regions being one instance, from its epipolar weight."""
+        return (np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + PRIOR) / SPAN
 
-def nothing_known() -> Known:
-    """To start from, for one table and its costs."""
-    return Known({}, {}, {})
+    def scores(self, view: int, clusters: Ints) -> Floats:
+        """Leave-one-out scores of the regions of one view in clusters, S(n, c).
 
+        A row scores (views that show c - hidden * views that show others - missing or absent * views that show nothing)
+        / (views that the point lies in); a pixel scores as its best row, but not below -hidden; a region as the mean of
+        its pixels, and -hidden without pixels.
 
-def members_of(ids: Ints, num_clusters: int) -> list[Ints]:
-    """The members of clusters 0 .. K - 1 in rising order; `ids` (D,) is K for regions that are in none."""
-    order = np.argsort(ids, kind="stable")
-    return np.split(order, np.searchsorted(ids[order], np.arange(1, num_clusters + 1)))[:num_clusters]
+        Args:
+            view: the view.
+            clusters: (D,) cluster of each region in [0, K), -1 for regions in no cluster that is asked for. Those of
+                the view itself do not matter.
 
+        Returns:
+            (N, K) float32 in [-hidden, 1].
+        """
+        members = self._members_elsewhere(view, clusters)
+        keys = [(view, one.tobytes()) for one in members]
+        new = [k for k, key in enumerate(keys) if key not in self._scores]
+        if new:
+            fresh = self._score_clusters(view, [members[k] for k in new])
+            self._scores.update({keys[k]: fresh[:, column] for column, k in enumerate(new)})
+        regions = self.table.bounds.regions(view)
+        return np.stack([self._scores[key] for key in keys], 1) if keys else np.zeros((regions.stop - regions.start, 0))
 
-def known_scores(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs, known: Known) -> Floats:
-    """What `score_matrix` returns, by looking only at clusters that are not known yet; they are added to `known`."""
-    num_clusters = int(ids.max(initial=0))
-    keys = [(view, members.tobytes()) for members in members_of(ids, num_clusters)]
-    new = np.array([k for k, key in enumerate(keys) if key not in known.scores], np.int64)
-    if len(new):
-        place = np.full(num_clusters + 1, len(new))
-        place[new] = np.arange(len(new))
-        fresh = score_matrix(table, place[ids], view, bounds, costs)
-        known.scores.update({keys[k]: fresh[:, i] for i, k in enumerate(new.tolist())})
-    here = bounds.of(view)[0]
-    return np.stack([known.scores[key] for key in keys], 1) if keys else np.zeros((here.stop - here.start, 0))
+    def pixel_scores(self, view: int, clusters: Ints) -> Floats:
+        """(P, K) float32: the scores of the view's P sampled pixels, see `scores`."""
+        return self._score_pixels(view, self._members_elsewhere(view, clusters))
 
+    def landings(self, clusters: Ints) -> Floats:
+        """Where clusters expect to be seen in each view, R(c, n).
 
-def score_matrix(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs) -> Floats:
-    """Leave-one-out scores of the regions of one view in some clusters, S(n, c).
+        Args:
+            clusters: (D,) cluster of each region in [0, K).
 
-    A row scores (views that show c - hidden * views that show others - missing or absent * views that show nothing)
-    / (views that the point lies in); a pixel scores as its best row, but not below -hidden; a region as the mean of its
-    pixels, and -hidden without pixels.
+        Returns:
+            (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best row shows n. The
+            best row is chosen without n's view; pixels whose best row scores below 0 do not count, and equal rows
+            share.
+        """
+        keys = [members.tobytes() for members in members_of(clusters, int(clusters.max(initial=-1)) + 1)]
+        new = np.array([k for k, key in enumerate(keys) if key not in self._landings], np.int64)
+        if len(new):
+            fresh = self._land(clusters, new)
+            self._landings.update({keys[k]: fresh[row] for row, k in enumerate(new.tolist())})
+        return np.stack([self._landings[key] for key in keys]) if keys else np.zeros((0, len(clusters)), np.float32)
 
-    Args:
-        table: rows of D regions.
-        ids: (D,) cluster of each region in [0, K); K for regions of no cluster that is asked for, and for the regions
-            of the view itself, whatever they are.
-        view: the view.
-        bounds: of the table.
-        costs: of views that do not show the cluster.
+    def landed_clusters(self) -> list[Ints]:
+        """The members of every cluster whose landings were asked for: all that a search has seen."""
+        return [np.frombuffer(key, np.int64) for key in self._landings]
 
-    Returns:
-        (N, K) float32 in [-hidden, 1].
-    """
-    best = pixel_scores(table, ids, view, bounds, costs)
-    regions, pixels, _ = bounds.of(view)
-    owner = table.pixel_region[pixels] - regions.start
-    start = run_starts(owner)
-    found = np.full((regions.stop - regions.start, best.shape[1]), -costs.hidden, np.float32)
-    if len(start):
-        counts = np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
-        found[owner[start]] = np.add.reduceat(best, start, 0) / counts
-    return found
+    def own(self, clusters: Ints) -> Floats:
+        """(D,) score of each region in its own cluster, its own view left out; `clusters` (D,) in [0, K)."""
+        key = clusters.tobytes()
+        if key not in self._own:
+            self._own[key] = self._score_own(clusters)
+        return self._own[key]
 
+    def value(self, clusters: Ints) -> float:
+        """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all
+        pairs that are put together; `clusters` (D,) in [0, K)."""
+        is_alone = np.bincount(clusters)[clusters] < 2
+        pairs = self.pair_factor * float((self.evidence * self.together(clusters)).sum()) / 2
+        return float(self.own(clusters)[~is_alone].sum()) + pairs
 
-def pixel_scores(table: RowTable, ids: Ints, view: int, bounds: Bounds, costs: Costs) -> Floats:
-    """(P, K) float32: the same for each of the view's pixels, see `score_matrix`."""
-    _, pixels, rows = bounds.of(view)
-    num_clusters = int(ids.max(initial=0))
-    labels = torch.from_numpy(table.labels[rows].T.astype(np.int64))
-    cluster = torch.from_numpy(np.append(ids, [num_clusters, num_clusters]))[labels]
-    shown = torch.zeros(num_clusters + 1, labels.shape[1])  # rows run fastest: they are what is maximised over
-    shown.scatter_add_(0, cluster, torch.ones(1).expand(cluster.shape))
-    is_empty = (labels == EMPTY).float()
-    num_labels = (labels >= 0).sum(0).float()
-    num_inside = num_labels + is_empty.sum(0)
-    cost = torch.from_numpy(_empty_costs(table, ids, num_clusters, costs)) @ is_empty
-    score = shown[:num_clusters].mul_(1 + costs.hidden).sub_(cost).sub_(costs.hidden * num_labels).div_(num_inside)
-    best = np.full((pixels.stop - pixels.start, num_clusters), -costs.hidden, np.float32)
-    start = run_starts(table.pixel[rows])
-    if len(start):
-        place = table.pixel[rows][start] - pixels.start
-        best[place] = np.maximum(np.maximum.reduceat(score.numpy(), start, 1), -costs.hidden).T
-    return best
+    def explained(self, clusters: Ints) -> float:
+        """Mean score of the regions that are not alone in their cluster; 0 without any."""
+        is_together = np.bincount(clusters, minlength=1)[clusters] > 1
+        return float(self.own(clusters)[is_together].mean()) if is_together.any() else 0.0
 
+    def gains(self, view: int, clusters: Ints, landings: Floats) -> ViewGains:
+        """What the regions of one view gain from the clusters of the others.
 
-def _empty_costs(table: RowTable, ids: Ints, num_clusters: int, costs: Costs) -> Floats:
-    """(K, V) float32: what a view without a region costs each cluster."""
-    has_mask = np.zeros((num_clusters + 1, table.num_views), bool)
-    has_mask[ids, table.view_index] = True
-    return np.where(has_mask[:num_clusters], costs.missing, costs.absent).astype(np.float32)
+        Args:
+            view: the view.
+            clusters: (D,) cluster of each region in [0, K).
+            landings: `landings` of an earlier partition: may have fewer rows; newer clusters expect to land nowhere.
+        """
+        here = self.table.bounds.regions(view)
+        is_other = self.table.view_index != view
+        numbers, inverse = np.unique(clusters[is_other], return_inverse=True)
+        compact = np.full(len(clusters), -1)
+        compact[is_other] = inverse
+        score = self.scores(view, compact)
+        landing = np.zeros_like(score)
+        has_landing = numbers < len(landings)
+        landing[:, has_landing] = landings[numbers[has_landing], here].T
+        members = np.zeros((len(clusters), len(numbers) + 1))
+        members[np.arange(len(clusters)), compact] = 1  # the last column takes the view itself
+        pairs = self.pair_factor * (self.evidence[here] @ members[:, :-1])
+        return ViewGains(numbers, score, landing, score + self.config.gains.landing * landing + pairs)
 
+    @property
+    def pair_factor(self) -> float:
+        """What an epipolar weight of 1.5 in place of 0.5 gains in this number of views."""
+        return self.config.gains.pair_factor(self.table.num_views)
 
-def known_landings(table: RowTable, ids: Ints, costs: Costs, known: Known) -> Floats:
-    """What `landing_matrix` returns, by looking only at clusters that are not known yet; they are added to `known`."""
-    keys = [members.tobytes() for members in members_of(ids, int(ids.max(initial=-1)) + 1)]
-    new = np.array([k for k, key in enumerate(keys) if key not in known.landings], np.int64)
-    if len(new):
-        fresh = landing_matrix(table, ids, costs, new)
-        known.landings.update({keys[k]: fresh[i] for i, k in enumerate(new.tolist())})
-    return np.stack([known.landings[key] for key in keys]) if keys else np.zeros((0, len(ids)), np.float32)
+    def together(self, clusters: Ints) -> NDArray[np.bool_]:
+        """(D, D) whether two regions of different views are in one cluster."""
+        views = self.table.view_index
+        return (clusters[:, None] == clusters) & (views[:, None] != views)
 
+    def _members_elsewhere(self, view: int, clusters: Ints) -> list[Ints]:
+        """The members of clusters 0 .. K - 1 in other views."""
+        elsewhere = np.where(self.table.view_index == view, -1, clusters)
+        return members_of(elsewhere, int(clusters.max(initial=-1)) + 1)
 
-def landing_matrix(table: RowTable, ids: Ints, costs: Costs, clusters: Ints | None = None) -> Floats:
-    """Where clusters expect to be seen in each view, R(c, n).
+    def _score_clusters(self, view: int, members: list[Ints]) -> Floats:
+        """(N, C) float32: the scores of the view's regions in C clusters."""
+        best = self._score_pixels(view, members)
+        regions, pixels = self.table.bounds.regions(view), self.table.bounds.pixels(view)
+        owner = self.table.pixel_region[pixels] - regions.start
+        start = run_starts(owner)
+        score = np.full((regions.stop - regions.start, len(members)), -self.config.costs.hidden, np.float32)
+        if len(start):
+            counts = np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
+            score[owner[start]] = np.add.reduceat(best, start, 0) / counts
+        return score
 
-    Args:
-        table: rows of D regions.
-        ids: (D,) cluster of each region in [0, K).
-        costs: of views that do not show the cluster.
-        clusters: (C,) the clusters that are asked for; None for all K.
+    def _score_pixels(self, view: int, members: list[Ints]) -> Floats:
+        """(P, C) float32: the scores of the view's pixels in C clusters without members in this view."""
+        table, hidden, num_clusters = self.table, self.config.costs.hidden, len(members)
+        pixels, rows = table.bounds.pixels(view), table.bounds.rows(view)
+        number_of = np.full(len(table.view_index) + 2, num_clusters)  # the last two for EMPTY and OUTSIDE
+        for number, regions in enumerate(members):
+            number_of[regions] = number
+        # torch on the CPU: its scatter_add has no equal in NumPy
+        labels = torch.from_numpy(table.labels[rows].T.astype(np.int64))
+        cluster = torch.from_numpy(number_of)[labels]
+        shown = torch.zeros(num_clusters + 1, labels.shape[1])  # rows run fastest: they are what is maximised over
+        shown.scatter_add_(0, cluster, torch.ones(1).expand(cluster.shape))
+        is_empty = (labels == EMPTY).float()
+        num_labels = (labels >= 0).sum(0).float()
+        num_inside = num_labels + is_empty.sum(0)
+        cost = torch.from_numpy(self._empty_costs(members)) @ is_empty
+        score = shown[:num_clusters].mul_(1 + hidden).sub_(cost).sub_(hidden * num_labels).div_(num_inside)
+        best = np.full((pixels.stop - pixels.start, num_clusters), -hidden, np.float32)
+        start = run_starts(table.pixel[rows])
+        if len(start):
+            pixel = table.pixel[rows][start] - pixels.start
+            best[pixel] = np.maximum(np.maximum.reduceat(score.numpy(), start, 1), -hidden).T
+        return best
 
-    Returns:
-        (C, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best row shows n. The best
-        row is chosen without n's view; pixels whose best row scores below 0 do not count, and equal rows share.
-    """
-    num_clusters = int(ids.max(initial=-1)) + 1
-    clusters = np.arange(num_clusters) if clusters is None else clusters
-    place = np.full(num_clusters, -1)
-    place[clusters] = np.arange(len(clusters))
-    region = table.pixel_region[table.pixel]
-    rows = np.flatnonzero(place[ids[region]] >= 0)
-    labels, region, pixel = table.labels[rows], region[rows], table.pixel[rows]
-    own = place[ids[region]]
-    gain, is_inside = own_row_gains(table, ids, costs, rows)
-    total, count = gain.sum(1), is_inside.sum(1)
-    start = run_starts(pixel)
-    run = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(total))))
-    found = np.zeros((len(clusters), len(ids)), np.float32)
-    for view in np.unique(table.view_index).tolist() if len(start) else ():
-        score = (total - gain[:, view]) / np.maximum(count - is_inside[:, view], 1)
-        best = np.maximum.reduceat(score, start)
-        use = np.flatnonzero((score >= best[run] - 1e-6) & (best[run] >= 0) & (table.view_index[region] != view))
-        share = 1 / np.bincount(run[use], minlength=len(start))[run[use]]
-        pixels = np.bincount(own[use], share, len(clusters))
-        hit = labels[use, view] >= 0
-        flat = own[use][hit] * len(ids) + labels[use, view][hit]
-        landed = np.bincount(flat, share[hit], len(clusters) * len(ids)).reshape(found.shape)
-        found += landed / np.maximum(pixels, 1e-9)[:, None]
-    return found
+    def _empty_costs(self, members: list[Ints]) -> Floats:
+        """(C, V) float32: what a view without a region costs each cluster."""
+        has_mask = np.zeros((len(members), self.table.num_views), bool)
+        for number, regions in enumerate(members):
+            has_mask[number, self.table.view_index[regions]] = True
+        return np.where(has_mask, self.config.costs.missing, self.config.costs.absent).astype(np.float32)
 
+    def _land(self, clusters: Ints, asked: Ints) -> Floats:
+        """(C, D) float32: the landings of the clusters that are asked for."""
+        table = self.table
+        row_of = np.full(int(clusters.max(initial=-1)) + 1, -1)
+        row_of[asked] = np.arange(len(asked))
+        region = table.pixel_region[table.pixel]
+        rows = np.flatnonzero(row_of[clusters[region]] >= 0)
+        labels, region, pixel = table.labels[rows], region[rows], table.pixel[rows]
+        cluster = row_of[clusters[region]]
+        gain, is_inside = self._row_gains(clusters, rows)
+        total, count = gain.sum(1), is_inside.sum(1)
+        start = run_starts(pixel)
+        run = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(total))))
+        landing = np.zeros((len(asked), len(clusters)), np.float32)
+        for view in np.unique(table.view_index).tolist() if len(start) else ():
+            score = (total - gain[:, view]) / np.maximum(count - is_inside[:, view], 1)
+            best = np.maximum.reduceat(score, start)
+            use = np.flatnonzero((score >= best[run] - 1e-6) & (best[run] >= 0) & (table.view_index[region] != view))
+            share = 1 / np.bincount(run[use], minlength=len(start))[run[use]]
+            pixels = np.bincount(cluster[use], share, len(asked))
+            hit = labels[use, view] >= 0
+            flat = cluster[use][hit] * len(clusters) + labels[use, view][hit]
+            landed = np.bincount(flat, share[hit], len(asked) * len(clusters)).reshape(landing.shape)
+            landing += landed / np.maximum(pixels, 1e-9)[:, None]
+        return landing
 
-def own_row_gains(
-    table: RowTable, ids: Ints, costs: Costs, rows: Ints | slice = slice(None)
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """(I, V) float32, what each view of each row adds to the score of the region in its own cluster; and (I, V) bool,
-    whether the point lies in that view. The sum of the gains over the number of these views is the score of the row.
+    def _score_own(self, clusters: Ints) -> Floats:
+        """(D,) score of each region in its own cluster."""
+        table, hidden = self.table, self.config.costs.hidden
+        gain, is_inside = self._row_gains(clusters)
+        score = gain.sum(1) / np.maximum(is_inside.sum(1), 1)
+        best = np.full(len(table.pixel_region), -hidden)
+        start = run_starts(table.pixel)
+        if len(start):
+            best[table.pixel[start]] = np.maximum(np.maximum.reduceat(score, start), -hidden)
+        counts = np.bincount(table.pixel_region, minlength=len(clusters))
+        return np.bincount(table.pixel_region, best, len(clusters)) / np.maximum(counts, 1)
 
-    `ids` (D,) is the cluster of each region in [0, K); `rows` (I,) are the rows that are asked for, all by default.
-    """
-    labels, own = table.labels[rows], ids[table.pixel_region[table.pixel[rows]]]
-    empty = _empty_costs(table, ids, int(ids.max(initial=-1)) + 1, costs)
-    gain = np.full(labels.shape, -costs.hidden, np.float32)
-    gain[np.append(ids, [-1, -1])[labels] == own[:, None]] = 1
-    gain = np.where(labels == EMPTY, -empty[own], gain)
-    is_inside = labels >= EMPTY
-    return gain * is_inside, is_inside
-
-
-def known_own_scores(table: RowTable, ids: Ints, costs: Costs, known: Known) -> Floats:
-    """What `own_scores` returns, looked for once."""
-    key = ids.tobytes()
-    if key not in known.own:
-        known.own[key] = own_scores(table, ids, costs)
-    return known.own[key]
-
-
-def own_scores(table: RowTable, ids: Ints, costs: Costs) -> Floats:
-    """(D,) score of each region in its own cluster, its own view left out: see `nview.score_matrix`."""
-    gain, is_inside = own_row_gains(table, ids, costs)
-    score = gain.sum(1) / np.maximum(is_inside.sum(1), 1)
-    best = np.full(len(table.pixel_region), -costs.hidden)
-    start = run_starts(table.pixel)
-    if len(start):
-        best[table.pixel[start]] = np.maximum(np.maximum.reduceat(score, start), -costs.hidden)
-    counts = np.bincount(table.pixel_region, minlength=len(ids))
-    return np.bincount(table.pixel_region, best, len(ids)) / np.maximum(counts, 1)
-
-
-def partition_value(
-    table: RowTable, evidence: Floats, ids: Ints, costs: Costs, known: Known | None = None
-) -> float:
-    """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all pairs
-    that are put together.
-
-    Args:
-        table: rows of D regions.
-        evidence: (D, D) symmetric, for (> 0) or against (< 0) each pair.
-        ids: (D,) cluster of each region in [0, K).
-        costs: of views that do not show the cluster.
-        known: what is found about the ids is added.
-    """
-    is_alone = np.bincount(ids)[ids] < 2
-    together = (ids[:, None] == ids) & (table.view_index[:, None] != table.view_index)
-    pairs = costs.pair_factor(table.num_views) * float((evidence * together).sum()) / 2
-    return float(known_own_scores(table, ids, costs, known or nothing_known())[~is_alone].sum()) + pairs
+    def _row_gains(self, clusters: Ints, rows: Ints | slice = slice(None)) -> tuple[Floats, NDArray[np.bool_]]:
+        """(I, V) float32, what each view of each row adds to the score of the region in its own cluster; and (I, V)
+        bool, whether the point lies in that view. The sum of the gains over the number of these views is the score."""
+        table, hidden = self.table, self.config.costs.hidden
+        labels, own = table.labels[rows], clusters[table.pixel_region[table.pixel[rows]]]
+        empty = self._empty_costs(members_of(clusters, int(clusters.max(initial=-1)) + 1))
+        gain = np.full(labels.shape, -hidden, np.float32)
+        gain[np.append(clusters, [-1, -1])[labels] == own[:, None]] = 1
+        gain = np.where(labels == EMPTY, -empty[own], gain)
+        is_inside = labels >= EMPTY
+        return gain * is_inside, is_inside

@@ -1,8 +1,8 @@
-"""Stage 5e: how sure a match is: the chance that a region's id is right, from what speaks for it.
+"""How sure a match is: the probability that a region's id is right, from the evidence for it.
 
 A logistic regression, fitted once on simulated development plants (true and degraded masks, 3 to 20 views, 4 to 32
-leaves): of the regions scored about 0.8, about 80 % are right there. A region is right when its cluster is the largest
-one of its leaf, and its leaf is the most frequent one of its cluster.
+leaves): of the regions scored about 0.8, about 80 % are right there (`benchmarks/confidence.py`). A region is right
+when its cluster is the largest one of its leaf, and its leaf is the most frequent one of its cluster.
 """
 
 from __future__ import annotations
@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.matching.nview.cluster_scores import ClusterScores
+
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
@@ -20,8 +22,8 @@ COEFFICIENTS = (1.24, 1.20, 2.96, -0.69, 1.26, -0.90, -1.59, -0.95)
 
 
 @dataclass(frozen=True, eq=False)
-class Support:
-    """What speaks for the ids of D regions.
+class IdEvidence:
+    """The evidence for the ids of D regions.
 
     Attributes:
         score: (D,) leave-one-out score in the own cluster.
@@ -42,24 +44,54 @@ class Support:
     num_views: int
 
 
-def features(support: Support) -> Floats:
-    """(D, 7) what the chance depends on, each limited to a range that the plants fill."""
-    others = max(support.num_views - 1, 1)
+def collect_evidence(scores: ClusterScores, clusters: Ints) -> IdEvidence:
+    """The evidence for the cluster of each region; there is none for regions alone in theirs.
+
+    `clusters` (D,) int64 is the cluster of each region in [0, K).
+    """
+    table, alone = scores.table, scores.config.gains.alone
+    landings = scores.landings(clusters)
+    score, own_gain, rival_gain, landing = (np.zeros(len(clusters)) for _ in range(4))
+    for view in np.unique(table.view_index).tolist():
+        here = table.bounds.regions(view)
+        gains = scores.gains(view, clusters, landings)
+        is_own = clusters[here][:, None] == gains.clusters
+        score[here] = (gains.score * is_own).sum(1)
+        own_gain[here] = (gains.total * is_own).sum(1)
+        rival_gain[here] = np.where(is_own, alone, gains.total).max(1, initial=alone)
+        landing[here] = (gains.landing * is_own).sum(1)
+    is_partner = scores.together(clusters)
+    is_same_view = table.view_index[:, None] == table.view_index
+    num_partners = is_partner.sum(1)
+    return IdEvidence(
+        score=score,
+        margin=own_gain - rival_gain,
+        landing=landing,
+        weight=(scores.graph.weights * is_partner).sum(1) / np.maximum(num_partners, 1),
+        num_partners=num_partners,
+        num_pieces=((clusters[:, None] == clusters) & is_same_view).sum(1),
+        num_views=table.num_views,
+    )
+
+
+def features(evidence: IdEvidence) -> Floats:
+    """(D, 7) what the probability depends on, each clipped to a range that the plants fill."""
+    others = max(evidence.num_views - 1, 1)
     return np.stack(
         [
-            np.clip(support.score, -0.2, 1),
-            np.clip(support.margin, -1, 1.5),
-            np.clip(support.landing, 0, 1),
-            np.clip(support.weight, 0, 1),
-            np.minimum(support.num_partners / others, 1),
-            1 / np.maximum(support.num_partners, 1),
-            support.num_pieces > 1,
+            np.clip(evidence.score, -0.2, 1),
+            np.clip(evidence.margin, -1, 1.5),
+            np.clip(evidence.landing, 0, 1),
+            np.clip(evidence.weight, 0, 1),
+            np.minimum(evidence.num_partners / others, 1),
+            1 / np.maximum(evidence.num_partners, 1),
+            evidence.num_pieces > 1,
         ],
         1,
     )
 
 
-def match_scores(support: Support) -> Floats:
-    """(D,) in [0, 1]: the chance that each id is right; 0 for regions that are alone."""
-    logit = COEFFICIENTS[0] + features(support) @ np.array(COEFFICIENTS[1:])
-    return np.where(support.num_partners > 0, 1 / (1 + np.exp(-logit)), 0.0)
+def match_scores(evidence: IdEvidence) -> Floats:
+    """(D,) in [0, 1]: the probability that each id is right; 0 for regions that are alone."""
+    logit = COEFFICIENTS[0] + features(evidence) @ np.array(COEFFICIENTS[1:])
+    return np.where(evidence.num_partners > 0, 1 / (1 + np.exp(-logit)), 0.0)

@@ -1,4 +1,4 @@
-"""Stage 5d: masks that cover two instances, and which part of them shows the second one."""
+"""Masks that cover two instances, and which part of them shows the second one."""
 
 from __future__ import annotations
 
@@ -7,23 +7,17 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.matching.nview.cluster_scores import (
-    Costs,
-    Known,
-    known_landings,
-    known_own_scores,
-    members_of,
-    pixel_scores,
-    view_bounds,
-)
-from mvseg.matching.nview.label_rows import RowTable
+from mvseg.matching.nview.cluster_scores import ClusterScores
+from mvseg.matching.result import MergedMask
+from mvseg.partition import members_of
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]
 NEIGHBOURS = 3  # sampled pixels that decide for the pixels around them
+HALF_AS_GOOD = 0.5  # share of a cluster's median score from which it explains a pixel
 
 
-def merged_regions(table: RowTable, ids: Ints, costs: Costs, known: Known) -> Ints:
+def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tuple[MergedMask, ...]:
     """Masks that cover two instances: two clusters explain disjoint parts of them.
 
     A cluster that has no region in a view, but lands on one that belongs to another cluster, may share it. A pixel is
@@ -31,69 +25,78 @@ def merged_regions(table: RowTable, ids: Ints, costs: Costs, known: Known) -> In
     such clusters that one shares it which explains most pixels that the region's own cluster does not.
 
     Args:
-        table: rows of D regions.
-        ids: (D,) cluster of each region in [0, K).
-        costs: thresholds, and costs of views that do not show a cluster.
-        known: what is found about clusters is added.
+        scores: of D regions, ordered by view.
+        clusters: (D,) cluster of each region in [0, K).
+        regions: the D regions.
 
     Returns:
-        (M, 3) int64: region, its cluster, the other one.
+        One entry per such mask, by view; the ids are cluster numbers plus one.
     """
-    bounds, views = view_bounds(table), table.view_index
-    landing, own = known_landings(table, ids, costs, known), known_own_scores(table, ids, costs, known)
-    clusters = members_of(ids, len(landing))
-    usual = np.array([np.median(own[members]) for members in clusters])
-    is_real = np.array([len(np.unique(views[members])) >= max(2, costs.few * table.num_views) for members in clusters])
-    found: list[tuple[int, int, int]] = []
-    for view in np.unique(views).tolist():
-        regions, pixels, _ = bounds.of(view)
-        here = np.arange(regions.start, regions.stop)
-        is_second = (landing[:, here] >= costs.merged_landing) & is_real[:, None] & is_real[ids[here]]
-        is_second[ids[here]] = False
-        shared = here[is_second.any(0)]
-        if not len(shared):
-            continue
-        asked = np.union1d(np.flatnonzero(is_second.any(1)), ids[shared])
-        column = np.full(len(clusters), len(asked))
-        column[asked] = np.arange(len(asked))
-        scores = pixel_scores(table, np.where(views == view, len(asked), column[ids]), view, bounds, costs)
-        is_explained = scores >= 0.5 * usual[asked]
-        for region in shared.tolist():
-            pair = np.append(ids[region], np.flatnonzero(is_second[:, region - regions.start]))
-            part = is_explained[table.pixel_region[pixels] == region][:, column[pair]]
-            share = (part & ~part[:, :1]).mean(0)
-            best = int(share.argmax())
-            if share[best] >= costs.merged_share:
-                found.append((region, int(pair[0]), int(pair[best])))
-    return np.array(found, np.int64).reshape(-1, 3)
+    pairs = [pair for view in range(scores.table.num_views) for pair in _shared_in_view(scores, clusters, view)]
+    merged = []
+    for region, second in pairs:
+        part = second_part(scores, clusters, regions, region=region, second=second)
+        merged.append(MergedMask(region=region, own=int(clusters[region]) + 1, other=second + 1, part=part))
+    return tuple(merged)
 
 
-def second_part(regions: Regions, table: RowTable, ids: Ints, region: int, second: int, costs: Costs) -> Tensor:
+def _shared_in_view(scores: ClusterScores, clusters: Ints, view: int) -> list[tuple[int, int]]:
+    """Regions of one view that two clusters share, with the second cluster."""
+    table, thresholds = scores.table, scores.config.thresholds
+    landings, own = scores.landings(clusters), scores.own(clusters)
+    members = members_of(clusters, len(landings))
+    is_seen_enough = np.array(
+        [len(np.unique(table.view_index[one])) >= max(2, thresholds.few * table.num_views) for one in members], bool
+    )
+    here = np.flatnonzero(table.view_index == view)
+    is_second = (landings[:, here] >= thresholds.merged_landing) & is_seen_enough[:, None]
+    is_second &= is_seen_enough[clusters[here]]
+    is_second[clusters[here]] = False
+    shared = here[is_second.any(0)]
+    if not len(shared):
+        return []
+    asked = np.union1d(np.flatnonzero(is_second.any(1)), clusters[shared])
+    column = np.full(len(members), -1)
+    column[asked] = np.arange(len(asked))
+    usual = np.array([np.median(own[members[number]]) for number in asked])
+    is_explained = scores.pixel_scores(view, column[clusters]) >= HALF_AS_GOOD * usual
+    pixel_region = table.pixel_region[table.bounds.pixels(view)]
+    pairs = []
+    for region in shared.tolist():
+        candidates = np.append(clusters[region], np.flatnonzero(is_second[:, region - here[0]]))
+        part = is_explained[pixel_region == region][:, column[candidates]]
+        share = (part & ~part[:, :1]).mean(0)
+        best = int(share.argmax())
+        if share[best] >= thresholds.merged_share:
+            pairs.append((region, int(candidates[best])))
+    return pairs
+
+
+def second_part(scores: ClusterScores, clusters: Ints, regions: Regions, *, region: int, second: int) -> Tensor:
     """Where a merged mask shows its second instance: where its cluster explains the nearest sampled pixels better.
 
     Args:
-        regions: D regions ordered by view.
-        table: their rows.
-        ids: (D,) cluster of each region in [0, K).
+        scores: of D regions, ordered by view.
+        clusters: (D,) cluster of each region in [0, K).
+        regions: the D regions.
         region: the merged one.
         second: the other cluster.
-        costs: of views that do not show a cluster.
 
     Returns:
         (h, w) bool on the CPU, in the region's box and inside its mask; nowhere for a region without sampled pixels.
     """
-    view, bounds = int(table.view_index[region]), view_bounds(table)
-    asked = np.where(ids == ids[region], 0, np.where(ids == second, 1, 2))
-    asked[table.view_index == view] = 2
-    pixels = bounds.of(view)[1]
-    here = table.pixel_region[pixels] == region
-    scores = pixel_scores(table, asked, view, bounds, costs)[here]
+    table = scores.table
+    view = int(table.view_index[region])
+    pixels = table.bounds.pixels(view)
+    is_here = table.pixel_region[pixels] == region
     mask = regions.crop(region).cpu()
     part, spots = torch.zeros_like(mask), mask.nonzero()
-    if not here.any():
+    if not is_here.any():
         return part
-    sampled = torch.from_numpy(table.pixel_xy[pixels][here]) - regions.boxes[region, :2].cpu()
+    pair = np.where(clusters == clusters[region], 0, np.where(clusters == second, 1, -1))
+    pixel_scores = scores.pixel_scores(view, pair)[is_here]
+    sampled = torch.from_numpy(table.pixel_xy[pixels][is_here]) - regions.boxes[region, :2].cpu()
     nearest = torch.cdist(spots.flip(1) + 0.5, sampled).topk(min(NEIGHBOURS, len(sampled)), largest=False).indices
-    speaks = torch.from_numpy(scores[:, 1] - scores[:, 0])[nearest].mean(1)
-    part[spots[:, 0], spots[:, 1]] = speaks > 0
+    advantage = torch.from_numpy(pixel_scores[:, 1] - pixel_scores[:, 0])[nearest].mean(1)
+    part[spots[:, 0], spots[:, 1]] = advantage > 0
     return part

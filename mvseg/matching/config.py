@@ -1,0 +1,52 @@
+"""How regions are matched. The fields are keys of the YAML files and of the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mvseg.errors import InputError
+
+
+@dataclass(frozen=True)
+class MatchConfig:
+    """How regions are matched across views.
+
+    Attributes:
+        method: nview (evidence of all views at once; the most accurate), one-per-view (epipolar weights of pairs of
+            views, no two regions of a view in one cluster; the fastest), symnmf (the paper's), or auto: nview, but
+            symnmf when the number of instances or a range for it is given.
+        num_points: random pixels per region that send out epipolar lines (the paper: 200); null takes all pixels.
+        num_instances: number of instances, when it is known; symnmf only, the others find it by themselves.
+        search_range: smallest and largest number of instances to try, as in [5, 9]; null for [m, 2 m], m the largest
+            number of masks in any view. The range decides much: equal parts always look good. symnmf only.
+        num_restarts: random starts of each factorisation of symnmf.
+        seed: of the random pixels and starts.
+    """
+
+    method: Literal["auto", "nview", "one-per-view", "symnmf"] = "auto"
+    num_points: int | None = None
+    num_instances: int | None = None
+    search_range: tuple[int, int] | None = None
+    num_restarts: int = 2
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("num_points", "num_instances", "num_restarts"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise InputError(f"match.{name} is {value}, expected at least 1")
+        if self.method in ("nview", "one-per-view") and (self.num_instances or self.search_range):
+            raise InputError(f"match.num_instances and match.search_range are for symnmf, not for {self.method}")
+        if self.search_range is not None and not 1 <= self.search_range[0] <= self.search_range[1]:
+            low, high = self.search_range
+            raise InputError(f"match.search_range is [{low}, {high}], expected 1 <= smallest <= largest")
+        if not 0 <= self.seed < 2**32:
+            raise InputError(f"match.seed is {self.seed}, expected a number from 0 to 2^32 - 1")
+
+    @property
+    def resolved_method(self) -> Literal["nview", "one-per-view", "symnmf"]:
+        """The method, with "auto" decided."""
+        if self.method != "auto":
+            return self.method
+        return "symnmf" if self.num_instances or self.search_range else "nview"

@@ -1,0 +1,83 @@
+"""The numbers of the N-view matcher by what they are: costs of a row, gains of a region, thresholds of the search.
+
+They were chosen on simulated development plants, with true and degraded masks (`benchmarks/matching.py --split dev`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+
+@dataclass(frozen=True)
+class RowCosts:
+    """What a view counts in a row of a cluster, when one that shows the cluster counts 1.
+
+    Attributes:
+        missing: cost of no region there, although the cluster has one in this view.
+        absent: cost of no region there when the cluster has none in this view (its mask may be missed).
+        hidden: cost of a region of another cluster there; also the most that a pixel without any good row costs.
+    """
+
+    missing: float = 0.7
+    absent: float = 0.3
+    hidden: float = 0.15
+
+
+@dataclass(frozen=True)
+class Gains:
+    """What a region gains from a cluster beside its score there.
+
+    Attributes:
+        landing: gain of a region on which all best rows of the cluster land.
+        weight: gain from each region of the cluster whose epipolar weight exceeds 0.5 by 1, over V - 1. With few views
+            there is little other evidence; there it is larger by `weight_few` / (V - 1).
+        weight_few: see `weight`.
+        alone: gain of a region in no cluster.
+    """
+
+    landing: float = 0.5
+    weight: float = 2.0
+    weight_few: float = 2.0
+    alone: float = 0.0
+
+    def pair_factor(self, num_views: int) -> float:
+        """What an epipolar weight of 1.5 in place of 0.5 gains."""
+        others = max(num_views - 1, 1)
+        return (self.weight + self.weight_few / others) / others
+
+
+@dataclass(frozen=True)
+class Thresholds:
+    """When regions join a cluster whose place in their view is taken, and when a mask covers two instances.
+
+    Attributes:
+        piece_landing: least landing on a left-over region that joins a cluster whose place is taken.
+        piece_score: least score of such a region, as a share of the score of the region that holds the place.
+        few: share of the views; clusters that no more of them show are doubted.
+        few_landing: least landing of a cluster on a region of a doubted one that it takes over.
+        merged_landing: least landing of a cluster on a region that it may share with another cluster.
+        merged_share: least share of the pixels of such a region that only the second cluster explains.
+    """
+
+    piece_landing: float = 0.05
+    piece_score: float = 0.5
+    few: float = 0.25
+    few_landing: float = 0.02
+    merged_landing: float = 0.25
+    merged_share: float = 0.2
+
+
+@dataclass(frozen=True)
+class NViewConfig:
+    """All of them."""
+
+    costs: RowCosts = field(default_factory=RowCosts)
+    gains: Gains = field(default_factory=Gains)
+    thresholds: Thresholds = field(default_factory=Thresholds)
+
+    def for_views(self, num_views: int) -> NViewConfig:
+        """The same for a number of views: of three views, two do not suffice to tell a piece from a neighbour."""
+        if num_views > 3:
+            return self
+        piece_landing, piece_score = max(self.thresholds.piece_landing, 0.1), max(self.thresholds.piece_score, 0.8)
+        return replace(self, thresholds=replace(self.thresholds, piece_landing=piece_landing, piece_score=piece_score))

@@ -1,0 +1,126 @@
+"""The search for the partition that explains all views best.
+
+From each start one assignment problem per view, as in `one_per_view.py`, but decided by how well the clusters explain
+the regions in all views. Regions that are left over may join a cluster whose place in their view is taken, if it
+expects to be seen there too: the pieces of an instance that the segmenter split, or that a stem in front of it divides.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
+from mvseg.matching.nview.config import NViewConfig
+from mvseg.matching.nview.soft_start import soft_starts
+from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_order
+from mvseg.partition import renumber
+
+MAX_SWEEPS = 3
+AS_GOOD = 0.99  # share of the best value that pairwise clusters must reach
+SECOND_CHANCE = 0.4  # mean epipolar weight with which regions that are left alone join after all
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.int64]
+
+
+def search(scores: ClusterScores, pairwise: Ints) -> Ints:
+    """The best partition that refinement finds from one start, or, with few views, two.
+
+    Clusters from the weights alone are kept when they are worth nearly as much: then the masks are sound, and the
+    weights know better what becomes of slivers that few views show.
+
+    Args:
+        scores: of D regions in three views or more.
+        pairwise: (D,) int64, clusters from the weights alone, in [0, K).
+
+    Returns:
+        (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
+    """
+    refined = []
+    for start in soft_starts(scores.table):
+        refined.append(refine(scores, refine(scores, start), join_pieces=True))
+    values = [scores.value(clusters) for clusters in (pairwise, *refined)]
+    best = pairwise
+    if max(values) - values[0] > (1 - AS_GOOD) * abs(max(values)):
+        best = refined[int(np.argmax(values[1:]))]
+        best = join_alone(scores.graph, best, stop=SECOND_CHANCE)
+    return join_few(scores, best)
+
+
+def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False) -> Ints:
+    """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
+
+    Args:
+        scores: of D regions.
+        clusters: (D,) clusters to start from.
+        join_pieces: left-over regions may join a cluster whose place in their view is taken.
+
+    Returns:
+        (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
+    """
+    clusters, bounds = renumber(clusters), scores.table.bounds
+    order = view_order(scores.graph)
+    for _ in range(MAX_SWEEPS):
+        before = renumber(clusters)
+        clusters, landings = before.copy(), scores.landings(before)
+        for view in order.tolist():
+            here = bounds.regions(view)
+            if here.start == here.stop:
+                continue
+            gains = scores.gains(view, clusters, landings)
+            chosen = assign_one_to_one(gains.total, scores.config.gains.alone)
+            if join_pieces:
+                chosen = _join_pieces(chosen, gains, scores.config)
+            fresh = clusters.max() + 1 + np.arange(len(chosen))
+            clusters[here] = np.append(gains.clusters, fresh)[chosen]
+        if (renumber(clusters) == before).all():
+            break
+    return renumber(clusters)
+
+
+def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
+    """Dissolve clusters that few views show into those that expect to be seen where they are.
+
+    Pieces of split masks, and masks that are merged with something else, find each other across views and form spurious
+    instances. A region of such a cluster joins the larger one that expects most to be seen on it and explains some of
+    it, whether its place is taken or not; if there is one. With three views no cluster is seen often enough to be
+    doubted.
+
+    Args:
+        scores: of D regions.
+        clusters: (D,) cluster of each region in [0, K).
+
+    Returns:
+        (D,) int64 cluster of each region in [0, K), numbered by their first region.
+    """
+    clusters, table, thresholds = renumber(clusters), scores.table, scores.config.thresholds
+    is_shown = np.zeros((int(clusters.max(initial=-1)) + 1, table.num_views), bool)
+    is_shown[clusters, table.view_index] = True
+    is_few = is_shown.sum(1) <= max(1, thresholds.few * table.num_views)
+    if table.num_views < 4 or not is_few.any():
+        return clusters
+    landings, joined = scores.landings(clusters), clusters.copy()
+    for view in np.unique(table.view_index[is_few[clusters]]).tolist():
+        here = table.bounds.regions(view)
+        gains = scores.gains(view, clusters, landings)
+        fits = ~is_few[gains.clusters] & (gains.landing >= thresholds.few_landing) & (gains.score > 0)
+        moves = is_few[clusters[here]] & fits.any(1)
+        if moves.any():
+            joined[here][moves] = gains.clusters[np.where(fits, gains.landing, -1)[moves].argmax(1)]
+    return renumber(joined)
+
+
+def _join_pieces(chosen: Ints, gains: ViewGains, config: NViewConfig) -> Ints:
+    """Put left-over regions into taken clusters that expect to be seen on them and explain them well."""
+    is_in = chosen < len(gains.clusters)
+    holder = np.full(len(gains.clusters), np.inf)
+    holder[chosen[is_in]] = gains.score[is_in, chosen[is_in]]
+    fits = (gains.landing >= config.thresholds.piece_landing) & (gains.score > 0)
+    fits &= gains.score >= config.thresholds.piece_score * holder
+    value = np.where(fits, gains.score + config.gains.landing * gains.landing, -np.inf)
+    joins = ~is_in & fits.any(1)
+    chosen = chosen.copy()
+    if joins.any():
+        chosen[joins] = value[joins].argmax(1)
+    return chosen

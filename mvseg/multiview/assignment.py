@@ -1,0 +1,127 @@
+"""Which instance does a region proposal belong to (Eqs. 4, 5)?"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from mvseg.errors import InputError
+from mvseg.matching.epipolar import Samples, bin_histogram, binned_pairs, dilate, view_samples
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+LATTICE = 65_536  # at most about this many pixels of an image measure the area of a band
+
+
+class EpipolarAssignment(nn.Module):
+    """Assigns each proposal to the instance whose epipolar map it resembles most (Eq. 5). Has no parameters.
+
+    Args:
+        max_pixels: masks of more pixels are thinned to a lattice of about this many (see `Regions.pixels`); the masks
+            of Mask R-CNN carry no more detail than 28 x 28.
+    """
+
+    def __init__(self, max_pixels: int = 1024) -> None:
+        super().__init__()
+        self.max_pixels = max_pixels
+
+    @torch.no_grad()
+    def forward(
+        self, proposals: Regions, regions: Regions, instance_ids: Tensor, *, cameras: Cameras
+    ) -> tuple[Tensor, Tensor]:
+        """Assign the proposals of all views.
+
+        Args:
+            proposals: R masks in V views.
+            regions: D regions of the previous iteration.
+            instance_ids: (D,) int64, their ids in [1, K]; -1 = none.
+            cameras: V cameras.
+
+        Returns:
+            (R,) int64 id of the instance with the largest similarity, -1 where every similarity is 0, and (R,) float32,
+            that similarity.
+        """
+        similarity = ruzicka_similarity(
+            proposals, regions, instance_ids, cameras=cameras, max_pixels=self.max_pixels
+        )
+        if not similarity.shape[1]:
+            nothing = torch.zeros(len(proposals), device=proposals.device)
+            return torch.full_like(proposals.view_index, -1), nothing
+        best, column = similarity.max(1)
+        return torch.where(best > 0, column + 1, -1), best
+
+
+def ruzicka_similarity(
+    proposals: Regions,
+    regions: Regions,
+    instance_ids: Tensor,
+    *,
+    cameras: Cameras,
+    max_pixels: int | None = None,
+) -> Tensor:
+    """Ruzicka similarity of every proposal's mask with every instance's epipolar map in its view (Eqs. 4, 5).
+
+    With a map M in [0, 1] and a mask A of 0 and 1, sum min(M, A) is the sum of M over the mask, and
+    sum max = sum M + |A| - sum min: no map is ever drawn.
+
+    Args:
+        proposals: R masks in V views.
+        regions: D regions.
+        instance_ids: (D,) int64 in [1, K] or -1.
+        cameras: V cameras.
+        max_pixels: thins the masks of the proposals; None takes all pixels.
+
+    Returns:
+        (R, K) float32 in [0, 1], the first column for id 1; 0 where an instance has no region in another view: those of
+        the proposal's own view have no band there, and do not count in Eq. 4 (the paper does not say).
+    """
+    if instance_ids.shape != regions.view_index.shape:
+        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+    cameras = cameras.to(regions.device)
+    num_clusters = max(int(instance_ids.max()), 0) if len(instance_ids) else 0
+    clustered = regions.select(instance_ids > 0)
+    cluster_of = instance_ids[instance_ids > 0] - 1
+    sources, source_members = view_samples(clustered)
+    targets, target_members = view_samples(proposals, max_pixels)
+    images = [_image_lattice(size, regions.device) for size in cameras.sizes.tolist()]
+    on_mask = torch.zeros(len(proposals), num_clusters, device=regions.device)  # sum of bands over the mask
+    on_image = torch.zeros(len(cameras), num_clusters, device=regions.device)  # sum of bands over the image
+    count = torch.zeros(len(cameras), num_clusters, device=regions.device)  # #_c of Eq. 4
+    joint = [_concatenate(source, target) for source, target in zip(sources, targets, strict=True)]
+    for pair in binned_pairs(joint, cameras):
+        for source, target, side in ((pair.i, pair.j, 0), (pair.j, pair.i, 1)):
+            clusters = cluster_of[source_members[source]]
+            sent = pair.counts[side][: len(clusters)] > 0
+            bands = torch.zeros(num_clusters, pair.bins.num_bins, device=regions.device)
+            bands.index_add_(0, clusters, dilate(sent, pair.bins.band_radius(side)))
+            count[target] += torch.bincount(clusters, minlength=num_clusters)
+            received = pair.counts[1 - side][sources[target].num_regions :]
+            on_mask[target_members[target]] += received @ bands.T
+            image = bin_histogram(pair.bins, pair.pencil.angles(1 - side, images[target].xy), images[target])
+            on_image[target] += (image @ bands.T)[0]
+    count = count.clamp(min=1)
+    smallest = on_mask / count[proposals.view_index]
+    largest = (on_image / count)[proposals.view_index] + proposals.areas[:, None] - smallest
+    return smallest / largest.clamp(min=1e-12)
+
+
+def _concatenate(first: Samples, second: Samples) -> Samples:
+    """The regions of both sets, first and then second, in one."""
+    return Samples(
+        xy=torch.cat((first.xy, second.xy)),
+        owner=torch.cat((first.owner, second.owner + first.num_regions)),
+        weight=torch.cat((first.weight, second.weight)),
+        num_regions=first.num_regions + second.num_regions,
+    )
+
+
+def _image_lattice(size: list[int], device: torch.device) -> Samples:
+    """All pixels of an image as one region, thinned to at most about LATTICE of them."""
+    width, height = size
+    step = max(1, round((width * height / LATTICE) ** 0.5))
+    x = torch.arange(step // 2, width, step, device=device) + 0.5
+    y = torch.arange(step // 2, height, step, device=device) + 0.5
+    xy = torch.cartesian_prod(x, y)
+    weight = torch.full((len(xy),), width * height / len(xy), device=device)
+    owner = torch.zeros(len(xy), dtype=torch.int64, device=device)
+    return Samples(xy=xy, owner=owner, weight=weight, num_regions=1)

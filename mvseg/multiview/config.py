@@ -1,0 +1,34 @@
+"""How instances are found in photos. The fields are keys of the YAML files and of the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mvseg.errors import InputError
+
+
+@dataclass(frozen=True)
+class DetectConfig:
+    """How leaves are found in the photos when no masks are given.
+
+    Attributes:
+        weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
+        min_score: detections that score less are dropped; in [0, 1]. A score is how sure the detector is that it sees a
+            leaf, times the IoU that its mask is expected to have.
+        image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to what the
+            weights say, smaller ones stay as they are.
+        num_iterations: of assignment to epipolar maps and NMS; 0 matches what plain NMS keeps, and no more.
+    """
+
+    weights: str = "leaf-slim"
+    min_score: float = 0.3
+    image_size: int | None = None
+    num_iterations: int = 1
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.min_score <= 1:
+            raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
+        if self.image_size is not None and self.image_size < 32:
+            raise InputError(f"detect.image_size is {self.image_size}, expected at least 32")
+        if self.num_iterations < 0:
+            raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")

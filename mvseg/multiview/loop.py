@@ -1,0 +1,103 @@
+"""Match, assign, suppress, and again (Sec. 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.match_regions import match_regions
+from mvseg.matching.result import Matching
+from mvseg.multiview.assignment import EpipolarAssignment
+from mvseg.multiview.nms import cluster_aware_nms, confirmed
+from mvseg.multiview.proposals import Proposals
+from mvseg.scene import Cameras
+
+
+def match_proposals(
+    proposals: Proposals,
+    cameras: Cameras,
+    *,
+    num_iterations: int = 1,
+    cluster_iou: float = 0.3,
+    detections_per_view: int = 100,
+    match: MatchConfig = MatchConfig(),
+) -> tuple[Tensor, Matching]:
+    """Match first, alternate assignment and NMS, and ask the other views (steps 2 to 4 of `MultiViewMaskRCNN`).
+
+    Args:
+        proposals: the excessive set of all V views.
+        cameras: V cameras on the same device.
+        num_iterations: of assignment and NMS.
+        cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
+        detections_per_view: the best scores stay.
+        match: how regions are matched.
+
+    Returns:
+        (S,) int64 indices of the proposals kept, best score first, and their matching.
+    """
+    assignment = EpipolarAssignment()
+    per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
+    keep = _suppress(proposals, per_class, cluster_iou, detections_per_view=detections_per_view)
+    matching, num_instances = _match_classes(proposals.select(keep), cameras, match)
+    if match.resolved_method != "symnmf":
+        num_instances = {}
+    for _ in range(num_iterations):
+        regions = proposals.regions.select(keep)
+        ids, _ = assignment(proposals.regions, regions, matching.instance_ids, cameras=cameras)
+        groups = torch.cat((per_class, ids[:, None]), 1)
+        keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
+        matching, _ = _match_classes(proposals.select(keep), cameras, match, num_instances=num_instances)
+    if num_iterations and matching.support is not None:
+        stays = confirmed(
+            proposals.boxes[keep],
+            per_class[keep],
+            matching.instance_ids,
+            match_scores=matching.match_scores,
+            iou_threshold=cluster_iou,
+        )
+        if not stays.all():
+            keep = keep[stays]
+            matching, _ = _match_classes(proposals.select(keep), cameras, match, num_instances=num_instances)
+    return keep, matching
+
+
+def _suppress(
+    proposals: Proposals, groups: Tensor, iou_threshold: float, *, detections_per_view: int
+) -> Tensor:
+    """NMS by group, then the limit of detections per view, as torchvision has it."""
+    keep = cluster_aware_nms(proposals.boxes, proposals.scores, groups, iou_threshold)
+    view = proposals.regions.view_index[keep]
+    earlier = (view[:, None] == view).tril(-1).sum(1)
+    return keep[earlier < detections_per_view]
+
+
+def _match_classes(
+    proposals: Proposals,
+    cameras: Cameras,
+    match: MatchConfig,
+    *,
+    num_instances: Mapping[int, int] = MappingProxyType({}),
+) -> tuple[Matching, dict[int, int]]:
+    """Match proposals class by class; instances of different classes get different ids.
+
+    `num_instances` holds the numbers of instances of some classes, by class; the others are looked for. Returns the
+    matching and the numbers that it found.
+    """
+    parts, places, counts = [], [], {}
+    for number in proposals.classes.unique().tolist():
+        members = (proposals.classes == number).nonzero()[:, 0]
+        config = replace(match, num_instances=num_instances.get(number) or match.num_instances)
+        parts.append(match_regions(proposals.regions.select(members), cameras, config))
+        places.append(members)
+        counts[number] = parts[-1].num_instances
+    if not parts:
+        nothing = torch.zeros(0, device=proposals.regions.device)
+        return Matching(nothing.long(), nothing, num_instances=0, method=match.resolved_method), counts
+    joined = Matching.concatenate(parts).reorder(torch.cat(places))
+    methods = {part.method for part in parts}
+    return (joined if len(methods) == 1 else replace(joined, method=match.resolved_method)), counts

@@ -1,0 +1,38 @@
+"""How instances become voxels. The fields are keys of the YAML files and of the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from mvseg.errors import InputError
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """How instances become voxels.
+
+    Attributes:
+        threshold: a voxel belongs to an instance when more than this share of the instance's masks contains it (the
+            paper: 0.5); in [0, 1).
+        seen_share: keeps thin instances thin: of the instance's views with a clear line of sight to a voxel (its pixel
+            shows this instance, or no instance at all), more than this share must show the instance. A view in which
+            another instance may hide the voxel does not count; what has no mask (stems, missed leaves) hides nothing.
+            In [0, 1); 0 is the paper's rule, which leaves thin instances thick.
+        voxel_size: edge of a voxel in the scene's unit; null to derive it from the budget.
+        voxel_budget: voxels in an instance's bounding box when no size is given.
+    """
+
+    threshold: float = 0.5
+    seen_share: float = 0.8
+    voxel_size: float | None = None
+    voxel_budget: int = 250_000
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.threshold < 1:
+            raise InputError(f"reconstruct.threshold is {self.threshold:g}, expected a number in [0, 1)")
+        if not 0 <= self.seen_share < 1:
+            raise InputError(f"reconstruct.seen_share is {self.seen_share:g}, expected a number in [0, 1)")
+        if self.voxel_size is not None and not 0 < self.voxel_size < float("inf"):
+            raise InputError(f"reconstruct.voxel_size is {self.voxel_size:g}, expected a positive number")
+        if self.voxel_budget < 1:
+            raise InputError(f"reconstruct.voxel_budget is {self.voxel_budget}, expected at least 1")

@@ -1,0 +1,54 @@
+"""Where a result comes from: what goes to run.json."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from mvseg._version import __version__
+from mvseg.config import RunConfig
+from mvseg.detectors.zoo import find_weights
+from mvseg.results.result import Result
+
+
+def describe_run(
+    result: Result, masks: Path | None, config: RunConfig, *, remarks: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Version, inputs with their SHA-256, resolved options, warnings.
+
+    Args:
+        result: of the run.
+        masks: the masks that were given; None for a result of a detector, whose weights are hashed instead.
+        config: of the run; options of stages that did not run are left out.
+        remarks: the warnings of the run.
+    """
+    options = asdict(config)
+    if masks is not None:
+        del options["detect"]
+    if config.reconstruct is None:
+        del options["reconstruct"]
+    source = masks or find_weights(config.detect.weights) or Path(config.detect.weights)
+    return {
+        "mvseg": __version__,
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "scene": result.scene.name,
+        "inputs": {str(path): hash_files(path) for path in (result.scene.source, source) if path is not None},
+        "config": {"masks": masks and str(masks)} | options,
+        "warnings": list(remarks),
+    }
+
+
+def hash_files(path: Path) -> str:
+    """SHA-256 of a file; of a folder, that of the lines "<SHA-256 of the file>  <its path>", sorted by path."""
+    if not path.is_dir():
+        return hashlib.sha256(path.read_bytes()).hexdigest()
+    files = sorted(file for file in path.rglob("*") if file.is_file())
+    lines = [f"{hash_files(file)}  {file.relative_to(path).as_posix()}\n" for file in files]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -1,0 +1,33 @@
+"""Everything known about one scene after a run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from torch import Tensor
+
+from mvseg.matching.result import Matching
+from mvseg.reconstruction.voxels import VoxelGrid
+from mvseg.regions import Regions
+from mvseg.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Result:
+    """Everything known about one scene.
+
+    Attributes:
+        scene: the scene.
+        regions: D masks, undistorted.
+        matching: their ids.
+        shapes: {instance id: voxels}; None when only ids were asked for.
+        seconds: {stage: wall time}.
+        detection_scores: (D,) float32, how sure a detector was of each mask; None when the masks were given.
+    """
+
+    scene: Scene
+    regions: Regions
+    matching: Matching
+    shapes: dict[int, VoxelGrid] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    detection_scores: Tensor | None = None
