@@ -1,19 +1,22 @@
-"""Stage 1: cameras, views and scenes. This docstring is the convention sheet of the whole project.
+"""Cameras, views and scenes. This docstring is the convention sheet of the whole project.
 
 Frames     world, cam (one per view), px. Poses are `cam_from_world`: x_cam = R @ x_world + t. The camera looks along
            +z, +x is right, +y is down (OpenCV, COLMAP). Names carry frames, so that products cancel: `j_from_world`,
            `px_from_cam`, `world_from_px`.
 Pixels     the centre of the top-left pixel is (0.5, 0.5) (COLMAP); pixel (column c, row r) covers [c, c+1) x [r, r+1).
-           Zero-centred habits (OpenCV, torchvision's masks_to_boxes) are converted where they enter, in `formats/` and
-           `multiview.py`, nowhere else.
+           Zero-centred habits (OpenCV, torchvision) are converted where they enter: in `formats/`, `detectors/` and, for
+           boxes of masks, `regions.py`.
 Boxes      xyxy, half-open and continuous: x2 - x1 is the number of pixel columns.
 Lenses     distortion is removed once, on load: `Cameras` are pinholes. `View.lens` keeps the photo's own camera, so
            that labels can be written in the frame of the photo the user took.
 Axes       V views, D all regions of a scene, N and M regions of two views, K clusters, P points or pixels, B bins of
            plane angle, H W image.
 Units      world units are the scene's (`Scene.unit`); thresholds are in pixels or fractions, never in world units.
-Types      cameras and plane angles in float64 on entry, image-sized work in float32; indices int64. The device is the
-           device of the inputs.
+Ids        instances are 1, 2, ... in Python as in files; -1 is a region matched to nothing, 0 the background of a label
+           image. Cluster numbers (0, 1, ...) are array indices inside `matching/` and do not leave it.
+Types      cameras and plane angles in float64 on entry, image-sized work in float32; indices int64. Tensors, on the
+           device of the inputs; only `matching/nview/` works in NumPy, between `row_table` and the `Matching` that
+           `match_nview` returns.
 Ragged     one flat tensor and an index vector, never padded, never lists of lists.
 """
 
@@ -63,7 +66,7 @@ class Cameras:
                 raise InputError(f"{field} has shape {tuple(value.shape)}, expected {(num_views, *shape)}")
             object.__setattr__(self, field, value.to(torch.int64 if field == "sizes" else torch.float64))
         for index in range(num_views):
-            problem = camera_problem(self.K[index], self.R[index], self.t[index], self.sizes[index])
+            problem = camera_problem(self.K[index], self.R[index], self.t[index], size=self.sizes[index])
             if problem:
                 raise InputError(f"view {index}: {problem}")
 
@@ -74,14 +77,16 @@ class Cameras:
         """The cameras at a slice, a list or a tensor of view indices; of one view: `cameras[[0]]`."""
         if isinstance(index, int):
             raise InputError(f"cameras[{index}] asks for a single camera, expected a list: cameras[[{index}]]")
-        return Cameras(self.K[index], self.R[index], self.t[index], self.sizes[index])
+        return Cameras(K=self.K[index], R=self.R[index], t=self.t[index], sizes=self.sizes[index])
 
     @property
     def device(self) -> torch.device:
         return self.K.device
 
     def to(self, device: torch.device | str) -> Cameras:
-        return Cameras(self.K.to(device), self.R.to(device), self.t.to(device), self.sizes.to(device))
+        return Cameras(
+            K=self.K.to(device), R=self.R.to(device), t=self.t.to(device), sizes=self.sizes.to(device)
+        )
 
     @property
     def centers(self) -> Tensor:
@@ -108,7 +113,7 @@ class Cameras:
         return px[..., :2] / px[..., 2:], cam[..., 2]
 
 
-def camera_problem(K: Tensor, R: Tensor, t: Tensor, size: Tensor) -> str | None:
+def camera_problem(K: Tensor, R: Tensor, t: Tensor, *, size: Tensor) -> str | None:
     """What is wrong with one camera, as the end of a sentence; None for a sound one. Shapes as in `Cameras`."""
     for name, value in (("K", K), ("R", R), ("t", t)):
         if not torch.isfinite(value).all():

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
+import os
+import runpy
 import shutil
 import struct
 import subprocess
@@ -30,6 +32,7 @@ from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_co
 
 ROOT = Path(__file__).parent.parent
 NAN, INF = float("nan"), float("inf")
+COARSE = ["--reconstruct.voxel_budget", "500"]  # for tests that look at no shape
 Break = Callable[[Path], None]
 
 
@@ -106,14 +109,15 @@ def test_demo_evaluates_to_one(demo: Path, capsys: pytest.CaptureFixture[str]) -
 
 def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
-    assert main(["infer", "--quiet", "--out", str(out)]) == 0
-    found = json.loads((out / "instances.json").read_text())["annotations"]
-    assert all(DetectConfig().min_score <= one["score"] <= 1 and "source_label" not in one for one in found)
+    assert main(["infer", "--quiet", *COARSE, "--out", str(out)]) == 0
+    detections = json.loads((out / "instances.json").read_text())["annotations"]
+    assert all(DetectConfig().min_score <= entry["score"] <= 1 for entry in detections)
+    assert not any("source_label" in entry for entry in detections)
     run = json.loads((out / "run.json").read_text())
     assert run["config"]["masks"] is None
     assert run["config"]["detect"]["weights"] == "leaf-slim"
     assert any(path.endswith("weights.safetensors") for path in run["inputs"])
-    assert run["counts"]["regions"] == len(found)
+    assert run["counts"]["regions"] == len(detections)
     capsys.readouterr()
     assert main(["eval", str(out), "--truth", str(demo_scene() / "truth")]) == 0
     metrics = json.loads((out / "metrics.json").read_text())
@@ -172,12 +176,33 @@ def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "plant" / "labels" / "003.png").is_file()
 
 
-@pytest.mark.parametrize("arguments", [["--help"], ["--version"], ["infer", "--help"], ["match", "--help"]])
-def test_help_and_version(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--help"], ["{infer,match,eval,train,simulate,models}"]),
+        (["--version"], [f"mvseg {mvseg.__version__}"]),
+        (["infer", "--help"], ["--masks", "--detect.weights", "--match.method", "--reconstruct.seen_share"]),
+        (["match", "--help"], ["scenes [scenes ...]", "--masks", "--match.method"]),
+        (["train", "--help"], ["--photos", "--labels", "--resume"]),
+    ],
+)
+def test_help_and_version(arguments: list[str], words: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as stop:
         main(arguments)
     assert stop.value.code == 0
-    assert capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert [word for word in words if word not in shown] == []
+
+
+@pytest.mark.parametrize(("script", "option"), [("infer.py", "--match.method"), ("train.py", "--photos")])
+def test_scripts_of_the_checkout_are_verbs(
+    script: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", [script, "--help"])
+    with pytest.raises(SystemExit) as stop:
+        runpy.run_path(str(ROOT / script), run_name="__main__")
+    assert stop.value.code == 0
+    assert option in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -209,10 +234,13 @@ def test_wrong_options(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("arguments", [[], ["guess"], ["match"], ["eval"], ["eval", "results"]])
-def test_incomplete_commands(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(arguments) == 2
-    assert complaint(capsys)
+@pytest.mark.parametrize(
+    ("command", "missing"),
+    [("", "verb"), ("guess", "'guess'"), ("match", "scenes"), ("eval", "result"), ("eval results", "truth")],
+)
+def test_incomplete_commands(command: str, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(command.split()) == 2
+    assert missing in complaint(capsys)
 
 
 # --- Several scenes -------------------------------------------------------------------------------
@@ -255,7 +283,7 @@ def test_scenes_of_one_name_are_refused(plant: Path, tmp_path: Path, capsys: pyt
 
 def test_masks_only(tmp_path: Path) -> None:
     plant = write_scene(tmp_path / "plant", images=False)
-    assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *COARSE]) == 0
     assert len(list((tmp_path / "out" / "overlay").iterdir())) == 4
 
 
@@ -265,7 +293,8 @@ def test_two_cameras_at_one_place(verb: str, plant: Path, tmp_path: Path, capsys
     edit_rig(plant, 1, R=same["R"], t=same["t"])
     for kind in ("images", "masks"):
         shutil.copy(plant / kind / "000.png", plant / kind / "001.png")
-    assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    coarse = COARSE if verb == "infer" else []
+    assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *coarse]) == 0
     warning = "views 0 and 1 were taken from one place: this pair is skipped"
     assert capsys.readouterr().err == f"mvseg: warning: {warning}\n"
     (run,) = (tmp_path / "out").rglob("run.json")
@@ -442,7 +471,7 @@ def test_bad_input(name: str, plant: Path, tmp_path: Path, capsys: pytest.Captur
     change(plant)
     masks = "masks.json" if (plant / "masks.json").exists() else "masks"
     before = sorted(tmp_path.rglob("*"))
-    assert main(["infer", str(plant), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert main(["infer", str(plant), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet", *COARSE]) == 2
     assert message in complaint(capsys)
     assert sorted(tmp_path.rglob("*")) == before  # no result, and nothing half of one
 
@@ -453,7 +482,8 @@ def test_the_same_scene_whole_is_fine(plant: Path, tmp_path: Path) -> None:
     colmap()(tmp_path / "colmap")
     coco(json.dumps({"images": IMAGES, "annotations": []}))(plant)
     for scene, masks in ((plant, "masks"), (tmp_path / "colmap", "masks"), (plant, "masks.json")):
-        assert main(["infer", str(scene), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+        arguments = ["infer", str(scene), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet", *COARSE]
+        assert main(arguments) == 0
     transforms()(plant)
     assert main(["match", str(plant), "--out", str(tmp_path / "other"), "--quiet"]) == 0
 
@@ -486,19 +516,23 @@ def test_scene_or_masks_that_are_not_there(plant: Path, tmp_path: Path, capsys: 
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("name", ["JPEG cut", "images.bin cut at 0.2", "mask cut"])
-def test_bad_input_in_a_process_of_its_own(name: str, plant: Path, tmp_path: Path) -> None:
-    """Libraries that write to stderr by themselves would show here."""
-    change, message = BAD_INPUT[name]
-    change(plant)
-    command = [sys.executable, str(ROOT / "infer.py"), str(plant), "--masks", "masks", "--out", "out", "--quiet"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120, check=False)
+def test_bad_input_in_a_process_of_its_own(tmp_path: Path) -> None:
+    """Libraries that write to stderr by themselves would show here: one sentence per broken scene, and nothing else."""
+    names = ["JPEG cut", "images.bin cut at 0.2", "mask cut"]
+    for number, name in enumerate(names):
+        BAD_INPUT[name][0](write_scene(tmp_path / f"plant_{number}"))
+    scenes = [f"plant_{number}" for number in range(len(names))]
+    command = [sys.executable, "-m", "mvseg.cli", "match", *scenes, "--out", "out", "--quiet"]
+    checkout = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=checkout, capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 2
     assert done.stdout == ""
-    assert done.stderr.startswith("mvseg: error: ")
-    assert done.stderr.count("\n") == 1
-    assert message in done.stderr
-    assert [path.name for path in tmp_path.iterdir()] == ["plant"]
+    lines = done.stderr.splitlines()
+    assert len(lines) == len(names)
+    for name, line in zip(names, lines, strict=True):
+        assert line.startswith("mvseg: error: ")
+        assert BAD_INPUT[name][1] in line
+    assert list((tmp_path / "out").rglob("*")) == []
 
 
 def test_masks_are_looked_for_in_two_places(
@@ -532,7 +566,7 @@ def test_options_out_of_range(plant: Path, tmp_path: Path, option: str, capsys: 
 def test_an_earlier_result_is_not_replaced_in_silence(
     plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]
+    arguments = ["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]
     assert main(arguments) == 0
     assert capsys.readouterr().out.endswith("in 4 views\n")
     assert main(arguments) == 0
@@ -555,21 +589,21 @@ def test_masks_that_show_no_true_leaf_are_counted(
 def test_detect_options_beside_masks_are_warned_of(
     plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = ["infer", str(plant), "--masks", "masks", "--detect.min_score", "0.9", "--quiet"]
+    arguments = ["infer", str(plant), "--masks", "masks", "--detect.min_score", "0.9", "--quiet", *COARSE]
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
     assert "the detect options do nothing" in capsys.readouterr().err
     assert "detect" in json.loads((tmp_path / "out" / "run.json").read_text())["warnings"][0]
 
 
-def test_the_same_remark_is_made_once(
+def test_a_repeated_warning_is_given_once(
     plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    def remark_twice(*args: Any, **options: Any) -> Matching:
+    def warn_twice(*args: Any, **options: Any) -> Matching:
         for _ in range(2):
             warnings.warn("look here", InputWarning, stacklevel=1)
         return match_regions(*args, **options)
 
-    monkeypatch.setattr("mvseg.pipeline.match_regions", remark_twice)
+    monkeypatch.setattr("mvseg.pipeline.match_regions", warn_twice)
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert capsys.readouterr().err == "mvseg: warning: look here\n"
     assert json.loads((tmp_path / "out" / "plant" / "run.json").read_text())["warnings"] == ["look here"]

@@ -3,90 +3,189 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 import subprocess
 import sys
 import zipfile
+from dataclasses import fields
+from importlib.util import resolve_name
 from pathlib import Path
 
 import pytest
+import yaml
 
 import mvseg
+from mvseg.cli import build_parser
+from mvseg.simulation.demo_plant import write_demo_plant
+from mvseg.training.config import TrainConfig
 
 ROOT = Path(__file__).parent.parent
 PACKAGE = ROOT / "mvseg"
 
-# A module imports only from those before it in this list; a folder stands for its files.
-ORDER = [
-    "errors",
-    "_version",
-    "scene",
-    "regions",
-    "partition",
-    "demo",
-    "formats",
-    "detectors",
-    "matching",
-    "reconstruction",
-    "multiview",
-    "evaluation",
-    "baselines",
-    "config",
-    "training",
-    "results",
-    "pipeline",
-    "simulation",
-    "cli",
-]
+# A room (a folder, or a module of the top level) imports only from the lines above its own, so rooms of one line never
+# import each other. `__init__` stands for `mvseg` itself: below it, nothing imports the package.
+FLOORS = (
+    ("errors", "_version"),
+    ("scene",),
+    ("regions",),
+    ("partition",),
+    ("demo",),
+    ("formats", "detectors", "matching", "reconstruction"),
+    ("multiview", "traits", "evaluation", "baselines", "simulation"),
+    ("config",),
+    ("training", "results"),
+    ("pipeline",),
+    ("batch",),
+    ("__init__",),
+    ("cli",),
+)
+FLOOR_OF = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts): path.read_text(encoding="utf-8")
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
 
 
-def stage(path: Path) -> str:
-    return path.relative_to(PACKAGE).with_suffix("").parts[0]
+def room_of(module: str) -> str:
+    """The room of "mvseg.formats.coco" is "formats"; that of "mvseg" is "__init__"."""
+    return [*module.split("."), "__init__"][1]
 
 
-def imports_of(path: Path) -> set[str]:
-    """Stages of mvseg that a file imports when it is loaded (not inside functions, not for type checkers)."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    found = set()
-    for node in tree.body:
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("mvseg."):
-            found.add(str(node.module).split(".")[1])
-        assert not (isinstance(node, ast.Import) and any(name.name == "models" for name in node.names))
-    return found
+def imported_rooms(source: str, module: str) -> set[str]:
+    """Rooms that a module imports, anywhere in it: in functions, in `if TYPE_CHECKING` and by relative imports, too.
+
+    `from mvseg import x` imports `__init__`, whatever x is: names of rooms and public names look alike there.
+    """
+    package = module.rpartition(".")[0]
+    imported: set[str] = set()
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            imported.update(name.name for name in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            imported.add(resolve_name("." * node.level + (node.module or ""), package))
+    return {room_of(name) for name in imported if name.split(".")[0] == "mvseg"}
 
 
-@pytest.mark.parametrize("path", sorted(PACKAGE.rglob("*.py")), ids=lambda path: path.relative_to(PACKAGE).as_posix())
-def test_imports_go_one_way(path: Path) -> None:
-    if path == PACKAGE / "__init__.py":
-        return
-    assert stage(path) in ORDER
-    earlier = ORDER[: ORDER.index(stage(path)) + 1]
-    assert imports_of(path) <= set(earlier)
+def forbidden_rooms(source: str, module: str) -> set[str]:
+    """Of these, the rooms that do not lie above the module's own; rooms without a floor are forbidden."""
+    own = room_of(module)
+    others = imported_rooms(source, module) - {own}
+    return {room for room in others if FLOOR_OF.get(room, len(FLOORS)) >= FLOOR_OF[own]}
 
 
-def test_every_public_name_is_there_and_importing_the_package_is_cheap() -> None:
-    for name in mvseg.__all__:
-        assert getattr(mvseg, name) is not None
-    code = "import sys, mvseg, mvseg.cli; sys.exit(int('torch' in sys.modules))"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+@pytest.mark.parametrize("module", MODULES)
+def test_imports_go_one_way(module: str) -> None:
+    assert room_of(module) in FLOOR_OF
+    assert forbidden_rooms(MODULES[module], module) == set()
+
+
+@pytest.mark.parametrize(
+    ("line", "room"),
+    [
+        ("import mvseg.results.folder", "results"),
+        ("import os, mvseg.results.folder as folder", "results"),
+        ("from mvseg.results import folder", "results"),
+        ("from mvseg.results.folder import save_result", "results"),
+        ("from ..results import folder", "results"),
+        ("from ..results.folder import save_result", "results"),
+        ("import mvseg", "__init__"),
+        ("from mvseg import regions", "__init__"),
+        ("from .. import regions", "__init__"),
+        ("def run():\n    import mvseg.pipeline", "pipeline"),
+        ("if TYPE_CHECKING:\n    from mvseg.pipeline import run_scene", "pipeline"),
+        ("try:\n    pass\nexcept ImportError:\n    from mvseg import cli", "__init__"),
+        ("class Lazy:\n    def run(self):\n        from ..cli import main", "cli"),
+        ("from mvseg.matching.affinity import Affinity", "matching"),  # a room of the same floor
+        ("from mvseg.attic import x", "attic"),  # a room that has no floor
+    ],
+)
+def test_every_kind_of_forbidden_import_is_seen(line: str, room: str) -> None:
+    source = f"import torch\nfrom mvseg.errors import InputError\n\n{line}\n"
+    assert forbidden_rooms(source, "mvseg.formats.coco") == {room}
+
+
+@pytest.mark.parametrize(
+    ("module", "source"),
+    [
+        ("mvseg.formats.coco", "from . import lens\nfrom .rig import load\nimport mvseg.formats.mesh"),  # its own room
+        ("mvseg.formats.__init__", "from . import lens\nfrom .. errors import InputError"),
+        ("mvseg.formats.coco", "import models\nfrom mvsegment import x\nimport mvsegment.results"),  # other packages
+        ("mvseg.formats.coco", "from mvseg.scene import Scene\nfrom ..regions import Regions\nimport mvseg.demo"),
+        ("mvseg.cli", "import mvseg\nfrom mvseg.pipeline import run_scene\nfrom .batch import run_batch"),
+        ("mvseg.__init__", "from mvseg.pipeline import run_scene\nfrom ._version import __version__"),
+    ],
+)
+def test_imports_from_above_are_fine(module: str, source: str) -> None:
+    assert forbidden_rooms(source, module) == set()
+
+
+def test_other_floors_are_one_way_too() -> None:
+    assert forbidden_rooms("from ...results import folder", "mvseg.matching.nview.search") == {"results"}
+    assert forbidden_rooms("from mvseg.cli import main", "mvseg.__init__") == {"cli"}
+    assert forbidden_rooms("from mvseg.regions import Regions", "mvseg.scene") == {"regions"}
+    assert forbidden_rooms("import mvseg", "mvseg.pipeline") == {"__init__"}
+
+
+def typed_homes() -> dict[str, str]:
+    """Public name -> module, from the imports in `mvseg/__init__.py` that only type checkers read."""
+    (block,) = [node for node in ast.parse(MODULES["mvseg.__init__"]).body if isinstance(node, ast.If)]
+    imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
+    return {str(name.asname): str(node.module) for node in imports for name in node.names}
+
+
+def test_public_names_come_from_where_type_checkers_look() -> None:
+    homes = typed_homes()
+    assert {*homes, "__version__"} == set(mvseg.__all__)
+    assert {name: inspect.unwrap(getattr(mvseg, name)).__module__ for name in homes} == homes
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         mvseg.nothing  # noqa: B018
 
 
-def test_public_names_for_type_checkers_are_the_same() -> None:
-    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
-    (block,) = [node for node in tree.body if isinstance(node, ast.If)]
-    typed = {name.asname for node in block.body if isinstance(node, ast.ImportFrom) for name in node.names}
-    assert typed == set(mvseg.__all__) - {"__version__"}
+def test_importing_the_package_is_cheap() -> None:
+    code = "import sys, mvseg, mvseg.cli; sys.exit(int('torch' in sys.modules))"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-def test_the_readmes_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (example,) = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
-    assert len(example.strip().splitlines()) <= 20
+def test_the_readmes_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    examples = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    assert len(examples) == 2
     monkeypatch.chdir(tmp_path)
-    scope: dict = {}
-    exec(compile(example, "README.md", "exec"), scope)
-    assert scope["matching"].num_instances == 12
+    masks_given, masks_found = scopes = [{}, {}]
+    for example, scope in zip(examples, scopes, strict=True):
+        assert len(example.strip().splitlines()) <= 20
+        exec(compile(example, "README.md", "exec"), scope)
+    assert masks_given["matching"].num_instances == 12
+    assert (tmp_path / "leaf_1.ply").is_file()
+    sizes = [len(view["instance_ids"]) for view in masks_found["detections"]]
+    assert sizes == [len(view["masks"]) for view in masks_found["detections"]]
+    assert len(sizes) == 9
+    assert sum(sizes) >= 85  # of 108 visible leaves
+
+
+# Links of Markdown, and paths in it that start at the root.
+PATHS = re.compile(r"\]\(([^)#]+)|\b((?:mvseg|benchmarks|configs|docs|models|tests)/[\w/.-]+\.\w+)")
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("models/**/*.md")]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_files_that_the_documents_name_are_there(page: Path) -> None:
+    absent = []
+    for link, path in PATHS.findall(page.read_text(encoding="utf-8")):
+        target = page.parent / link if link else ROOT / path
+        if not link.startswith("http") and not target.exists():
+            absent.append(link or path)
+    assert absent == []
+
+
+def test_text_of_the_benchmarks_page_is_that_of_its_sources() -> None:
+    """Without the records nobody can regenerate the page, so its text is edited twice by hand."""
+    page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")
+    sources = ROOT / "benchmarks" / "paper_tables"
+    notes = (sources / "notes.md").read_text(encoding="utf-8").split("\n## ")[1:]
+    texts = [(sources / "benchmarks.template.md").read_text(encoding="utf-8"), *(n.partition("\n")[2] for n in notes)]
+    assert len(texts) > 5
+    assert [text.strip()[:60] for text in texts if text.strip() not in page] == []
 
 
 def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
@@ -109,8 +208,6 @@ def test_shipped_scene_is_small() -> None:
 
 
 def test_shipped_masks_are_what_the_script_makes(tmp_path: Path) -> None:
-    from mvseg.simulation.demo_plant import write_demo_plant
-
     write_demo_plant(tmp_path / "plant")
     shipped = sorted((PACKAGE / "demo_plant").rglob("*.png"))
     assert len(shipped) == 18
@@ -120,8 +217,12 @@ def test_shipped_masks_are_what_the_script_makes(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("config", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda path: path.name)
 def test_published_configs_are_understood(config: Path) -> None:
-    from mvseg.cli import build_parser
-
+    """Unknown keys, wrong types and values out of range are errors."""
     verb = "train" if config.parent.name == "train" else "infer"
-    args = build_parser().parse_args([verb, "--config", str(config)])
-    assert args.verb == verb
+    args = build_parser().parse_args([verb, "--config", str(config)])[verb]
+    if verb == "train":
+        TrainConfig(**{field.name: args[field.name] for field in fields(TrainConfig)})
+        return
+    kinds = {"match": mvseg.MatchConfig, "detect": mvseg.DetectConfig, "reconstruct": mvseg.ReconstructConfig}
+    for name, settings in yaml.safe_load(config.read_text(encoding="utf-8")).items():
+        assert kinds[name](**vars(args[name])) == kinds[name](**settings) != kinds[name]()

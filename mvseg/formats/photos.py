@@ -89,7 +89,7 @@ def _problem(photo: Photo) -> str | None:
     if max(photo.width, photo.height) > MAX_SIDE:
         return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_SIDE} pixels a side"
     size = torch.tensor([photo.width, photo.height])
-    return camera_problem(torch.as_tensor(photo.K), torch.as_tensor(photo.R), torch.as_tensor(photo.t), size)
+    return camera_problem(torch.as_tensor(photo.K), torch.as_tensor(photo.R), torch.as_tensor(photo.t), size=size)
 
 
 def check_photos(scene: Scene) -> None:

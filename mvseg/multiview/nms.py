@@ -12,6 +12,8 @@ from mvseg.errors import InputError
 def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float = 0.3) -> Tensor:
     """Non-maximum suppression in which boxes of different groups never suppress each other.
 
+    Takes its arguments as `torchvision.ops.batched_nms` does.
+
     Args:
         boxes: (R, 4) xyxy.
         scores: (R,).
