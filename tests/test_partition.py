@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from mvseg.partition import drop_singletons, members_of, number_instances, renumber, separate_unmatched
+from mvseg.partition import drop_singletons, number_instances, renumber, separate_unmatched
 
 
 def test_clusters_are_numbered_from_0_and_instances_from_1_by_their_first_member() -> None:
@@ -33,9 +33,3 @@ def test_regions_alone_are_unmatched_and_back() -> None:
     assert apart[0] == apart[2] == 0
     assert len({apart[0], apart[1], apart[3]}) == 3
     np.testing.assert_array_equal(drop_singletons(renumber(apart)), [0, -1, 0, -1])
-
-
-def test_members() -> None:
-    members = members_of(np.array([2, -1, 0, 2]), 4)
-    assert [cluster.tolist() for cluster in members] == [[2], [], [0, 3], []]
-    assert members_of(np.zeros(0, np.int64), 0) == []

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from mvseg.matching.epipolar import BinnedPair, Bins, Samples, bin_histogram, binned_pairs, dilate, view_samples
+from mvseg.matching.epipolar import Bins, binned_pairs, dilate, draw_points, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -52,12 +52,11 @@ def region_affinity(
         The graph. A region in a view alone, or whose bands meet nothing, has no edge.
     """
     samples, members = view_samples(regions)
-    senders = None if num_points is None else _draw_points(samples, num_points, seed)
+    senders = None if num_points is None else draw_points(samples, num_points, seed)
     edges, weights = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)], []
-    for pair in binned_pairs(samples, cameras, progress=progress):
+    for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):
         i, j = pair.i, pair.j
-        lines = pair.counts if senders is None else _line_counts(pair, senders[i], senders[j])
-        forth, back = pairwise_affinity(pair.bins, pair.counts, lines)
+        forth, back = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
         mean = (forth + back.T) / 2
         first, second = mean.nonzero().unbind(1)
         edges.append(torch.stack((members[i][first], members[j][second]), 1).sort(1).values)
@@ -88,24 +87,3 @@ def _directed(lines: Tensor, pixels: Tensor, *, band_radius: int, half_line: int
     covered = dilate(lines > 0, band_radius) @ pixels.T / pixels.sum(1).clamp(min=1)
     passing = lines @ dilate(pixels > 0, half_line).T / lines.sum(1, keepdim=True).clamp(min=1)
     return covered * passing
-
-
-def _line_counts(pair: BinnedPair, first: Samples, second: Samples) -> tuple[Tensor, Tensor]:
-    """(N, B) and (M, B): how many of the drawn points lie in each bin."""
-    angles = [pair.pencil.angles(side, sample.xy) for side, sample in enumerate((first, second))]
-    return bin_histogram(pair.bins, angles[0], first), bin_histogram(pair.bins, angles[1], second)
-
-
-def _draw_points(samples: list[Samples], num_points: int, seed: int) -> list[Samples]:
-    """`num_points` random pixels of each region, drawn with replacement as in the paper; weights 1."""
-    generator = torch.Generator().manual_seed(seed)
-    drawn = []
-    for sample in samples:
-        counts = torch.bincount(sample.owner, minlength=sample.num_regions)
-        first = counts.cumsum(0) - counts
-        draw = torch.rand(sample.num_regions, num_points, generator=generator).to(sample.xy.device)
-        order = sample.owner.argsort(stable=True)
-        picks = order[(first[:, None] + (draw * counts[:, None]).long()).flatten()]
-        ones = torch.ones_like(sample.weight[picks])
-        drawn.append(replace(sample, xy=sample.xy[picks], owner=sample.owner[picks], weight=ones))
-    return drawn

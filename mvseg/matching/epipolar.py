@@ -12,7 +12,7 @@ behind one of the cameras; where both epipoles lie outside the images the two ar
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import ceil
 
 import torch
@@ -62,6 +62,21 @@ def view_samples(regions: Regions, max_per_region: int | None = None) -> tuple[l
         xy, owner, weight = regions.select(nodes).pixels(max_per_region)
         samples.append(Samples(xy=xy, owner=owner, weight=weight, num_regions=len(nodes)))
     return samples, members
+
+
+def draw_points(samples: Sequence[Samples], num_points: int, seed: int) -> list[Samples]:
+    """`num_points` random pixels of each region, drawn with replacement as in the paper (Sec. 3.1); weights 1."""
+    generator = torch.Generator().manual_seed(seed)
+    drawn = []
+    for sample in samples:
+        counts = torch.bincount(sample.owner, minlength=sample.num_regions)
+        first = counts.cumsum(0) - counts
+        draw = torch.rand(sample.num_regions, num_points, generator=generator).to(sample.xy.device)
+        order = sample.owner.argsort(stable=True)
+        picks = order[(first[:, None] + (draw * counts[:, None]).long()).flatten()]
+        ones = torch.ones_like(sample.weight[picks])
+        drawn.append(replace(sample, xy=sample.xy[picks], owner=sample.owner[picks], weight=ones))
+    return drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -223,18 +238,33 @@ class BinnedPair:
         j: the second view.
         pencil: of i and j.
         bins: common to both.
-        counts: (N, B) and (M, B) float32, pixels of each region of i and of j in each bin.
+        pixels: (N, B) and (M, B) float32, pixels of each region of i and of j in each bin.
+        lines: (N, B) and (M, B) float32, lines that the same regions send out in each bin.
     """
 
     i: int
     j: int
     pencil: Pencil
     bins: Bins
-    counts: tuple[Tensor, Tensor]
+    pixels: tuple[Tensor, Tensor]
+    lines: tuple[Tensor, Tensor]
 
 
-def binned_pairs(samples: Sequence[Samples], cameras: Cameras, *, progress: bool = False) -> Iterator[BinnedPair]:
-    """All pairs of views i < j that both hold pixels and have a baseline."""
+def binned_pairs(
+    samples: Sequence[Samples],
+    cameras: Cameras,
+    *,
+    senders: Sequence[Samples] | None = None,
+    progress: bool = False,
+) -> Iterator[BinnedPair]:
+    """All pairs of views i < j that both hold pixels and have a baseline.
+
+    Args:
+        samples: pixels of the regions, one entry per view.
+        cameras: V cameras.
+        senders: the pixels that send out lines; None for all.
+        progress: show a progress bar over the pairs.
+    """
     skip = is_coincident(cameras).tolist()
     occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
     pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
@@ -242,8 +272,15 @@ def binned_pairs(samples: Sequence[Samples], cameras: Cameras, *, progress: bool
         pencil = epipolar_pencil(cameras, i, j)
         angles = pencil.angles(0, samples[i].xy), pencil.angles(1, samples[j].xy)
         bins = choose_bins(pencil, (samples[i].xy, samples[j].xy), angles)
-        counts = bin_histogram(bins, angles[0], samples[i]), bin_histogram(bins, angles[1], samples[j])
-        yield BinnedPair(i=i, j=j, pencil=pencil, bins=bins, counts=counts)
+        pixels = bin_histogram(bins, angles[0], samples[i]), bin_histogram(bins, angles[1], samples[j])
+        lines = pixels
+        if senders is not None:
+            first, second = (
+                bin_histogram(bins, pencil.angles(side, senders[view].xy), senders[view])
+                for side, view in enumerate((i, j))
+            )
+            lines = first, second
+        yield BinnedPair(i=i, j=j, pencil=pencil, bins=bins, pixels=pixels, lines=lines)
 
 
 def dilate(occupied: Tensor, radius: int) -> Tensor:

@@ -97,10 +97,9 @@ def power_iteration(graph: ViewGraph, clusters: Ints, *, alone: float = ALONE) -
     Returns:
         (D,) cluster of each region in [0, K), regions that stay alone included.
     """
-    order = view_order(graph)
+    order, clusters = view_order(graph), renumber(clusters)
     for _ in range(MAX_SWEEPS):
-        before = renumber(clusters)
-        clusters = before
+        before = clusters
         for view in order:
             here = np.flatnonzero(graph.view_index == view)
             rest = np.where(graph.view_index == view, -1, clusters)
@@ -110,9 +109,10 @@ def power_iteration(graph: ViewGraph, clusters: Ints, *, alone: float = ALONE) -
             gain = graph.weights[here] @ members / max(graph.num_views - 1, 1)
             rest[here] = assign_one_to_one(gain, alone)
             clusters = rest
-        if (renumber(clusters) == before).all():
+        clusters = renumber(clusters)
+        if (clusters == before).all():
             break
-    return renumber(clusters)
+    return clusters
 
 
 def join_alone(graph: ViewGraph, clusters: Ints, *, stop: float) -> Ints:

@@ -91,11 +91,11 @@ def ruzicka_similarity(
     for pair in binned_pairs(joint, cameras):
         for source, target, side in ((pair.i, pair.j, 0), (pair.j, pair.i, 1)):
             clusters = cluster_of[source_members[source]]
-            sent = pair.counts[side][: len(clusters)] > 0
+            sent = pair.pixels[side][: len(clusters)] > 0
             bands = torch.zeros(num_clusters, pair.bins.num_bins, device=regions.device)
             bands.index_add_(0, clusters, dilate(sent, pair.bins.band_radius(side)))
             count[target] += torch.bincount(clusters, minlength=num_clusters)
-            received = pair.counts[1 - side][sources[target].num_regions :]
+            received = pair.pixels[1 - side][sources[target].num_regions :]
             on_mask[target_members[target]] += received @ bands.T
             image = bin_histogram(pair.bins, pair.pencil.angles(1 - side, images[target].xy), images[target])
             on_image[target] += (image @ bands.T)[0]

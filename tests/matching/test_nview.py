@@ -11,7 +11,7 @@ import torch
 from sklearn.metrics import adjusted_rand_score
 
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.nview.cluster_scores import ClusterScores
+from mvseg.matching.nview.cluster_scores import ClusterScores, members_of
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.label_rows import EMPTY, OUTSIDE, RowTable, row_table, sample_pixels
 from mvseg.matching.nview.match_nview import match_nview
@@ -188,6 +188,12 @@ def test_pixels_are_spread_evenly_and_never_more_than_asked(balls: BallScene) ->
         column, row = (xy[region == index] - torch.tensor([x1, y1])).long().unbind(1)
         assert balls.regions.crop(index)[row, column].all()
         assert len(torch.unique(xy[region == index], dim=0)) == counts[index]
+
+
+def test_members_are_in_rising_order_and_the_unmatched_are_left_out() -> None:
+    members = members_of(np.array([2, -1, 0, 2]), 4)
+    assert [cluster.tolist() for cluster in members] == [[2], [], [0, 3], []]
+    assert members_of(np.zeros(0, np.int64), 0) == []
 
 
 # --- the search

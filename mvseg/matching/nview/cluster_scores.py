@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -17,7 +18,6 @@ from numpy.typing import NDArray
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.label_rows import EMPTY, RowTable, run_starts
 from mvseg.matching.one_per_view import ViewGraph
-from mvseg.partition import members_of
 
 # Log-odds that two regions show one instance against their epipolar weight, on degraded masks of development plants.
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
@@ -26,6 +26,13 @@ PRIOR, SPAN = 2.5, 6.0  # added to the log-odds; what divides them
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
+
+
+def members_of(clusters: Ints, num_clusters: int) -> list[Ints]:
+    """The members of clusters 0 .. K - 1 in rising order; an unused number has none, -1 is left out."""
+    order = np.argsort(clusters, kind="stable")
+    starts = np.searchsorted(clusters[order], np.arange(num_clusters + 1))
+    return [order[start:stop] for start, stop in pairwise(starts)]
 
 
 @dataclass(frozen=True, eq=False)

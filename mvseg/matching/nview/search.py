@@ -62,8 +62,8 @@ def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False) 
     clusters, bounds = renumber(clusters), scores.table.bounds
     order = view_order(scores.graph)
     for _ in range(MAX_SWEEPS):
-        before = renumber(clusters)
-        clusters, landings = before.copy(), scores.landings(before)
+        before, landings = clusters, scores.landings(clusters)
+        clusters = before.copy()
         for view in order.tolist():
             here = bounds.regions(view)
             if here.start == here.stop:
@@ -74,9 +74,10 @@ def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False) 
                 chosen = _join_pieces(chosen, gains, scores.config)
             fresh = clusters.max() + 1 + np.arange(len(chosen))
             clusters[here] = np.append(gains.clusters, fresh)[chosen]
-        if (renumber(clusters) == before).all():
+        clusters = renumber(clusters)
+        if (clusters == before).all():
             break
-    return renumber(clusters)
+    return clusters
 
 
 def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
@@ -89,12 +90,12 @@ def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
 
     Args:
         scores: of D regions.
-        clusters: (D,) cluster of each region in [0, K).
+        clusters: (D,) cluster of each region in [0, K), numbered by their first region.
 
     Returns:
-        (D,) int64 cluster of each region in [0, K), numbered by their first region.
+        (D,) int64, the same for what is left.
     """
-    clusters, table, thresholds = renumber(clusters), scores.table, scores.config.thresholds
+    table, thresholds = scores.table, scores.config.thresholds
     is_shown = np.zeros((int(clusters.max(initial=-1)) + 1, table.num_views), bool)
     is_shown[clusters, table.view_index] = True
     is_few = is_shown.sum(1) <= max(1, thresholds.few * table.num_views)
