@@ -4,8 +4,8 @@ Frames     world, cam (one per view), px. Poses are `cam_from_world`: x_cam = R 
            +z, +x is right, +y is down (OpenCV, COLMAP). Names carry frames, so that products cancel: `j_from_world`,
            `px_from_cam`, `world_from_px`.
 Pixels     the centre of the top-left pixel is (0.5, 0.5) (COLMAP); pixel (column c, row r) covers [c, c+1) x [r, r+1).
-           Zero-centred habits (OpenCV, torchvision) are converted where they enter, in `formats/` and `detectors/`; boxes
-           of masks are made in `regions.py`.
+           Zero-centred habits (OpenCV, torchvision) are converted where they enter, in `formats/` and `detectors/`.
+           Boxes of masks are made in `regions.py`.
 Boxes      xyxy, half-open and continuous: x2 - x1 is the number of pixel columns.
 Lenses     distortion is removed once, on load: `Cameras` are pinholes. `View.lens` keeps the photo's own camera, so
            that labels can be written in the frame of the photo the user took.
