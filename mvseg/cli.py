@@ -161,12 +161,12 @@ def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet
             warnings.warn("the detect options do nothing: masks are given", InputWarning, stacklevel=1)
         result = run_scene(scene, masks, config, progress=not quiet)
     # each matching of a detector's loop may repeat a warning
-    remarks = list(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning)))
+    messages = list(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning)))
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
-    for remark in remarks:
-        print(f"mvseg: warning: {remark}", file=sys.stderr)
-    run = describe_run(result, masks, config, remarks=remarks)
+    for message in messages:
+        print(f"mvseg: warning: {message}", file=sys.stderr)
+    run = describe_run(result, masks, config, messages=messages)
     run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
     save_result(result, out, run, progress=not quiet)
     num_masks, num_views = len(result.regions), len(result.scene.views)
@@ -191,8 +191,8 @@ def _eval(args: Namespace) -> int:
     metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[judged], true[judged]))
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
     if metrics["no_instance"]:
-        remark = f"{metrics['no_instance']} of {len(ids)} masks show no leaf of the truth: they are not judged"
-        print(f"mvseg: warning: {remark}", file=sys.stderr)
+        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: they are not judged"
+        print(f"mvseg: warning: {message}", file=sys.stderr)
     for name, value in metrics.items():
         print(f"{name:15} {value:.4f}" if isinstance(value, float) else f"{name:15} {value}")
     try:
@@ -222,9 +222,8 @@ def _models(args: Namespace) -> int:
         return 0
     for entry in list_detectors():
         scores = entry.metrics.get("test") or entry.metrics.get("validation") or {}
-        found = [scores.get(name) for name in ("mask_AP", "mask_AP50")]
-        known = [value for value in found if value is not None]
-        shown = "mask AP {:.3f}, AP50 {:.3f}".format(*known) if len(known) == 2 else "not measured"
+        measured = [scores[name] for name in ("mask_AP", "mask_AP50") if scores.get(name) is not None]
+        shown = "mask AP {:.3f}, AP50 {:.3f}".format(*measured) if len(measured) == 2 else "not measured"
         size = f"{entry.weights.stat().st_size / 1e6:.0f} MB" if entry.weights.is_file() else "weights missing"
         print(f"{entry.name:15} {size}, {shown}; {entry.weights.parent / 'card.md'}")
     return 0

@@ -583,7 +583,7 @@ def test_masks_that_show_no_true_leaf_are_counted(
     write_label_png(truth / "001.png", np.zeros_like(labels))
     capsys.readouterr()
     assert main(["eval", str(out / "plant"), "--truth", str(truth)]) == 0
-    assert "3 of 12 masks show no leaf of the truth" in capsys.readouterr().err
+    assert "3 of 12 masks show no true leaf" in capsys.readouterr().err
 
 
 def test_detect_options_beside_masks_are_warned_of(

@@ -91,7 +91,7 @@ class TestDescribeRun:
     def test_it_says_where_a_result_comes_from(self, plant: Path) -> None:
         result = run_scene(plant, plant / "masks", IDS_ONLY)
         config = RunConfig(match=MatchConfig(seed=3), reconstruct=None)
-        run = describe_run(result, plant / "masks", config, remarks=["odd"])
+        run = describe_run(result, plant / "masks", config, messages=["odd"])
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert (run["scene"], run["warnings"]) == ("plant", ["odd"])

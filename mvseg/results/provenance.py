@@ -18,7 +18,7 @@ from mvseg.results.result import Result
 
 
 def describe_run(
-    result: Result, masks: Path | None, config: RunConfig, *, remarks: Sequence[str] = ()
+    result: Result, masks: Path | None, config: RunConfig, *, messages: Sequence[str] = ()
 ) -> dict[str, Any]:
     """Version, inputs with their SHA-256, resolved options, warnings.
 
@@ -26,7 +26,7 @@ def describe_run(
         result: of the run.
         masks: the masks that were given; None for a result of a detector, whose weights are hashed instead.
         config: of the run; options of stages that did not run are left out.
-        remarks: the warnings of the run.
+        messages: the warnings of the run.
     """
     options = asdict(config)
     if masks is not None:
@@ -41,7 +41,7 @@ def describe_run(
         "scene": result.scene.name,
         "inputs": {str(path): hash_files(path) for path in (result.scene.source, source) if path is not None},
         "config": {"masks": masks and str(masks)} | options,
-        "warnings": list(remarks),
+        "warnings": list(messages),
     }
 
 

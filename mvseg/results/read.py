@@ -59,14 +59,14 @@ def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
         for number, image in images.items()
     }
     true = []
-    for index, one in enumerate(content.annotations):
-        if one.image_id not in images:
-            raise InputError(f"{path}: annotations[{index}]: there is no image {one.image_id}")
-        image = images[one.image_id]
+    for index, annotation in enumerate(content.annotations):
+        if annotation.image_id not in images:
+            raise InputError(f"{path}: annotations[{index}]: there is no image {annotation.image_id}")
+        image = images[annotation.image_id]
         try:
-            mask = decode_rle(one.segmentation.counts, image.width, image.height)
+            mask = decode_rle(annotation.segmentation.counts, image.width, image.height)
         except InputError as error:
             raise InputError(f"{path}: annotations[{index}]: {error}") from None
         true.append(shown_instance(labels[image.id], mask))
-    ids = [one.instance_id for one in content.annotations]
+    ids = [annotation.instance_id for annotation in content.annotations]
     return torch.tensor(ids, dtype=torch.int64), torch.tensor(true, dtype=torch.int64)
