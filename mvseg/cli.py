@@ -149,7 +149,8 @@ def _match(args: Namespace) -> int:
 def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet: bool) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
     from mvseg.pipeline import run_scene  # keeps --help and wrong options quick
-    from mvseg.results.folder import check_out, save_result
+    from mvseg.results.earlier import check_out
+    from mvseg.results.folder import save_result
     from mvseg.results.provenance import describe_run
 
     check_out(out)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +23,13 @@ from mvseg.formats.lens import distort
 from mvseg.formats.mesh import write_glb, write_ply
 from mvseg.formats.photos import read_photo
 from mvseg.reconstruction.voxels import VoxelGrid
+from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, instance_color
 from mvseg.results.result import Result
 
-RUN_FILE = "run.json"
-
 
 def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False) -> None:
-    """Write a result folder; an earlier result at the same place is replaced.
+    """Write a result folder; an earlier result at the same place is replaced, what the user put there stays.
 
     The folder appears complete or not at all: it is written beside its place and moved there at the end; until then an
     earlier result stays. The overlays are drawn on the photos, or on grey when the scene has none at all.
@@ -43,8 +41,8 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         progress: show a progress bar over the views.
 
     Raises:
-        InputError: the place cannot be written, holds something that is no result, or a photo is broken or,
-            when others are there, missing.
+        InputError: the place cannot be written or holds something that is no result (see `check_out`), or a photo is
+            broken or, when others are there, missing.
     """
     check_out(out)
     try:
@@ -56,24 +54,12 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
             counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
             seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
             how = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
-            text = json.dumps(run | how | {"counts": counts, "seconds": seconds}, indent=1, default=str)
+            more = {"counts": counts, "seconds": seconds, "files": list_files(folder)}
+            text = json.dumps(run | how | more, indent=1, default=str)
             (folder / RUN_FILE).write_text(text + "\n", encoding="utf-8")
+            keep_user_files(out, folder)
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
-
-
-def check_out(out: Path) -> None:
-    """Raises InputError when `out` is a file, lies where nothing can be written, or is a folder that holds something
-    other than an earlier result."""
-    place = out.resolve()
-    if out.is_dir():
-        if not os.access(place, os.R_OK) or (any(place.iterdir()) and not (place / RUN_FILE).is_file()):
-            raise InputError(f"{out}: holds files that are no earlier result, expected a new or an empty folder")
-    elif out.exists() or any(parent.is_file() for parent in place.parents):
-        raise InputError(f"{out}: the output folder is not writable (a file is in its place)")
-    nearest = next((parent for parent in place.parents if parent.exists()), place)
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"{out}: the output folder is not writable (no right to write in {nearest})")
 
 
 def _write_images(result: Result, folder: Path, progress: bool) -> None:

@@ -13,6 +13,7 @@ import pytest
 import torch
 import trimesh
 
+import mvseg.results.earlier
 import mvseg.results.folder
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
@@ -23,7 +24,8 @@ from mvseg.formats.scene_folder import load_masks
 from mvseg.matching.result import MergedMask
 from mvseg.pipeline import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.results.folder import check_out, save_result
+from mvseg.results.earlier import check_out
+from mvseg.results.folder import save_result
 from mvseg.results.overlay import instance_color
 from mvseg.results.read import read_instances
 from mvseg.results.result import Result
@@ -323,9 +325,39 @@ class TestWholeOrNotAtAll:
 
     def test_an_earlier_result_is_replaced_whole(self, result: Result, tmp_path: Path) -> None:
         save_result(result, tmp_path / "out", {})
-        (tmp_path / "out" / "metrics.json").touch()
         save_result(ids_only(result), tmp_path / "out", {})
         assert files_below(tmp_path / "out") == IDS_FILES
+        assert [path.name for path in tmp_path.iterdir()] == ["out"]
+
+    def test_files_of_the_user_stay(self, result: Result, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        save_result(result, out, {})
+        (out / "metrics.json").write_text("{}")
+        (out / "notes").mkdir()
+        (out / "notes" / "day 1.txt").write_text("watered")
+        (out / "notes" / "photos").symlink_to(tmp_path / "nowhere")
+        for _ in range(2):
+            save_result(ids_only(result), out, {})
+            assert files_below(out) == IDS_FILES | {"metrics.json", "notes/day 1.txt"}
+            assert (out / "notes" / "day 1.txt").read_text() == "watered"
+            assert (out / "notes" / "photos").is_symlink()
+
+    def test_a_changed_file_of_an_earlier_result_is_not_replaced(self, result: Result, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        save_result(ids_only(result), out, {})
+        (out / "labels" / "001.png").write_bytes(b"painted by hand")
+        with pytest.raises(InputError, match=r"001\.png: was changed after mvseg wrote it"):
+            save_result(result, out, {})
+        assert (out / "labels" / "001.png").read_bytes() == b"painted by hand"
+        assert files_below(out) == IDS_FILES
+
+    def test_a_file_of_the_user_with_a_name_of_the_new_result(self, result: Result, tmp_path: Path) -> None:
+        out = tmp_path / "out"
+        save_result(ids_only(result), out, {})
+        (out / "traits.csv").write_text("mine")
+        with pytest.raises(InputError, match=r"traits\.csv: is not from mvseg, but the new result has a file"):
+            save_result(result, out, {})
+        assert (out / "traits.csv").read_text() == "mine"
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
 
     def test_an_empty_folder_and_a_link_to_it_are_taken(self, result: Result, tmp_path: Path) -> None:
@@ -345,9 +377,12 @@ class TestWholeOrNotAtAll:
 class TestPlaces:
     def test_a_folder_of_other_files_is_refused(self, result: Result, tmp_path: Path) -> None:
         (tmp_path / "thesis.tex").write_text("ten years of work")
-        with pytest.raises(InputError, match="holds files that are no earlier result, expected a new or an empty"):
-            save_result(result, tmp_path, {})
-        assert (tmp_path / "thesis.tex").read_text() == "ten years of work"
+        for run in (None, "", "{}", "[1]", '{"files": 3}', '{"mvseg": "0.1.0"}'):  # other programs write run.json, too
+            if run is not None:
+                (tmp_path / "run.json").write_text(run)
+            with pytest.raises(InputError, match="holds files that are no earlier result, expected a new or an empty"):
+                save_result(result, tmp_path, {})
+            assert (tmp_path / "thesis.tex").read_text() == "ten years of work"
 
     def test_a_file_is_refused(self, tmp_path: Path) -> None:
         (tmp_path / "out").touch()
@@ -356,7 +391,7 @@ class TestPlaces:
                 check_out(place)
 
     def test_no_right_to_write(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(mvseg.results.folder.os, "access", lambda path, mode: path != tmp_path)
+        monkeypatch.setattr(mvseg.results.earlier.os, "access", lambda path, mode: path != tmp_path)
         with pytest.raises(InputError, match=r"new/out: the output folder is not writable \(no right to write in"):
             check_out(tmp_path / "new" / "out")
 
@@ -367,7 +402,7 @@ class TestPlaces:
     def test_new_empty_and_earlier_places_are_fine(self, tmp_path: Path) -> None:
         check_out(tmp_path / "a" / "b")
         check_out(tmp_path)
-        (tmp_path / "run.json").touch()
+        (tmp_path / "run.json").write_text('{"files": {}}')
         check_out(tmp_path)
         assert [path.name for path in tmp_path.iterdir()] == ["run.json"]
 

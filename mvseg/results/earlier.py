@@ -1,0 +1,80 @@
+"""An earlier result in the place of a new one: only what mvseg wrote there, and nobody changed, is replaced.
+
+A result's run.json lists the files that were written with it and their SHA-256. Everything else in the folder belongs
+to the user (notes, the metrics.json of `mvseg eval`) and moves on into the new result.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from pathlib import Path
+
+from mvseg.errors import InputError
+from mvseg.results.provenance import hash_files
+
+RUN_FILE = "run.json"
+
+
+def check_out(out: Path) -> None:
+    """Is this a place for a result?
+
+    Raises:
+        InputError: `out` is a file, lies where nothing can be written, or is a folder that is neither empty nor an
+            earlier result, or an earlier result in which a file was changed.
+    """
+    place = out.resolve()
+    if out.is_dir():
+        if not os.access(place, os.R_OK):
+            raise InputError(f"{out}: cannot be read, expected a new or an empty folder, or an earlier result")
+        if any(place.iterdir()):
+            _check_unchanged(out, _read_listed(out))
+    elif out.exists() or any(parent.is_file() for parent in place.parents):
+        raise InputError(f"{out}: the output folder is not writable (a file is in its place)")
+    nearest = next((parent for parent in place.parents if parent.exists()), place)
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(f"{out}: the output folder is not writable (no right to write in {nearest})")
+
+
+def list_files(folder: Path) -> dict[str, str]:
+    """{path in the folder: SHA-256} of all files but run.json itself; what run.json says of them."""
+    return {name: hash_files(folder / name) for name in _names_below(folder) if name != RUN_FILE}
+
+
+def keep_user_files(out: Path, folder: Path) -> None:
+    """Copy what the user put into the earlier result at `out` into the new one in `folder`.
+
+    Raises:
+        InputError: a file of the user has the name of one of the new result; nothing of `out` is changed.
+    """
+    if not out.is_dir() or not any(out.iterdir()):
+        return
+    for name in sorted(_names_below(out) - _read_listed(out).keys() - {RUN_FILE}):
+        if os.path.lexists(folder / name):
+            message = "is not from mvseg, but the new result has a file of this name: move it away"
+            raise InputError(f"{out / name}: {message}")
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(out / name, folder / name, follow_symlinks=False)
+
+
+def _names_below(folder: Path) -> set[str]:
+    paths = folder.rglob("*")
+    return {path.relative_to(folder).as_posix() for path in paths if path.is_symlink() or not path.is_dir()}
+
+
+def _read_listed(out: Path) -> dict[str, str]:
+    """The files that the run.json of an earlier result lists, with their SHA-256."""
+    try:
+        files = json.loads((out / RUN_FILE).read_text(encoding="utf-8"))["files"]
+        return {str(name): str(sha256) for name, sha256 in files.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):  # no run.json, or another program's
+        message = "holds files that are no earlier result, expected a new or an empty folder"
+        raise InputError(f"{out}: {message}") from None
+
+
+def _check_unchanged(out: Path, listed: dict[str, str]) -> None:
+    for name, sha256 in listed.items():
+        path = out / name
+        if path.is_file() and hash_files(path) != sha256:
+            raise InputError(f"{path}: was changed after mvseg wrote it: move it away, or choose another --out")
