@@ -1,20 +1,22 @@
 """What does a detector find, and what does the cluster-aware loop add? `python benchmarks/detector.py --scenes DIR ...`
 
-Scenes are folders as `mvseg simulate` writes them (photos, true label images, true leaf meshes) or anything in the same
-layout; without `truth/leaves` nothing is said about hidden leaves. Three questions:
+Scenes are folders as `mvseg simulate` writes them (photos, true label images, true leaf meshes) or others with the same
+layout; without `truth/leaves` there are no figures for hidden leaves. Three questions:
 
-1. Average precision of the detector alone, photo by photo (all that torchvision's class score puts at 0.05 or more).
-2. The loop: of what scores at least `--min_score`, plain NMS against cluster-aware NMS after 0, 1, 2, 3 iterations:
-   mask AP, precision, recall of all leaves and of those less than half visible (visible pixels against the silhouette
-   that the leaf would have alone).
-3. The ids given to what was found: s_match, e_k and ARI over the detections that show a leaf (IoU >= 0.5).
+1. Average precision of the detector alone, photo by photo (all detections with a class score of 0.05 or more).
+2. The loop, for detections with a score of `--min_score` or more: plain NMS against cluster-aware NMS after 1, 2, 3
+   iterations. Mask AP, precision, recall of all leaves, and recall of leaves that are less than half visible (visible
+   pixels against the silhouette that the leaf would have alone).
+3. The ids of the detections: s_match, e_k and ARI over those that find a leaf (see `found_leaves`).
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections import defaultdict
+import sys
+from collections import Counter
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,9 @@ import torch
 import trimesh
 from tqdm import tqdm
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import load_photos
@@ -36,29 +41,37 @@ from mvseg.scene import Cameras, Scene
 from mvseg.training.average_precision import annotate_truth, average_precision, describe_mask, detect_and_label
 from mvseg.training.data import SampleList, list_samples, read_sample
 
-FOUND_IOU = 0.5
-HIDDEN = 0.5  # less than this share visible
+HIDDEN = 0.5  # a leaf is hidden when less than this share of it is visible
+
+
+@dataclass(frozen=True, eq=False)
+class SceneTruth:
+    """The D visible leaves of a scene: their regions, V label maps, and (D,) bool, which of them are hidden."""
+
+    regions: Regions
+    maps: list[np.ndarray]
+    is_hidden: torch.Tensor
 
 
 def list_photos(folders: list[Path]) -> SampleList:
     """The photos of all scenes with their true labels."""
     lists = [list_samples(folder / "images", folder / "truth") for folder in folders]
-    return SampleList(tuple(sample for one in lists for sample in one.samples), ("leaf",))
+    return SampleList(tuple(sample for of_scene in lists for sample in of_scene.samples), ("leaf",))
 
 
 def visible_share(folder: Path, cameras: Cameras, truth: Regions) -> np.ndarray:
-    """(D,) visible pixels of each true region against the silhouette of its leaf alone; NaN without meshes."""
+    """(D,) visible pixels of each true region over those of its leaf's silhouette alone; NaN without meshes."""
     share = np.full(len(truth), np.nan)
-    for number, (view, leaf) in enumerate(zip(truth.view_index.tolist(), truth.labels.tolist(), strict=True)):
+    for index, (view, leaf) in enumerate(zip(truth.view_index.tolist(), truth.labels.tolist(), strict=True)):
         path = folder / "truth" / "leaves" / f"leaf_{leaf:03d}.ply"
         if path.is_file():
             mesh = trimesh.load(path, process=False)
-            share[number] = min(1.0, int(truth.areas[number]) / max(1, silhouette_area(mesh, cameras, view)))
+            share[index] = min(1.0, int(truth.areas[index]) / max(1, silhouette_area(mesh, cameras, view)))
     return share
 
 
 def silhouette_area(mesh: trimesh.Trimesh, cameras: Cameras, view: int) -> int:
-    """Pixels inside the image that a mesh covers when nothing stands before it."""
+    """Pixels inside the image that a mesh covers when nothing hides it."""
     K, R, t = (x[view].numpy() for x in (cameras.K, cameras.R, cameras.t))
     seen = (mesh.vertices @ R.T + t) @ K.T
     width, height = cameras.sizes[view].tolist()
@@ -70,77 +83,68 @@ def silhouette_area(mesh: trimesh.Trimesh, cameras: Cameras, view: int) -> int:
     return int(frame.sum())
 
 
-def pair_up(found: Regions, truth: Regions, sizes: list[list[int]], scores: torch.Tensor) -> np.ndarray:
-    """(N,) index of the true region that each detection shows, best scores first, or -1."""
-    shows = np.full(len(found), -1)
-    for view, size in enumerate(sizes):
-        here, there = ((some.view_index == view).nonzero()[:, 0] for some in (found, truth))
-        if not len(here) or not len(there):
-            continue
-        a, b = (
-            torch.stack([some.mask(n, *size).flatten() for n in index.tolist()]).float()
-            for some, index in ((found, here), (truth, there))
-        )
-        common = a @ b.T
-        iou = (common / (a.sum(1)[:, None] + b.sum(1) - common)).numpy()
-        for row in scores[here].argsort(descending=True).tolist():
-            best = int(iou[row].argmax())
-            if iou[row, best] >= FOUND_IOU:
-                shows[int(here[row])] = int(there[best])
-                iou[:, best] = -1
-    return shows
-
-
-def annotate(found: Proposals, sizes: list[list[int]], first_image: int) -> list[dict[str, Any]]:
+def annotate(proposals: Proposals, sizes: list[list[int]], first_image: int) -> list[dict[str, Any]]:
     """COCO annotations of the detections of one scene."""
     annotations = []
-    for number, view in enumerate(found.regions.view_index.tolist()):
-        described = describe_mask(found.regions.mask(number, *sizes[view]), first_image + view)
-        annotations.append({**described, "category_id": 1, "iscrowd": 0, "score": float(found.scores[number])})
+    for index, view in enumerate(proposals.regions.view_index.tolist()):
+        described = describe_mask(proposals.regions.mask(index, *sizes[view]), first_image + view)
+        annotations.append({**described, "category_id": 1, "iscrowd": 0, "score": float(proposals.scores[index])})
     return annotations
 
 
-def run_loop(scene: Scene, photos: list[torch.Tensor], args: argparse.Namespace, row: str) -> tuple[Proposals, Any]:
-    """One row of the table: "plain 0.5" is NMS without clusters, a number is that many iterations."""
+def build_model(args: argparse.Namespace, row: str) -> MultiViewMaskRCNN:
+    """The model of a row of the table: "plain 0.5" is NMS without clusters, a number is that many iterations."""
     detector = load_detector(args.weights, image_size=args.image_size, min_score=args.min_score)
-    plain = row.startswith("plain")
-    model = MultiViewMaskRCNN(
-        detector, num_iterations=0 if plain else int(row), cluster_iou=float(row.split()[1]) if plain else 0.3
-    )
-    return model.find_regions(photos, scene.cameras)
+    if row.startswith("plain"):
+        return MultiViewMaskRCNN(detector, num_iterations=0, cluster_iou=float(row.split()[1]))
+    return MultiViewMaskRCNN(detector, num_iterations=int(row), cluster_iou=0.3)
+
+
+def read_truth(folder: Path, scene: Scene) -> SceneTruth:
+    regions = load_masks(scene, folder / "truth")
+    sizes = scene.cameras.sizes.tolist()
+    maps = [regions.label_map(view, regions.labels, size).numpy() for view, size in enumerate(sizes)]
+    return SceneTruth(regions, maps, torch.from_numpy(visible_share(folder, scene.cameras, regions) < HIDDEN))
+
+
+def count_found(proposals: Proposals, instance_ids: torch.Tensor, truth: SceneTruth) -> dict[str, float]:
+    """Numbers of true regions and of detections, and how right the ids of those detections are that find a leaf."""
+    credited = credit_masks(proposals.regions, proposals.scores, truth.maps)
+    right, found = credited > 0, is_found(truth.regions, proposals.regions, credited)
+    ids = matching_metrics(instance_ids[right], credited[right])
+    return {
+        "found": int(found.sum()),
+        "true": len(found),
+        "right": int(right.sum()),
+        "detections": len(right),
+        "hidden_found": int((found & truth.is_hidden).sum()),
+        "hidden": int(truth.is_hidden.sum()),
+        "s_match": ids.s_match,
+        "e_k": ids.e_k,
+        "ari": ids.ari,
+    }
 
 
 def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dict[str, float | None]]:
     """Mask AP, precision, recalls and ids of every row, pooled over the scenes (ids: mean over the scenes)."""
     rows = ["plain 0.3", "plain 0.5", *[str(n) for n in range(1, args.iterations + 1)]]
-    counts: dict[str, dict[str, list[float]]] = {row: defaultdict(list) for row in rows}
+    totals: dict[str, Counter[str]] = {row: Counter() for row in rows}
     truths: list[dict[str, Any]] = []
     detections: dict[str, list[dict[str, Any]]] = {row: [] for row in rows}
     num_images = 0
     for folder in tqdm(folders, "scenes"):
         scene = load_scene(folder)
-        photos, truth = load_photos(scene), load_masks(scene, folder / "truth")
-        sizes = scene.cameras.sizes.tolist()
-        hidden = visible_share(folder, scene.cameras, truth) < HIDDEN
+        photos, truth = load_photos(scene), read_truth(folder, scene)
         by_name = {Path(sample.name).stem: sample for sample in list_photos([folder]).samples}
         for view, name in enumerate(view.name for view in scene.views):
             truths += annotate_truth(read_sample(by_name[Path(name).stem]), num_images + view, 1)
         for row in rows:
-            found, matching = run_loop(scene, photos, args, row)
-            shows = pair_up(found.regions, truth, sizes, found.scores)
-            hit = np.isin(np.arange(len(truth)), shows)
-            detections[row] += annotate(found, sizes, num_images)
-            good = shows >= 0
-            ids = matching_metrics(matching.instance_ids[torch.from_numpy(good)], truth.labels[shows[good]])
-            values = {"found": hit.sum(), "true": len(hit), "right": good.sum(), "detections": len(good)}
-            values |= {"hidden_found": (hit & hidden).sum(), "hidden": hidden.sum()}
-            values |= {"s_match": ids.s_match, "e_k": ids.e_k, "ari": ids.ari}
-            for name, value in values.items():
-                counts[row][name].append(float(value))
+            proposals, matching = build_model(args, row).find_regions(photos, scene.cameras)
+            detections[row] += annotate(proposals, scene.cameras.sizes.tolist(), num_images)
+            totals[row].update(count_found(proposals, matching.instance_ids, truth))
         num_images += len(photos)
     table: dict[str, dict[str, float | None]] = {}
-    for row in rows:
-        total = {name: sum(values) for name, values in counts[row].items()}
+    for row, total in totals.items():
         scores = average_precision(truths, detections[row], num_images)
         table[row] = {
             "mask_AP": scores["mask_AP"],
@@ -157,15 +161,15 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=Path, nargs="+", required=True, help="scene folders with truth/")
     parser.add_argument("--weights", default="leaf-slim")
-    parser.add_argument("--image_size", type=int, help="longer side that photos are scaled to (what the weights say)")
-    parser.add_argument("--min_score", type=float, default=DetectConfig.min_score, help="of the loop's detections")
-    parser.add_argument("--iterations", type=int, default=3, help="0 for average precision alone")
+    parser.add_argument("--image_size", type=int, help="longer side of scaled photos (default: as the weights say)")
+    parser.add_argument("--min_score", type=float, default=DetectConfig.min_score, help="of detections in the loop")
+    parser.add_argument("--iterations", type=int, default=3, help="of the loop at most; 0 for average precision alone")
     parser.add_argument("--json", type=Path, help="write the figures here")
     args = parser.parse_args()
     samples = list_photos(args.scenes)
-    shown = tqdm(range(len(samples)), "photos")
+    indices = tqdm(range(len(samples)), "photos")
     detector = load_detector(args.weights, image_size=args.image_size)
-    alone = average_precision(*detect_and_label(detector, samples, shown, torch.device("cpu")), len(samples))
+    alone = average_precision(*detect_and_label(detector, samples, indices, torch.device("cpu")), len(samples))
     print(json.dumps(alone))
     report: dict[str, Any] = {"num_photos": len(samples), "detector": alone}
     if args.iterations:

@@ -1,6 +1,7 @@
 """Memory and time of the NMS loop on 28 views x 300 proposals, 1280 x 960: `python benchmarks/proposal_memory.py`
 
-Masks as the mask head gives them (28 x 28 probabilities and boxes), pasted as crops, matched, assigned and suppressed.
+Masks as the mask head returns them (28 x 28 probabilities and boxes) are pasted as crops, matched, assigned to clusters
+and suppressed.
 """
 
 from __future__ import annotations
@@ -8,17 +9,24 @@ from __future__ import annotations
 import argparse
 import json
 import resource
+import sys
 import time
+from pathlib import Path
 
 import torch
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.proposals import gather_proposals
+from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.growth import grow_plant
+from mvseg.simulation.growth import Plant, grow_plant
 
 
-def mask_head_output(plant, cameras, view: int, count: int, generator: torch.Generator) -> dict[str, torch.Tensor]:
+def mask_head_output(
+    plant: Plant, cameras: Cameras, view: int, *, count: int, generator: torch.Generator
+) -> dict[str, torch.Tensor]:
     """`count` jittered boxes around the projections of the leaves, with elliptic masks."""
     width, height = cameras.sizes[view].tolist()
     boxes = []
@@ -32,29 +40,29 @@ def mask_head_output(plant, cameras, view: int, count: int, generator: torch.Gen
     chosen = chosen.clamp(min=torch.zeros(4), max=torch.tensor([width, height, width, height]).float())
     grid = torch.linspace(-1, 1, 28)
     ellipse = ((grid[:, None] ** 2 + grid**2) < 1).float().expand(count, 1, 28, 28)
-    scores = torch.rand(count, generator=generator)
-    labels = torch.ones(count, dtype=torch.int64)
     return {
         "boxes": chosen,
         "masks": ellipse,
-        "scores": scores,
-        "labels": labels,
+        "scores": torch.rand(count, generator=generator),
+        "labels": torch.ones(count, dtype=torch.int64),
         "frame": torch.tensor([width, height]),
     }
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--views", type=int, default=28)
     parser.add_argument("--proposals", type=int, default=300)
     args = parser.parse_args()
     generator = torch.Generator().manual_seed(0)
     plant = grow_plant("ovate", 28, seed=3)
     cameras = arc_cameras(args.views, plant, width=1280, height=960)
-    found = [mask_head_output(plant, cameras, view, args.proposals, generator) for view in range(args.views)]
+    outputs = [
+        mask_head_output(plant, cameras, view, count=args.proposals, generator=generator) for view in range(args.views)
+    ]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start = time.perf_counter()
-    proposals = gather_proposals(found, cameras.sizes.tolist())
+    proposals = gather_proposals(outputs, cameras.sizes.tolist())
     gathered = time.perf_counter()
     keep, matching = match_proposals(proposals, cameras)
     report = {

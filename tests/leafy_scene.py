@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.formats.image_file import write_png
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene, View
 from mvseg.simulation.cameras import arc_cameras
@@ -28,17 +28,16 @@ class LeafyScene:
 
 
 def write_leafy_scene(folder: Path, *, num_leaves: int = 4, num_views: int = 10, size: int = 320) -> LeafyScene:
-    """Views 5 degrees apart in azimuth, at one height; `folder` must be there."""
-    plant = grow_plant("ovate", num_leaves, 18)  # hardly a leaf in front of another
+    """Views evenly spread over 45 degrees of azimuth, at one height; `folder` must be there."""
+    plant = grow_plant("ovate", num_leaves, 18)  # hardly any leaf hides another
     cameras = arc_cameras(num_views, plant, span_deg=45, elevations_deg=(40,), width=size, height=size)
     stage = build_stage(plant, seed=12)
     stage = replace(stage, look=replace(stage.look, spots=2.0, quilting=0.15, gloss=0.0, noise=0.004))
     views, labels, depths = [], [], []
     for view in range(num_views):
-        K, R, t = (part[view].numpy() for part in (cameras.K, cameras.R, cameras.t))
-        shot = render_stage(stage, K, R, t, size, size)
+        shot = render_stage(stage, cameras, view)
         views.append(View(f"{view:03d}", folder / f"{view:03d}.png"))
-        assert cv2.imwrite(str(views[-1].path), shot.rgb[..., ::-1])
+        write_png(views[-1].path, shot.rgb)
         labels.append(shot.ids)
         depths.append(shot.depth)
     vertices = np.concatenate([leaf.vertices for leaf in plant.leaves])

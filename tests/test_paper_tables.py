@@ -1,4 +1,4 @@
-"""The paper's experiments, on the smallest preset: what is run, kept, averaged and written up."""
+"""The paper's experiments on the smallest preset: what is run, kept, averaged and written up."""
 
 from __future__ import annotations
 
@@ -11,26 +11,25 @@ import numpy as np
 import pytest
 import torch
 
-ROOT = Path(__file__).parent.parent
-sys.path.insert(0, str(ROOT))  # benchmarks are no part of the package
+sys.path.insert(0, str(Path(__file__).parents[1]))  # benchmarks are not part of the package
 
-from benchmarks.paper_tables import printed  # noqa: E402
-from benchmarks.paper_tables.__main__ import main  # noqa: E402
-from benchmarks.paper_tables.averages import average_columns, measure  # noqa: E402
-from benchmarks.paper_tables.cells import PRESETS, Cell, keep_record, list_cells, open_cell, read_cell  # noqa: E402
-from benchmarks.paper_tables.experiments import hash_detector, run_real, run_simulated  # noqa: E402
-from benchmarks.paper_tables.masks import detected_masks, tie_detections, true_masks  # noqa: E402
-from benchmarks.paper_tables.methods import METHODS, PRINTED  # noqa: E402
-from benchmarks.paper_tables.number_of_leaves import DEFAULT, RULES, score_numbers  # noqa: E402
-from benchmarks.paper_tables.shape_error import measure_points, measure_shares, unite  # noqa: E402
-from benchmarks.paper_tables.workers import start_process  # noqa: E402
-from mvseg.evaluation.id_metrics import matching_metrics  # noqa: E402
-from mvseg.evaluation.shape_distance import shape_distance  # noqa: E402
-from mvseg.matching.config import MatchConfig  # noqa: E402
-from mvseg.matching.match_regions import match_regions  # noqa: E402
-from mvseg.multiview.config import DetectConfig  # noqa: E402
-from mvseg.regions import regions_from_label_maps  # noqa: E402
-from mvseg.simulation.dataset import list_scenes  # noqa: E402
+from benchmarks.paper_tables import printed
+from benchmarks.paper_tables.__main__ import main
+from benchmarks.paper_tables.averages import average_columns, measure
+from benchmarks.paper_tables.cells import PRESETS, Cell, keep_record, list_cells, open_cell, read_cell
+from benchmarks.paper_tables.experiments import hash_detector, run_real, run_simulated
+from benchmarks.paper_tables.masks import detected_masks, tie_detections, true_masks
+from benchmarks.paper_tables.methods import METHODS, PRINTED
+from benchmarks.paper_tables.number_of_leaves import DEFAULT, RULES, score_numbers
+from benchmarks.paper_tables.shape_error import TrueLeaves, measure_points, measure_shares, unite
+from mvseg.errors import InputError
+from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.evaluation.shape_distance import shape_distance
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.match_regions import match_regions
+from mvseg.multiview.config import DetectConfig
+from mvseg.regions import regions_from_label_maps
+from mvseg.simulation.dataset import list_scenes, start_worker
 
 
 @pytest.fixture(scope="module")
@@ -88,14 +87,14 @@ def test_the_whole_run_is_written_up_and_goes_on_where_it_stopped(
     assert {path: path.stat().st_mtime_ns for path in times} == times
 
 
-def test_processes_of_a_pool_find_what_they_are_to_call() -> None:
-    """`python -m PACKAGE` does not import its `__main__` in the processes of a pool (seen: they fail without end)."""
-    for function in (run_simulated, run_real, start_process):
+def test_processes_of_a_pool_find_the_functions_that_they_call() -> None:
+    """`python -m PACKAGE` does not import its `__main__` in the processes of a pool: they would fail without end."""
+    for function in (run_simulated, run_real, start_worker):
         assert not function.__module__.endswith("__main__")
 
 
 def test_without_matplotlib_there_are_no_plots(
-    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cell: Cell
+    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "matplotlib", None)
     main(["--preset", "tiny", "--cache", str(cache), "--write_only", "--out", str(tmp_path)])
@@ -111,7 +110,7 @@ def test_a_record_is_whole_or_not_there(tmp_path: Path) -> None:
         keep_record(path, fail)
     assert not path.exists()
     assert keep_record(path, lambda: {"ari": 1}) == keep_record(path, fail) == {"ari": 1}
-    assert [one.name for one in path.parent.iterdir()] == ["record.json"]
+    assert [file.name for file in path.parent.iterdir()] == ["record.json"]
 
 
 def test_the_papers_cells_with_three_fresh_test_plants_each() -> None:
@@ -140,7 +139,7 @@ def test_printed_leaf_columns_of_table_3_are_those_of_10_cameras(values: tuple[f
 # --- averages
 
 
-def test_cells_count_once_and_missing_answers_are_told() -> None:
+def test_cells_count_once_and_missing_values_are_counted() -> None:
     records = [
         {"views": 3, "leaves": 4, "ari": 1.0},
         {"views": 3, "leaves": 4, "ari": 0.5},
@@ -148,8 +147,9 @@ def test_cells_count_once_and_missing_answers_are_told() -> None:
         {"views": 5, "leaves": 4, "na": "no points"},
         {"views": 5, "leaves": 8, "na": "no points"},
     ]
-    found = average_columns(records, measure("ari"), views=(3, 5, 10), leaves=(4, 8))
-    assert [one.text(2) for one in found] == ["0.50", "N/A", "-", "0.75 (2 of 3)", "0.25 (1 of 2)", "0.50 (3 of 5)"]
+    columns = average_columns(records, measure("ari"), views=(3, 5, 10), leaves=(4, 8))
+    texts = [column.text(2) for column in columns]
+    assert texts == ["0.50", "N/A", "-", "0.75 (2 of 3)", "0.25 (1 of 2)", "0.50 (3 of 5)"]
     at_three = average_columns(records, measure("ari"), views=(), leaves=(4,), leaves_at=3)
     assert at_three[0].text(2) == "0.75"
 
@@ -157,16 +157,16 @@ def test_cells_count_once_and_missing_answers_are_told() -> None:
 # --- masks
 
 
-def test_detections_are_tied_to_true_masks_by_half_their_union() -> None:
+def test_a_detection_shows_the_leaf_that_is_half_of_their_union() -> None:
     truth = np.zeros((20, 20), np.uint16)
     truth[:10, :10], truth[:10, 10:], truth[15:] = 1, 2, 65535
-    found = np.zeros((20, 20), np.uint16)
-    found[:10, :6] = 1  # 0.6 of leaf 1
-    found[:10, 16:] = 2  # 0.4 of leaf 2
-    found[15:] = 3  # all of what is to be ignored
-    tied = tie_detections(regions_from_label_maps([found]), (truth,))
-    assert tied.true_ids.tolist() == [1, 0, 0]
-    assert tied.num_missed == 1
+    detected = np.zeros((20, 20), np.uint16)
+    detected[:10, :6] = 1  # 0.6 of leaf 1
+    detected[:10, 16:] = 2  # 0.4 of leaf 2
+    detected[15:] = 3  # all ignored pixels
+    masks = tie_detections(regions_from_label_maps([detected]), (truth,))
+    assert masks.true_ids.tolist() == [1, 0, 0]
+    assert masks.num_missed == 1
 
 
 def test_a_perfect_detector_gives_the_true_masks(cell: Cell, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -182,10 +182,10 @@ def test_a_perfect_detector_gives_the_true_masks(cell: Cell, monkeypatch: pytest
 
     monkeypatch.setattr("mvseg.training.average_precision.detect", detect)
     monkeypatch.setattr("mvseg.detectors.zoo.load_detector", lambda name: name)
-    found, true = detected_masks(cell, "leaf"), true_masks(cell)
-    assert found.num_missed == 0
-    assert sorted(found.true_ids.tolist()) == sorted(true.true_ids.tolist())
-    assert found.regions.areas.sum() == true.regions.areas.sum()
+    detected, true = detected_masks(cell, "leaf"), true_masks(cell)
+    assert detected.num_missed == 0
+    assert sorted(detected.true_ids.tolist()) == sorted(true.true_ids.tolist())
+    assert detected.regions.areas.sum() == true.regions.areas.sum()
 
 
 def test_detectors_differ_by_weights_and_by_least_score(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,15 +215,16 @@ def test_the_default_range_is_what_match_regions_does(cell: Cell) -> None:
 # --- shapes
 
 
-def test_halves_of_the_distance_make_up_d() -> None:
+def test_d_is_the_mean_of_its_halves() -> None:
     rng = np.random.default_rng(0)
     points, truth = rng.random((50, 3)), rng.random((70, 3))
-    found = measure_points(points, truth, length=2.0)
-    assert found["d"] == pytest.approx(shape_distance(torch.from_numpy(points), torch.from_numpy(truth)) / 2)
-    assert found["d"] == pytest.approx((found["excess"] + found["gaps"]) / 2)
-    assert "na" in measure_points(points[:0], truth, length=2.0)
-    by_share = measure_shares(points, np.linspace(0, 1, 50), (0.5, 1.0), truth, 2.0)
-    assert by_share["0.5"] == measure_points(points[25:], truth, 2.0)
+    leaves = TrueLeaves(truth, mean_length=2.0)
+    measures = measure_points(points, leaves)
+    assert measures["d"] == pytest.approx(shape_distance(torch.from_numpy(points), torch.from_numpy(truth)) / 2)
+    assert measures["d"] == pytest.approx((measures["excess"] + measures["gaps"]) / 2)
+    assert "na" in measure_points(points[:0], leaves)
+    by_share = measure_shares(points, np.linspace(0, 1, 50), leaves, thresholds=(0.5, 1.0))
+    assert by_share["0.5"] == measure_points(points[25:], leaves)
     assert "na" in by_share["1"]
 
 
@@ -238,7 +239,7 @@ def test_united_leaves_have_each_voxel_once_with_its_largest_share() -> None:
     assert len(unite([], 0.5)[0]) == 0
 
 
-def test_a_scene_without_truth_is_told(tmp_path: Path, cell: Cell) -> None:
+def test_a_scene_without_truth_is_refused(tmp_path: Path, cell: Cell) -> None:
     (tmp_path / "cameras.json").write_bytes((cell.folder / "cameras.json").read_bytes())
-    with pytest.raises(Exception, match="the mask file is missing"):
+    with pytest.raises(InputError, match="the mask file is missing"):
         read_cell(tmp_path, "bare", {})

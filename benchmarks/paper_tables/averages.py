@@ -1,4 +1,4 @@
-"""Averages over cells, as the paper's tables have them, and Markdown tables of them."""
+"""Averages over cells, as in the paper's tables, and Markdown tables of them."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ class Average:
     """Mean of a measure over cells; a cell is a number of leaves and a number of cameras, and counts once.
 
     Attributes:
-        value: mean over the cells of the mean over their plants; None when no scene has an answer.
-        answered: scenes that have one.
-        asked: scenes.
+        value: mean over the cells of the mean over their plants; None when no scene has a value.
+        answered: number of scenes with a value.
+        asked: number of scenes.
     """
 
     value: float | None
@@ -28,7 +28,8 @@ class Average:
     asked: int
 
     def text(self, decimals: int) -> str:
-        """The value, and how many scenes gave it when some gave none; N/A where none did; "-" where none was run."""
+        """The value, with the number of scenes behind it when some have none; "N/A" when all have none; "-" without
+        scenes."""
         if self.value is None:
             return "N/A" if self.asked else "-"
         part = "" if self.answered == self.asked else f" ({self.answered} of {self.asked})"
@@ -36,7 +37,7 @@ class Average:
 
 
 def average(records: Iterable[Record], pick: Pick) -> Average:
-    """The average of what `pick` finds in each record; None = no answer."""
+    """The average of the values that `pick` takes from the records; None = no value."""
     cells = defaultdict(list)
     asked = 0
     for record in records:
@@ -50,17 +51,17 @@ def average(records: Iterable[Record], pick: Pick) -> Average:
 
 
 def average_columns(
-    records: Sequence[Record], pick: Pick, views: Sequence[int], leaves: Sequence[int], *, leaves_at: int | None = None
+    records: Sequence[Record], pick: Pick, *, views: Sequence[int], leaves: Sequence[int], leaves_at: int | None = None
 ) -> list[Average]:
     """One average per number of cameras, then one per number of leaves (with `leaves_at` cameras only), then all."""
-    own = [record for record in records if leaves_at in (None, record["views"])]
+    for_leaves = [record for record in records if leaves_at in (None, record["views"])]
     columns = [average([r for r in records if r["views"] == number], pick) for number in views]
-    columns += [average([r for r in own if r["leaves"] == number], pick) for number in leaves]
+    columns += [average([r for r in for_leaves if r["leaves"] == number], pick) for number in leaves]
     return [*columns, average(records, pick)]
 
 
 def measure(*keys: str) -> Pick:
-    """Picks `record[key][key]...`; None where the record, or a part of it on the way, is not applicable."""
+    """Picks `record[key][key]...`; None where the record, or the part of it that is asked for, is not applicable."""
 
     def pick(record: Record) -> float | None:
         value: Record | float = record

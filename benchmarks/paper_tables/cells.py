@@ -1,9 +1,8 @@
-"""The simulated scenes: test plants of every number of leaves, photographed by every number of cameras, kept."""
+"""The simulated scenes: test plants of every number of leaves, photographed by every number of cameras, and cached."""
 
 from __future__ import annotations
 
 import json
-import os
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,14 +11,16 @@ from typing import Any
 import numpy as np
 
 from mvseg.errors import InputError
+from mvseg.formats.atomic import write_text_whole
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
 from mvseg.simulation import dataset
-from mvseg.simulation.dataset import Preset, SceneSpec, list_scenes, scene_cameras, write_scene, write_text
+from mvseg.simulation.dataset import Preset, SceneSpec, list_scenes, scene_cameras
 from mvseg.simulation.growth import grow_plant
+from mvseg.simulation.scene_writer import write_scene
 
-SEED = 7  # the test plants of seed 0 have been looked at
+SEED = 7  # the test plants of seed 0 were used in development
 Record = dict[str, Any]
 
 PAPER = replace(dataset.PRESETS["paper-eval"], plants=(("test", 3),))
@@ -32,11 +33,11 @@ PRESETS = {
 
 @dataclass(frozen=True, eq=False)
 class Cell:
-    """One plant seen by one set of cameras, or a real scene in the same layout.
+    """One plant and one set of cameras, or a real scene in the same layout.
 
     Attributes:
         name: unique among the cells.
-        axes: what the tables sort by: "leaves", "views", "family" of a simulated plant; empty for a real scene.
+        axes: what the tables group by: "leaves", "views", "family" of a simulated plant; empty for a real scene.
         folder: of the scene: cameras, images/, masks/, truth/.
         scene: cameras and views.
         truth: V arrays (H, W) uint16, true leaf ids, 0 = no leaf, 65535 = ignore.
@@ -55,7 +56,7 @@ def list_cells(preset: Preset) -> list[SceneSpec]:
 
 
 def open_cell(spec: SceneSpec, preset: Preset, cache: Path) -> Cell:
-    """The cell of a simulated scene, which is photographed into the cache when it is not there yet."""
+    """The cell of a simulated scene; one that is not in the cache is photographed first."""
     folder = cache / "scenes" / f"{preset.size[0]}px-seed-{SEED}" / spec.folder
     if not folder.exists():
         plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
@@ -65,7 +66,7 @@ def open_cell(spec: SceneSpec, preset: Preset, cache: Path) -> Cell:
 
 
 def read_cell(folder: Path, name: str, axes: Record) -> Cell:
-    """The cell of a scene folder that is there.
+    """The cell of an existing scene folder.
 
     Raises:
         InputError: the folder has no cameras or no true labels; see `load_scene` and `read_label_png`.
@@ -76,23 +77,19 @@ def read_cell(folder: Path, name: str, axes: Record) -> Cell:
         if view.lens is not None:
             raise InputError(f"{folder}: view {view.name} has lens distortion, expected undistorted photos and labels")
         maps.append(read_label_png(folder / "truth" / f"{view.name}.png", width, height))
-    return Cell(name, axes, folder, scene, tuple(maps))
+    return Cell(name=name, axes=axes, folder=folder, scene=scene, truth=tuple(maps))
 
 
 def keep_record(path: Path, make: Callable[[], Record]) -> Record:
-    """The record in a file; made, and written whole, when there is none.
+    """The record in a file; where there is none it is made and written.
 
-    A record is not made again when the code changes: then delete the folder `records` of the cache, or the part of it
-    that is concerned.
+    A change of the code does not make old records again: delete the cache's folder `records`, or the affected part.
     """
     if path.is_file():
         return read_record(path)
     record = make()
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Two runs on one cache may make the same record: each writes a file of its own before it takes the name.
-    unfinished = path.with_suffix(f".{os.getpid()}")
-    write_text(unfinished, json.dumps(record))
-    os.replace(unfinished, path)
+    write_text_whole(path, json.dumps(record))
     return record
 
 

@@ -1,8 +1,7 @@
-"""Dense points of a scene by stereo on the CPU, kept beside the records."""
+"""Dense points of a scene by stereo on the CPU, cached beside the records."""
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import numpy as np
@@ -10,15 +9,20 @@ import torch
 
 from benchmarks.paper_tables.cells import Cell
 from mvseg.baselines.dense_points import DensePoints, sgbm_points
+from mvseg.formats.atomic import write_whole
 
 
 def dense_points(cell: Cell, cache: Path) -> DensePoints:
-    """The points of semi-global matching (back end "sgbm"; the paper's PatchMatch needs a graphics card)."""
-    place = cell.folder.parents[1].name if cell.axes else "real"  # simulated scenes differ by size and seed
-    path = cache / "points" / place / f"{cell.name}.npy"
+    """The points of semi-global matching (backend "sgbm"; the paper's PatchMatch needs a graphics card)."""
+    origin = cell.folder.parents[1].name if cell.axes else "real"  # simulated scenes differ by size and seed
+    path = cache / "points" / origin / f"{cell.name}.npy"
     if not path.is_file():
+        positions = sgbm_points(cell.scene).positions.numpy()
         path.parent.mkdir(parents=True, exist_ok=True)
-        unfinished = path.with_suffix(f".{os.getpid()}.npy")
-        np.save(unfinished, sgbm_points(cell.scene).positions.numpy())
-        os.replace(unfinished, path)
+
+        def save(partial: Path) -> None:
+            with partial.open("wb") as file:
+                np.save(file, positions)
+
+        write_whole(path, save)
     return DensePoints(torch.from_numpy(np.load(path)), "sgbm")

@@ -1,4 +1,4 @@
-"""What is run on every cell, and where its records are kept."""
+"""What is run on every cell, and where its records are."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from benchmarks.paper_tables.number_of_leaves import score_numbers
 from benchmarks.paper_tables.shapes import SHAPES, measure_shape
 from mvseg.detectors.zoo import find_weights
 from mvseg.multiview.config import DetectConfig
-from mvseg.simulation.dataset import SceneSpec
+from mvseg.simulation.dataset import SceneSpec, plant_index
 
 TABLES = ("1", "2", "3", "k")
 
@@ -31,8 +31,8 @@ class Plan:
         tables: of `TABLES`.
         methods: keys of `METHODS`.
         shapes: keys of `SHAPES`.
-        shape_plants: plants per number of leaves that table 3 is made of.
-        detector: whose masks are matched too; None for none.
+        shape_plants: plants per number of leaves in table 3.
+        detector: a detector whose masks are matched, too; None for none.
         real: folders of real scenes.
     """
 
@@ -56,13 +56,13 @@ class Plan:
         return self.cache / "records" / self.preset
 
     def match_records(self, kind: str) -> Path:
-        """Folder of the records of matching, by method; detectors are told apart by `hash_detector`."""
+        """Folder of the records of matching, by method; `hash_detector` distinguishes detectors."""
         detector = f"-{hash_detector(self.detector)}" if self.detector and kind.startswith("detected") else ""
         return self.records / "match" / f"{slug(kind)}{detector}"
 
 
 def run_simulated(spec: SceneSpec, plan: Plan) -> None:
-    """Make the records of one simulated scene that are not there yet."""
+    """Make the missing records of one simulated scene."""
     wanted = [path for path, _ in list_records(spec, plan)]
     if all(path.is_file() for path in wanted):
         return
@@ -73,25 +73,26 @@ def run_simulated(spec: SceneSpec, plan: Plan) -> None:
 
 
 def run_real(folder: Path, plan: Plan) -> None:
-    """Make the records of one real scene, matched with its true masks, that are not there yet."""
+    """Make the missing records of one real scene, matched with its true masks."""
     cell = read_cell(folder, folder.resolve().name, {})
     masks = remember(partial(make_masks, cell, plan))
     for method in plan.methods:
         path = real_record(plan, folder, method)
-        keep_record(path, lambda method=method: score_method(cell, masks("true"), method, plan.cache))
+        keep_record(path, lambda method=method: score_method(cell, masks("true"), method, cache=plan.cache))
 
 
 Maker = Callable[[Cell, Callable[[str], Masks]], Record]
 
 
 def list_records(spec: SceneSpec, plan: Plan) -> Iterator[tuple[Path, Maker]]:
-    """The path of every record that the plan asks of a scene, and what makes it of the cell and its masks by kind."""
+    """The path of every record that the plan wants of a scene, and the function that makes it from the cell and its
+    masks by kind."""
     file = spec.folder.replace("/", "_") + ".json"
     if "1" in plan.tables:
         for kind in plan.kinds:
             for method in plan.methods:
                 path = plan.match_records(kind) / slug(method) / file
-                yield path, lambda cell, masks, k=kind, m=method: score_method(cell, masks(k), m, plan.cache)
+                yield path, lambda cell, masks, k=kind, m=method: score_method(cell, masks(k), m, cache=plan.cache)
     if "k" in plan.tables:
         for kind in ("true", "degraded"):
             path = plan.records / "numbers" / slug(kind) / file
@@ -99,23 +100,18 @@ def list_records(spec: SceneSpec, plan: Plan) -> Iterator[tuple[Path, Maker]]:
     if "3" in plan.tables and plant_index(spec) < plan.shape_plants:
         for name in plan.shapes:
             path = plan.records / "shapes" / slug(name) / file
-            yield path, lambda cell, masks, n=name: measure_shape(cell, masks, n, plan.cache)
+            yield path, lambda cell, masks, n=name: measure_shape(cell, masks, n, cache=plan.cache)
 
 
 def read_records(folder: Path, specs: list[SceneSpec]) -> list[Record]:
-    """The records in a folder of `list_records` that are there, with the axes of their scenes."""
-    found = []
+    """The records in a folder of `list_records` so far, with the axes of their scenes."""
+    records = []
     for spec in specs:
         path = folder / (spec.folder.replace("/", "_") + ".json")
         if path.is_file():
             axes = {"scene": spec.folder, "leaves": spec.num_leaves, "views": spec.num_views, "family": spec.family}
-            found.append(axes | read_record(path))
-    return found
-
-
-def plant_index(spec: SceneSpec) -> int:
-    """Which plant of its number of leaves a scene shows, from 0."""
-    return int(spec.folder.split("-")[1].split("_")[0])
+            records.append(axes | read_record(path))
+    return records
 
 
 def real_record(plan: Plan, folder: Path, method: str) -> Path:
@@ -132,7 +128,7 @@ def make_masks(cell: Cell, plan: Plan, kind: str) -> Masks:
 
 
 def remember(make: Callable[[str], Masks]) -> Callable[[str], Masks]:
-    """The function, which makes each kind of masks once."""
+    """The same function, which makes each kind of masks only once."""
     made: dict[str, Masks] = {}
 
     def once(kind: str) -> Masks:
@@ -145,14 +141,13 @@ def remember(make: Callable[[str], Masks]) -> Callable[[str], Masks]:
 
 @functools.cache
 def hash_detector(detector: str) -> str:
-    """First digits of the SHA-256 of a detector's weights (nothing where there is no such file) and of the least score
-    of its masks."""
+    """First digits of the SHA-256 of a detector's weights (no bytes when there is no such file) and its least score."""
     path = find_weights(detector) or Path(detector)
     weights = path.read_bytes() if path.is_file() else b""
     return hashlib.sha256(weights + str(DetectConfig.min_score).encode()).hexdigest()[:8]
 
 
 def slug(name: str) -> str:
-    """A name as a part of a path: letters, digits, dots and dashes."""
+    """A name as part of a path: letters, digits, dots and dashes."""
     words = "".join(letter if letter.isalnum() or letter == "." else " " for letter in name.lower()).split()
     return "-".join(words)

@@ -26,7 +26,7 @@ class Masks:
     Attributes:
         regions: all D masks; all of them are matched.
         true_ids: (D,) int64, the leaf that each one shows; 0 = none, not scored.
-        num_missed: true masks that no detection was tied to; 0 for true and degraded masks.
+        num_missed: true masks without a detection; 0 for true and degraded masks.
     """
 
     regions: Regions
@@ -35,22 +35,22 @@ class Masks:
 
 
 def true_masks(cell: Cell) -> Masks:
-    """The visible part of every leaf, in an order that says nothing."""
+    """The visible part of every leaf, in an order that tells nothing."""
     regions = load_masks(cell.scene, cell.folder / "masks")
     return Masks(regions, most_shown(regions, cell.truth))
 
 
 def degraded_masks(cell: Cell) -> Masks:
-    """What a segmenter with the faults of `Faults()` makes of the true masks; one over two leaves is the larger's."""
-    size = [len(cell.truth), *cell.name.encode()]
-    seeds = np.random.SeedSequence(size).generate_state(len(cell.truth))
+    """The masks of a segmenter with the default `Faults`; a mask over two leaves counts as that of the larger part."""
+    entropy = [len(cell.truth), *cell.name.encode()]
+    seeds = np.random.SeedSequence(entropy).generate_state(len(cell.truth))
     maps = [degrade_labels(ids, Faults(), seed=int(seed)) for ids, seed in zip(cell.truth, seeds, strict=True)]
     regions = regions_from_label_maps(maps)
     return Masks(regions, most_shown(regions, cell.truth))
 
 
 def detected_masks(cell: Cell, detector: str) -> Masks:
-    """What a shipped detector, or one in a .safetensors file, finds in each photo on its own."""
+    """The masks that a shipped detector, or one in a .safetensors file, finds in each photo separately."""
     from mvseg.detectors.zoo import load_detector
     from mvseg.training.average_precision import detect
 
@@ -58,8 +58,8 @@ def detected_masks(cell: Cell, detector: str) -> Masks:
     view_index, boxes, crops = [], [], []
     with torch.no_grad():
         for view, photo in enumerate(load_photos(cell.scene)):
-            found, pasted = detect(model, photo)
-            for score, soft in zip(found["scores"].tolist(), pasted, strict=True):
+            detections, pasted = detect(model, photo)
+            for score, soft in zip(detections["scores"].tolist(), pasted, strict=True):
                 mask = soft > 0.5
                 if score < DetectConfig.min_score or int(mask.sum()) < MIN_PIXELS:
                     continue
@@ -78,8 +78,8 @@ def most_shown(regions: Regions, truth: tuple[np.ndarray, ...]) -> Tensor:
 
 
 def tie_detections(regions: Regions, truth: tuple[np.ndarray, ...]) -> Masks:
-    """Tie each detection to the leaf in whose true mask it has its best IoU, if that is 0.5 or more."""
-    ids = tied_instances(regions, truth)
-    found = set(zip(regions.view_index.tolist(), ids.tolist(), strict=True))
+    """The masks of a detector; each shows the leaf whose true mask it has its best IoU with, if that is 0.5 or more."""
+    leaf = tied_instances(regions, truth)
+    found = set(zip(regions.view_index[leaf > 0].tolist(), leaf[leaf > 0].tolist(), strict=True))
     num_true = sum(len(set(np.unique(labels)) - {0, IGNORE_LABEL}) for labels in truth)
-    return Masks(regions, ids, num_true - sum(leaf > 0 for _, leaf in found))
+    return Masks(regions, leaf, num_missed=num_true - len(found))

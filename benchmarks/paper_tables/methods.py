@@ -1,4 +1,4 @@
-"""The systems of the paper and ours, behind one call: masks and scene in, instance ids out."""
+"""The paper's systems and ours behind one call: masks and scene in, instance ids out."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mvseg.regions import Regions
 
 Method = Callable[[Regions, Cell, Path], Matching]
 
-# row of the tables -> row of the paper that it stands beside
+# row of the tables -> row of the paper that it is compared with
 PRINTED = {
     "MVS-based": "MVS-based",
     "Point-based": "Point-based",
@@ -64,13 +64,13 @@ METHODS: dict[str, Method] = {
 }
 
 
-def score_method(cell: Cell, masks: Masks, method: str, cache: Path) -> Record:
+def score_method(cell: Cell, masks: Masks, method: str, *, cache: Path) -> Record:
     """Match the masks of a cell and compare with the truth.
 
-    Masks that show no leaf are matched with the others and left out of the scores.
+    Masks that show no leaf are matched with the others, but not scored.
 
     Returns:
-        The measures; only {"na": why} where the method has no answer.
+        The measures; {"na": why} alone where the method has no answer.
     """
     start = time.perf_counter()
     try:
@@ -79,10 +79,10 @@ def score_method(cell: Cell, masks: Masks, method: str, cache: Path) -> Record:
         return {"na": str(error)}
     seconds = time.perf_counter() - start
     ids, judged = matching.instance_ids, masks.true_ids > 0
-    found = matching_metrics(ids[judged], masks.true_ids[judged])
-    # Eq. 8 counts a mask on its own as right; with all of them in one cluster, as an arg max over rows of zeros has it:
-    together = matching_metrics(torch.where(ids < 0, len(ids), ids)[judged], masks.true_ids[judged])
-    purity = {"s_match": found.s_match, "s_together": together.s_match}
-    measures = {"e_k": found.e_k, "ari": found.ari, "f1": found.pair_f1}
+    metrics = matching_metrics(ids[judged], masks.true_ids[judged])
+    # Eq. 8 counts an unmatched mask as right. An arg max over rows of zeros would put all of these into one cluster:
+    together = matching_metrics(torch.where(ids < 0, len(ids) + 1, ids)[judged], masks.true_ids[judged])
+    purity = {"s_match": metrics.s_match, "s_together": together.s_match}
+    measures = {"e_k": metrics.e_k, "ari": metrics.ari, "f1": metrics.pair_f1}
     counts = {"masks": len(ids), "untied": int((ids < 0).sum()), "no_leaf": int((~judged).sum())}
     return {**purity, **measures, **counts, "missed": masks.num_missed, "by": matching.method, "seconds": seconds}

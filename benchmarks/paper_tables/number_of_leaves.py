@@ -1,4 +1,4 @@
-"""The question of |k|: SymNMF with the number of leaves given, and found by Eq. 7 in one range or another."""
+"""The question of |k|: SymNMF with the number of leaves given, or found by Eq. 7 in different ranges."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mvseg.matching.symnmf import factorise, size_spread
 KS_AT_ONCE = 8
 DEFAULT = "[m, 2 m]"
 
-# name -> smallest and largest k as multiples of m, the largest number of masks in a view; below 2 stands for 2
+# name -> smallest and largest k as multiples of m, the largest number of masks in a view; at least 2
 RANGES = {
     "m": (1.0, 1.0),
     "[m, 1.5 m]": (1.0, 1.5),
@@ -29,9 +29,9 @@ RULES = ("k given", *RANGES, f"{DEFAULT}, mean for the sum")
 
 
 def score_numbers(cell: Cell, masks: Masks) -> Record:
-    """{rule: measures} of the paper's clustering, for all `RULES`; all of them choose among the same partitions.
+    """{rule: measures} of the paper's clustering for all `RULES`, which choose among the same partitions.
 
-    The last rule is Eq. 7 as a standard deviation: with the mean over the clusters where the paper prints the sum.
+    The last rule is Eq. 7 as a standard deviation: with a mean over the clusters in place of the paper's sum.
     """
     judged = masks.true_ids > 0
     most = int(masks.regions.num_per_view.max())
@@ -46,21 +46,22 @@ def score_numbers(cell: Cell, masks: Masks) -> Record:
     chosen[RULES[-1]] = min(ks, key=lambda k: (spread[k] / k**0.5, k))
     record: Record = {}
     for name, k in chosen.items():
-        found = matching_metrics(partitions[k][judged], masks.true_ids[judged])
-        record[name] = {"s_match": found.s_match, "e_k": found.e_k, "ari": found.ari, "f1": found.pair_f1, "k": k}
+        metrics = matching_metrics(partitions[k][judged], masks.true_ids[judged])
+        measures = {"s_match": metrics.s_match, "e_k": metrics.e_k, "ari": metrics.ari, "f1": metrics.pair_f1}
+        record[name] = {**measures, "k": k}
     return record
 
 
 def partition_all(cell: Cell, masks: Masks, ks: list[int]) -> dict[int, Tensor]:
-    """{k: (D,) labels, -1 for masks that are tied to no other}: what `cluster_affinity` does for each k."""
+    """{k: (D,) labels, -1 for masks without an edge}: what `cluster_affinity` does for each k."""
     affinity = region_affinity(masks.regions, cell.scene.cameras)
     W = affinity.to_dense()
-    tied = W.sum(1) > 0
+    has_edge = W.sum(1) > 0
     partitions = {}
     for start in range(0, len(ks), KS_AT_ONCE):
         some = ks[start : start + KS_AT_ONCE]
-        for k, H in zip(some, factorise(W[tied][:, tied], some), strict=True):
+        for k, H in zip(some, factorise(W[has_edge][:, has_edge], some), strict=True):
             labels = torch.full((len(W),), -1, dtype=torch.int64)
-            labels[tied] = H.argmax(1)
+            labels[has_edge] = H.argmax(1)
             partitions[k] = labels
     return partitions

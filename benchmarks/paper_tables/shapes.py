@@ -1,4 +1,4 @@
-"""Table 3: what is reconstructed from which masks and ids, and by which rule."""
+"""Table 3: reconstructions from different masks and ids, and by different rules."""
 
 from __future__ import annotations
 
@@ -39,29 +39,24 @@ Shape = Callable[[Cell, Masked, Path], Record]
 
 
 @lru_cache(maxsize=100)
-def carve(cell: Cell, masks: Masks, members: tuple[int, ...], threshold: float, size: float) -> VoxelGrid | None:
-    """The voxels of one instance (see `back_project`); kept, because the methods agree on most instances.
+def carve(cell: Cell, masks: Masks, members: tuple[int, ...], *, threshold: float, size: float) -> VoxelGrid | None:
+    """The voxels of one instance (see `back_project`); cached, because the methods agree on most instances.
 
     Args:
-        cell: whose cameras.
+        cell: gives the cameras.
         masks: of the cell.
         members: indices of the instance's masks.
         threshold: share of the masks that a voxel needs.
         size: of the voxels, world units.
     """
     regions = masks.regions.select(torch.tensor(members))
-    with warnings.catch_warnings():  # an instance without a shape is part of the error that is measured
+    with warnings.catch_warnings():  # an instance without a shape is part of the measured error
         warnings.simplefilter("ignore", InputWarning)
         return back_project(regions, cell.scene.cameras, config=ReconstructConfig(threshold=threshold, voxel_size=size))
 
 
-def members_of(ids: Tensor) -> dict[int, tuple[int, ...]]:
-    """{instance: indices of its masks}."""
-    return {i: tuple((ids == i).nonzero()[:, 0].tolist()) for i in ids[ids >= 0].unique().tolist()}
-
-
-def measure_thresholds(cell: Cell, masks: Masks, ids: Tensor, per_leaf: int = VOXELS_PER_LEAF) -> Record:
-    """{"0.5": measures, ...}: d of the shapes of some instances, by the share of masks that a voxel needs.
+def measure_thresholds(cell: Cell, masks: Masks, ids: Tensor, *, per_leaf: int = VOXELS_PER_LEAF) -> Record:
+    """{"0.5": measures, ...}: d of the shapes of all instances, by the share of masks that a voxel needs.
 
     Args:
         cell: with true leaf meshes.
@@ -69,17 +64,18 @@ def measure_thresholds(cell: Cell, masks: Masks, ids: Tensor, per_leaf: int = VO
         ids: (D,) instance ids.
         per_leaf: voxels along the mean length of a leaf.
     """
-    truth, length = true_leaves(cell)
-    size = length / per_leaf
-    grids = [carve(cell, masks, members, min(THRESHOLDS), size) for members in members_of(ids).values()]
+    truth = true_leaves(cell)
+    size = truth.mean_length / per_leaf
+    instances = [tuple((ids == i).nonzero()[:, 0].tolist()) for i in ids[ids > 0].unique().tolist()]
+    grids = [carve(cell, masks, members, threshold=min(THRESHOLDS), size=size) for members in instances]
     shares = [(grid.points, grid.votes[grid.occupied]) for grid in grids if grid is not None]
-    return {"shapes": len(shares)} | measure_shares(*unite(shares, size), THRESHOLDS, truth, length)
+    return {"shapes": len(shares)} | measure_shares(*unite(shares, size), truth, thresholds=THRESHOLDS)
 
 
 def measure_hidden(cell: Cell, masks: Masks, ids: Tensor) -> Record:
-    """{"0.5": measures, ...} by the rule for hidden parts, `ReconstructConfig.seen_share`, beside the paper's 0.5."""
-    truth, length = true_leaves(cell)
-    size = length / VOXELS_PER_LEAF
+    """{"0.5": measures, ...} by the rule for hidden parts, `ReconstructConfig.seen_share`, with the paper's 0.5."""
+    truth = true_leaves(cell)
+    size = truth.mean_length / VOXELS_PER_LEAF
     record: Record = {}
     for share in THRESHOLDS:
         config = ReconstructConfig(threshold=PAPER_THRESHOLD, seen_share=share, voxel_size=size)
@@ -87,20 +83,23 @@ def measure_hidden(cell: Cell, masks: Masks, ids: Tensor) -> Record:
             warnings.simplefilter("ignore", InputWarning)
             grids = reconstruct_instances(masks.regions, ids, cell.scene.cameras, config=config).values()
         points = unite([(grid.points, torch.ones(int(grid.occupied.sum()))) for grid in grids], size)[0]
-        record[f"{share:g}"] = measure_points(points, truth, length)
+        record[f"{share:g}"] = measure_points(points, truth)
     return {"shapes": len(grids)} | record
 
 
-def look_up(cell: Cell, maps: list[Tensor], points: Tensor) -> Iterator[Tensor]:
-    """Per view (P,) int64: the label at the pixel of each point, -1 outside of the image and behind the camera."""
-    for labels, px, z in zip(maps, *cell.scene.cameras.project(points), strict=True):
-        height, width = labels.shape
+def is_in_mask(cell: Cell, masks: Masks, points: Tensor) -> Iterator[Tensor]:
+    """Per view (P,) bool: does the point project into any mask?"""
+    ones = torch.ones(len(masks.regions), dtype=torch.int64)
+    sizes = cell.scene.cameras.sizes.tolist()
+    for view, (px, z) in enumerate(zip(*cell.scene.cameras.project(points), strict=True)):
+        width, height = sizes[view]
+        covered = masks.regions.label_map(view, ones, (width, height)) > 0
         column, row = px.nan_to_num(-1, -1, -1).floor().clamp(-1, max(height, width)).long().unbind(1)
         inside = (z > 0) & (column >= 0) & (column < width) & (row >= 0) & (row < height)
-        yield torch.where(inside, labels[row.clamp(0, height - 1), column.clamp(0, width - 1)], -1)
+        yield inside & covered[row.clamp(0, height - 1), column.clamp(0, width - 1)]
 
 
-def measure_shape(cell: Cell, masks: Masked, name: str, cache: Path) -> Record:
+def measure_shape(cell: Cell, masks: Masked, name: str, *, cache: Path) -> Record:
     """The record of one entry of `SHAPES`; {"na": why} where nothing can be reconstructed."""
     try:
         return SHAPES[name](cell, masks, cache)
@@ -109,33 +108,30 @@ def measure_shape(cell: Cell, masks: Masked, name: str, cache: Path) -> Record:
 
 
 def dense(cell: Cell, masks: Masked, cache: Path) -> Record:
-    """All points of stereo: of leaves, stems, pot and ground."""
+    """All points of stereo: on leaves, stems, pot and ground."""
     points = dense_points(cell, cache)
-    return {"by": f"mvs ({points.backend})", "0.5": measure_points(points.positions.numpy(), *true_leaves(cell))}
+    return {"by": f"mvs ({points.backend})", "0.5": measure_points(points.positions.numpy(), true_leaves(cell))}
 
 
 def dense_on_leaves(cell: Cell, masks: Masked, cache: Path) -> Record:
     """The points of stereo that lie in some true mask of more than half of the views."""
     points = dense_points(cell, cache)
-    own = masks("true")
-    sizes = cell.scene.cameras.sizes.tolist()
-    maps = [own.regions.label_map(view, own.true_ids, size) for view, size in enumerate(sizes)]
-    shown = torch.stack([labels > 0 for labels in look_up(cell, maps, points.positions)]).double().mean(0)
-    on_leaves = points.positions[shown > PAPER_THRESHOLD].numpy()
-    return {"by": f"mvs ({points.backend})", "0.5": measure_points(on_leaves, *true_leaves(cell))}
+    shares = torch.stack(list(is_in_mask(cell, masks("true"), points.positions))).double().mean(0)
+    on_leaves = points.positions[shares > PAPER_THRESHOLD].numpy()
+    return {"by": f"mvs ({points.backend})", "0.5": measure_points(on_leaves, true_leaves(cell))}
 
 
 def semantic(kind: str) -> Shape:
-    """All masks of a view as one: voxels twice as large as those of single leaves, for there are many."""
+    """All masks of a view together; voxels twice as large as for single leaves, because there are many more."""
 
     def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
-        truth, length = true_leaves(cell)
-        config = ReconstructConfig(threshold=PAPER_THRESHOLD, voxel_size=2 * length / VOXELS_PER_LEAF)
+        truth = true_leaves(cell)
+        config = ReconstructConfig(threshold=PAPER_THRESHOLD, voxel_size=2 * truth.mean_length / VOXELS_PER_LEAF)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", InputWarning)
             grid = reconstruct_semantic(masks(kind).regions, cell.scene, config)
         points = np.zeros((0, 3)) if grid is None else grid.points.numpy()
-        return {"0.5": measure_points(points, truth, length)}
+        return {"0.5": measure_points(points, truth)}
 
     return measure
 
@@ -144,8 +140,8 @@ def matched(kind: str, method: Literal["symnmf", "nview"]) -> Shape:
     """Estimated ids and the paper's rule."""
 
     def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
-        own = masks(kind)
-        return measure_thresholds(cell, own, estimate(cell, own, method))
+        of_kind = masks(kind)
+        return measure_thresholds(cell, of_kind, estimate(cell, of_kind, method))
 
     return measure
 
@@ -154,24 +150,25 @@ def matched_hidden(kind: str) -> Shape:
     """Estimated ids and the rule for hidden parts."""
 
     def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
-        own = masks(kind)
-        return measure_hidden(cell, own, estimate(cell, own, "nview"))
+        of_kind = masks(kind)
+        return measure_hidden(cell, of_kind, estimate(cell, of_kind, "nview"))
 
     return measure
 
 
-def known(per_leaf: int = VOXELS_PER_LEAF) -> Shape:
-    """True masks with their true ids."""
+def with_true_ids(per_leaf: int = VOXELS_PER_LEAF) -> Shape:
+    """True masks with their true ids, and the paper's rule."""
 
     def measure(cell: Cell, masks: Masked, cache: Path) -> Record:
         ids = masks("true").true_ids
-        return measure_thresholds(cell, masks("true"), torch.where(ids > 0, ids, -1), per_leaf)
+        return measure_thresholds(cell, masks("true"), torch.where(ids > 0, ids, -1), per_leaf=per_leaf)
 
     return measure
 
 
 @lru_cache(maxsize=8)
 def estimate(cell: Cell, masks: Masks, method: Literal["symnmf", "nview"]) -> Tensor:
+    """(D,) instance ids."""
     return match_regions(masks.regions, cell.scene.cameras, MatchConfig(method=method)).instance_ids
 
 
@@ -183,11 +180,11 @@ SHAPES: dict[str, Shape] = {
     "MVIS (paper), true masks": matched("true", "symnmf"),
     "MVIS (nview), true masks": matched("true", "nview"),
     "MVIS (nview), true masks, hidden parts": matched_hidden("true"),
-    "true ids": known(),
+    "true ids": with_true_ids(),
     "MVIS (paper), degraded masks": matched("degraded", "symnmf"),
     "MVIS (nview), degraded masks": matched("degraded", "nview"),
     "MVIS (nview), degraded masks, hidden parts": matched_hidden("degraded"),
-    "true ids, 25 voxels": known(25),
-    "true ids, 100 voxels": known(100),
+    "true ids, 25 voxels": with_true_ids(25),
+    "true ids, 100 voxels": with_true_ids(100),
     "voxels of the truth": lambda cell, masks, cache: {"0.5": measure_voxelised_truth(cell, VOXELS_PER_LEAF)},
 }

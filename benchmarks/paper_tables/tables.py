@@ -1,4 +1,4 @@
-"""The tables of the paper from the records, the paper's printed rows beside ours, in Markdown."""
+"""The tables of the paper from the records, in Markdown, with the paper's printed rows beside ours."""
 
 from __future__ import annotations
 
@@ -8,23 +8,24 @@ from pathlib import Path
 from benchmarks.paper_tables import printed
 from benchmarks.paper_tables.averages import average, average_columns, markdown_table, measure
 from benchmarks.paper_tables.cells import PRESETS, Record, list_cells, read_record
-from benchmarks.paper_tables.experiments import Plan, plant_index, read_records, real_record, slug
+from benchmarks.paper_tables.experiments import Plan, read_records, real_record, slug
 from benchmarks.paper_tables.methods import PRINTED
 from benchmarks.paper_tables.number_of_leaves import RULES
 from benchmarks.paper_tables.shapes import DEFAULT_SHARE, SHAPES, THRESHOLDS
+from mvseg.simulation.dataset import plant_index
 
 MEASURES = {"s_match": ("s_match", 3), "e_k": ("e_k", 2), "ARI": ("ari", 3), "pair F1": ("f1", 3)}
 TOGETHER = "s_match, untied together"
 
 
 def axes(plan: Plan) -> tuple[list[int], list[int]]:
-    """The numbers of cameras and of leaves, the largest first, as the paper's columns stand."""
+    """The numbers of cameras and of leaves, the largest first, in the order of the paper's columns."""
     preset = PRESETS[plan.preset]
     return sorted(preset.views, reverse=True), sorted(preset.leaves, reverse=True)
 
 
 def printed_cells(values: Sequence[float | None], plan: Plan, decimals: int) -> list[str]:
-    """Printed values of the columns that the preset has; the average over all columns only where it has all."""
+    """Printed values of the columns that the preset has; the average over all columns only if it has them all."""
     views, leaves = axes(plan)
     cells = ["N/A" if value is None else f"{value:.{decimals}f}" for value in values]
     by_views = dict(zip(printed.VIEWS, cells[:4], strict=True))
@@ -37,27 +38,27 @@ def printed_cells(values: Sequence[float | None], plan: Plan, decimals: int) -> 
 def read_matches(plan: Plan, kind: str) -> dict[str, list[Record]]:
     """{method: records} of table 1, for one kind of masks."""
     specs = list_cells(PRESETS[plan.preset])
-    found = {m: read_records(plan.match_records(kind) / slug(m), specs) for m in plan.methods}
-    return {method: records for method, records in found.items() if records}
+    by_method = {method: read_records(plan.match_records(kind) / slug(method), specs) for method in plan.methods}
+    return {method: records for method, records in by_method.items() if records}
 
 
 def read_shapes(plan: Plan, names: Iterable[str] = tuple(SHAPES)) -> dict[str, list[Record]]:
-    """{shape: records} of table 3 for those of the names that were run, of the scenes that all of them have."""
+    """{shape: records} of table 3 for those of the names that were run, restricted to the scenes that they share."""
     specs = [spec for spec in list_cells(PRESETS[plan.preset]) if plant_index(spec) < plan.shape_plants]
     wanted = [name for name in names if name in plan.shapes]
-    found = {name: read_records(plan.records / "shapes" / slug(name), specs) for name in wanted}
-    return shared_scenes({name: records for name, records in found.items() if records})
+    by_shape = {name: read_records(plan.records / "shapes" / slug(name), specs) for name in wanted}
+    return shared_scenes({name: records for name, records in by_shape.items() if records})
 
 
 def shared_scenes(groups: dict[str, list[Record]]) -> dict[str, list[Record]]:
-    """The records of the scenes that all groups have: a run that was stopped compares the same scenes."""
+    """The records of the scenes that all groups share, so that an interrupted run, too, compares the same scenes."""
     names = [{record["scene"] for record in records} for records in groups.values()]
     shared = set.intersection(*names) if names else set()
     return {name: [record for record in records if record["scene"] in shared] for name, records in groups.items()}
 
 
 def row_name(method: str, records: Sequence[Record]) -> str:
-    """The method with the back end that answered, where that says more than the method's own name."""
+    """The method, with the backend that was used where there is a choice."""
     by = sorted({record["by"] for record in records if "by" in record})
     details = [name[name.index("(") + 1 : -1] for name in by if "(" in name]
     return f"{method} ({', '.join(details)})" if details else method
@@ -74,9 +75,9 @@ def table_1(plan: Plan, kind: str) -> str:
         for method, records in matches.items():
             if name == TOGETHER and not any(record.get("untied") for record in records):
                 continue
-            found = average_columns(records, measure(key), views, leaves)
+            columns = average_columns(records, measure(key), views=views, leaves=leaves)
             label = row_name(method, records) + (f", {len(records)} scenes" if len(records) < most else "")
-            rows.append([name, label, *(one.text(decimals) for one in found)])
+            rows.append([name, label, *(column.text(decimals) for column in columns)])
             beside.add(PRINTED[method])
         for method, values in printed.TABLE_1.get(name, {}).items():
             if method in beside:
@@ -89,29 +90,30 @@ def table_1(plan: Plan, kind: str) -> str:
 
 
 def count_masks(plan: Plan, kind: str) -> str:
-    """One sentence: how many scenes and masks, and of detections how many showed no leaf or were missed."""
-    records = next((found for found in read_matches(plan, kind).values() if not any("na" in one for one in found)), [])
-    total, free, missed = (sum(r.get(key, 0) for r in records) for key in ("masks", "no_leaf", "missed"))
+    """One sentence: how many scenes and masks; for detections also how many show no leaf, and how many are missing."""
+    by_method = read_matches(plan, kind).values()
+    records = next((records for records in by_method if not any("na" in record for record in records)), [])
+    total, without, missed = (sum(r.get(key, 0) for r in records) for key in ("masks", "no_leaf", "missed"))
     text = f"{len(records)} of {len(list_cells(PRESETS[plan.preset]))} scenes, {total} masks"
-    if free or missed:
-        text += f", of which {free} show no leaf (matched, not scored); {missed} true masks have no detection"
+    if without or missed:
+        text += f", of which {without} show no leaf (matched, not scored); {missed} true masks have no detection"
     return text + "."
 
 
 def table_2(plan: Plan) -> str:
-    """Every method on every real scene; the paper's scenes for orientation."""
+    """Every method on every real scene; the paper's own scenes for orientation."""
     rows = []
     for folder in plan.real:
         for method in plan.methods:
             path = real_record(plan, folder, method)
             if path.is_file():
-                found = read_record(path)
-                values = [measure(key)(found) for key, _ in MEASURES.values()]
+                record = read_record(path)
+                values = [measure(key)(record) for key, _ in MEASURES.values()]
                 texts = ["N/A" if value is None else f"{value:.3f}" for value in values]
-                rows.append([folder.resolve().name, row_name(method, [found]), *texts])
-    for place, scene in enumerate(("real plant", "balloon", "ornament", "average")):
+                rows.append([folder.resolve().name, row_name(method, [record]), *texts])
+    for column, scene in enumerate(("real plant", "balloon", "ornament", "average")):
         for method, scores in printed.TABLE_2.items():
-            s_match, e_k = scores[place]
+            s_match, e_k = scores[column]
             rows.append([f"*paper: {scene}*", f"*{method}*", f"{s_match:.3f}", f"{e_k:g}", "-", "-"])
     return markdown_table(["scene", "method", *MEASURES], rows)
 
@@ -140,23 +142,23 @@ def table_3(plan: Plan) -> str:
             rows.append([f"*paper: {paper}*", *(cells if at == 10 else [*cells[: len(views)], *["-"] * len(leaves)])])
             last = paper
         if name in shapes:
-            found = average_columns(shapes[name], measure(threshold, "d"), views, leaves, leaves_at=at)[:-1]
+            columns = average_columns(shapes[name], measure(threshold, "d"), views=views, leaves=leaves, leaves_at=at)
             label = name + (f" {threshold}" if "hidden" in name else "")
-            rows.append([row_name(label, shapes[name]), *(one.text(3) for one in found)])
+            rows.append([row_name(label, shapes[name]), *(column.text(3) for column in columns[:-1])])
     header = ["method", *(f"{n} cams" for n in views), *(f"{n} leaves, {at} cams" for n in leaves)]
     return f"{count_scenes(shapes, plan)}\n\n{markdown_table(header, rows)}"
 
 
 def count_scenes(groups: dict[str, list[Record]], plan: Plan) -> str:
-    """One sentence: of how many scenes a table is made, and of how many it would be when everything has been run."""
+    """One sentence: how many scenes a table shows, out of how many when everything has been run."""
     asked = sum(plant_index(spec) < plan.shape_plants for spec in list_cells(PRESETS[plan.preset]))
-    found = len(next(iter(groups.values()), []))
-    remark = "" if found == asked else " The others were not run yet: columns are not of the same plants."
-    return f"{found} of {asked} scenes.{remark}"
+    done = len(next(iter(groups.values()), []))
+    remark = "" if done == asked else " The others have not been run yet: columns do not show the same plants."
+    return f"{done} of {asked} scenes.{remark}"
 
 
 def table_error(plan: Plan) -> str:
-    """What d is made of: one thing changed at a time; d (excess / gaps) per number of cameras."""
+    """What d consists of: one thing is changed at a time; d (excess / gaps) per number of cameras."""
     wanted = [
         ("voxels that hold the true points", "voxels of the truth"),
         ("true masks and ids, 25 voxels per leaf length", "true ids, 25 voxels"),
@@ -221,6 +223,6 @@ def table_numbers(plan: Plan) -> str:
 
 
 def read_notes(path: Path) -> dict[str, str]:
-    """{heading: text} of a file of `## heading` sections, written by hand."""
+    """{heading: text} of a hand-written file of `## heading` sections."""
     sections = path.read_text(encoding="utf-8").split("\n## ")
     return {name.strip(): text.strip() for name, _, text in (section.partition("\n") for section in sections[1:])}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from benchmarks.paper_tables.cells import PRESETS, SEED, list_cells
+from benchmarks.paper_tables.cells import PRESETS, SEED, Record, list_cells, read_record
 from benchmarks.paper_tables.experiments import Plan, read_records, real_record, slug
 from benchmarks.paper_tables.number_of_leaves import RULES
 from benchmarks.paper_tables.plots import plot_all
@@ -22,17 +22,20 @@ from benchmarks.paper_tables.tables import (
     table_numbers,
     table_rules,
 )
-from mvseg.simulation.dataset import write_text
+from mvseg.formats.atomic import write_text_whole
 
 TEMPLATE = Path(__file__).with_name("benchmarks.template.md")
 NOTES = Path(__file__).with_name("notes.md")
 
 
 def write_up(plan: Plan, out: Path) -> str:
-    """Write `benchmarks.md`, `.json` and the plots into a folder; what was written, as text.
+    """Write `benchmarks.md`, `benchmarks.json` and the plots into a folder.
 
-    What stands between the tables is written by hand: in the template what holds for any run, in the notes what holds
-    for the records of the preset "paper", which alone gets them.
+    The text between the tables is written by hand. The template holds for any run; the notes are about the records of
+    the preset "paper", and only that preset gets them.
+
+    Returns:
+        The content of `benchmarks.md`.
     """
     out.mkdir(parents=True, exist_ok=True)
     plots = {path.stem: path.name for path in plot_all(plan, out)}
@@ -59,9 +62,9 @@ def write_up(plan: Plan, out: Path) -> str:
         parts += ["## The number of leaves: given, and found", f"`{base} --tables k`", table_numbers(plan)]
         parts.append(notes.get("numbers", ""))
     text = "\n\n".join(part for part in parts if part) + "\n"
-    write_text(out / "benchmarks.md", text)
+    write_text_whole(out / "benchmarks.md", text)
     real = " --real FOLDER ..." if plan.real else ""
-    write_text(out / "benchmarks.json", describe_records(plan, f"{base}{detector}{real}"))
+    write_text_whole(out / "benchmarks.json", describe_records(plan, f"{base}{detector}{real}"))
     return text
 
 
@@ -70,17 +73,18 @@ def picture(plots: dict[str, str], name: str) -> str:
 
 
 def describe_records(plan: Plan, command: str) -> str:
-    """All records as JSON, one scene a line, numbers to five digits."""
+    """All records as JSON, one line per scene, numbers to five digits."""
     specs = list_cells(PRESETS[plan.preset])
-    groups = {f"table 3, {name}": found for shape in SHAPES for name, found in read_shapes(plan, [shape]).items()}
+    shapes = [read_shapes(plan, [shape]) for shape in SHAPES]  # one at a time: each with all scenes that it has
+    groups = {f"table 3, {name}": records for of_shape in shapes for name, records in of_shape.items()}
     for kind in plan.kinds:
-        groups |= {f"table 1, {kind}, {name}": found for name, found in read_matches(plan, kind).items()}
+        groups |= {f"table 1, {kind}, {name}": records for name, records in read_matches(plan, kind).items()}
     for kind in ("true", "degraded"):
         groups[f"number of leaves, {kind}"] = read_records(plan.records / "numbers" / slug(kind), specs)
     for folder in plan.real:
         paths = {method: real_record(plan, folder, method) for method in plan.methods}
-        found = [{"method": m} | json.loads(path.read_text()) for m, path in paths.items() if path.is_file()]
-        groups[f"table 2, {folder.resolve().name}"] = found
+        records = [{"method": m} | read_record(path) for m, path in paths.items() if path.is_file()]
+        groups[f"table 2, {folder.resolve().name}"] = records
     about = {"command": command, "preset": plan.preset, "seed": SEED, "rules for the number of leaves": RULES}
     parts = [json.dumps(about)[1:-1]]
     for name, records in groups.items():
@@ -88,8 +92,8 @@ def describe_records(plan: Plan, command: str) -> str:
     return "{\n" + ",\n".join(parts) + "\n}\n"
 
 
-def shorten(record: dict) -> str:
-    """One record as compact JSON, without timings (which no two runs share), numbers to five digits."""
+def shorten(record: Record) -> str:
+    """One record as compact JSON without timings (they differ from run to run), numbers to five digits."""
     rounded = json.loads(json.dumps(record), parse_float=lambda text: float(f"{float(text):.5g}"))
     rounded.pop("seconds", None)
     return json.dumps(rounded, separators=(",", ":"))

@@ -1,9 +1,12 @@
-"""Dense points of a scene by multi-view stereo, for the comparisons of Sec. 4.2 and 4.3; three ways to get them."""
+"""Dense points of a scene by multi-view stereo, for the comparisons of Sec. 4.2 and 4.3.
+
+From one of three backends: semi-global matching (any CPU), COLMAP's PatchMatch (CUDA), or a file made elsewhere.
+"""
 
 from __future__ import annotations
 
 import tempfile
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +25,7 @@ from mvseg.scene import Cameras, Scene
 
 MAX_SIDE = 1000  # pixels; larger photos are made smaller for stereo
 NUM_SOURCES = 20  # views that each view is compared with at most, COLMAP's default
-POINTS_PER_VIEW = 50  # of the made-up sparse model
+POINTS_PER_VIEW = 50  # of the artificial sparse model
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,7 +34,7 @@ class DensePoints:
 
     Attributes:
         positions: (P, 3) float64, world frame of the scene's cameras; none when stereo found nothing.
-        backend: what made them: "sgbm", "patchmatch" or "file". Results of different ones must not be mixed.
+        backend: what made them: "sgbm", "patchmatch" or "file". Results of different backends must not be mixed.
     """
 
     positions: Tensor
@@ -47,11 +50,11 @@ def read_dense_points(path: Path | str) -> DensePoints:
     """Points that were made elsewhere, in the world frame of the scene's cameras; backend "file".
 
     Args:
-        path: a PLY file, or a dense workspace of COLMAP: its fused.ply, or where there is none its depth and normal
-            maps in stereo/, which are fused here (needs no graphics card).
+        path: a PLY file, or a dense workspace of COLMAP: its fused.ply, or if there is none its depth and normal maps
+            in stereo/, which are fused here (no graphics card needed).
 
     Raises:
-        InputError: nothing of the kind is there, or it cannot be read.
+        InputError: there is no such file, or it cannot be read.
     """
     path = Path(path)
     if path.is_dir() and not (path / "fused.ply").is_file():
@@ -70,13 +73,13 @@ def read_dense_points(path: Path | str) -> DensePoints:
 
 
 def patch_match_points(scene: Scene) -> DensePoints:
-    """Points of COLMAP's PatchMatch stereo and fusion with their default settings, the paper's own; "patchmatch".
+    """Points of COLMAP's PatchMatch stereo and fusion with default settings, as in the paper; backend "patchmatch".
 
     Raises:
         InputError: this pycolmap was built without CUDA, or a photo is missing or broken.
     """
     if not pycolmap.has_cuda:
-        raise InputError("PatchMatch stereo needs a pycolmap with CUDA, as pycolmap-cuda12; this one has none")
+        raise InputError("PatchMatch stereo needs a pycolmap with CUDA, such as pycolmap-cuda12; this one has none")
     photos, cameras = read_small_photos(scene)
     with tempfile.TemporaryDirectory(prefix="mvseg-") as folder:
         workspace = Workspace(Path(folder), cameras)
@@ -88,9 +91,9 @@ def patch_match_points(scene: Scene) -> DensePoints:
 
 
 def sgbm_points(scene: Scene) -> DensePoints:
-    """Points of semi-global matching (see `stereo`) and COLMAP's fusion, on any CPU; "sgbm".
+    """Points of semi-global matching (see `stereo`) and COLMAP's fusion, on any CPU; backend "sgbm".
 
-    None come out where no two views are within 25 degrees of each other.
+    There are none when no two views are within 25 degrees of each other.
 
     Raises:
         InputError: a photo is missing or broken.
@@ -103,8 +106,8 @@ def sgbm_points(scene: Scene) -> DensePoints:
 def fuse_depths(photos: list[np.ndarray], depths: list[np.ndarray], cameras: Cameras) -> Tensor:
     """(P, 3) float64 world points of V depth maps (H, W) float32, 0 = unknown, by COLMAP's fusion.
 
-    A point needs three views that agree; depths may differ by 1.5 %, normals (of the depth maps, thus rough) by 45
-    degrees.
+    A point needs three views that agree: depths within 1.5 %, normals (rough, since they come from the depth maps)
+    within 45 degrees.
     """
     if not any(depth.any() for depth in depths):
         return torch.zeros(0, 3, dtype=torch.float64)
@@ -120,27 +123,27 @@ def fuse_depths(photos: list[np.ndarray], depths: list[np.ndarray], cameras: Cam
 
 
 def read_small_photos(scene: Scene) -> tuple[list[np.ndarray], Cameras]:
-    """V photos (H, W, 3) uint8 RGB of at most `MAX_SIDE` pixels a side, and their cameras on the CPU."""
+    """V photos (H, W, 3) uint8 RGB, scaled down to at most `MAX_SIDE` pixels a side, and their cameras on the CPU."""
     cameras = scene.cameras.to("cpu")
     K, sizes, photos = cameras.K.clone(), cameras.sizes.clone(), []
     for view in range(len(cameras)):
         photo = read_photo(scene, view)
         scale = min(1.0, MAX_SIDE / max(photo.shape[:2]))
         if scale < 1:
-            old = sizes[view].double()
-            sizes[view] = (old * scale).round().long().clamp(min=1)
+            full = sizes[view].double()
+            sizes[view] = (full * scale).round().long().clamp(min=1)
             photo = cv2.resize(photo, tuple(sizes[view].tolist()), interpolation=cv2.INTER_AREA)
-            K[view, :2] *= (sizes[view] / old)[:, None]  # pixel corners are whole numbers: scaling needs no shift
+            K[view, :2] *= (sizes[view] / full)[:, None]  # pixel corners are whole numbers: scaling needs no shift
         photos.append(photo)
-    return photos, Cameras(K, cameras.R, cameras.t, sizes)
+    return photos, replace(cameras, K=K, sizes=sizes)
 
 
 @dataclass(frozen=True, eq=False)
 class Workspace:
     """A dense workspace of COLMAP in `folder`.
 
-    COLMAP computes with float32: its world has the origin in the middle of what the cameras see, and their mean
-    distance for unit, wherever the scene's world is.
+    COLMAP computes with float32. So the workspace has a world of its own: the origin is the centre of what the cameras
+    see, and the unit is their mean distance from it.
     """
 
     folder: Path
@@ -152,7 +155,7 @@ class Workspace:
 
     @property
     def unit(self) -> float:
-        """World units of the scene in one of the workspace."""
+        """One unit of the workspace in world units of the scene."""
         return float(torch.linalg.vector_norm(self.cameras.centers - self.ball.center, dim=1).mean())
 
     @property
@@ -163,18 +166,18 @@ class Workspace:
         return max(near, 0.2 * float(distance.min())) / self.unit, far / self.unit
 
     def to_world(self, points: Tensor) -> Tensor:
-        """(P, 3) from the workspace to the scene's world."""
+        """(P, 3) points of the workspace in the scene's world."""
         return points * self.unit + self.ball.center
 
     def image_name(self, view: int) -> str:
         return f"{view:05d}.png"
 
     def map_path(self, kind: str, view: int) -> Path:
-        """Of the "depth" or "normal" map of a view."""
+        """Where the "depth" or "normal" map of a view is."""
         return self.folder / "stereo" / f"{kind}_maps" / f"{self.image_name(view)}.geometric.bin"
 
     def write(self, photos: list[np.ndarray]) -> None:
-        """Photos, a model, and which views to compare; everything but the maps."""
+        """Write photos, a model, and which views to compare: everything except the maps."""
         for name in ("images", "sparse", "stereo/depth_maps", "stereo/normal_maps", "stereo/consistency_graphs"):
             (self.folder / name).mkdir(parents=True)
         for view, photo in enumerate(photos):
@@ -188,8 +191,11 @@ class Workspace:
         self.model(sources).write(self.folder / "sparse")
 
     def model(self, sources: list[list[int]]) -> pycolmap.Reconstruction:
-        """The cameras as a COLMAP model. Fusion takes from the sparse points which views overlap: random points of the
-        ball, seen by a view and its sources, say so here."""
+        """The cameras as a COLMAP model.
+
+        Fusion decides from the sparse points which views overlap. Here these are random points in the ball that a view
+        and its sources see.
+        """
         model = pycolmap.Reconstruction()
         generator = torch.Generator().manual_seed(0)
         for view in range(len(self.cameras)):
@@ -217,22 +223,22 @@ class Workspace:
 
 
 def fuse(workspace: Path, options: pycolmap.StereoFusionOptions) -> Tensor:
-    """(P, 3) float64: the points that COLMAP's fusion makes of the depth and normal maps in a dense workspace.
+    """(P, 3) float64: the points that COLMAP fuses from the depth and normal maps in a dense workspace.
 
     Raises:
         InputError: the workspace cannot be read.
     """
     with tempfile.TemporaryDirectory(prefix="mvseg-") as output:
-        options.num_threads = 1  # with more, the points depend on which thread is first
+        options.num_threads = 1  # with more, the points depend on which thread comes first
         quiet = pycolmap.logging.minloglevel
         pycolmap.logging.minloglevel = int(pycolmap.logging.ERROR)
         try:
-            found = pycolmap.stereo_fusion(output, workspace, options=options)
+            fused = pycolmap.stereo_fusion(output, workspace, options=options)
         except (RuntimeError, ValueError, OSError) as error:
             raise InputError(f"{workspace}: depth maps cannot be fused ({' '.join(str(error).split())})") from None
         finally:
             pycolmap.logging.minloglevel = quiet
-    points = [point.xyz for point in found.points3D.values()]
+    points = [point.xyz for point in fused.points3D.values()]
     return torch.from_numpy(np.array(points, np.float64).reshape(-1, 3))
 
 

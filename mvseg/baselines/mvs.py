@@ -1,4 +1,4 @@
-"""MVS-based matching (Sec. 4.2): the dense points of multi-view stereo tell which regions show one thing."""
+"""MVS-based matching (Sec. 4.2): regions correspond where the dense points of multi-view stereo project."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from mvseg.baselines.dense_points import DensePoints
-from mvseg.baselines.ties import tie_graph
+from mvseg.baselines.edges import edge_graph
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
@@ -15,10 +15,10 @@ from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 
-NEAREST_SHARE = 0.1  # of the points in a region, whose centroid stands for it
+NEAREST_SHARE = 0.1  # of the points in a region; their centroid stands for the region
 
 
-def match_mvs(regions: Regions, scene: Scene, points: DensePoints, config: MatchConfig = MatchConfig()) -> Matching:
+def match_mvs(regions: Regions, scene: Scene, points: DensePoints, *, config: MatchConfig = MatchConfig()) -> Matching:
     """Match regions by dense points (Sec. 4.2, "MVS-based matching").
 
     Args:
@@ -28,8 +28,8 @@ def match_mvs(regions: Regions, scene: Scene, points: DensePoints, config: Match
         config: see `match_graph`.
 
     Returns:
-        The matching, method "mvs (<backend of the points>)". Regions without a point in them are tied only by what
-        others find in them; those that are tied to none are -1.
+        The matching, method "mvs (<backend of the points>)". A region that no point projects into has edges only from
+        the points of other regions; a region without any edge is -1.
 
     Raises:
         InputError: no points at all ("N/A" in the paper's tables), fewer than two views, or regions and cameras of
@@ -44,33 +44,33 @@ def match_mvs(regions: Regions, scene: Scene, points: DensePoints, config: Match
 
 
 def projection_graph(regions: Regions, cameras: Cameras, points: Tensor) -> Affinity:
-    """Ties each region to those that its point falls into in other views.
+    """An edge from each region to every region of another view that its 3D position projects into.
 
     Args:
-        regions: D regions; where they overlap the point falls into the smallest.
+        regions: D regions; where they overlap the smallest counts.
         cameras: V cameras, on the device of the regions.
         points: (P, 3) world positions.
     """
     anchors = region_points(regions, cameras, points)
     pixels, depth = cameras.project(anchors)
-    number = torch.arange(len(regions), device=regions.device)
-    ties = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)]
+    index = torch.arange(len(regions), device=regions.device)
+    pairs = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)]
     for view in range(len(cameras)):
         width, height = cameras.sizes[view].tolist()
-        frame = regions.label_map(view, number + 1, (width, height))
+        frame = regions.label_map(view, index + 1, (width, height))
         is_inside = (depth[view] > 0) & (pixels[view] >= 0).all(1) & (pixels[view] < cameras.sizes[view]).all(1)
-        senders = number[is_inside & (regions.view_index != view)]
+        senders = index[is_inside & (regions.view_index != view)]
         column, row = pixels[view, senders].long().unbind(1)
         hit = frame[row, column] - 1
-        ties.append(torch.stack((senders, hit), 1)[hit >= 0])
-    return tie_graph(torch.cat(ties), len(regions))
+        pairs.append(torch.stack((senders, hit), 1)[hit >= 0])
+    return edge_graph(torch.cat(pairs), len(regions))
 
 
 def region_points(regions: Regions, cameras: Cameras, points: Tensor) -> Tensor:
-    """The 3D position that stands for each region: the centroid of the nearest 10 % of the points projected into it.
+    """The 3D position that stands for each region: the centroid of the nearest 10 % of the points that project into it.
 
-    Nearest to the camera's centre, one point at least. Points behind other surfaces are not told apart, as in the
-    paper: that the nearest are taken is what keeps them out.
+    Nearest to the camera's centre; at least one point. Points behind other surfaces are not recognised as such, as in
+    the paper: taking the nearest points is what keeps them out.
 
     Args:
         regions: D regions.

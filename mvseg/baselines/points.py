@@ -1,11 +1,11 @@
-"""Point-based matching (Sec. 4.2): epipolar lines of centroids instead of epipolar bands of regions."""
+"""Point-based matching (Sec. 4.2): epipolar lines of centroids in place of epipolar bands of regions."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
-from mvseg.baselines.ties import tie_graph
+from mvseg.baselines.edges import edge_graph
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.epipolar import is_coincident
@@ -22,7 +22,7 @@ def match_points(regions: Regions, scene: Scene, config: MatchConfig = MatchConf
 
     Args:
         regions: D regions in V views.
-        scene: V >= 2 cameras; the photos are not looked at.
+        scene: V >= 2 cameras; the photos are not used.
         config: see `match_graph`.
 
     Returns:
@@ -32,33 +32,34 @@ def match_points(regions: Regions, scene: Scene, config: MatchConfig = MatchConf
         InputError: fewer than two views, or regions and cameras of different numbers of views.
     """
     check_views(regions, scene.cameras)
-    return match_graph(nearest_ray_graph(regions, scene.cameras.to(regions.device)), regions, config, method="points")
+    graph = nearest_ray_graph(regions, scene.cameras.to(regions.device))
+    return match_graph(graph, regions, config, method="points")
 
 
 def nearest_ray_graph(regions: Regions, cameras: Cameras) -> Affinity:
-    """Ties each region to the region of each other view whose ray passes nearest in 3D.
+    """An edge from each region to the region of each other view whose ray passes nearest in 3D.
 
-    The epipolar line of a centroid is the image of its viewing ray, thus the "nearest epipolar lines in 3D space" of
-    the paper are the nearest rays. The distance is the plain one in world units, as printed: no ray is too far to be
-    the nearest, so every region is tied to one of every other view that has any. Views at one place are not tied (all
-    their rays meet), nor are regions whose rays come nearest behind a camera.
+    The epipolar line of a centroid is the image of its viewing ray, so the "nearest epipolar lines in 3D space" of the
+    paper are the nearest rays. The distance is in world units and without a limit, as in the paper: every region has
+    an edge to every other view that has regions. Exceptions: two views with the same centre have no edges (all their
+    rays meet), and neither do regions whose rays come nearest behind a camera.
 
     Args:
-        regions: D regions; the first wins where two are exactly as near.
+        regions: D regions; of two that are equally near the first is taken.
         cameras: V cameras, on the device of the regions.
     """
     centers, rays = centroid_rays(regions, cameras)
     skip = is_coincident(cameras)
     members = [(regions.view_index == view).nonzero()[:, 0] for view in range(len(cameras))]
-    ties = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)]
-    for i, own in enumerate(members):
-        for j, other in enumerate(members):
-            if skip[i, j] or not len(own) or not len(other):
+    pairs = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)]
+    for i, here in enumerate(members):
+        for j, there in enumerate(members):
+            if skip[i, j] or not len(here) or not len(there):
                 continue
-            distance = pairwise_ray_distance((centers[own], rays[own]), (centers[other], rays[other]))
-            nearest, place = distance.min(1)
-            ties.append(torch.stack((own, other[place]), 1)[nearest.isfinite()])
-    return tie_graph(torch.cat(ties), len(regions))
+            distance = pairwise_ray_distance((centers[here], rays[here]), (centers[there], rays[there]))
+            least, nearest = distance.min(1)
+            pairs.append(torch.stack((here, there[nearest]), 1)[least.isfinite()])
+    return edge_graph(torch.cat(pairs), len(regions))
 
 
 def centroid_rays(regions: Regions, cameras: Cameras) -> tuple[Tensor, Tensor]:
@@ -73,15 +74,15 @@ def centroid_rays(regions: Regions, cameras: Cameras) -> tuple[Tensor, Tensor]:
 
 
 def pairwise_ray_distance(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> Tensor:
-    """Distance of the rays of two views where they come nearest.
+    """Distance between the rays of two views where they come nearest.
 
     Args:
         first: origins (N, 3) and unit directions (N, 3) of the rays of one view.
         second: (M, 3) and (M, 3) of the other.
 
     Returns:
-        (N, M), world units; of parallel rays the distance of their lines; infinite where the nearest points lie behind
-        an origin, or a ray is NaN.
+        (N, M), world units; for parallel rays the distance between their lines; infinite where the nearest points lie
+        behind an origin, or a ray is NaN.
     """
     shift = second[0] - first[0][:, None]
     u, v = first[1][:, None].expand_as(shift), second[1].expand_as(shift)

@@ -12,10 +12,10 @@ from mvseg.scene import Scene
 def reconstruct_semantic(
     regions: Regions, scene: Scene, config: ReconstructConfig = ReconstructConfig()
 ) -> VoxelGrid | None:
-    """The voxels of all leaves as one thing: "we unified the silhouettes of all leaves" (Sec. 4.3).
+    """The voxels of all leaves together: "we unified the silhouettes of all leaves" (Sec. 4.3).
 
-    A voxel is occupied when more than the threshold's share of the views that show any leaf have a mask there. Give a
-    voxel size to compare with instances: the voxel budget here is that of the whole plant.
+    A voxel is occupied when, of the views that show any leaf, more than a share of `config.threshold` have a mask
+    there. Give a voxel size to compare with instances: the voxel budget is for the whole plant here.
 
     Args:
         regions: D regions; ids are not needed.
@@ -23,7 +23,7 @@ def reconstruct_semantic(
         config: threshold, voxel size (world units) or voxel budget.
 
     Returns:
-        The grid, None when fewer than two views show anything or no point has enough votes.
+        The grid; None when fewer than two views show anything, or no point has enough votes.
 
     Raises:
         InputError: regions and cameras of different numbers of views; see also `back_project`.

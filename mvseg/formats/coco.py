@@ -149,11 +149,13 @@ def encode_mask(mask: np.ndarray) -> dict[str, Any]:
     return {"size": [int(side) for side in rle["size"]], "counts": rle["counts"].decode("ascii")}
 
 
-def write_coco(path: Path, images: list[dict[str, Any]], annotations: list[dict[str, Any]]) -> None:
-    """Write a COCO file of one category, "instance"; annotations carry "segmentation" (RLE) and their own keys."""
+def write_coco(
+    path: Path, images: list[dict[str, Any]], annotations: list[dict[str, Any]], *, category: str = "instance"
+) -> None:
+    """Write a COCO file of one category; annotations carry "segmentation" (RLE) and their own keys."""
     for number, annotation in enumerate(annotations, start=1):
         rle = annotation["segmentation"]
         annotation |= {"id": number, "category_id": 1, "iscrowd": 0}
         annotation |= {"area": int(coco_mask.area(rle)), "bbox": coco_mask.toBbox(rle).tolist()}
-    content = {"images": images, "categories": [{"id": 1, "name": "instance"}], "annotations": annotations}
+    content = {"images": images, "categories": [{"id": 1, "name": category}], "annotations": annotations}
     path.write_text(json.dumps(content) + "\n", encoding="utf-8")

@@ -27,7 +27,7 @@ class Leaf:
         faces: (F, 3) int32, wound so that the normal is the upper side.
         uv: (P, 2) float64; u runs from 0 at the base to 1 at the tip, v from -1 to 1 across the blade, 0 on the midrib.
         length: along the midrib, mm.
-        width: from edge to edge along the surface, at the widest place of the midrib, mm (the flattened blade's width).
+        width: from edge to edge along the surface, where the blade is widest, mm (the flattened blade's width).
         area: one-sided area of the mesh, mm^2.
     """
 
@@ -42,7 +42,7 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Blade:
-    """The shape of one blade before it is placed; fields as in `plants.Family`, but single numbers and radians."""
+    """The shape of one blade before it is placed; fields as in `families.Family`, but single numbers and radians."""
 
     length: float
     width: float
@@ -60,10 +60,41 @@ class Blade:
     rows: int = 28
 
 
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """A curve of straight pieces that bends evenly: a midrib, a petiole, a stem.
+
+    Attributes:
+        azimuth, elevation: direction at its start, radians.
+        steps: (n,) lengths of the pieces, mm.
+        droop: by how much it bends down in all, radians.
+        sweep: by how much it bends sideways in all, radians.
+    """
+
+    azimuth: float
+    elevation: float
+    steps: Floats
+    droop: float = 0.0
+    sweep: float = 0.0
+
+
+def arc_angles(arc: Arc) -> tuple[Floats, Floats]:
+    """Pitch (n,) and heading (n,) of the pieces of an arc."""
+    middle = (np.cumsum(arc.steps) - arc.steps / 2) / arc.steps.sum()
+    return arc.elevation - arc.droop * middle**1.3, arc.azimuth + arc.sweep * middle
+
+
+def arc_points(base: Floats, arc: Arc) -> Floats:
+    """(n + 1, 3) points of an arc that leaves `base` (3,); neighbours are exactly `arc.steps` apart."""
+    pitch, heading = arc_angles(arc)
+    ahead = np.stack([np.cos(pitch) * np.cos(heading), np.cos(pitch) * np.sin(heading), np.sin(pitch)], 1)
+    return base + np.concatenate([np.zeros((1, 3)), np.cumsum(arc.steps[:, None] * ahead, 0)])
+
+
 def blade_stations(rows: int) -> Floats:
-    """(rows + 2,) places along the midrib from 0 to 1, denser at both ends, where the outline is round."""
-    place = np.linspace(0, 1, rows + 2)
-    return 0.4 * place + 0.6 * (1 - np.cos(np.pi * place)) / 2
+    """(rows + 2,) positions along the midrib from 0 to 1, denser at both ends, where the outline is round."""
+    even = np.linspace(0, 1, rows + 2)
+    return 0.4 * even + 0.6 * (1 - np.cos(np.pi * even)) / 2
 
 
 def blade_faces(rows: int) -> Ints:
@@ -75,13 +106,14 @@ def blade_faces(rows: int) -> Ints:
 
 
 def grid_faces(grid: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Two triangles for each cell of an (r, c) grid of vertex numbers; their normal is down the rows x along them."""
+    """(F, 3) two triangles for each cell of an (r, c) grid of vertex indices; their normal points at a viewer who sees
+    the rows run down and the columns run to the right."""
     a, b, c, d = (x.ravel() for x in (grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]))
     return np.concatenate([np.stack([a, d, c], 1), np.stack([a, c, b], 1)])
 
 
 def blade_uv(rows: int) -> Floats:
-    """(P, 2) base-to-tip and edge-to-edge coordinates of the vertices that `place_blade` gives."""
+    """(P, 2) base-to-tip and edge-to-edge coordinates of the vertices that `place_blade` returns."""
     u, v = np.meshgrid(blade_stations(rows)[1:-1], np.linspace(-1, 1, BLADE_COLUMNS), indexing="ij")
     return np.concatenate([[[0.0, 0.0]], np.stack([u.ravel(), v.ravel()], 1), [[1.0, 0.0]]])
 
@@ -97,30 +129,14 @@ def half_widths(blade: Blade) -> Floats:
     return blade.width / 2 * half / half.max()
 
 
-def arc_angles(azimuth: float, elevation: float, steps: Floats, droop: float, sweep: float) -> tuple[Floats, Floats]:
-    """Pitch and heading (n,) of the straight pieces, of lengths `steps`, of the curve that `arc_points` gives."""
-    middle = (np.cumsum(steps) - steps / 2) / steps.sum()
-    return elevation - droop * middle**1.3, azimuth + sweep * middle
-
-
-def arc_points(base: Floats, azimuth: float, elevation: float, steps: Floats, droop: float, sweep: float) -> Floats:
-    """(n + 1, 3) points of a curve that leaves `base` and bends down by `droop` and sideways by `sweep` in all.
-
-    Its pieces have the lengths `steps` (n,) exactly.
-    """
-    pitch, heading = arc_angles(azimuth, elevation, steps, droop, sweep)
-    ahead = np.stack([np.cos(pitch) * np.cos(heading), np.cos(pitch) * np.sin(heading), np.sin(pitch)], 1)
-    return base + np.concatenate([np.zeros((1, 3)), np.cumsum(steps[:, None] * ahead, 0)])
-
-
-def place_blade(blade: Blade, base: Floats, azimuth: float, elevation: float) -> Floats:
+def place_blade(blade: Blade, base: Floats, *, azimuth: float, elevation: float) -> Floats:
     """(P, 3) vertices of a blade whose midrib leaves `base` (3,) towards `azimuth` at `elevation`."""
     u = blade_stations(blade.rows)
     steps = np.diff(u) * blade.length
-    midrib = arc_points(base, azimuth, elevation, steps, blade.droop, blade.sweep)[1:-1]
-    tip = arc_points(base, azimuth, elevation, steps, blade.droop, blade.sweep)[-1]
-    angles = arc_angles(azimuth, elevation, steps, blade.droop, blade.sweep)
-    pitch, heading = ((x[1:] + x[:-1]) / 2 for x in angles)
+    arc = Arc(azimuth=azimuth, elevation=elevation, steps=steps, droop=blade.droop, sweep=blade.sweep)
+    points = arc_points(base, arc)
+    midrib, tip = points[1:-1], points[-1]
+    pitch, heading = ((angle[1:] + angle[:-1]) / 2 for angle in arc_angles(arc))
     level = np.stack([-np.sin(heading), np.cos(heading), np.zeros_like(heading)], 1)
     upright = np.stack([-np.sin(pitch) * np.cos(heading), -np.sin(pitch) * np.sin(heading), np.cos(pitch)], 1)
     turn = (blade.roll + blade.twist * u[1:-1])[:, None]
@@ -129,7 +145,7 @@ def place_blade(blade: Blade, base: Floats, azimuth: float, elevation: float) ->
     # the cross-section is a chain of equal pieces from the midrib to the edge, so folding does not change the width
     pieces = BLADE_COLUMNS // 2
     slope = blade.fold + blade.curl * (np.arange(pieces) + 0.5) / pieces
-    out, lift = (np.concatenate([[0.0], np.cumsum(f(slope))]) / pieces for f in (np.cos, np.sin))
+    out, lift = (np.concatenate([[0.0], np.cumsum(part)]) / pieces for part in (np.cos(slope), np.sin(slope)))
     v = np.linspace(-1, 1, BLADE_COLUMNS)
     waves = blade.ripple * v**2 * np.sin(18 * u[1:-1, None] + blade.phase + 1.7 * np.sign(v))
     half = half_widths(blade)[:, None]
@@ -139,12 +155,21 @@ def place_blade(blade: Blade, base: Floats, azimuth: float, elevation: float) ->
     return np.concatenate([base[None], grid.reshape(-1, 3), tip[None]])
 
 
-def measure_leaf(leaf_id: int, vertices: Floats, faces: Ints, uv: Floats) -> Leaf:
-    """The leaf of one blade's mesh, with its length, width and area."""
+def measure_leaf(leaf_id: int, vertices: Floats) -> Leaf:
+    """The leaf whose vertices (P, 3) `place_blade` returned, with its length, width and area."""
     grid = vertices[1:-1].reshape(-1, BLADE_COLUMNS, 3)
+    faces = blade_faces(len(grid))
     midrib = np.concatenate([vertices[:1], grid[:, BLADE_COLUMNS // 2], vertices[-1:]])
     length = float(np.linalg.norm(np.diff(midrib, axis=0), axis=1).sum())
     width = float(np.linalg.norm(np.diff(grid, axis=1), axis=2).sum(1).max())
     corner = vertices[faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
-    return Leaf(leaf_id, vertices, faces, uv, length, width, float(area))
+    return Leaf(
+        leaf_id=leaf_id,
+        vertices=vertices,
+        faces=faces,
+        uv=blade_uv(len(grid)),
+        length=length,
+        width=width,
+        area=float(area),
+    )

@@ -9,8 +9,8 @@ import sys
 from pathlib import Path
 
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.dataset import write_scene
 from mvseg.simulation.growth import grow_plant
+from mvseg.simulation.scene_writer import write_scene
 
 NUM_LEAVES = 12
 NUM_VIEWS = 9

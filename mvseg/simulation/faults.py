@@ -13,7 +13,7 @@ from mvseg.errors import InputError
 Labels = NDArray[np.uint16]
 Mask = NDArray[np.bool_]
 
-LEAST_LEFT = 0.5  # of its pixels is left of a mask after erosion: segmenters do not wipe thin blades out
+MIN_LEFT = 0.5  # share of its pixels that a mask keeps after erosion: segmenters do not wipe thin blades out
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ class Faults:
 
 
 def degrade_labels(labels: Labels, faults: Faults, *, seed: int) -> Labels:
-    """What a faulty segmenter makes of the true masks of one view.
+    """The masks of a faulty segmenter, from the true masks of one view.
 
     Args:
         labels: (H, W) uint16, 0 = no instance, every other number is one mask.
         faults: how often it errs.
-        seed: the same numbers give the same faults.
+        seed: the same labels and seed give the same faults.
 
     Returns:
         (H, W) uint16, masks numbered from 1 in no particular order; the numbers have nothing to do with those of
-        `labels`. Where outgrown masks overlap, the smaller one is on top.
+        `labels`. Where dilated masks overlap, the smaller one is on top.
     """
     rng = np.random.default_rng(seed)
     numbers = [n for n in np.unique(labels).tolist() if n and rng.random() >= faults.missed]
     masks = [labels == number for number in numbers]
-    masks = merge_touching(masks, touching_pairs(labels, numbers), faults.merged, rng)
+    masks = merge_touching(masks, touching_pairs(labels, numbers), share=faults.merged, rng=rng)
     masks = [part for mask in masks for part in (cut(mask, rng) if rng.random() < faults.split else [mask])]
     masks = [blur(mask, faults.blur_px, rng) for mask in masks]
     degraded = np.zeros(labels.shape, np.uint16)
@@ -68,10 +68,10 @@ def degrade_labels(labels: Labels, faults: Faults, *, seed: int) -> Labels:
 
 
 def touching_pairs(labels: Labels, numbers: list[int]) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b, of places in `numbers` whose masks have neighbouring pixels (of four neighbours)."""
-    place = np.full(int(labels.max(initial=0)) + 1, -1)
-    place[numbers] = np.arange(len(numbers))
-    dense = place[labels]
+    """Pairs (a, b), a < b, of indices into `numbers` whose masks have neighbouring pixels (of four neighbours)."""
+    index_of = np.full(int(labels.max(initial=0)) + 1, -1)
+    index_of[numbers] = np.arange(len(numbers))
+    dense = index_of[labels]
     sides = [(dense[1:], dense[:-1]), (dense[:, 1:], dense[:, :-1])]
     ends = np.concatenate([np.stack([a.ravel(), b.ravel()], 1) for a, b in sides])
     ends = np.unique(np.sort(ends[(ends[:, 0] != ends[:, 1]) & (ends.min(1) >= 0)], 1), axis=0)
@@ -79,18 +79,18 @@ def touching_pairs(labels: Labels, numbers: list[int]) -> list[tuple[int, int]]:
 
 
 def merge_touching(
-    masks: list[Mask], pairs: list[tuple[int, int]], share: float, rng: np.random.Generator
+    masks: list[Mask], pairs: list[tuple[int, int]], *, share: float, rng: np.random.Generator
 ) -> list[Mask]:
-    """The masks, those of a random `share` of the pairs united; each mask takes part in one union at most."""
+    """The masks with a random `share` of the pairs united; each mask takes part in one union at most."""
     merged = list(masks)
     is_free = np.ones(len(masks), bool)
-    gone = set()
+    absorbed = set()
     for a, b in pairs:
         if rng.random() < share and is_free[a] and is_free[b]:
             merged[a] = masks[a] | masks[b]
             is_free[[a, b]] = False
-            gone.add(b)
-    return [mask for index, mask in enumerate(merged) if index not in gone]
+            absorbed.add(b)
+    return [mask for index, mask in enumerate(merged) if index not in absorbed]
 
 
 def cut(mask: Mask, rng: np.random.Generator) -> list[Mask]:
@@ -107,7 +107,7 @@ def cut(mask: Mask, rng: np.random.Generator) -> list[Mask]:
 
 
 def blur(mask: Mask, most_px: int, rng: np.random.Generator) -> Mask:
-    """The mask eroded or dilated by 1 to `most_px` pixels; erosion stops before it takes over half of the pixels."""
+    """The mask eroded or dilated by 1 to `most_px` pixels; erosion stops before it removes over half of the pixels."""
     if most_px == 0:
         return mask
     radius = int(rng.integers(1, most_px + 1))
@@ -115,7 +115,7 @@ def blur(mask: Mask, most_px: int, rng: np.random.Generator) -> Mask:
         return cv2.dilate(mask.astype(np.uint8), disc(radius)).astype(bool)
     while radius:
         eroded = cv2.erode(mask.astype(np.uint8), disc(radius)).astype(bool)
-        if eroded.sum() >= LEAST_LEFT * mask.sum():
+        if eroded.sum() >= MIN_LEFT * mask.sum():
             return eroded
         radius -= 1
     return mask

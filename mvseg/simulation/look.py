@@ -26,14 +26,14 @@ class Look:
     horizon: Floats
     leaf: Floats
     leaf_spread: float  # from leaf to leaf
-    through: Floats  # colour of the light that passes a blade
+    through: Floats  # colour of the light that passes through a blade
     vein: float
     num_veins: float
     quilting: float  # slope of the bulges between the veins
     spots: float
     gloss: float
     shine: float  # exponent of the highlight
-    drops: float  # part of the blade that is wet
+    drops: float  # share of the blade that is wet
     plain: Floats  # (5, 3) colours of STEM, POT, SOIL, GROUND, STAKE
     grain: Floats  # (5,) contrast of their noise
     ground_grain: tuple[float, float, float]  # size of the noise in mm, its stretch, distance of joints in mm (0: none)
@@ -104,7 +104,7 @@ def fractal_noise(rng: np.random.Generator, shape: tuple[int, int], steepness: f
 
 
 def draw_backdrop(rng: np.random.Generator, light: Floats) -> Floats:
-    """(128, 256, 3) a blurred room or garden around the plant: panels of other colours over a gradient."""
+    """(128, 256, 3) a blurred room or garden around the plant: panels of random colours over a gradient."""
     image = np.ones((128, 256, 3), np.float32) * light * np.linspace(1.2, 0.7, 128, dtype=np.float32)[:, None, None]
     for _ in range(rng.integers(0, 25)):
         x, y, w, h = rng.integers(0, 256), rng.integers(10, 80), rng.integers(4, 60), rng.integers(6, 60)

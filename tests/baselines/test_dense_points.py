@@ -11,7 +11,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from leafy_scene import LeafyScene, write_leafy_scene
+from leafy_scene import LeafyScene
 from mvseg.baselines.dense_points import (
     DensePoints,
     Workspace,
@@ -32,11 +32,6 @@ from synthetic import moved
 
 
 @pytest.fixture(scope="module")
-def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
-    return write_leafy_scene(tmp_path_factory.mktemp("leafy"))
-
-
-@pytest.fixture(scope="module")
 def photos(leafy: LeafyScene) -> list[np.ndarray]:
     return [read_photo(leafy.scene, view) for view in range(10)]
 
@@ -53,16 +48,16 @@ def distance_to(points: torch.Tensor, targets: torch.Tensor) -> np.ndarray:
 
 
 def test_sgbm_finds_surfaces_and_matches_the_leaves(leafy: LeafyScene) -> None:
-    """On an easy scene, so that what it finds on a hard one is the method's doing."""
+    """On an easy scene, so that its failures on a hard one are the method's."""
     points = sgbm_points(leafy.scene)
     assert points.backend == "sgbm"
     unit = float(torch.linalg.vector_norm(leafy.scene.cameras.t, dim=1).mean())  # distance from the plant, about
     assert np.quantile(distance_to(points.positions, leafy.vertices), 0.9) < 0.01 * unit
-    found = match_mvs(leafy.regions, leafy.scene, points)
-    metrics = matching_metrics(found.instance_ids, leafy.regions.labels)
+    matching = match_mvs(leafy.regions, leafy.scene, points)
+    metrics = matching_metrics(matching.instance_ids, leafy.regions.labels)
     assert metrics.s_match >= 0.95
     assert metrics.ari >= 0.9
-    assert found.method == "mvs (sgbm)"
+    assert matching.method == "mvs (sgbm)"
 
 
 def test_true_depths_are_fused_to_the_surface_wherever_the_world_is(
@@ -96,7 +91,7 @@ def test_patch_match_without_cuda_is_refused(leafy: LeafyScene, monkeypatch: pyt
 
 
 def test_patch_match_gets_a_whole_workspace(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """With the true depths in place of what a graphics card would find."""
+    """With the true depths in place of those that a graphics card would find."""
     depths, cameras = true_depths(leafy), leafy.scene.cameras
 
     def write_true_maps(folder: str, options: pycolmap.PatchMatchOptions) -> None:
@@ -106,8 +101,8 @@ def test_patch_match_gets_a_whole_workspace(leafy: LeafyScene, monkeypatch: pyte
         assert lines[1].split(", ")[:2] == ["00001.png", "00002.png"]
         assert len(lines) == 20
         for view, depth in enumerate(depths):
-            known = depth[depth > 0] / workspace.unit
-            assert options.depth_min < known.min() < known.max() < options.depth_max
+            depths_there = depth[depth > 0] / workspace.unit
+            assert options.depth_min < depths_there.min() < depths_there.max() < options.depth_max
             assert cv2.imread(str(workspace.folder / "images" / workspace.image_name(view))).shape == (320, 320, 3)
             write_map(workspace.map_path("depth", view), (depth / workspace.unit)[None])
             write_map(workspace.map_path("normal", view), depth_normals(depth, cameras.K[view].numpy()))
@@ -177,10 +172,10 @@ def test_normals_of_a_plane() -> None:
     normal = np.array([0.3, -0.4, -0.8])
     depth = (-5 / (rays @ normal)).astype(np.float32)
     depth[12, 12] = 0
-    found = depth_normals(depth, K)
-    np.testing.assert_allclose(found[:, 3, 3], normal / np.linalg.norm(normal), atol=1e-3)
-    np.testing.assert_allclose(found[:, 12, 13], -rays[12, 13] / np.linalg.norm(rays[12, 13]), atol=1e-6)
-    assert ((found * rays.transpose(2, 0, 1)).sum(0) < 0).all()
+    normals = depth_normals(depth, K)
+    np.testing.assert_allclose(normals[:, 3, 3], normal / np.linalg.norm(normal), atol=1e-3)
+    np.testing.assert_allclose(normals[:, 12, 13], -rays[12, 13] / np.linalg.norm(rays[12, 13]), atol=1e-6)
+    assert ((normals * rays.transpose(2, 0, 1)).sum(0) < 0).all()
 
 
 def test_map_file_is_colmaps(tmp_path: Path) -> None:

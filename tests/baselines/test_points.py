@@ -111,7 +111,7 @@ def test_order_of_regions_and_views_changes_nothing(balls: BallScene) -> None:
     assert adjusted_rand_score(turned.regions.labels, ids) == 1
 
 
-def test_views_at_one_place_are_not_tied(balls: BallScene) -> None:
+def test_views_at_one_place_share_no_edge(balls: BallScene) -> None:
     twice = permute_views(balls, [0, 0, 5])
     view = twice.regions.view_index[nearest_ray_graph(twice.regions, twice.cameras).edges]
     assert sorted(set(map(tuple, view.tolist()))) == [(0, 2), (1, 2)]

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from leafy_scene import LeafyScene, write_leafy_scene
+from leafy_scene import LeafyScene
 from mvseg.baselines import sparse
 from mvseg.baselines.sparse import (
     Keypoints,
     find_keypoints,
     keypoint_graph,
-    keypoint_owner,
+    keypoint_owners,
     match_keypoints,
     match_sparse,
 )
@@ -28,11 +28,6 @@ from reference import match_keypoints_reference
 from synthetic import arc_positions, cameras_at
 
 
-@pytest.fixture(scope="module")
-def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
-    return write_leafy_scene(tmp_path_factory.mktemp("leafy"))
-
-
 def test_finds_the_leaves_of_an_easy_scene(leafy: LeafyScene) -> None:
     found = match_sparse(leafy.regions, leafy.scene)
     metrics = matching_metrics(found.instance_ids, leafy.regions.labels)
@@ -41,8 +36,8 @@ def test_finds_the_leaves_of_an_easy_scene(leafy: LeafyScene) -> None:
     assert found.method in ("sparse (akaze)", "sparse (sift)")
 
 
-def test_paper_detector_is_taken_where_opencv_has_it(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    """ORB stands in for AKAZE here: bits as well, and in every OpenCV."""
+def test_the_papers_detector_is_used_where_opencv_has_it(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch) -> None:
+    """ORB replaces AKAZE here: its descriptors are bits as well, and every OpenCV has it."""
     for name in ("AKAZE_create", "xfeatures2d"):
         monkeypatch.delattr(cv2, name, raising=False)
     assert sparse.keypoint_detector()[1] == "sift"
@@ -74,29 +69,29 @@ def test_keypoints_count_from_pixel_corners() -> None:
     assert (xy - torch.tensor([60.5, 40.5])).abs().amax(1).min() < 0.2
 
 
-def test_ties_are_those_of_the_most_shared_keypoints() -> None:
+def test_edges_lead_to_the_region_with_most_shared_keypoints() -> None:
     """Two views of 64 x 32 pixels: region 0 (left) and 1 (right) in view 0, region 2 (left) and 3 (right) in view 1."""
     labels = np.zeros((32, 64), np.int64)
     labels[:, :30], labels[:, 34:] = 1, 2
     regions = regions_from_label_maps([labels, labels])
     cameras = cameras_at(arc_positions(2), width=64, height=32)
-    scene = Scene("pair", tuple(View(str(v), Path(f"{v}.png")) for v in range(2)), cameras)
     # Keypoint k of one view is keypoint k of the other; columns in both views, 32 = between the regions.
     columns = torch.tensor([[5, 5], [6, 6], [7, 40], [40, 41], [41, 8], [42, 9], [32, 9], [32, 32]]).double()
     descriptors = torch.from_numpy(np.random.default_rng(0).integers(0, 256, (len(columns), 64)).astype(np.float32))
     keypoints = [Keypoints(torch.stack((x, torch.full_like(x, 3)), 1), descriptors) for x in columns.T]
-    assert keypoint_owner(regions, scene, 0, keypoints[0]).tolist() == [0, 0, 0, 1, 1, 1, -1, -1]
+    owners = keypoint_owners(regions, keypoints[0], view=0, size=[64, 32])
+    assert owners.tolist() == [0, 0, 0, 1, 1, 1, -1, -1]
     # 0 and 1 share two with 2 and one with 3, which has no better partner.
-    assert keypoint_graph(regions, scene, keypoints).edges.tolist() == [[0, 2], [0, 3], [1, 2], [1, 3]]
+    assert keypoint_graph(regions, cameras, keypoints).edges.tolist() == [[0, 2], [0, 3], [1, 2], [1, 3]]
     fewer = [Keypoints(points.xy[:3], points.descriptors[:3]) for points in keypoints]
-    assert keypoint_graph(regions, scene, fewer).edges.tolist() == [[0, 2], [0, 3]]
+    assert keypoint_graph(regions, cameras, fewer).edges.tolist() == [[0, 2], [0, 3]]
 
 
 def test_order_of_regions_changes_nothing(leafy: LeafyScene) -> None:
     order = torch.randperm(len(leafy.regions), generator=torch.Generator().manual_seed(0))
     keypoints = [find_keypoints(read_photo(leafy.scene, view), cv2.ORB.create(500)) for view in range(10)]
-    plain = keypoint_graph(leafy.regions, leafy.scene, keypoints).edges
-    shuffled = order[keypoint_graph(leafy.regions.select(order), leafy.scene, keypoints).edges]
+    plain = keypoint_graph(leafy.regions, leafy.scene.cameras, keypoints).edges
+    shuffled = order[keypoint_graph(leafy.regions.select(order), leafy.scene.cameras, keypoints).edges]
     assert set(map(tuple, shuffled.sort(1).values.tolist())) == set(map(tuple, plain.tolist()))
     assert len(plain) > 40
 

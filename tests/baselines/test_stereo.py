@@ -78,7 +78,7 @@ def test_rectified_rows_agree_and_disparity_tells_the_depth(is_turned: bool) -> 
         K[:, :2, 2] = K[:, :2, 2].flip(1)
         cameras = Cameras(K, roll @ cameras.R, (roll @ cameras.t[:, :, None])[:, :, 0], cameras.sizes.flip(1))
     ball = seen_ball(cameras)
-    pair = rectify(cameras, ball, 0, 1)
+    pair = rectify(cameras, ball, (0, 1))
     assert pair is not None
     points = ball.radius / 2 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double().clamp(-1, 1)
     pixels, depth = cameras.project(points)
@@ -96,8 +96,8 @@ def test_rectified_rows_agree_and_disparity_tells_the_depth(is_turned: bool) -> 
 def test_no_pair_along_the_line_of_sight_or_without_baseline() -> None:
     towards = cameras_at(torch.tensor([[10.0, 0, 0], [8.0, 0.1, 0], [10.0, 0, 0]]))
     ball = seen_ball(cameras_at(arc_positions(4)))
-    assert rectify(towards, ball, 0, 1) is None
-    assert rectify(towards, ball, 0, 2) is None
+    assert rectify(towards, ball, (0, 1)) is None
+    assert rectify(towards, ball, (0, 2)) is None
 
 
 def test_disparity_of_a_shifted_image() -> None:
@@ -113,13 +113,13 @@ def test_consistent_depth_is_that_of_the_slow_twin() -> None:
     depths = [rng.uniform(9.7, 10.3, (24, 32)).astype(np.float32) for _ in range(3)]
     for depth in depths:
         depth[rng.uniform(size=depth.shape) < 0.2] = np.nan
-    fast = consistent_depth(depths, cameras, 0, [1, 2])
+    fast = consistent_depth(depths, cameras, view=0, others=[1, 2])
     np.testing.assert_array_equal(fast, consistent_depth_reference(depths, cameras, 0, [1, 2], stereo.MAX_DEPTH_ERROR))
     assert 50 < (fast > 0).sum() < 500
-    assert not consistent_depth(depths, cameras, 0, []).any()
+    assert not consistent_depth(depths, cameras, view=0, others=[]).any()
 
 
-def test_smoothing_drops_lonely_pixels() -> None:
+def test_smoothing_drops_isolated_pixels() -> None:
     depth = np.zeros((12, 12), np.float32)
     depth[2:8, 2:8], depth[10, 10], depth[4, 4] = 5, 9, 7
     smoothed = smooth(depth)

@@ -14,7 +14,7 @@ from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.nms import cluster_aware_nms
 from mvseg.multiview.proposals import Proposals, gather_proposals
 from mvseg.regions import regions_from_label_maps
-from mvseg.simulation.proposals import simulate_proposals
+from simulated_proposals import simulate_proposals
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
 
 

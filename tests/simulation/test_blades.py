@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
 
 from mvseg.simulation.blades import (
     BLADE_COLUMNS,
+    Arc,
     Blade,
     Leaf,
     arc_points,
-    blade_faces,
     blade_stations,
-    blade_uv,
     half_widths,
     measure_leaf,
     place_blade,
@@ -26,8 +26,7 @@ BENT = dataclasses.replace(FLAT, droop=1.2, sweep=-0.3, twist=0.5, roll=0.2, fol
 
 
 def make_leaf(blade: Blade, azimuth: float = 0.4, elevation: float = 0.0) -> Leaf:
-    vertices = place_blade(blade, np.array([3.0, -2.0, 50.0]), azimuth, elevation)
-    return measure_leaf(1, vertices, blade_faces(blade.rows), blade_uv(blade.rows))
+    return measure_leaf(1, place_blade(blade, np.array([3.0, -2.0, 50.0]), azimuth=azimuth, elevation=elevation))
 
 
 def test_flat_blade_has_the_area_of_its_outline() -> None:
@@ -46,13 +45,13 @@ def test_flat_blade_comes_close_to_the_integral_of_its_outline() -> None:
     assert make_leaf(FLAT).area == pytest.approx(FLAT.length * FLAT.width * beta / peak, rel=0.01)
 
 
-def test_a_blade_of_constant_width_is_a_rectangle_but_for_its_ends() -> None:
+def test_a_blade_of_constant_width_is_a_rectangle_except_at_its_ends() -> None:
     blade = Blade(length=50.0, width=10.0, outline=(0.0, 0.0))
     gap = blade_stations(blade.rows)[1] * 50
     assert make_leaf(blade).area == pytest.approx(10 * (50 - gap), rel=1e-12)
 
 
-def test_upper_side_of_a_level_blade_looks_up() -> None:
+def test_upper_side_of_a_level_blade_faces_up() -> None:
     leaf = make_leaf(FLAT)
     corner = leaf.vertices[leaf.faces]
     normals = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
@@ -87,16 +86,16 @@ def test_uv_follows_the_midrib_and_the_edge() -> None:
     assert np.allclose(leaf.vertices[1:-1, 1] + 2, half * leaf.uv[1:-1, 1])
 
 
-def test_lobes_and_teeth_only_take_from_the_outline() -> None:
-    plain = Blade(length=70.0, width=40.0, outline=(0.5, 0.5), rows=44)
-    lobed = half_widths(dataclasses.replace(plain, lobes=(3, 0.6)))
-    assert lobed.max() == pytest.approx(20)
-    assert lobed.min() > 0
-    is_peak = (lobed[1:-1] > lobed[:-2]) & (lobed[1:-1] > lobed[2:])
-    assert is_peak.sum() >= 3
+@pytest.mark.parametrize(("change", "num_peaks"), [({}, 1), ({"lobes": (3, 0.6)}, 3), ({"teeth": 0.4}, 22)])
+def test_lobes_and_teeth_are_peaks_of_the_outline_and_keep_the_width(change: dict[str, Any], num_peaks: int) -> None:
+    half = half_widths(Blade(length=70.0, width=40.0, outline=(0.5, 0.6), rows=44, **change))
+    assert half.max() == pytest.approx(20)
+    assert half.min() > 0
+    padded = np.pad(half, 1)
+    assert ((padded[1:-1] > padded[:-2]) & (padded[1:-1] > padded[2:])).sum() == num_peaks
 
 
 def test_arc_has_the_lengths_of_its_steps() -> None:
     steps = np.array([1.0, 2.0, 0.5])
-    points = arc_points(np.zeros(3), 0.3, 1.0, steps, 0.8, -0.4)
+    points = arc_points(np.zeros(3), Arc(azimuth=0.3, elevation=1.0, steps=steps, droop=0.8, sweep=-0.4))
     assert np.allclose(np.linalg.norm(np.diff(points, axis=0), axis=1), steps)

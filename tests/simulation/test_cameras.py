@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from mvseg.errors import InputError
-from mvseg.simulation.cameras import arc_cameras
+from mvseg.simulation.cameras import FRAME_FILL, arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 
 
@@ -19,15 +19,13 @@ def plant() -> Plant:
 
 
 @pytest.mark.parametrize("size", [(480, 480), (320, 200), (100, 300)])
-def test_arc_holds_the_plant_and_fills_the_frame(plant: Plant, size: tuple[int, int]) -> None:
+def test_the_farthest_point_of_leaves_and_stems_fills_the_frame(plant: Plant, size: tuple[int, int]) -> None:
     cameras = arc_cameras(5, plant, width=size[0], height=size[1])
-    points = torch.from_numpy(np.concatenate([leaf.vertices for leaf in plant.leaves]))
-    px, depth = cameras.project(points)
+    stems = [part.vertices for part in plant.parts if part.material == "stem"]
+    px, depth = cameras.project(torch.from_numpy(np.concatenate([leaf.vertices for leaf in plant.leaves] + stems)))
     assert (depth > 0).all()
-    assert (px > 0).all()
-    assert (px < torch.tensor(size)).all()
-    reach = ((px - torch.tensor(size) / 2).abs() / (torch.tensor(size) / 2)).amax().item()
-    assert 0.7 < reach < 0.95
+    half = torch.tensor(size) / 2
+    assert ((px - half).abs() / half).max().item() == pytest.approx(FRAME_FILL)
 
 
 def test_arc_spans_its_angle_at_its_elevations_around_one_point(plant: Plant) -> None:

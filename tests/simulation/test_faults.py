@@ -63,7 +63,7 @@ def test_outlines_move_by_one_to_three_pixels() -> None:
     assert widths == {34, 36, 38, 42, 44, 46}
 
 
-def test_erosion_spares_thin_blades_and_small_masks_go() -> None:
+def test_erosion_spares_thin_blades_and_small_masks_are_discarded() -> None:
     labels = np.zeros((40, 100), np.uint16)
     labels[10:13, 5:95] = 1
     labels[30:33, 5:14] = 2

@@ -9,11 +9,12 @@ from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 
 from mvseg.errors import InputError
-from mvseg.simulation.growth import FAMILIES, Plant, grow_plant, grow_shoots
+from mvseg.simulation.families import FAMILIES
+from mvseg.simulation.growth import Plant, grow_plant, grow_shoots
 
 
 def share_of_crossing_leaves(plant: Plant) -> float:
-    """Leaves of which more than one mesh edge in fifty passes through another leaf."""
+    """Share of the leaves of which more than one mesh edge in fifty passes through another leaf."""
     starts = np.cumsum([0] + [len(leaf.vertices) for leaf in plant.leaves])
     faces = np.concatenate([leaf.faces + start for leaf, start in zip(plant.leaves, starts[:-1], strict=True)])
     owner = np.repeat([leaf.leaf_id for leaf in plant.leaves], [len(leaf.faces) for leaf in plant.leaves])
@@ -23,9 +24,9 @@ def share_of_crossing_leaves(plant: Plant) -> float:
     crossing = 0
     for leaf in plant.leaves:
         start, end = leaf.vertices[leaf.faces[:, 0]], leaf.vertices[leaf.faces[:, 1]]
-        found = scene.run(start.astype(np.float32), (end - start).astype(np.float32), output=True)
-        is_hit = (found["primID"] >= 0) & (found["tfar"] < 1)
-        crossing += np.mean(is_hit & (owner[found["primID"]] != leaf.leaf_id)) > 0.02
+        hits = scene.run(start.astype(np.float32), (end - start).astype(np.float32), output=True)
+        is_hit = (hits["primID"] >= 0) & (hits["tfar"] < 1)
+        crossing += np.mean(is_hit & (owner[hits["primID"]] != leaf.leaf_id)) > 0.02
     return crossing / len(plant.leaves)
 
 
@@ -96,6 +97,6 @@ def test_leaves_of_one_plant_differ() -> None:
         (("ovate", 3, -1), "seed is -1"),
     ],
 )
-def test_wrong_wishes_are_named(arguments: tuple[str, int, int], message: str) -> None:
+def test_wrong_arguments_are_named(arguments: tuple[str, int, int], message: str) -> None:
     with pytest.raises(InputError, match=message):
         grow_plant(*arguments)

@@ -1,4 +1,4 @@
-"""Makes docs/demo.jpg from the result of the shipped scene: `python infer.py && python docs/picture.py`."""
+"""Draws docs/demo.jpg from the result of the shipped scene: `python infer.py && python benchmarks/figures/demo.py`"""
 
 from __future__ import annotations
 
@@ -9,17 +9,18 @@ import numpy as np
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-ROOT = Path(__file__).parent.parent
-HEIGHT = 300
+ROOT = Path(__file__).parents[2]
+HEIGHT = 300  # pixels of each picture
 
 
-def read(path: Path) -> np.ndarray:
+def read_scaled(path: Path) -> np.ndarray:
+    """(HEIGHT, W, 3) BGR."""
     image = cv2.imread(str(path), cv2.IMREAD_COLOR)
     return cv2.resize(image, (round(HEIGHT * image.shape[1] / image.shape[0]), HEIGHT), interpolation=cv2.INTER_AREA)
 
 
 def draw_meshes(path: Path, azimuth_deg: float, elevation_deg: float = 20.0) -> np.ndarray:
-    """(HEIGHT, HEIGHT, 3) BGR: the meshes of a GLB seen in parallel, shaded by their normals, world +z up."""
+    """(HEIGHT, HEIGHT, 3) BGR: the meshes of a GLB in parallel projection, shaded by their normals, world +z up."""
     parts = list(trimesh.load_scene(path).geometry.values())
     mesh = trimesh.util.concatenate(parts)
     colors = np.concatenate([np.repeat(part.visual.vertex_colors[:1, :3], len(part.faces), 0) for part in parts])
@@ -43,8 +44,8 @@ def draw_meshes(path: Path, azimuth_deg: float, elevation_deg: float = 20.0) -> 
 def main() -> None:
     result = ROOT / "results" / "demo_plant"
     views = ("001", "004", "007")
-    photos = [read(ROOT / "mvseg" / "demo_plant" / "images" / f"{view}.jpg") for view in views]
-    overlays = [read(result / "overlay" / f"{view}.png") for view in views]
+    photos = [read_scaled(ROOT / "mvseg" / "demo_plant" / "images" / f"{view}.jpg") for view in views]
+    overlays = [read_scaled(result / "overlay" / f"{view}.png") for view in views]
     meshes = [draw_meshes(result / "scene.glb", azimuth) for azimuth in (30, 110)]
     rows = [np.concatenate([*row, mesh], 1) for row, mesh in zip((photos, overlays), meshes, strict=True)]
     cv2.imwrite(str(ROOT / "docs" / "demo.jpg"), np.concatenate(rows), [cv2.IMWRITE_JPEG_QUALITY, 85])

@@ -1,4 +1,4 @@
-"""Region proposals as a detector makes them, from true masks: jittered boxes and masks, with duplicates."""
+"""Region proposals like those of a detector, made from true masks: jittered boxes and masks, with duplicates."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def simulate_proposals(
         jitter: standard deviation of each edge, as a share of the side of the box.
 
     Returns:
-        The proposals, and (R,) int64, the label each was made from.
+        The R proposals, and (R,) int64, the label that each was made from.
     """
     rng = np.random.default_rng(seed)
     truth = regions_from_label_maps(label_maps)
@@ -44,7 +44,7 @@ def simulate_proposals(
         prominence = min(1.0, (areas[index] / (0.01 * width * height)) ** 0.5)
         for _ in range(copies):
             error = rng.normal(0, jitter, 4)
-            moved = _move_mask(mask, truth.boxes[index].numpy(), error, int(rng.integers(-2, 3)))
+            moved = _move_mask(mask, truth.boxes[index].numpy(), error=error, grow_px=int(rng.integers(-2, 3)))
             if not moved.any():
                 continue
             x1, y1, x2, y2 = mask_box(torch.from_numpy(moved))
@@ -56,10 +56,11 @@ def simulate_proposals(
             labels.append(int(truth.labels[index]))
     regions = stack_regions(view_index, boxes, crops, labels=labels, num_views=len(label_maps))
     classes = torch.ones(len(regions), dtype=torch.int64)
-    return Proposals(regions, regions.boxes.float(), torch.tensor(scores), classes), regions.labels
+    proposals = Proposals(regions=regions, boxes=regions.boxes.float(), scores=torch.tensor(scores), classes=classes)
+    return proposals, regions.labels
 
 
-def _move_mask(mask: np.ndarray, box: np.ndarray, error: np.ndarray, grow: int) -> np.ndarray:
+def _move_mask(mask: np.ndarray, box: np.ndarray, *, error: np.ndarray, grow_px: int) -> np.ndarray:
     """(H, W) bool: the mask stretched so that its box's edges move by `error` times the box's sides, then grown."""
     x1, y1, x2, y2 = box.astype(float)
     width, height = x2 - x1, y2 - y1
@@ -68,6 +69,6 @@ def _move_mask(mask: np.ndarray, box: np.ndarray, error: np.ndarray, grow: int) 
     scale_y = max(0.2, (height + bottom - top) / height)
     there_from_here = np.array([[scale_x, 0, x1 + left - scale_x * x1], [0, scale_y, y1 + top - scale_y * y1]])
     moved = cv2.warpAffine(mask.astype(np.uint8), there_from_here, mask.shape[::-1], flags=cv2.INTER_NEAREST)
-    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(grow) + 1,) * 2)
-    moved = cv2.dilate(moved, kernel) if grow > 0 else cv2.erode(moved, kernel)
+    kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(grow_px) + 1,) * 2)
+    moved = cv2.dilate(moved, kernel) if grow_px > 0 else cv2.erode(moved, kernel)
     return np.asarray(moved) > 0

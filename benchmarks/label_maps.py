@@ -1,0 +1,110 @@
+"""Label maps of the simulated evaluation scenes, true and with a segmenter's faults; rendered once, then cached.
+
+The 16 cells of the evaluation are {4, 8, 16, 32} leaves x {3, 5, 10, 20} views, on the simulated plants of the preset
+"paper-eval" (480 x 480, cameras on a 200 degree arc, exact poses).
+"""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvseg.evaluation.truth import shown_instances
+from mvseg.formats.atomic import write_whole
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Cameras
+from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index, scene_cameras
+from mvseg.simulation.faults import Faults, degrade_labels
+from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.ray_cast import build_bvh, merge_meshes
+from mvseg.simulation.scene_writer import drop_small
+
+MIN_PIXELS = 30
+KINDS = ("true", "degraded")
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledScene:
+    """One scene without photos.
+
+    Attributes:
+        true: (V, H, W) uint16, the leaf that each pixel shows, 0 = none.
+        degraded: (V, H, W) uint16, the masks of a faulty segmenter; their numbers mean nothing across views.
+        cameras: V cameras.
+    """
+
+    true: np.ndarray
+    degraded: np.ndarray
+    cameras: Cameras
+
+    def masks(self, kind: str) -> tuple[Regions, Tensor]:
+        """The D regions of one of `KINDS`, and (D,) int64, the leaf that each of them shows."""
+        regions = regions_from_label_maps(list(self.true if kind == "true" else self.degraded))
+        return regions, shown_instances(regions, self.true, count_background=False)
+
+
+def load_maps(spec: SceneSpec, cache: Path) -> LabelledScene:
+    """A scene of the preset "paper-eval"; rendered when it is not in the cache."""
+    path = cache / "maps" / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
+    if not path.exists():
+        scene = render_maps(spec)
+        poses = {name: getattr(scene.cameras, name).numpy() for name in ("K", "R", "t", "sizes")}
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+        def save(partial: Path) -> None:
+            with partial.open("wb") as file:
+                np.savez_compressed(file, true=scene.true, degraded=scene.degraded, **poses)
+
+        write_whole(path, save)
+    with np.load(path) as saved:
+        cameras = Cameras(**{name: torch.from_numpy(saved[name]) for name in ("K", "R", "t", "sizes")})
+        return LabelledScene(saved["true"], saved["degraded"], cameras)
+
+
+def render_maps(spec: SceneSpec) -> LabelledScene:
+    plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
+    cameras = scene_cameras(spec, plant, PRESETS["paper-eval"])
+    true = visible_ids(plant, cameras)
+    seeds = np.random.SeedSequence([spec.seed, spec.num_views]).generate_state(len(true))
+    degraded = [degrade_labels(ids, Faults(), seed=int(seed)) for ids, seed in zip(true, seeds, strict=True)]
+    return LabelledScene(true, np.stack(degraded), cameras)
+
+
+def visible_ids(plant: Plant, cameras: Cameras) -> np.ndarray:
+    """(V, H, W) uint16 ids of the leaves, 0 elsewhere: one ray through each pixel's centre, and no light."""
+    mesh = merge_meshes(plant)
+    bvh = build_bvh(mesh)
+    maps = []
+    for view, (width, height) in enumerate(cameras.sizes.tolist()):
+        v, u = np.mgrid[:height, :width] + 0.5
+        pixels = np.stack([u.ravel(), v.ravel(), np.ones(u.size)], 1)
+        rays = (pixels @ cameras.world_from_px[view].numpy().T).astype(np.float32)
+        face = bvh.run(np.tile(cameras.centers[view].numpy().astype(np.float32), (len(rays), 1)), rays)
+        maps.append(np.where(face >= 0, mesh.owner[face], 0).reshape(height, width).astype(np.uint16))
+    return np.stack([drop_small(ids, MIN_PIXELS) for ids in maps])
+
+
+def add_scene_options(parser: argparse.ArgumentParser) -> None:
+    """The options that say which scenes to run on; see `chosen_scenes`."""
+    parser.add_argument("--cache", type=Path, required=True, help="folder for rendered label maps")
+    parser.add_argument("--split", choices=("dev", "test"), default="dev")
+    parser.add_argument("--seed", type=int, default=0, help="of the plants; another one gives plants never seen before")
+    parser.add_argument("--leaves", nargs="+", type=int, default=PRESETS["paper-eval"].leaves)
+    parser.add_argument("--views", nargs="+", type=int, default=PRESETS["paper-eval"].views)
+    parser.add_argument("--plants", type=int, default=6, help="at most this many per number of leaves")
+    parser.add_argument("--workers", type=int, default=2, help="scenes at once")
+
+
+def chosen_scenes(args: argparse.Namespace) -> list[SceneSpec]:
+    """The scenes that the options of `add_scene_options` ask for."""
+    return [
+        spec
+        for spec in list_scenes(PRESETS["paper-eval"], args.seed)
+        if spec.split == args.split and spec.num_leaves in args.leaves and spec.num_views in args.views
+        if plant_index(spec) < args.plants
+    ]

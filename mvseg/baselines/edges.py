@@ -1,0 +1,20 @@
+"""What the compared matchers share: an edge of weight one per corresponding pair of regions (Sec. 4.2)."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from mvseg.matching.affinity import Affinity
+
+
+def edge_graph(pairs: Tensor, num_regions: int) -> Affinity:
+    """The graph in which corresponding regions share an edge of weight one (Sec. 4.2).
+
+    Args:
+        pairs: (T, 2) int64, pairs of regions of different views; order and repetitions mean nothing. A pair that only
+            one of its two regions chose weighs as much as one that both chose: the paper has no other weight than one.
+        num_regions: D.
+    """
+    edges = pairs.sort(1).values.unique(dim=0)
+    return Affinity(edges, torch.ones(len(edges), device=pairs.device), num_regions)

@@ -1,0 +1,110 @@
+"""One simulated scene on disk, as mvseg reads it.
+
+A scene folder holds
+
+    cameras.json              rig: poses cam_from_world, pixel centres at half integers
+    images/000.jpg            photos
+    masks/000.png             uint16 labels, 0 = not a leaf; shuffled numbers, which mean nothing across views
+    truth/000.png             the same pixels with the true leaf ids
+    truth/leaves/leaf_001.ply one mesh per leaf
+    truth/traits.csv          leaf_id, length, width, area in the scene's unit
+
+and appears whole or not at all.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import trimesh
+from numpy.typing import NDArray
+
+from mvseg.errors import InputError
+from mvseg.formats.atomic import folder_whole, write_text_whole
+from mvseg.formats.label_png import write_label_png
+from mvseg.formats.rig import write_rig
+from mvseg.scene import Cameras, Scene, View
+from mvseg.simulation.growth import Plant
+from mvseg.simulation.ray_cast import build_stage, render_stage
+
+JPEG_QUALITY = 90
+
+
+def write_scene(folder: Path | str, plant: Plant, cameras: Cameras, *, seed: int, min_pixels: int = 30) -> None:
+    """Photograph a plant and write the scene folder described at the top of this module.
+
+    Args:
+        folder: must not exist; its parent is made. A failure leaves nothing behind.
+        plant: seen by the cameras in its own world units.
+        cameras: V views of any sizes.
+        seed: of light, materials, noise and of the numbers in `masks/`; the truth does not depend on it.
+        min_pixels: a leaf with fewer visible pixels in a view is left out of that view's masks and truth.
+
+    Raises:
+        InputError: the folder exists.
+    """
+    folder = Path(folder)
+    if folder.exists():
+        raise InputError(f"{folder} exists already, expected a new folder for the scene")
+    with folder_whole(folder) as partial:
+        write_views(partial, plant, cameras, seed=seed, min_pixels=min_pixels)
+        write_truth(partial / "truth", plant)
+
+
+def write_views(folder: Path, plant: Plant, cameras: Cameras, *, seed: int, min_pixels: int) -> None:
+    """Write rig file, photos, masks and true label images."""
+    (folder / "images").mkdir()
+    stage = build_stage(plant, seed=seed)
+    names = [f"{view:03d}" for view in range(len(cameras))]
+    for view, name in enumerate(names):
+        shot = render_stage(stage, cameras, view)
+        truth = drop_small(shot.ids, min_pixels)
+        write_jpeg(folder / "images" / f"{name}.jpg", shot.rgb)
+        write_label_png(folder / "truth" / f"{name}.png", truth)
+        write_label_png(folder / "masks" / f"{name}.png", shuffle_labels(truth, np.random.default_rng([seed, view])))
+    files = [f"images/{name}.jpg" for name in names]
+    views = tuple(View(name, folder / file) for name, file in zip(names, files, strict=True))
+    scene = Scene(name=folder.name, views=views, cameras=cameras, unit=plant.unit)
+    write_rig(folder / "cameras.json", scene, files)
+
+
+def write_truth(folder: Path, plant: Plant) -> None:
+    """Write the leaf meshes and the table of traits."""
+    (folder / "leaves").mkdir()
+    sizes = [(f"{leaf.length:.6f}", f"{leaf.width:.6f}", f"{leaf.area:.6f}") for leaf in plant.leaves]
+    rows = [(leaf.leaf_id, *size) for leaf, size in zip(plant.leaves, sizes, strict=True)]
+    write_table(folder / "traits.csv", ["leaf_id", "length", "width", "area"], rows)
+    for leaf in plant.leaves:
+        mesh = trimesh.Trimesh(leaf.vertices, leaf.faces, process=False)
+        mesh.export(folder / "leaves" / f"leaf_{leaf.leaf_id:03d}.ply")
+
+
+def drop_small(labels: NDArray[np.uint16], min_pixels: int) -> NDArray[np.uint16]:
+    """(H, W) labels without those that cover fewer than `min_pixels` pixels."""
+    return np.where(np.bincount(labels.ravel())[labels] >= min_pixels, labels, 0).astype(np.uint16)
+
+
+def shuffle_labels(labels: NDArray[np.uint16], rng: np.random.Generator) -> NDArray[np.uint16]:
+    """(H, W) the same regions, numbered from 1 in random order."""
+    numbers, dense = np.unique(labels, return_inverse=True)
+    shuffled = np.zeros(len(numbers), np.uint16)
+    shuffled[numbers > 0] = rng.permutation(np.count_nonzero(numbers)) + 1
+    return shuffled[dense.reshape(labels.shape)]
+
+
+def write_jpeg(path: Path, rgb: NDArray[np.uint8]) -> None:
+    """Write a photo (H, W, 3); OpenCV's own writer does not report a full disk."""
+    options = [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
+    path.write_bytes(cv2.imencode(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), options)[1].tobytes())
+
+
+def write_table(path: Path, columns: list[str], rows: list[tuple[Any, ...]]) -> None:
+    """Write a CSV file with a header, whole or not at all."""
+    table = io.StringIO()
+    csv.writer(table, lineterminator="\n").writerows([columns, *rows])
+    write_text_whole(path, table.getvalue())
