@@ -30,6 +30,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detectors.zoo import load_detector
+from mvseg.evaluation.average_precision import annotate_truth, average_precision, describe_mask
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
@@ -38,8 +39,8 @@ from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
-from mvseg.training.average_precision import annotate_truth, average_precision, describe_mask, detect_and_label
 from mvseg.training.data import SampleList, list_samples, read_sample
+from mvseg.training.validation import detect_and_label
 
 HIDDEN = 0.5  # a leaf is hidden when less than this share of it is visible
 
@@ -169,7 +170,7 @@ def main() -> None:
     samples = list_photos(args.scenes)
     indices = tqdm(range(len(samples)), "photos")
     detector = load_detector(args.weights, image_size=args.image_size)
-    alone = average_precision(*detect_and_label(detector, samples, indices, torch.device("cpu")), len(samples))
+    alone = average_precision(*detect_and_label(detector, samples, indices), len(samples))
     print(json.dumps(alone))
     report: dict[str, Any] = {"num_photos": len(samples), "detector": alone}
     if args.iterations:

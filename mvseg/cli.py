@@ -214,7 +214,8 @@ def _train(args: Namespace) -> int:
 
 
 def _models(args: Namespace) -> int:
-    from mvseg.detectors.zoo import list_detectors, pack_detector
+    from mvseg.detectors.zoo import list_detectors
+    from mvseg.training.pack import pack_detector
 
     if (args.pack is None) != (args.into is None):
         raise InputError("--pack and --into belong together, expected both or neither")

@@ -180,7 +180,7 @@ def test_a_perfect_detector_gives_the_true_masks(cell: Cell, monkeypatch: pytest
         unsure = torch.ones_like(masks[0])
         return {"scores": torch.tensor([0.9] * len(masks) + [DetectConfig().min_score - 0.01])}, [*masks, unsure]
 
-    monkeypatch.setattr("mvseg.training.average_precision.detect", detect)
+    monkeypatch.setattr("mvseg.detectors.run.detect", detect)
     monkeypatch.setattr("mvseg.detectors.zoo.load_detector", lambda name: name)
     detected, true = detected_masks(cell, "leaf"), true_masks(cell)
     assert detected.num_missed == 0

@@ -1,10 +1,16 @@
-"""A tiny data set and a tiny Mask R-CNN for the training tests, and a run that ends itself by SIGKILL (as a script)."""
+"""A tiny data set and a tiny Mask R-CNN for the training tests; as a script, runs that are killed or that share steps.
+
+The script imports everything once and forks a process per run: imports take longer than the runs.
+"""
 
 from __future__ import annotations
 
 import os
 import signal
+import socket
 import sys
+import traceback
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -22,6 +28,9 @@ from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredic
 from torchvision.ops import MultiScaleRoIAlign
 
 import mvseg.training.loop
+from mvseg.detectors.mask_rcnn import build_detector
+from mvseg.detectors.weights_file import Description
+from mvseg.training.files import write_config, write_metrics, write_weights
 from mvseg.training.loop import TrainConfig, train
 from mvseg.training.state import apply_gradients
 
@@ -100,6 +109,19 @@ def make_config(folder: Path, output: Path, **changes: Any) -> TrainConfig:
     return TrainConfig(**settings | changes)
 
 
+def write_finished_run(folder: Path) -> Path:
+    """The files of a finished training run of the smaller architecture, three categories, without the training."""
+    folder.mkdir()
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(0)
+        model = build_detector("mobilenet_v3_large_fpn", 4)
+    description = Description("mobilenet_v3_large_fpn", ("a", "b", "c"), 96)
+    write_weights(folder / "model.safetensors", model, description)
+    write_metrics(folder / "metrics.json", {"best": {"epoch": 3, "mask_AP": 0.5, "mask_AP50": 0.75}})
+    write_config(folder / "config.yaml", {"arch": "mobilenet_v3_large_fpn"})
+    return folder
+
+
 def parse_config(path: Path) -> TrainConfig:
     """A YAML file as the command line reads it."""
     parser = jsonargparse.ArgumentParser(exit_on_error=False)
@@ -111,15 +133,14 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def die_at(moment: str) -> None:
-    """Arrange for SIGKILL "in step 4", "in checkpoint 3" (half written) or "in evaluation 1"; they count from 1."""
-    what, number = moment.removeprefix("in ").rsplit(" ", 1)
+def die_at(what: str, number: int) -> None:
+    """Arrange for SIGKILL in a step, checkpoint (half written) or evaluation with this number; they count from 1."""
     calls = 0
 
     def is_due() -> bool:
         nonlocal calls
         calls += 1
-        return calls == int(number)
+        return calls == number
 
     if what == "step":
         step = lambda *args: die() if is_due() else apply_gradients(*args)  # noqa: E731
@@ -135,14 +156,59 @@ def die_at(moment: str) -> None:
 
         patch.object(torch, "save", write_half).start()
     else:
-        patch.object(mvseg.training.loop, "detect_and_label", lambda *args: die()).start()
+        evaluate = mvseg.training.loop.detect_and_label
+        detect = lambda *args: die() if is_due() else evaluate(*args)  # noqa: E731
+        patch.object(mvseg.training.loop, "detect_and_label", detect).start()
 
 
 def load_weights(path: Path) -> dict[str, Tensor]:
     return load_file(path)
 
 
+def fork(run: Callable[[], None]) -> int:
+    """Start a process that does `run`; its process id."""
+    process = os.fork()
+    if process:
+        return process
+    try:
+        run()
+    except BaseException:
+        traceback.print_exc()
+        os._exit(1)
+    os._exit(0)
+
+
+def is_killed(run: Callable[[], None]) -> bool:
+    """Whether a process that does `run` ends by SIGKILL."""
+    _, status = os.waitpid(fork(run), 0)
+    return os.WIFSIGNALED(status) and os.WTERMSIG(status) == signal.SIGKILL
+
+
+def train_until(moment: str, folder: Path, output: Path) -> None:
+    """Resume the run until a moment like "step 4, 2 workers"."""
+    what, number, num_workers, _ = moment.replace(",", "").split()
+    die_at(what, int(number))
+    train(make_config(folder, output, resume=True, num_workers=int(num_workers)), build_tiny())
+
+
+def train_as(rank: int, port: int, config: TrainConfig) -> None:
+    """Be one of two processes, with the environment that torchrun gives them."""
+    os.environ.update(RANK=str(rank), LOCAL_RANK=str(rank), WORLD_SIZE="2")
+    os.environ.update(MASTER_ADDR="127.0.0.1", MASTER_PORT=str(port))
+    train(config, build_tiny())
+
+
+def train_together(folder: Path, output: Path) -> bool:
+    """Whether two processes get to the end of the run."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+    processes = [fork(lambda rank=rank: train_as(rank, port, make_config(folder, output))) for rank in range(2)]
+    return all(os.waitpid(process, 0)[1] == 0 for process in processes)
+
+
 if __name__ == "__main__":
     torch.set_num_threads(1)  # as in the tests (conftest.py): bits are compared
-    die_at(sys.argv[3])
-    train(make_config(Path(sys.argv[1]), Path(sys.argv[2]), resume=True, num_workers=int(sys.argv[4])), build_tiny())
+    data, out, *moments = sys.argv[1:]
+    if moments:
+        sys.exit(not all(is_killed(lambda m=m: train_until(m, Path(data), Path(out))) for m in moments))
+    sys.exit(not train_together(Path(data), Path(out)))

@@ -51,8 +51,8 @@ def degraded_masks(cell: Cell) -> Masks:
 
 def detected_masks(cell: Cell, detector: str) -> Masks:
     """The masks that a shipped detector, or one in a .safetensors file, finds in each photo separately."""
+    from mvseg.detectors.run import detect
     from mvseg.detectors.zoo import load_detector
-    from mvseg.training.average_precision import detect
 
     model = load_detector(detector)
     view_index, boxes, crops = [], [], []

@@ -1,1 +1,1 @@
-"""Stage 2b: who makes regions from images."""
+"""Mask R-CNNs: built by name, loaded from files or from the zoo, run."""

@@ -1,10 +1,10 @@
-"""Where to cut a mask head's probabilities, and what the mask is then worth: by the IoU that is to be expected.
+"""Where to cut a mask head's probabilities, and how good the mask then is: by its expected IoU.
 
 Cutting at 0.5 minimises the expected number of wrong pixels, not the IoU that masks are judged by: a thin leaf that the
-head is unsure of never reaches 0.5 and comes out empty or in shreds. Of all cuts we take the one with the largest
-expected IoU (after Nowozin, "Optimal Decisions from Probabilistic Models: the Intersection-over-Union Case", CVPR 2014;
-here the expectation of the intersection over that of the union), and the score of the box is multiplied by it (as Huang
-et al., "Mask Scoring R-CNN", CVPR 2019, do with an IoU that they learn). Nothing is learned and nothing tuned.
+head is unsure of never reaches 0.5, and its mask comes out empty or in pieces. Of all cuts we take the one with the
+largest expected IoU (after Nowozin, "Optimal Decisions from Probabilistic Models: the Intersection-over-Union Case",
+CVPR 2014; here the expectation of the intersection over that of the union), and multiply the score of the box by it (as
+Huang et al., "Mask Scoring R-CNN", CVPR 2019, do with an IoU that they learn). Nothing is learned, nothing tuned.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-CUT = 0.5  # where everybody cuts the probabilities of torchvision's mask heads
+CUT = 0.5  # where the masks of torchvision's detectors are cut, by convention
 EPS = 1e-9  # probabilities are kept this far from 0 and 1, where log odds are infinite
 
 
@@ -24,7 +24,7 @@ def expect_iou(probabilities: Tensor) -> tuple[Tensor, Tensor]:
 
     Returns:
         (D,) float64 cuts: the mask is where the probability is larger. Half-way (in log odds) between the smallest
-        probability inside and the largest outside, or 1e-9 when none is outside. (D,) float64 IoU to be expected.
+        probability inside and the largest outside, or 1e-9 when none is outside. (D,) float64 expected IoU.
     """
     p = probabilities.double().sort(dim=1, descending=True).values
     sums, counts = p.cumsum(1), torch.arange(1, p.shape[1] + 1, device=p.device)
@@ -35,18 +35,18 @@ def expect_iou(probabilities: Tensor) -> tuple[Tensor, Tensor]:
     return cuts, expected
 
 
-def decide_masks(found: dict[str, Tensor]) -> dict[str, Tensor]:
-    """Detections whose masks are best cut at 0.5 and whose scores count the quality of the mask.
+def decide_masks(detections: dict[str, Tensor]) -> dict[str, Tensor]:
+    """Detections whose masks are best cut at 0.5, and whose scores include the quality of the mask.
 
     Args:
-        found: what torchvision's RoI heads return for one photo: "masks" (D, 1, S, S) probabilities in the frame of
+        detections: what torchvision's RoI heads return for a photo: "masks" (D, 1, S, S) probabilities in the frame of
             the boxes, "scores" (D,), and anything else.
 
     Returns:
         The same with other "masks": the log odds of each are shifted so that its best cut falls on 0.5; and with
         "scores" multiplied by the expected IoU. The order of the detections stays.
     """
-    masks, scores = found["masks"], found["scores"]
+    masks, scores = detections["masks"], detections["scores"]
     cuts, expected = expect_iou(masks.flatten(1))
     log_odds = masks.double().logit(eps=EPS) - cuts.logit(eps=EPS)[:, None, None, None]
-    return found | {"masks": log_odds.sigmoid().to(masks.dtype), "scores": (scores * expected).to(scores.dtype)}
+    return detections | {"masks": log_odds.sigmoid().to(masks.dtype), "scores": (scores * expected).to(scores.dtype)}

@@ -7,25 +7,26 @@ A detector is a folder of its name with
     train.yaml                   the recipe: `mvseg train --config train.yaml`
     metrics.json                 what it reached
     card.md                      data, intended use, limits
+
+`mvseg.training.pack` makes such a folder from a training run.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import shutil
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
 import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
-from mvseg.detectors.mask_rcnn import build_detector, read_weights
+from mvseg.detectors.mask_rcnn import build_detector
+from mvseg.detectors.weights_file import read_weights
 from mvseg.errors import InputError
 
 WEIGHTS, HASH = "weights.safetensors", "weights.safetensors.sha256"
@@ -69,8 +70,8 @@ def _read_entry(folder: Path) -> ZooEntry:
         stated = (folder / HASH).read_text(encoding="utf-8").split()[0]
         metrics = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
     except (OSError, ValueError, IndexError) as error:
-        raise InputError(f"{folder} is no complete detector ({type(error).__name__}: {error})") from error
-    return ZooEntry(folder.name, folder / WEIGHTS, stated, metrics)
+        raise InputError(f"{folder} is not a complete detector ({type(error).__name__}: {error})") from error
+    return ZooEntry(name=folder.name, weights=folder / WEIGHTS, sha256=stated, metrics=metrics)
 
 
 def find_weights(name: str) -> Path | None:
@@ -85,10 +86,10 @@ def find_weights(name: str) -> Path | None:
     entry = _read_entry(folder)
     if not entry.weights.is_file():
         raise InputError(f"{entry.weights}: the weights of '{name}' are missing, expected a complete installation")
-    found = hashlib.sha256(entry.weights.read_bytes()).hexdigest()
-    if found != entry.sha256:
+    actual = hashlib.sha256(entry.weights.read_bytes()).hexdigest()
+    if actual != entry.sha256:
         raise InputError(
-            f"{entry.weights}: the SHA-256 is {found[:12]}..., expected {entry.sha256[:12]}...: the file is damaged"
+            f"{entry.weights}: the SHA-256 is {actual[:12]}..., expected {entry.sha256[:12]}...: the file is damaged"
         )
     return entry.weights
 
@@ -102,7 +103,7 @@ def load_detector(
         weights: the name of a shipped detector (`list_detectors`), or a .safetensors file that a training run wrote.
         image_size: longer side, in pixels, that photos are scaled to. None: larger photos are scaled down to what the
             file says, smaller ones stay as they are.
-        min_score: detections that score less are dropped; `mvseg infer` does so at 0.3. None for torchvision's 0.05.
+        min_score: detections that score less are discarded; `mvseg infer` does so at 0.3. None for torchvision's 0.05.
 
     Raises:
         InputError: neither a name nor a readable file, a wrong hash, or a file that does not say what it holds.
@@ -111,9 +112,12 @@ def load_detector(
     if not path.is_file():
         names = ", ".join(sorted(_list_folders())) or "none"
         raise InputError(f"'{weights}' is neither a shipped detector ({names}) nor a file of weights")
-    arch, categories = read_description(path)
+    _, description = read_weights(path)
+    if description is None:
+        raise InputError(f"{path} does not say its architecture, expected a model.safetensors of a training run")
     with torch.random.fork_rng(devices=[]):  # random weights are drawn before the file's take their place
-        detector = build_detector(arch, len(categories) + 1, str(path), image_size=image_size)
+        num_classes = len(description.categories) + 1
+        detector = build_detector(description.arch, num_classes, str(path), image_size=image_size)
     if min_score is not None:
         detector.roi_heads.score_thresh = min_score
     if image_size is None:
@@ -133,50 +137,3 @@ class _ShrinkOnly(GeneralizedRCNNTransform):  # type: ignore[misc]  # torchvisio
         self, image: Tensor, target: dict[str, Tensor] | None = None
     ) -> tuple[Tensor, dict[str, Tensor] | None]:
         return (image, target) if max(image.shape[-2:]) <= self.max_size else super().resize(image, target)
-
-
-def read_description(path: Path) -> tuple[str, tuple[str, ...]]:
-    """Architecture and categories (without background) of a weights file, from its metadata.
-
-    Raises:
-        InputError: the file is no .safetensors of a training run.
-    """
-    _, metadata = read_weights(path)
-    if not {"arch", "categories"} <= metadata.keys():
-        raise InputError(f"{path} does not say its architecture, expected a model.safetensors of a training run")
-    return metadata["arch"], tuple(json.loads(metadata["categories"]))
-
-
-def pack_detector(run: Path, folder: Path, image_size: int | None = None) -> None:
-    """Make a zoo folder of a training run: half-precision weights, hash, recipe and metrics; the card is yours.
-
-    Args:
-        run: output folder of the run.
-        folder: of the detector's name; made when missing. A card.md in it stays.
-        image_size: longer side, in pixels, that photos are scaled to from now on; None for that of the training.
-
-    Raises:
-        InputError: the run has no weights, metrics or config yet, or the folder cannot be written.
-    """
-    if image_size is not None and image_size < 32:
-        raise InputError(f"image_size is {image_size}, expected at least 32")
-    for name in ("model.safetensors", "metrics.json", "config.yaml"):
-        if not (run / name).is_file():
-            raise InputError(f"{run / name}: is missing, expected the output of a training run")
-    state, described = read_weights(run / "model.safetensors")
-    metadata = dict(described)
-    halves = {key: value.half() if value.is_floating_point() else value for key, value in state.items()}
-    content = safetensors.torch.save(halves, metadata | ({"image_size": str(image_size)} if image_size else {}))
-    try:
-        best = json.loads((run / "metrics.json").read_text(encoding="utf-8"))["best"]
-    except (ValueError, KeyError) as error:
-        raise InputError(f"{run / 'metrics.json'}: has no 'best', expected the file of a training run") from error
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{folder}: cannot be made ({error.strerror}), expected a folder") from error
-    (folder / WEIGHTS).write_bytes(content)
-    (folder / "metrics.json").write_text(json.dumps({"validation": best}, indent=1) + "\n", encoding="utf-8")
-    shutil.copyfile(run / "config.yaml", folder / "train.yaml")
-    # last: without it the folder is no entry
-    (folder / HASH).write_text(f"{hashlib.sha256(content).hexdigest()}  {WEIGHTS}\n", encoding="utf-8")

@@ -1,1 +1,1 @@
-"""Stage 2a: readers and writers, one file per format. Every conversion of convention lives here and nowhere else."""
+"""Readers and writers, one file per format. Conventions are converted here and nowhere else."""

@@ -1,4 +1,4 @@
-"""JSON files that people write by hand: read, checked against a pydantic model, every fault one sentence."""
+"""JSON files that people write: read, and checked against a pydantic model; each fault is one sentence."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def read_json(path: Path, model: type[Model]) -> Model:
     """Read a JSON file as `model`.
 
     Raises:
-        InputError: the file is missing, is not JSON, or does not fit the model; names the file and the place in it.
+        InputError: the file is missing, is not JSON, or does not fit the model; names the file and the key.
     """
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))  # Windows editors put a mark in front
@@ -33,5 +33,5 @@ def read_json(path: Path, model: type[Model]) -> Model:
         return model.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
-        place = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
-        raise InputError(f"{path}: {place + ': ' if place else ''}{first['msg']}") from None
+        key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
+        raise InputError(f"{path}: {key + ': ' if key else ''}{first['msg']}") from None

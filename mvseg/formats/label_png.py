@@ -1,10 +1,13 @@
-"""Label images: 16-bit (or 8-bit) single-channel PNGs; 0 = nothing, 65535 = ignore, every other number one mask."""
+"""Label images: PNGs of 16 (or 8) bits with a single channel; 0 = nothing, 65535 = ignore, any other number = one mask.
+
+A palette PNG gives its indices, not its colours: the tools that write labels with a palette (as PASCAL VOC's are) mean
+the index.
+"""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from mvseg.errors import InputError
@@ -12,25 +15,37 @@ from mvseg.formats.image_file import read_image, write_png
 
 
 def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
-    """(height, width) uint16 label map.
+    """(height, width) uint16 label map of a view.
 
     Raises:
-        InputError: the file is missing, cannot be decoded, has colour channels, is not 8 or 16 bits deep, or is of
-            another size than `width` x `height`.
+        InputError: as `read_labels`, or another size than `width` x `height`.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: the mask file is missing")
-    labels = read_image(path, cv2.IMREAD_UNCHANGED)
-    if labels is None:
-        raise InputError(f"{path}: cannot be read, expected a whole label PNG")
-    if labels.ndim != 2:
-        raise InputError(f"{path}: has {labels.shape[2]} colour channels, expected a label PNG with a single channel")
-    if labels.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{path}: holds {labels.dtype} numbers, expected 8 or 16 bits without sign")
+    labels = read_labels(path)
     if labels.shape != (height, width):
         size = f"{labels.shape[1]} x {labels.shape[0]}"
         raise InputError(f"{path}: the mask is {size}, its camera says {width} x {height}")
-    return labels.astype(np.uint16)
+    return labels
+
+
+def read_labels(path: Path) -> np.ndarray:
+    """(H, W) uint16 label map of whatever size.
+
+    Raises:
+        InputError: the file is missing, cannot be decoded, has colour channels, or does not hold
+            unsigned numbers of at most 16 bits.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: the mask file is missing")
+    try:
+        image = read_image(path)
+    except InputError as error:
+        raise InputError(f"{path}: cannot be read, expected a whole label PNG: {error}") from None
+    num_channels = len(image.getbands())
+    if num_channels > 1:
+        raise InputError(f"{path}: has {num_channels} colour channels, expected a label PNG with a single channel")
+    if image.mode in ("I", "F"):
+        raise InputError(f"{path}: holds signed or 32-bit numbers, expected 8 or 16 bits without sign")
+    return np.array(image.convert("L") if image.mode == "1" else image).astype(np.uint16)
 
 
 def write_label_png(path: Path, labels: np.ndarray) -> None:

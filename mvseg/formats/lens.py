@@ -1,9 +1,9 @@
 """Lens distortion: removed from photos and masks once, on load, and put back when labels are written.
 
-The undistorted image has the size and the K of the photo; only the distortion is gone. What the photo does not show is
-black (nothing, in masks). Every camera model of COLMAP works, through pycolmap; a rig file's OpenCV coefficients are
-COLMAP's FULL_OPENCV. Beyond some angle a lens polynomial turns back and shows the same photo pixel twice, and a fisheye
-sees what no pinhole can: positions whose way there and back does not end where it began are taken as not shown.
+The undistorted image has the size and the K of the photo; only the distortion is removed. What the photo does not show
+is black (nothing, in masks). Every camera model of COLMAP works, through pycolmap; a rig file's OpenCV coefficients are
+COLMAP's FULL_OPENCV. Beyond some angle a lens polynomial turns back, so that a photo pixel appears twice, and a fisheye
+sees what no pinhole can: a position that does not come back to itself, there and back, counts as not shown.
 """
 
 from __future__ import annotations
@@ -32,38 +32,41 @@ def pinhole_from_photo(lens: pycolmap.Camera, K: np.ndarray, xy: np.ndarray) -> 
 
 def undistort(image: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> np.ndarray:
     """The photo or label map as the pinhole K sees it: same shape and dtype; labels (2-D) are never mixed."""
-    return image if lens is None else _resample(image, _lookup(lens, K, image, photo_from_pinhole))
+    return image if lens is None else _look_up(image, lens, K, mapping=photo_from_pinhole)
 
 
 def distort(image: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> np.ndarray:
     """The inverse of `undistort`: an undistorted image or label map as the photo's own lens sees it."""
-    return image if lens is None else _resample(image, _lookup(lens, K, image, pinhole_from_photo))
+    return image if lens is None else _look_up(image, lens, K, mapping=pinhole_from_photo)
 
 
-def _lookup(lens: pycolmap.Camera, K: np.ndarray, image: np.ndarray, where: Mapping) -> np.ndarray:
-    size = (image.shape[1], image.shape[0])
-    return _positions(lens.model_name, tuple(lens.params), tuple(map(float, K.ravel())), size, where)
+def _look_up(image: np.ndarray, lens: pycolmap.Camera, K: np.ndarray, *, mapping: Mapping) -> np.ndarray:
+    """The image at the positions that a mapping gives; outside of it, 0."""
+    columns, rows = _positions(
+        model=lens.model_name,
+        params=tuple(lens.params),
+        K=tuple(map(float, K.ravel())),
+        size=(image.shape[1], image.shape[0]),
+        mapping=mapping,
+    )
+    interpolation = cv2.INTER_NEAREST if image.ndim == 2 else cv2.INTER_LINEAR
+    return np.asarray(cv2.remap(image, columns, rows, interpolation, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
 
 
-@lru_cache(maxsize=2)  # one lens, both ways: a scene's photos and masks ask for the same positions again and again
+@lru_cache(maxsize=2)  # one lens, both ways: a scene's photos and masks need the same positions again and again
 def _positions(
-    model: str, params: tuple[float, ...], K: tuple[float, ...], size: tuple[int, int], where: Mapping
+    *, model: str, params: tuple[float, ...], K: tuple[float, ...], size: tuple[int, int], mapping: Mapping
 ) -> np.ndarray:
-    """(2, H, W) float32: column and row at which to look up every pixel, counted from pixel centres as cv2.remap does;
-    far outside of the image for what it does not show."""
-    lens = pycolmap.Camera(model=model, width=size[0], height=size[1], params=list(params))
+    """(2, H, W) float32: the column and row at which to look up each pixel, counted from pixel centres as cv2.remap
+    does; far outside the image for what it does not show."""
+    width, height = size
+    lens = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     matrix = np.array(K).reshape(3, 3)
-    rows, columns = np.indices(size[::-1])
+    rows, columns = np.indices((height, width))
     centers = np.stack((columns.ravel(), rows.ravel()), 1) + 0.5
-    back = pinhole_from_photo if where is photo_from_pinhole else photo_from_pinhole
-    xy = where(lens, matrix, centers)
-    returned = back(lens, matrix, np.where(np.isfinite(xy), xy, -1e6))
+    inverse = pinhole_from_photo if mapping is photo_from_pinhole else photo_from_pinhole
+    xy = mapping(lens, matrix, centers)
+    returned = inverse(lens, matrix, np.where(np.isfinite(xy), xy, -1e6))
     is_shown = np.abs(returned - centers).max(1, keepdims=True) < 0.5  # pixels; False for what is not finite
     positions = np.where(is_shown, np.clip(xy - 0.5, -1e4, 1e5), -1e4)
-    return positions.T.astype(np.float32, order="C").reshape(2, *size[::-1])
-
-
-def _resample(image: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """Look up `image` at (2, H, W) positions; outside it is 0."""
-    how = cv2.INTER_NEAREST if image.ndim == 2 else cv2.INTER_LINEAR
-    return np.asarray(cv2.remap(image, positions[0], positions[1], how, borderMode=cv2.BORDER_CONSTANT, borderValue=0))
+    return positions.T.astype(np.float32, order="C").reshape(2, height, width)

@@ -1,4 +1,4 @@
-"""What every reader of cameras hands over, and how it becomes a scene."""
+"""From photos with cameras, as every reader of cameras gives them, to a scene; and the photos of a scene, read."""
 
 from __future__ import annotations
 
@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-import cv2
 import numpy as np
 import pycolmap
 import torch
 
 from mvseg.errors import InputError
-from mvseg.formats.image_file import MAX_SIDE, read_image
+from mvseg.formats.image_file import MAX_SIDE, file_name_problem, read_rgb
 from mvseg.formats.lens import undistort
 from mvseg.scene import Cameras, Scene, View, camera_problem
 
@@ -44,9 +43,15 @@ class Photo:
 def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Path) -> Scene:
     """The scene of a folder from its photos.
 
+    Args:
+        folder: the scene; its name becomes that of the scene.
+        photos: one per view.
+        unit: of the world, "" when unknown.
+        source: the file or folder that the cameras come from; messages name it.
+
     Raises:
-        InputError: fewer than two views, two views of one name, a file name that leads out of the folder, a camera that
-            is not sound. The message names the camera file, the view's index and its photo.
+        InputError: fewer than two views, two views with the same name, a file name that leads out of the folder, a
+            camera that is not sound. The message names the view's index and its photo.
     """
     if not photos:
         raise InputError(f"{source}: there are no views, expected at least two")
@@ -61,13 +66,13 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         for name, photo in zip(view_names([photo.file for photo in photos]), photos, strict=True)
     )
     cameras = Cameras(
-        torch.from_numpy(np.stack([photo.K for photo in photos])),
-        torch.from_numpy(np.stack([photo.R for photo in photos])),
-        torch.from_numpy(np.stack([photo.t for photo in photos])),
-        torch.tensor([[photo.width, photo.height] for photo in photos]),
+        K=torch.from_numpy(np.stack([photo.K for photo in photos])),
+        R=torch.from_numpy(np.stack([photo.R for photo in photos])),
+        t=torch.from_numpy(np.stack([photo.t for photo in photos])),
+        sizes=torch.tensor([[photo.width, photo.height] for photo in photos]),
     )
     try:
-        return Scene(folder.resolve().name, views, cameras, unit, source)
+        return Scene(name=folder.resolve().name, views=views, cameras=cameras, unit=unit, source=source)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
 
@@ -81,11 +86,9 @@ def view_names(files: Sequence[str]) -> list[str]:
 
 def _problem(photo: Photo) -> str | None:
     """What is wrong with a photo's path or camera, as the end of a sentence; None for a sound one."""
-    path = os.path.normpath(photo.file)
-    if os.path.isabs(path) or path.split(os.sep)[0] == "..":
-        return "the file name leads out of the scene folder"
-    if path == "." or "\0" in path:
-        return "this is no name of a file"
+    problem = file_name_problem(photo.file)
+    if problem:
+        return problem
     if max(photo.width, photo.height) > MAX_SIDE:
         return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_SIDE} pixels a side"
     size = torch.tensor([photo.width, photo.height])
@@ -120,11 +123,13 @@ def read_photo(scene: Scene, view: int) -> np.ndarray:
     path, (width, height) = scene.views[view].path, scene.cameras.sizes[view].tolist()
     if not path.is_file():
         raise InputError(f"{path}: the image of view {view} is missing")
-    image = read_image(path, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if image is None:
-        raise InputError(f"{path}: the image of view {view} cannot be read, expected a whole image file")
+    try:
+        image = read_rgb(path)
+    except InputError as error:
+        message = f"{path}: the image of view {view} cannot be read, expected a whole image file: {error}"
+        raise InputError(message) from None
     if image.shape[:2] != (height, width):
         size = f"{image.shape[1]} x {image.shape[0]}"
         raise InputError(f"{path}: the image of view {view} is {size}, its camera says {width} x {height}")
     K = scene.cameras.K[view].cpu().numpy()
-    return undistort(cv2.cvtColor(image, cv2.COLOR_BGR2RGB), scene.views[view].lens, K)
+    return undistort(image, scene.views[view].lens, K)

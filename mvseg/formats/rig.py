@@ -45,16 +45,16 @@ class _Rig(BaseModel):
 
 
 def read_rig(path: Path) -> Scene:
-    """The scene of a rig file; photos are looked for beside it. Unknown keys are warned of (a typing error in
-    "distortion" must not pass unseen).
+    """The scene of a rig file; photos are looked for beside it. Warns (InputWarning) of unknown keys: a misspelt
+    "distortion" must not pass unseen.
 
     Raises:
         InputError: the file is missing, broken or of another format, or holds unsound cameras; see `build_scene`.
     """
     rig = read_json(path, _Rig)
-    for place, part in [("the rig", rig), *((f"view {i}", view) for i, view in enumerate(rig.views))]:
-        for key in part.model_extra or {}:
-            warnings.warn(f"{path}: key '{key}' of {place} is not known and not used", InputWarning, stacklevel=2)
+    for owner, entry in [("the rig", rig), *((f"view {i}", view) for i, view in enumerate(rig.views))]:
+        for key in entry.model_extra or {}:
+            warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
     photos = [_photo(path, index, view) for index, view in enumerate(rig.views)]
     return build_scene(path.parent, photos, unit=rig.unit, source=path)
 
@@ -69,18 +69,21 @@ def _photo(path: Path, index: int, view: _RigView) -> Photo:
     if view.distortion and any(view.distortion):
         if K[0, 1] != 0:
             raise InputError(f"{path}: view {index} ({view.file}): K has skew together with distortion, expected none")
-        lens = opencv_lens(view.width, view.height, K, view.distortion)
-    return Photo(view.file, view.width, view.height, K, np.array(view.R), np.array(view.t), lens)
+        lens = opencv_lens(K, view.distortion, width=view.width, height=view.height)
+    R, t = np.array(view.R), np.array(view.t)
+    return Photo(file=view.file, width=view.width, height=view.height, K=K, R=R, t=t, lens=lens)
 
 
-def opencv_lens(width: int, height: int, K: np.ndarray, distortion: list[float]) -> pycolmap.Camera:
+def opencv_lens(K: np.ndarray, distortion: list[float], *, width: int, height: int) -> pycolmap.Camera:
     """OpenCV's k1, k2, p1, p2 (, k3 (, k4, k5, k6)) as COLMAP's FULL_OPENCV; K in this project's pixels."""
     coefficients = [*distortion, *[0.0] * (8 - len(distortion))]
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients]
     return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
 
 
-def write_rig(path: Path, scene: Scene, files: list[str], distortion: list[list[float] | None] | None = None) -> None:
+def write_rig(
+    path: Path, scene: Scene, files: list[str], *, distortion: list[list[float] | None] | None = None
+) -> None:
     """Write a rig file.
 
     Args:

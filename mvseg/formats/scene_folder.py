@@ -1,4 +1,4 @@
-"""A scene folder: cameras beside photos, and masks beside them. Tells which reader to call."""
+"""A scene folder: photos with their cameras and, perhaps, masks. Chooses the reader."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mvseg.formats.transforms_json import read_transforms
 from mvseg.regions import Regions, regions_from_label_maps, stack_regions
 from mvseg.scene import Scene
 
-BINARY = 255  # what segmenters write that tell leaf from background only
+BINARY = 255  # what segmenters write that only tell leaf from background
 
 
 def load_scene(folder: Path | str) -> Scene:
@@ -31,8 +31,8 @@ def load_scene(folder: Path | str) -> Scene:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        found = "is a file, expected the scene's folder" if folder.exists() else "no such scene folder"
-        raise InputError(f"{folder}: {found}")
+        problem = "is a file, expected the scene's folder" if folder.exists() else "no such scene folder"
+        raise InputError(f"{folder}: {problem}")
     if (folder / "cameras.json").is_file():
         return read_rig(folder / "cameras.json")
     for model in (folder / "sparse", folder / "sparse" / "0", folder / "colmap" / "sparse" / "0"):

@@ -44,7 +44,7 @@ class _Transforms(_Intrinsics):
 
 
 def read_transforms(path: Path) -> Scene:
-    """The scene of a transforms.json; its unit is unknown (""). A frame's own intrinsics go before those of the file.
+    """The scene of a transforms.json; its unit is unknown (""). A frame's own intrinsics override those of the file.
 
     Raises:
         InputError: the file is missing or broken, an intrinsic is missing, the camera model is not known, or a camera
@@ -54,9 +54,9 @@ def read_transforms(path: Path) -> Scene:
     shared = transforms.model_dump(exclude={"frames"}, exclude_none=True)
     photos = []
     for index, frame in enumerate(transforms.frames):
-        own = frame.model_dump(exclude={"file_path", "transform_matrix"}, exclude_none=True)
+        of_frame = frame.model_dump(exclude={"file_path", "transform_matrix"}, exclude_none=True)
         try:
-            photos.append(_photo(path.parent, frame, shared | own))
+            photos.append(_photo(path.parent, frame, shared | of_frame))
         except InputError as error:
             raise InputError(f"{path}: frame {index} ({frame.file_path}): {error}") from None
     return build_scene(path.parent, photos, unit="", source=path)
@@ -74,14 +74,14 @@ def _photo(folder: Path, frame: _Frame, intrinsics: dict) -> Photo:
         raise InputError("the last row of transform_matrix is not 0, 0, 0, 1")
     R = (world_from_cam[:3, :3] @ OPENGL_FROM_OPENCV).T
     file = frame.file_path
-    if not (folder / file).is_file():  # nerfstudio allows leaving ".png" away
+    if not (folder / file).is_file():  # nerfstudio allows leaving out ".png"
         file = next((file + end for end in (".png", ".jpg", ".jpeg") if (folder / (file + end)).is_file()), file)
-    lens = _lens(intrinsics, width, height, K)
-    return Photo(file, width, height, K, R, -R @ world_from_cam[:3, 3], lens)
+    t = -R @ world_from_cam[:3, 3]
+    return Photo(file=file, width=width, height=height, K=K, R=R, t=t, lens=_lens(intrinsics, K))
 
 
-def _lens(intrinsics: dict, width: int, height: int, K: np.ndarray) -> pycolmap.Camera | None:
-    model = intrinsics.get("camera_model", "OPENCV")
+def _lens(intrinsics: dict, K: np.ndarray) -> pycolmap.Camera | None:
+    model, width, height = intrinsics.get("camera_model", "OPENCV"), intrinsics["w"], intrinsics["h"]
     k1, k2, k3, k4, p1, p2 = (intrinsics.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if model == "OPENCV_FISHEYE":
         params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, k4]
@@ -90,4 +90,6 @@ def _lens(intrinsics: dict, width: int, height: int, K: np.ndarray) -> pycolmap.
         raise InputError(f"the camera model '{model}' is not known, expected OPENCV, OPENCV_FISHEYE or PINHOLE")
     if k4:
         raise InputError(f"k4 is {k4:g} in the model {model}, expected 0 (a term in r^8 is not supported)")
-    return opencv_lens(width, height, K, [k1, k2, p1, p2, k3]) if any((k1, k2, k3, p1, p2)) else None
+    if not any((k1, k2, k3, p1, p2)):
+        return None
+    return opencv_lens(K, [k1, k2, p1, p2, k3], width=width, height=height)

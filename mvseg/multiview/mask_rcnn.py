@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-from collections import OrderedDict
 from collections.abc import Iterable
 
 import torch
@@ -11,7 +9,7 @@ from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
-from mvseg.detectors.mask_cut import decide_masks
+from mvseg.detectors.run import run_heads
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
@@ -150,23 +148,10 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         return solid[keep], matching
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
-        """One view's excessive set: torchvision's own heads with a larger NMS threshold; in the transform's frame."""
-        resized, _ = self.transform([image])
-        features = self.backbone(resized.tensors)
-        if isinstance(features, Tensor):
-            features = OrderedDict([("0", features)])
-        lenient = copy.copy(self.roi_heads)  # shares the weights; the detector's own thresholds stay as they are
-        lenient.nms_thresh, lenient.detections_per_img = self.proposal_iou, self.proposals_per_view
-        # Under autocast the backbone may work in half precision; the coordinates of boxes may not.
-        with torch.autocast(image.device.type, enabled=False):
-            kind = next(self.roi_heads.parameters()).dtype
-            features = OrderedDict((level, map_.to(kind)) for level, map_ in features.items())
-            boxes, _ = self.rpn(resized, features)
-            (found,), _ = lenient(features, boxes, resized.image_sizes)
-        height, width = resized.image_sizes[0]
-        found = decide_masks(found | {key: found[key].float() for key in ("boxes", "scores", "masks")})
-        good = found["scores"] >= self.roi_heads.score_thresh
-        return {key: value[good] for key, value in found.items()} | {"frame": torch.tensor([width, height])}
+        """One view's excessive set, as `run_heads`; what scores too little once its mask is decided is discarded."""
+        found = run_heads(self, image, nms_thresh=self.proposal_iou, detections_per_img=self.proposals_per_view)
+        frame, is_good = found.pop("frame"), found["scores"] >= self.roi_heads.score_thresh
+        return {key: value[is_good] for key, value in found.items()} | {"frame": frame}
 
     def _collect(
         self,

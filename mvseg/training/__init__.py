@@ -1,1 +1,1 @@
-"""Fine-tuning a single-view detector."""
+"""Training and fine-tuning of a detector that sees one photo at a time."""

@@ -1,7 +1,7 @@
 """From samples to what a detector trains on: augmentation, targets, and the order of an epoch.
 
-Everything random here is a pure function of (seed, epoch, index): neither the number of workers nor of processes nor an
-interruption changes what a training run sees.
+Everything random here is a pure function of (seed, epoch, index): a training run sees the same photos whatever its
+number of workers or processes, and however often it is interrupted.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ from torch.utils.data import Dataset
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
+from mvseg.formats.labelled_photo import LabelledPhoto
 from mvseg.regions import masks_to_boxes
 from mvseg.training.config import Orientation
-from mvseg.training.data import LabelledPhoto, SampleList, read_sample
+from mvseg.training.data import SampleList, read_sample
 
 MEAN_COLOR = (124, 116, 104)  # RGB; what the detectors' normalisation maps to zero
-MIN_INSTANCE_PX = 16  # smaller leftovers of a crop teach noise
+MIN_INSTANCE_PX = 16  # smaller remains of an instance at the edge of a crop are noise
 
 Target = dict[str, Tensor]
 
@@ -71,7 +72,7 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
         return photo, target, index
 
 
-def augment(labelled: LabelledPhoto, how: Augmentation, seed: int) -> tuple[Tensor, Target]:
+def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> tuple[Tensor, Target]:
     """Augment one sample; torch's global generator is left as it was.
 
     Ignored pixels are painted over with the mean colour first: the network can then learn neither a leaf nor background
@@ -84,9 +85,9 @@ def augment(labelled: LabelledPhoto, how: Augmentation, seed: int) -> tuple[Tens
     photo[:, labelled.ignore] = mean_color(photo)[:, None]
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
-        photo, layers = orient(photo, labelled.layers, how.orientation)
-        photo, layers = rescale(photo, layers, how)
-        photo = distort_color(how)(tv_tensors.Image(photo))
+        photo, layers = orient(photo, labelled.layers, augmentation.orientation)
+        photo, layers = rescale(photo, layers, augmentation)
+        photo = distort_color(augmentation)(tv_tensors.Image(photo))
     return photo.as_subclass(Tensor).float() / 255, make_target(layers, labelled.classes)
 
 
@@ -100,26 +101,27 @@ def orient(photo: Tensor, layers: Tensor, orientation: Orientation) -> tuple[Ten
     return photo, layers
 
 
-def rescale(photo: Tensor, layers: Tensor, how: Augmentation) -> tuple[Tensor, Tensor]:
+def rescale(photo: Tensor, layers: Tensor, augmentation: Augmentation) -> tuple[Tensor, Tensor]:
     """Scale by a random factor and take, or fill, an S x S window at a random place.
 
     Layers are resized with nearest-exact: plain nearest, which torchvision's transforms use, shifts a mask against its
     photo by up to half a pixel.
     """
-    low, high = (math.log(factor) for factor in how.scale_range)
-    factor = math.exp(low + (high - low) * float(torch.rand(()))) * how.image_size / max(photo.shape[1:])
-    size = [max(1, round(factor * side)) for side in photo.shape[1:]]
+    side = augmentation.image_size
+    low, high = (math.log(factor) for factor in augmentation.scale_range)
+    factor = math.exp(low + (high - low) * float(torch.rand(()))) * side / max(photo.shape[1:])
+    size = [max(1, round(factor * length)) for length in photo.shape[1:]]
     photo = v2.functional.resize(photo, size, antialias=True)
     layers = torch.nn.functional.interpolate(layers[None].float(), size, mode="nearest-exact")[0].to(layers.dtype)
-    room = [how.image_size - side for side in size]
-    top, left = (int(torch.randint(min(0, free), max(0, free) + 1, ())) for free in room)
-    frame = mean_color(photo)[:, None, None].expand(3, how.image_size, how.image_size)
-    empty = layers.new_zeros((len(layers), how.image_size, how.image_size))
-    return paste(photo, frame.clone(), top, left), paste(layers, empty, top, left)
+    spare = [side - length for length in size]
+    top, left = (int(torch.randint(min(0, free), max(0, free) + 1, ())) for free in spare)
+    frame = mean_color(photo)[:, None, None].expand(3, side, side)
+    empty = layers.new_zeros((len(layers), side, side))
+    return paste(photo, frame.clone(), top=top, left=left), paste(layers, empty, top=top, left=left)
 
 
-def paste(image: Tensor, frame: Tensor, top: int, left: int) -> Tensor:
-    """Put an image into a frame (which is changed) at an offset that may be negative."""
+def paste(image: Tensor, frame: Tensor, *, top: int, left: int) -> Tensor:
+    """Put an image (C, h, w) into a frame (C, H, W), which is changed, at an offset that may be negative."""
     rows = slice(max(0, top), max(0, min(frame.shape[1], top + image.shape[1])))
     columns = slice(max(0, left), max(0, min(frame.shape[2], left + image.shape[2])))
     frame[:, rows, columns] = image[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
@@ -127,16 +129,17 @@ def paste(image: Tensor, frame: Tensor, top: int, left: int) -> Tensor:
 
 
 def mean_color(photo: Tensor) -> Tensor:
+    """(3,) the neutral colour, in the photo's dtype."""
     return torch.tensor(MEAN_COLOR, dtype=photo.dtype)
 
 
-def distort_color(how: Augmentation) -> v2.Transform:
+def distort_color(augmentation: Augmentation) -> v2.Transform:
     """Colour jitter and blur, for uint8 photos."""
-    strength = how.color_jitter
+    strength = augmentation.color_jitter
     return v2.Compose(
         [
             v2.ColorJitter(strength, strength, strength, strength / 10),
-            v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=how.blur_probability),
+            v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=augmentation.blur_probability),
         ]
     )
 
@@ -147,7 +150,7 @@ def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_
     Args:
         layers: (L, H, W) int, k where instance k is, see `LabelledPhoto`.
         classes: (N,) int64, class of instance 1..N.
-        min_pixels: instances of fewer pixels are left out.
+        min_pixels: instances of fewer pixels are discarded.
 
     Returns:
         "masks" (M, H, W) uint8, "labels" (M,) int64, "boxes" (M, 4) float32 xyxy, half-open, recomputed from the masks.
@@ -164,11 +167,11 @@ def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_
 # --- the order of an epoch
 
 
-def order_epoch(num_samples: int, batch_size: int, seed: int, epoch: int) -> list[list[int]]:
+def order_epoch(num_samples: int, batch_size: int, *, seed: int, epoch: int) -> list[list[int]]:
     """The batches of an epoch: every sample once, in random order; the last batch is filled up from a second shuffle.
 
-    (Dropping an incomplete batch would lose up to batch_size - 1 of a user's few photos, a small one would change what
-    the learning rate means.)
+    (Dropping an incomplete batch would lose up to batch_size - 1 of a user's few photos; a smaller batch would not fit
+    the learning rate.)
 
     Returns:
         ceil(num_samples / batch_size) lists of batch_size sample indices.

@@ -1,4 +1,4 @@
-"""What a training run can be told. The fields are the keys of configs/train/*.yaml and of the command line.
+"""The options of a training run. The fields are the keys of configs/train/*.yaml and of the command line.
 
 Imports nothing heavy, so that the command line can show its help quickly.
 """
@@ -15,8 +15,8 @@ from mvseg.errors import InputError
 
 Orientation = Literal["any", "upright", "fixed"]
 
-# may differ between the start of a run and its continuation: they do not change what is computed (the names of the
-# samples are compared on their own, so the data may have moved)
+# These may differ when a run is resumed: they do not change what is computed. (The names of the samples are compared
+# separately, so the data may have moved.)
 FREE_ON_RESUME = {"photos", "labels", "val_photos", "val_labels", "skip_broken", "output", "resume", "device",
                   "num_workers", "checkpoint_every", "log_every"}  # fmt: skip
 
@@ -32,7 +32,7 @@ class TrainConfig:
         val_photos: folder of the validation photos, together with val_labels.
         val_labels: labels of the validation photos.
         hold_out_every: without val_photos: hold every n-th photo (sorted by name, from the first) out of the training
-            for validation; 0 for no validation. Views of one plant belong on one side: use val_photos for scenes.
+            for validation; 0 for no validation. All views of a plant belong on one side: use val_photos for scenes.
         skip_broken: train without broken samples (they are counted and listed in broken_samples.txt) instead of
             stopping.
         arch: resnet18_fpn, mobilenet_v3_large_fpn, maskrcnn_resnet50_fpn, maskrcnn_resnet50_fpn_v2.
@@ -62,7 +62,7 @@ class TrainConfig:
         seed: of the weights, the order, the augmentation and the samplers of the losses.
         checkpoint_every: steps between checkpoints; every epoch ends with one, too.
         log_every: steps between records of the losses in log.jsonl and TensorBoard.
-        resume: go on from the checkpoint in output, if there is one.
+        resume: continue from the checkpoint in output, if there is one.
     """
 
     photos: Path
@@ -143,7 +143,7 @@ def config_values(config: TrainConfig) -> dict[str, Any]:
 
 
 def config_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
-    """The first field that keeps a run from going on with another config, "name (before, now after)", or None."""
+    """The first field that keeps a run from being resumed with another config, "name (before, now after)", or None."""
     for name in now:
         if name not in FREE_ON_RESUME and before.get(name) != now[name]:
             return f"{name} ({before.get(name)}, now {now[name]})"

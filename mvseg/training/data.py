@@ -1,33 +1,30 @@
 """Photos with instance masks as training samples: finding, checking and reading them.
 
-Two layouts: a folder of photos with a folder of label PNGs (same path and stem; 8 or 16 bit; 0 is background, 65535 is
-ignored; a scene's `images/` and `masks/` are such a pair), or a folder of photos with one COCO JSON file. A photo
-without any instance is a sample like another, provided that its label PNG or its COCO entry exists.
-Broken samples are reported by name, all of them; nothing is dropped in silence.
+Two layouts: a folder of photos with a folder of label PNGs (same path and stem; 0 is background, 65535 is ignored; a
+scene's `images/` and `masks/` are such a pair), or a folder of photos with one COCO JSON file. A photo without any
+instance is a sample like any other, provided that its label PNG or its COCO entry exists.
+Broken samples are all reported, by name; nothing is dropped silently.
 """
 
 from __future__ import annotations
 
-import json
 import os
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
-import torch
-from pycocotools import mask as coco_mask
-from torch import Tensor
+from pydantic import BaseModel
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.regions import IGNORE_LABEL
-
-PHOTO_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+from mvseg.formats.coco import CocoAnnotation, CocoFile, decode_segmentation
+from mvseg.formats.image_file import PHOTO_SUFFIXES, file_name_problem, read_rgb
+from mvseg.formats.json_file import read_json
+from mvseg.formats.label_png import read_labels
+from mvseg.formats.labelled_photo import LabelledPhoto, label_photo, mask_photo
 
 
 @dataclass(frozen=True)
@@ -39,14 +36,14 @@ class Sample:
         photo: the image file.
         label_map: a single-channel PNG, or None when the instances come from `annotations`.
         annotations: COCO annotations of this photo.
-        size: (height, width) in pixels that the COCO file states, or None.
+        size: (width, height) in pixels that the COCO file states, or None.
         class_of: COCO category id -> class, from 1 on.
     """
 
     name: str
     photo: Path
     label_map: Path | None = None
-    annotations: tuple[Mapping[str, Any], ...] = ()
+    annotations: tuple[CocoAnnotation, ...] = ()
     size: tuple[int, int] | None = None
     class_of: Mapping[int, int] = field(default_factory=dict)
 
@@ -65,24 +62,6 @@ class SampleList:
         return SampleList(tuple(self.samples[index] for index in indices), self.categories)
 
 
-@dataclass(frozen=True, eq=False)
-class LabelledPhoto:
-    """A sample in memory.
-
-    Attributes:
-        photo: (3, H, W) uint8, RGB.
-        layers: (L, H, W) int32, 0 for nothing, k for the k-th instance; an instance lies whole in one layer, and there
-            are as many layers as overlaps ask for (one for a label map).
-        classes: (N,) int64, class of instance 1..N.
-        ignore: (H, W) bool, pixels that nobody may learn from or judge.
-    """
-
-    photo: Tensor
-    layers: Tensor
-    classes: Tensor
-    ignore: Tensor
-
-
 # --- which samples there are
 
 
@@ -98,8 +77,8 @@ def list_samples(photos: Path, labels: Path) -> SampleList:
         category, "leaf".
 
     Raises:
-        InputError: a missing folder or file, no photo at all, a JSON file that is not COCO, an annotation of an unknown
-            image, two photos with one stem.
+        InputError: a missing folder or file, no photo at all, two photos with one stem, a JSON file that is not COCO,
+            an image whose file name leads out of the folder, an annotation of an image that is not listed.
     """
     if not photos.is_dir():
         raise InputError(f"{photos} is not a folder, expected the folder of the photos")
@@ -111,11 +90,12 @@ def list_samples(photos: Path, labels: Path) -> SampleList:
 
 
 def list_label_maps(photos: Path, labels: Path) -> SampleList:
-    found = sorted(path for path in photos.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
-    if not found:
-        raise InputError(f"{photos} holds no photo ({', '.join(sorted(PHOTO_SUFFIXES))})")
+    """The samples of a folder of label PNGs; see `list_samples`."""
+    paths = sorted(path for path in photos.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
+    if not paths:
+        raise InputError(f"{photos} holds no photo ({', '.join(PHOTO_SUFFIXES)})")
     by_stem: dict[Path, Path] = {}
-    for path in found:
+    for path in paths:
         stem = path.relative_to(photos).with_suffix("")
         if stem in by_stem:
             raise InputError(f"{by_stem[stem]} and {path} would share one label PNG, expected one photo per stem")
@@ -125,33 +105,48 @@ def list_label_maps(photos: Path, labels: Path) -> SampleList:
         stem = label_map.relative_to(labels).with_suffix("")
         by_stem.setdefault(stem, (photos / stem).with_suffix(".*"))
     samples = (
-        Sample(path.relative_to(photos).as_posix(), path, labels / f"{stem.as_posix()}.png")
+        Sample(name=path.relative_to(photos).as_posix(), photo=path, label_map=labels / f"{stem.as_posix()}.png")
         for stem, path in sorted(by_stem.items())
     )
     return SampleList(tuple(samples), ("leaf",))
 
 
+class _Category(BaseModel):
+    id: int
+    name: str
+
+
+class _TrainingFile(CocoFile):
+    categories: list[_Category]
+
+
 def list_coco(photos: Path, labels: Path) -> SampleList:
-    try:
-        content = json.loads(labels.read_text(encoding="utf-8"))
-        categories = sorted((int(entry["id"]), str(entry["name"])) for entry in content["categories"])
-        images = sorted(content["images"], key=lambda entry: str(entry["file_name"]))
-        annotations = defaultdict(list)
-        for annotation in content["annotations"]:
-            annotations[annotation["image_id"]].append(annotation)
-        sizes = [(int(entry["height"]), int(entry["width"])) for entry in images]
-        known = {entry["id"] for entry in images}
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(f"{labels} is not a COCO file of instances ({type(error).__name__}: {error})") from error
+    """The samples of a COCO file; see `list_samples`. Classes 1, 2, ... are the categories, ordered by their ids."""
+    content = read_json(labels, _TrainingFile)
+    images = sorted(content.images, key=lambda image: image.file_name)
+    categories = sorted((category.id, category.name) for category in content.categories)
     if not images or not categories:
         raise InputError(f"{labels} lists {len(images)} images and {len(categories)} categories, expected some of each")
-    unknown = sorted(set(annotations) - known, key=str)
-    if unknown:
-        raise InputError(f"{labels} has annotations of image {unknown[0]}, which it does not list")
-    class_of = {category: index + 1 for index, (category, _) in enumerate(categories)}
+    for image in images:
+        problem = file_name_problem(image.file_name, folder="the folder of the photos")
+        if problem:
+            raise InputError(f"{labels}: image {image.file_name}: {problem}")
+    annotations_of: dict[int | str, list[CocoAnnotation]] = defaultdict(list)
+    for annotation in content.annotations:
+        annotations_of[annotation.image_id].append(annotation)
+    unlisted = sorted(annotations_of.keys() - {image.id for image in images}, key=str)
+    if unlisted:
+        raise InputError(f"{labels} has annotations of image {unlisted[0]}, which it does not list")
+    class_of = {category: number for number, (category, _) in enumerate(categories, start=1)}
     samples = (
-        Sample(entry["file_name"], photos / entry["file_name"], None, tuple(annotations[entry["id"]]), size, class_of)
-        for entry, size in zip(images, sizes, strict=True)
+        Sample(
+            name=image.file_name,
+            photo=photos / image.file_name,
+            annotations=tuple(annotations_of[image.id]),
+            size=(image.width, image.height),
+            class_of=class_of,
+        )
+        for image in images
     )
     return SampleList(tuple(samples), tuple(name for _, name in categories))
 
@@ -160,104 +155,68 @@ def list_coco(photos: Path, labels: Path) -> SampleList:
 
 
 def read_sample(sample: Sample) -> LabelledPhoto:
-    """Read a photo and its instances.
+    """Read a photo and its instances. OpenCV has no part in it: its threads do not survive the fork of a data loader.
 
     Raises:
-        InputError: an unreadable photo or label map, a label map that is not single-channel 8 or 16 bit, sizes that
-            differ, an annotation of an unknown category, without pixels, or with a malformed mask. The message starts
-            with the sample's name.
+        InputError: the photo or its label map is missing or cannot be read, sizes differ, or an annotation has an
+            unknown category, no pixels, or a malformed mask. The message starts with the sample's name.
     """
     if not sample.photo.is_file():
         raise InputError(f"{sample.name}: the photo {sample.photo} is missing")
-    pixels = decode_image(sample.photo, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-    if pixels is None:
-        raise InputError(f"{sample.name}: the photo cannot be read as an image")
-    # not cv2.cvtColor: its threads do not survive the fork of a data loader's worker
-    photo = torch.from_numpy(pixels).permute(2, 0, 1).flip(0).contiguous()
-    size = (photo.shape[1], photo.shape[2])
-    if sample.label_map is None:
-        return LabelledPhoto(photo, *read_annotations(sample, size))
-    return LabelledPhoto(photo, *read_label_map(sample.label_map, sample.name, size))
-
-
-def decode_image(path: Path, flags: int) -> np.ndarray | None:
-    """The decoded image; None when it is no image. Works for every path, unlike cv2.imread on Windows."""
-    content = np.fromfile(path, np.uint8)
     try:
-        return cv2.imdecode(content, flags) if len(content) else None
-    except cv2.error:
-        return None
+        photo = read_rgb(sample.photo)
+    except InputError as error:
+        message = f"{sample.name}: the photo cannot be read, expected a whole image file: {error}"
+        raise InputError(message) from None
+    if sample.label_map is not None:
+        return label_photo(photo, read_label_map(sample, sample.label_map, photo.shape[:2]))
+    return read_annotations(sample, photo)
 
 
-def read_label_map(path: Path, name: str, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Layers, classes and ignored pixels of a label PNG, see `LabelledPhoto`."""
+def read_label_map(sample: Sample, path: Path, size: tuple[int, ...]) -> np.ndarray:
+    """The label map of a sample, checked against the (height, width) of its photo."""
     if not path.is_file():
-        raise InputError(f"{name}: its label map {path} is missing (a photo without instances needs an all-zero one)")
-    labels = decode_image(path, cv2.IMREAD_UNCHANGED)
-    if labels is None or labels.ndim != 2 or labels.dtype not in (np.uint8, np.uint16):
-        raise InputError(f"{name}: {path} is not a single-channel PNG of 8 or 16 bit")
+        raise InputError(
+            f"{sample.name}: its label map {path} is missing (a photo without instances needs an all-zero one)"
+        )
+    try:
+        labels = read_labels(path)
+    except InputError as error:
+        raise InputError(f"{sample.name}: {error}") from None
     if labels.shape != size:
         raise InputError(
-            f"{name}: its label map is {labels.shape[1]} x {labels.shape[0]} pixels, the photo {size[1]} x {size[0]}"
+            f"{sample.name}: its label map is {labels.shape[1]} x {labels.shape[0]} pixels, "
+            f"the photo {size[1]} x {size[0]}"
         )
-    ignore = labels == IGNORE_LABEL
-    values, indices = np.unique(np.where(ignore, 0, labels), return_inverse=True)
-    layer = indices.reshape(labels.shape) + (values[0] != 0)  # a map without background starts at instance 1
-    num_instances = int(layer.max())
-    layers = torch.from_numpy(layer.astype(np.int32))[None]
-    return layers, torch.ones(num_instances, dtype=torch.int64), torch.from_numpy(ignore)
+    return labels
 
 
-def read_annotations(sample: Sample, size: tuple[int, int]) -> tuple[Tensor, Tensor, Tensor]:
-    """Layers, classes and ignored pixels of COCO annotations; crowds become ignored pixels."""
-    if sample.size is not None and sample.size != size:
+def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
+    """A photo with its COCO annotations; crowds become ignored pixels."""
+    height, width = photo.shape[:2]
+    if sample.size is not None and sample.size != (width, height):
         raise InputError(
-            f"{sample.name}: the photo is {size[1]} x {size[0]} pixels, "
-            f"its COCO entry says {sample.size[1]} x {sample.size[0]}"
+            f"{sample.name}: the photo is {width} x {height} pixels, "
+            f"its COCO entry says {sample.size[0]} x {sample.size[1]}"
         )
-    masks, classes, ignore = [], [], np.zeros(size, bool)
+    masks, classes, ignore = [], [], np.zeros((height, width), bool)
     for annotation in sample.annotations:
-        mask = decode_annotation(annotation, sample.name, size)
-        if annotation.get("iscrowd", 0):
+        where = f"{sample.name}: annotation {annotation.id}"
+        try:
+            mask = decode_segmentation(annotation.segmentation, width, height)
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        if not mask.any():
+            raise InputError(f"{where}: its mask covers no pixel")
+        category = annotation.category_id
+        if annotation.iscrowd:
             ignore |= mask
-        elif annotation.get("category_id") in sample.class_of:
+        elif category in list(sample.class_of):  # a list: the file may give anything, also what has no hash
             masks.append(mask)
-            classes.append(sample.class_of[annotation["category_id"]])
+            classes.append(sample.class_of[category])
         else:
-            raise InputError(f"{sample.name}: an annotation has the unknown category {annotation.get('category_id')}")
-    return stack_masks(masks, size), torch.tensor(classes, dtype=torch.int64), torch.from_numpy(ignore)
-
-
-def decode_annotation(annotation: Mapping[str, Any], name: str, size: tuple[int, int]) -> np.ndarray:
-    """(H, W) bool mask of polygons or of a run-length encoding, compressed or not."""
-    where = f"{name}: annotation {annotation.get('id', '?')}"
-    try:
-        segments = annotation["segmentation"]
-        encoded = coco_mask.frPyObjects(segments, *size) if not is_compressed(segments) else segments
-        mask = coco_mask.decode(coco_mask.merge(encoded) if isinstance(encoded, list) else encoded).astype(bool)
-    except Exception as error:  # pycocotools raises bare Exception, too
-        raise InputError(f"{where} has no readable segmentation ({type(error).__name__}: {error})") from error
-    if mask.shape != size:
-        raise InputError(f"{where} is {mask.shape[1]} x {mask.shape[0]} pixels, the photo {size[1]} x {size[0]}")
-    if not mask.any():
-        raise InputError(f"{where} covers no pixel")
-    return mask
-
-
-def is_compressed(segments: Any) -> bool:
-    return isinstance(segments, dict) and isinstance(segments["counts"], str | bytes)
-
-
-def stack_masks(masks: Sequence[np.ndarray], size: tuple[int, int]) -> Tensor:
-    """(L, H, W) int32 with instance k+1 where masks[k] is; each instance goes to the first layer that is free there."""
-    layers = [np.zeros(size, np.int32)]
-    for number, mask in enumerate(masks, start=1):
-        free = next((layer for layer in layers if not layer[mask].any()), None)
-        if free is None:
-            free = np.zeros(size, np.int32)
-            layers.append(free)
-        free[mask] = number
-    return torch.from_numpy(np.stack(layers))
+            raise InputError(f"{where}: its category {category} is not listed")
+    return mask_photo(photo, masks, classes=classes, ignore=ignore)
 
 
 def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]:
@@ -273,13 +232,13 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
         except InputError as error:
             return str(error)
 
-    with ThreadPoolExecutor(max(1, min(8, (os.cpu_count() or 1)))) as pool:
-        found = list(tqdm(pool.map(inspect, samples), "checking samples", len(samples), disable=None, leave=False))
-    broken = {index: entry for index, entry in enumerate(found) if isinstance(entry, str)}
-    return [entry if isinstance(entry, int) else 0 for entry in found], broken
+    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+        answers = list(tqdm(pool.map(inspect, samples), "checking samples", len(samples), disable=None, leave=False))
+    broken = {index: answer for index, answer in enumerate(answers) if isinstance(answer, str)}
+    return [answer if isinstance(answer, int) else 0 for answer in answers], broken
 
 
-def keep_sound(samples: SampleList, what: str, skip_broken: bool) -> tuple[SampleList, dict[int, str]]:
+def keep_sound(samples: SampleList, what: str, *, skip_broken: bool) -> tuple[SampleList, dict[int, str]]:
     """The samples that can be used, and what is wrong with the others.
 
     Args:

@@ -1,36 +1,22 @@
-"""The files of a training run. Each is written whole: to a temporary name first, then moved over the old one."""
+"""The files of a training run; all but the growing log are written whole or not at all."""
 
 from __future__ import annotations
 
 import json
 import logging
-import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import safetensors.torch
 import torch
 import yaml  # type: ignore[import-untyped]
 from torch import nn
 
+from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
+from mvseg.formats.atomic import is_partial, write_text_whole, write_whole
 
 logger = logging.getLogger(__name__)
-
-
-def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
-    """Let `write` make a file under a temporary name, then move it to `path`: a reader, or a run that was killed at any
-    moment, finds the old content or the new one, never a part."""
-    partial = path.with_name(path.name + ".partial")
-    write(partial)
-    with partial.open("rb+") as file:
-        os.fsync(file.fileno())
-    os.replace(partial, path)
-
-
-def write_text_whole(path: Path, text: str) -> None:
-    write_whole(path, lambda partial: partial.write_text(text, encoding="utf-8"))
 
 
 def write_config(path: Path, config: Mapping[str, Any]) -> None:
@@ -39,17 +25,18 @@ def write_config(path: Path, config: Mapping[str, Any]) -> None:
 
 
 def write_metrics(path: Path, metrics: Mapping[str, Any]) -> None:
+    """Write metrics as JSON; numbers must be finite."""
     write_text_whole(path, json.dumps(metrics, indent=2, allow_nan=False) + "\n")
 
 
-def write_weights(path: Path, model: nn.Module, metadata: Mapping[str, str]) -> None:
-    """Write a model's state dict as .safetensors, on the CPU and contiguous."""
-    state = {key: value.detach().cpu().contiguous() for key, value in model.state_dict().items()}
-    content = safetensors.torch.save(state, dict(metadata))  # save_file would make a file that only its owner can read
+def write_weights(path: Path, model: nn.Module, description: Description) -> None:
+    """Write a model's state dict as .safetensors."""
+    content = encode_weights(model.state_dict(), description)
     write_whole(path, lambda partial: partial.write_bytes(content))
 
 
 def write_checkpoint(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a checkpoint; `read_checkpoint` reads it."""
     write_whole(path, lambda partial: torch.save(dict(content), partial))
 
 
@@ -67,6 +54,13 @@ def read_checkpoint(path: Path, device: torch.device) -> dict[str, Any]:
     return content
 
 
+def delete_partial(folder: Path) -> None:
+    """Delete the files that a killed run left half written."""
+    for path in folder.iterdir():
+        if is_partial(path) and path.is_file():
+            path.unlink()
+
+
 def append_record(path: Path, record: Mapping[str, Any]) -> None:
     """Add a line of JSON to a log."""
     with path.open("a", encoding="utf-8") as file:
@@ -74,7 +68,7 @@ def append_record(path: Path, record: Mapping[str, Any]) -> None:
 
 
 def cut_log(path: Path, step: int) -> None:
-    """Forget the records after `step`, and a torn last line: what a killed run did after its last checkpoint."""
+    """Remove the records after `step`, and a torn last line: what a killed run did after its last checkpoint."""
     if not path.is_file():
         return
     kept = []
@@ -89,7 +83,7 @@ def cut_log(path: Path, step: int) -> None:
 
 
 def open_tensorboard(folder: Path, step: int) -> Any | None:
-    """A TensorBoard writer that goes on after `step`, or None, with one line in the log, when it is not installed."""
+    """A TensorBoard writer that continues after `step`, or None, with one line in the log, if it is not installed."""
     try:
         from torch.utils.tensorboard import SummaryWriter
     except ImportError:

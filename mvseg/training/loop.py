@@ -1,18 +1,18 @@
 """Fine-tuning a single-view detector: epochs, evaluation, checkpoints, on one process or many.
 
 One optimisation step takes `batch_size` samples, in chunks of `images_per_forward`. torchrun's processes share the
-chunks of a step out; one process alone does them one after another and adds up the gradients. Each chunk seeds the
+chunks of a step; a single process works through them one after another and adds up the gradients. Each chunk seeds the
 random samplers of torchvision's losses from (seed, step, chunk), and no norm looks at the batch
 (mvseg/detectors/mask_rcnn.py). So a run depends on `batch_size` and `images_per_forward` but not on the number of
-processes: torchvision normalises its losses over the images of one forward call, and these are the same images. What
-remains is the order in which the gradients of the chunks are added up.
+processes: torchvision normalises its losses over the images of one forward call, and these are the same images. Only
+the order in which the gradients of the chunks are added up differs.
 
-All randomness is a function of the seed and the step. To continue a killed run with the same bits (on a CPU with the
-same number of threads) a checkpoint therefore needs no state of a generator, and none of a scheduler.
+All randomness is a function of the seed and the step. A killed run therefore resumes with the same bits (on a CPU, with
+the same number of threads) without the state of any generator or scheduler in its checkpoint.
 
 Files in `output`: config.yaml (resolved), log.jsonl (losses by step), metrics.json (by epoch), model.safetensors (the
-best epoch by mask AP; without validation samples the last), checkpoint.pt, tensorboard/ when tensorboard is installed,
-broken_samples.txt when samples were skipped.
+best epoch by mask AP; without validation samples the last), checkpoint.pt, tensorboard/ if tensorboard is installed,
+broken_samples.txt if samples were skipped.
 """
 
 from __future__ import annotations
@@ -32,24 +32,28 @@ from torch.utils.data import DataLoader
 from torchvision.models.detection import MaskRCNN
 from tqdm import tqdm
 
-from mvseg.detectors.mask_rcnn import count_parameters, describe_detector
+from mvseg.detectors.mask_rcnn import count_parameters
+from mvseg.detectors.weights_file import Description
 from mvseg.errors import InputError
+from mvseg.evaluation.average_precision import average_precision
+from mvseg.formats.atomic import is_partial, write_text_whole
 from mvseg.training.augmentation import Augmentation, AugmentedSamples, Target, mix_seed, order_epoch
-from mvseg.training.average_precision import average_precision, detect_and_label
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
 from mvseg.training.data import SampleList, keep_sound, list_samples
 from mvseg.training.files import (
     append_record,
     cut_log,
+    delete_partial,
     open_tensorboard,
     write_config,
     write_metrics,
-    write_text_whole,
     write_weights,
 )
 from mvseg.training.processes import Processes, join_processes
-from mvseg.training.state import TrainingState, apply_gradients, learning_rate, save_state, start_state
+from mvseg.training.schedule import learning_rate
+from mvseg.training.state import TrainingState, apply_gradients, save_state, start_state
+from mvseg.training.validation import detect_and_label
 
 logger = logging.getLogger(__name__)
 Chunk = tuple[list[Tensor], list[Target], list[int]]
@@ -57,9 +61,13 @@ Chunk = tuple[list[Tensor], list[Target], list[int]]
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What stays the same during a run: its config, its place among the processes, its sound samples.
+    """What stays the same during a run.
 
-    `held_out` are the validation samples, None without validation.
+    Attributes:
+        config: everything that the user chose.
+        processes: this process among those that train together.
+        samples: the sound training samples.
+        held_out: the sound validation samples, None without validation.
     """
 
     config: TrainConfig
@@ -85,8 +93,8 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
 
     Raises:
         InputError: broken samples (unless `skip_broken`), nothing to train on, an output folder with another run, a
-            checkpoint that does not belong to this config, weights that do not fit, a loss or gradient that is not
-            finite (the message names the photos).
+            checkpoint of another config, weights that do not fit, a loss or gradient that is not finite (the message
+            names the photos).
     """
     with join_processes(config.device) as processes:
         if config.num_chunks % processes.count:
@@ -97,19 +105,20 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
         cuda = [processes.device] if processes.device.type == "cuda" else []
         with torch.random.fork_rng(devices=cuda):
             samples, held_out = processes.ask_first(lambda: find_samples(config))
-            state = start_state(config, samples, processes.device, model)
-            run_epochs(Run(config, processes, samples, held_out), state)
+            state = start_state(config, samples, device=processes.device, model=model)
+            run = Run(config=config, processes=processes, samples=samples, held_out=held_out)
+            run_epochs(run, state)
 
 
 def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
-    """The training and the validation samples, checked; broken_samples.txt is written when some are skipped.
+    """The training and the validation samples, checked; broken_samples.txt is written if some are skipped.
 
     Raises:
-        InputError: an output folder with other things, broken samples, nothing to train on.
+        InputError: an output folder that holds something else, broken samples, nothing to train on.
     """
-    there = {path.name.removesuffix(".partial") for path in config.output.glob("*")}  # a run may be killed at once
-    if there and not there & {"config.yaml", "broken_samples.txt"}:
-        raise InputError(f"{config.output}: holds files that are no training run, expected a new or an empty folder")
+    names = {path.name for path in config.output.glob("*") if not is_partial(path)}
+    if names and not names & {"config.yaml", "broken_samples.txt"}:
+        raise InputError(f"{config.output}: holds files that no training run wrote, expected a new or an empty folder")
     samples, held_out = list_samples(config.photos, config.labels), None
     if config.val_photos is not None and config.val_labels is not None:
         held_out = list_samples(config.val_photos, config.val_labels)
@@ -119,10 +128,10 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
         indices = range(len(samples))
         held_out = samples.select(indices[:: config.hold_out_every])
         samples = samples.select([index for index in indices if index % config.hold_out_every])
-    samples, broken = keep_sound(samples, "training", config.skip_broken)
+    samples, broken = keep_sound(samples, "training", skip_broken=config.skip_broken)
     problems = list(broken.values())
     if held_out is not None:
-        held_out, broken = keep_sound(held_out, "validation", config.skip_broken)
+        held_out, broken = keep_sound(held_out, "validation", skip_broken=config.skip_broken)
         problems += broken.values()
     num_held_out = len(held_out) if held_out is not None else 0
     logger.info("%d samples to train on, %d to validate, %d skipped", len(samples), num_held_out, len(problems))
@@ -141,7 +150,7 @@ def run_epochs(run: Run, state: TrainingState) -> None:
     chunks = load_chunks(run, state.step)
     for epoch in range(len(state.history), run.config.epochs):
         started = time.monotonic()
-        train_epoch(run, state, network, chunks, board)
+        train_epoch(run, state, network=network, chunks=chunks, board=board)
         losses = {name: total / run.steps_per_epoch for name, total in state.loss_sums.items()}
         scores = evaluate(run, state) if run.held_out is not None else {}
         record = {"epoch": epoch, "step": state.step, **losses, **scores}
@@ -157,9 +166,16 @@ def run_epochs(run: Run, state: TrainingState) -> None:
 
 
 def train_epoch(
-    run: Run, state: TrainingState, network: nn.Module, chunks: Iterator[Chunk], board: Any | None
+    run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk], board: Any | None
 ) -> None:
-    """Do the steps that the current epoch still lacks, with a checkpoint now and then and one at the end.
+    """Do the remaining steps of the current epoch, with checkpoints on the way and one at the end.
+
+    Args:
+        run: what stays the same.
+        state: what changes.
+        network: the state's model, wrapped if several processes train.
+        chunks: this process's chunks from the state's step on.
+        board: TensorBoard's writer, or None.
 
     Raises:
         InputError: a loss or a gradient is not finite; the message names the photos.
@@ -169,21 +185,21 @@ def train_epoch(
     hidden = None if run.processes.is_first else True  # None: hidden unless on a terminal
     for step in tqdm(range(first, num_steps), f"epoch {epoch + 1}", num_steps, initial=first, disable=hidden):
         rate = learning_rate(config, state.step, num_steps * config.epochs)
-        losses = add_gradients(run, state, network, chunks)
+        losses = add_gradients(run, state, network=network, chunks=chunks)
         if not apply_gradients(config, state, rate):
-            batch = order_epoch(len(run.samples), config.batch_size, config.seed, epoch)[step]
-            raise not_finite("the gradient", run, state, batch)
+            batch = order_epoch(len(run.samples), config.batch_size, seed=config.seed, epoch=epoch)[step]
+            raise not_finite(f"the gradient of {name_step(state)}", run, batch)
         for name, value in losses.items():
             state.loss_sums[name] = state.loss_sums.get(name, 0.0) + value
         if run.processes.is_first:
             if state.step % config.log_every == 0:
-                log_losses(run, state, {"lr": rate, **losses}, board)
+                log_losses(run, state, {"lr": rate, **losses}, board=board)
             if state.step % config.checkpoint_every == 0 or step == num_steps - 1:
                 save_state(state, config, run.samples)
 
 
 def add_gradients(
-    run: Run, state: TrainingState, network: nn.Module, chunks: Iterator[Chunk]
+    run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk]
 ) -> dict[str, float]:
     """Forward and backward of this process's chunks of a step.
 
@@ -206,22 +222,24 @@ def add_gradients(
             losses = {name: value.float() for name, value in losses.items()}
             losses["loss"] = torch.stack(list(losses.values())).sum()
             if not math.isfinite(losses["loss"].item()):
-                raise not_finite("the loss", run, state, indices)
+                raise not_finite(f"the loss of {name_step(state)}", run, indices)
             (losses["loss"] / len(numbers)).backward()
         for name, value in losses.items():
             sums[name] = sums.get(name, torch.zeros_like(value)) + value.detach() / config.num_chunks
     return processes.add_up(sums)
 
 
-def not_finite(what: str, run: Run, state: TrainingState, indices: list[int]) -> InputError:
+def name_step(state: TrainingState) -> str:
+    return f"step {state.step} (epoch {len(state.history) + 1})"
+
+
+def not_finite(what: str, run: Run, indices: list[int]) -> InputError:
     names = ", ".join(run.samples.samples[index].name for index in indices)
-    return InputError(
-        f"{what} of step {state.step} (epoch {len(state.history) + 1}) is not finite on {names}: look at these photos, "
-        "or lower lr, or set precision to fp32"
-    )
+    return InputError(f"{what} is not finite on {names}: look at these photos, or lower lr, or set precision to fp32")
 
 
 def uses_bf16(config: TrainConfig, device: torch.device) -> bool:
+    """Whether the forward pass runs under bfloat16 autocast, see `TrainConfig.precision`."""
     if config.precision == "auto":
         return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
     return config.precision == "bf16"
@@ -231,11 +249,15 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
     """This process's chunks of all steps from `first_step` to the end of the run, read and augmented by workers."""
     config = run.config
     augmentation = Augmentation(
-        config.image_size, config.orientation, config.scale_range, config.color_jitter, config.blur_probability
+        image_size=config.image_size,
+        orientation=config.orientation,
+        scale_range=config.scale_range,
+        color_jitter=config.color_jitter,
+        blur_probability=config.blur_probability,
     )
     keys = []
     for epoch in range(first_step // run.steps_per_epoch, config.epochs):
-        batches = order_epoch(len(run.samples), config.batch_size, config.seed, epoch)
+        batches = order_epoch(len(run.samples), config.batch_size, seed=config.seed, epoch=epoch)
         for batch in batches[max(0, first_step - epoch * run.steps_per_epoch) :]:
             for number in range(run.processes.rank, config.num_chunks, run.processes.count):
                 chunk = batch[number * config.images_per_forward : (number + 1) * config.images_per_forward]
@@ -256,13 +278,13 @@ def collate(items: list[tuple[Tensor, Target, int]]) -> Chunk:
 
 
 def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
-    """Average precision on the validation samples, which the processes share out; the same dict in every process."""
+    """Average precision on the validation samples, which the processes share; the same dict in every process."""
     assert run.held_out is not None
     processes = run.processes
     indices = range(processes.rank, len(run.held_out), processes.count)
     shown = tqdm(indices, "evaluating", disable=None if processes.is_first else True, leave=False)
     state.result.eval()
-    truth, detections = detect_and_label(state.result, run.held_out, shown, processes.device)
+    truth, detections = detect_and_label(state.result, run.held_out, shown)
     state.model.train()
     return average_precision(processes.gather(truth), processes.gather(detections), len(run.held_out))
 
@@ -274,12 +296,13 @@ def open_files(run: Run, state: TrainingState) -> Any | None:
     """Write the config, cut the log to the state's step, and open TensorBoard's writer, if it is installed."""
     output = run.config.output
     output.mkdir(parents=True, exist_ok=True)
+    delete_partial(output)
     write_config(output / "config.yaml", config_values(run.config))
     cut_log(output / "log.jsonl", state.step)
     return open_tensorboard(output / "tensorboard", state.step)
 
 
-def log_losses(run: Run, state: TrainingState, values: dict[str, float], board: Any | None) -> None:
+def log_losses(run: Run, state: TrainingState, values: dict[str, float], *, board: Any | None) -> None:
     append_record(run.config.output / "log.jsonl", {"step": state.step, **values})
     if board is not None:
         for name, value in values.items():
@@ -290,8 +313,8 @@ def close_epoch(run: Run, state: TrainingState, board: Any | None) -> None:
     """Export the weights if the epoch is the best so far, then metrics and the checkpoint."""
     config, output, best = run.config, run.config.output, best_epoch(state.history)
     if best == len(state.history) - 1:
-        metadata = describe_detector(config.arch, run.samples.categories, config.image_size)
-        write_weights(output / "model.safetensors", state.result, metadata)
+        description = Description(config.arch, run.samples.categories, config.image_size)
+        write_weights(output / "model.safetensors", state.result, description)
     metrics = {
         "best_epoch": best,
         "best": state.history[best],

@@ -36,7 +36,7 @@ class Processes:
         return self.rank == 0
 
     def ask_first(self, question: Callable[[], T]) -> T:
-        """What the first process gets from `question`, in every process; so with an InputError that it raises."""
+        """What `question` returns in the first process, in every process; likewise the InputError that it raises."""
         answer: list[Any] = [None]
         if self.is_first:
             try:
@@ -78,13 +78,13 @@ def join_processes(device: str) -> Iterator[Processes]:
     rank, count, local_rank = (int(os.environ.get(key, 0)) for key in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
     kind = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     if kind not in ("cpu", "cuda") or (kind == "cuda" and local_rank >= torch.cuda.device_count()):
-        raise InputError(f"device '{device}' (process {local_rank}) is not there, expected cpu, cuda or auto")
-    place = torch.device("cpu") if kind == "cpu" else torch.device("cuda", local_rank)
-    if place.type == "cuda":
-        torch.cuda.set_device(place)
+        raise InputError(f"device '{device}' (process {local_rank}) is not available, expected cpu, cuda or auto")
+    chosen = torch.device("cpu") if kind == "cpu" else torch.device("cuda", local_rank)
+    if kind == "cuda":
+        torch.cuda.set_device(chosen)
     if count <= 1:
-        yield Processes(0, 1, place)
+        yield Processes(0, 1, chosen)
         return
-    dist.init_process_group("nccl" if place.type == "cuda" else "gloo")
-    yield Processes(rank, count, place)
+    dist.init_process_group("nccl" if kind == "cuda" else "gloo")
+    yield Processes(rank, count, chosen)
     dist.destroy_process_group()  # not after an exception: it would wait for processes that wait for this one

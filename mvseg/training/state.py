@@ -9,10 +9,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import nn
 from torchvision.models.detection import MaskRCNN
 
 from mvseg.detectors.mask_rcnn import build_detector
+from mvseg.detectors.run import leave_autocast
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.training.config import TrainConfig, config_difference, config_values
@@ -49,9 +50,15 @@ class TrainingState:
 
 
 def start_state(
-    config: TrainConfig, samples: SampleList, device: torch.device, model: MaskRCNN | None
+    config: TrainConfig, samples: SampleList, *, device: torch.device, model: MaskRCNN | None = None
 ) -> TrainingState:
-    """The state that a run begins with, or goes on from when `config.resume` is set and there is a checkpoint.
+    """The state that a run begins with, or resumes from if `config.resume` is set and there is a checkpoint.
+
+    Args:
+        config: of the run.
+        samples: the training samples.
+        device: where to train.
+        model: a detector to train in place of `build_detector(config.arch, ...)`.
 
     Raises:
         InputError: a checkpoint without `resume`, or one of another config or of other samples; see `build_detector`.
@@ -71,33 +78,26 @@ def start_state(
     averaged = copy.deepcopy(model).eval() if config.ema_decay else None
     state = TrainingState(model, build_optimizer(config, model), averaged)
     if checkpoint.is_file():
-        restore_state(state, read_checkpoint(checkpoint, device), config, samples)
-        logger.info("going on from step %d of %s", state.step, checkpoint)
+        saved = read_checkpoint(checkpoint, device)
+        check_checkpoint(saved, config, samples)
+        restore_state(state, saved)
+        logger.info("resuming from step %d of %s", state.step, checkpoint)
     elif config.resume:
         logger.info("%s has no checkpoint yet: starting from the beginning", config.output)
     return state
 
 
-def leave_autocast(head: nn.Module, inputs: Any, outputs: tuple[list[Tensor], ...]) -> tuple[list[Tensor], ...]:
-    """Forward hook of an RPN's head: float32 from here on.
-
-    Under autocast torchvision would decode proposals, and round true boxes, in bfloat16, whose numbers above 256 are
-    even: boxes one pixel wide collapse, and their regression loss is not a number.
-    """
-    return tuple([level.float() for level in levels] for levels in outputs)
-
-
-def restore_state(state: TrainingState, saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
-    """Put a checkpoint's content into a fresh state.
-
-    Raises:
-        InputError: the checkpoint was made with another config or with other samples.
-    """
+def check_checkpoint(saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
+    """Raises InputError unless a checkpoint's content was made with this config and these samples."""
     difference = config_difference(saved["config"], config_values(config))
     if difference:
         raise InputError(f"the checkpoint in {config.output} was made with another {difference}, expected the same")
     if saved["samples"] != [sample.name for sample in samples.samples]:
         raise InputError(f"the checkpoint in {config.output} was made with other training samples, expected the same")
+
+
+def restore_state(state: TrainingState, saved: dict[str, Any]) -> None:
+    """Put a checkpoint's content into a fresh state."""
     state.model.load_state_dict(saved["model"])
     state.optimizer.load_state_dict(saved["optimizer"])
     if state.averaged is not None:
@@ -106,7 +106,7 @@ def restore_state(state: TrainingState, saved: dict[str, Any], config: TrainConf
 
 
 def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -> None:
-    """Write the checkpoint into `config.output`, whole. `build_detector` reads it as weights, too."""
+    """Write the checkpoint into `config.output`, whole. `build_detector` can read it as weights, too."""
     content = {
         "model": state.model.state_dict(),
         "ema": None if state.averaged is None else state.averaged.state_dict(),
@@ -132,19 +132,6 @@ def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimi
     return torch.optim.SGD(groups, lr=config.lr, momentum=0.9)
 
 
-def learning_rate(config: TrainConfig, step: int, num_steps: int) -> float:
-    """The rate of step 0 <= step < num_steps, see `TrainConfig.lr`, `schedule` and `warmup_steps`."""
-    scale = config.batch_size / 16
-    peak = config.lr * (scale if config.optimizer == "sgd" else math.sqrt(scale))
-    warmup = min(config.warmup_steps, num_steps // 10)
-    if step < warmup:
-        return peak * (step + 1) / (warmup + 1)
-    if config.schedule == "multistep":
-        return peak * 0.1 ** sum(step >= share * num_steps for share in (0.6, 0.85))
-    progress = (step - warmup) / (num_steps - warmup)
-    return peak * (0.01 + 0.99 * (1 + math.cos(math.pi * progress)) / 2)
-
-
 @torch.no_grad()
 def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> bool:
     """Clip the gradients, step the optimizer, follow with the average, count the step.
@@ -159,7 +146,7 @@ def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> b
     for group in state.optimizer.param_groups:
         group["lr"] = rate
     state.optimizer.step()
-    if state.averaged is not None:
+    if state.averaged is not None:  # torch's AveragedModel would copy the first weights, and rename them
         decay = min(config.ema_decay, (1 + state.step) / (10 + state.step))
         for average, current in zip(state.averaged.parameters(), state.model.parameters(), strict=True):
             average.lerp_(current, 1 - decay)

@@ -25,7 +25,8 @@ OTHER = [2.0, 30.0, 10.0, 30.0, 10.0, 38.0]
 
 def make_scene(*files: str) -> Scene:
     eye = torch.eye(3).expand(len(files), 3, 3)
-    cameras = Cameras(eye, eye, torch.zeros(len(files), 3), torch.tensor([[WIDTH, HEIGHT]] * len(files)))
+    sizes = torch.tensor([[WIDTH, HEIGHT]] * len(files))
+    cameras = Cameras(K=eye, R=eye, t=torch.zeros(len(files), 3), sizes=sizes)
     names = [file.removeprefix("images/").rsplit(".", 1)[0] for file in files]
     return Scene("plant", tuple(map(View, names, [Path("plant") / file for file in files])), cameras)
 
@@ -137,7 +138,7 @@ BAD: list[tuple[Any, str]] = [
     ({"size": [HEIGHT, WIDTH], "counts": "ü~"}, "do not add up to 60 x 40"),
     ({"size": [HEIGHT, WIDTH], "counts": [100, 100]}, "do not add up to 60 x 40"),
     ({"size": [HEIGHT, WIDTH], "counts": [0, WIDTH * HEIGHT + 1]}, "do not add up to 60 x 40"),
-    ({"size": [WIDTH, HEIGHT], "counts": [0, WIDTH * HEIGHT]}, "its mask is 40 x 60, its camera says 60 x 40"),
+    ({"size": [WIDTH, HEIGHT], "counts": [0, WIDTH * HEIGHT]}, "its mask is 40 x 60, expected 60 x 40"),
     ({"size": [10**9, 10**9], "counts": "PPYo1"}, "its mask is 1000000000 x 1000000000"),
     ([], "expected polygons"),
     ([[]], "expected polygons"),
@@ -145,6 +146,8 @@ BAD: list[tuple[Any, str]] = [
     ([POLYGON, [1.0, 2.0, 3.0, 4.0]], "expected polygons"),
     ([[*POLYGON, 3.0]], "expected polygons"),
     ([[1.0, 2.0, 1e12, 4.0, 5.0, 6.0]], "leads far out of the image"),
+    ([[-500.0, 0.0, 560.0, 40.0] * 3000], "polygons are 6[0-9]* pixels long, more than any outline in the image"),
+    ({"size": [HEIGHT, WIDTH], "counts": "o" * 100_000 + "1"}, "are not a string that COCO writes"),
 ]
 
 
@@ -163,13 +166,15 @@ def test_broken_masks_are_named(segmentation: Any, message: str, scene: Scene, t
         {"counts": [WIDTH * HEIGHT]},
         {"size": [HEIGHT, WIDTH]},
         [[1.0, 2.0, float("nan"), 4.0, 5.0, 6.0]],
+        [[1.0, 2.0, 10**400, 4.0, 5.0, 6.0]],
         "circle",
         None,
     ],
 )
 def test_masks_of_another_form_are_named(segmentation: Any, scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": [POLYGON]}, {"segmentation": segmentation}])
-    with pytest.raises(InputError, match=r"masks.json: annotations\[1\]\.segmentation"):
+    message = r"masks.json: annotation 2: its segmentation is neither polygons of finite numbers nor run lengths"
+    with pytest.raises(InputError, match=message):
         read_coco(path, scene)
 
 

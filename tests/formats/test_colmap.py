@@ -182,7 +182,7 @@ class TestText:
         lines = [line for line in path.read_text().splitlines() if not line.startswith("2 ")]
         path.write_text("\n".join([*lines, "2 EQUIRECTANGULAR 128 96 128 96"]) + "\n")
         with pytest.raises(
-            InputError, match=r"image opencv/02.jpg: camera model EQUIRECTANGULAR is no perspective one"
+            InputError, match=r"image opencv/02.jpg: camera model EQUIRECTANGULAR is not a perspective one"
         ):
             load_scene(folder)
 

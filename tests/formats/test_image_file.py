@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from io import BytesIO
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
-from mvseg.formats.image_file import read_image, write_png
+from mvseg.errors import InputError
+from mvseg.formats import image_file
+from mvseg.formats.image_file import file_name_problem, read_image, read_rgb, write_png
 
-COLOR = cv2.IMREAD_COLOR
+AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
 
 def smooth_picture(height: int = 90, width: int = 120) -> np.ndarray:
@@ -22,6 +26,15 @@ def encode(suffix: str, *options: int) -> bytes:
     return cv2.imencode(suffix, smooth_picture(), options)[1].tobytes()
 
 
+def save(mode: str, kind: str, **options: object) -> bytes:
+    """The picture by Pillow's writer."""
+    file = BytesIO()
+    Image.fromarray(smooth_picture()).convert(mode).save(file, kind, **options)
+    return file.getvalue()
+
+
+ORIENTED = Image.Exif()
+ORIENTED[274] = 6  # turned by 90 degrees
 JPEGS = {
     "baseline": encode(".jpg"),
     "progressive": encode(".jpg", cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
@@ -30,59 +43,134 @@ JPEGS = {
 # A preview inside of an APP1 segment, as cameras write it: it has an end mark of its own.
 PREVIEW = b"Exif\0\0" + JPEGS["baseline"]
 WITH_PREVIEW = b"\xff\xd8\xff\xe1" + (len(PREVIEW) + 2).to_bytes(2, "big") + PREVIEW + JPEGS["baseline"][2:]
+SIXTEEN_BITS = np.arange(5000, dtype=np.uint16).reshape(50, 100) * 13
 WHOLE = JPEGS | {
     "preview": WITH_PREVIEW,
-    "appended film": JPEGS["baseline"] + b"ftyp" * 50,
+    "oriented": save("RGB", "JPEG", exif=ORIENTED),
+    "grey jpeg": save("L", "JPEG"),
     "png": encode(".png"),
-    "16-bit png": cv2.imencode(".png", np.arange(5000, dtype=np.uint16).reshape(50, 100))[1].tobytes(),
+    "16-bit png": cv2.imencode(".png", SIXTEEN_BITS)[1].tobytes(),
+    "16-bit colour png": cv2.imencode(".png", smooth_picture().astype(np.uint16) * 250)[1].tobytes(),
+    "16-bit tiff": cv2.imencode(".tif", SIXTEEN_BITS // 256 * 256)[1].tobytes(),  # OpenCV rounds, Pillow cuts
+    "png with alpha": save("RGBA", "PNG"),
+    "grey png with alpha": save("LA", "PNG"),
+    "black and white png": save("1", "PNG"),
+    "palette png": save("P", "PNG"),
+    "transparent palette png": save("P", "PNG", transparency=bytes(range(250))),
     "bmp": encode(".bmp"),
     "tiff": encode(".tif"),
+    "jpeg in tiff": save("RGB", "TIFF", compression="jpeg"),
+    "webp": save("RGB", "WEBP", lossless=True),
 }
 
 
 @pytest.mark.parametrize("name", WHOLE)
 def test_whole_files_give_the_pixels_of_opencv(name: str, tmp_path: Path) -> None:
-    path = tmp_path / "image"
-    path.write_bytes(WHOLE[name])
-    for flags in (COLOR, cv2.IMREAD_UNCHANGED):
-        image = read_image(path, flags)
-        assert image is not None
-        np.testing.assert_array_equal(image, cv2.imread(str(path), flags))
+    (tmp_path / "image").write_bytes(WHOLE[name])
+    image = read_rgb(tmp_path / "image")
+    assert image.flags.writeable  # torch.from_numpy warns of others
+    np.testing.assert_array_equal(image[..., ::-1], cv2.imread(str(tmp_path / "image"), AS_STORED))
 
 
-@pytest.mark.parametrize("name", sorted(set(WHOLE) - {"appended film", "bmp", "tiff"}))
+def test_a_film_behind_a_jpeg_does_no_harm(tmp_path: Path) -> None:
+    """As phones append it."""
+    (tmp_path / "image.jpg").write_bytes(JPEGS["baseline"] + b"ftyp" * 50)
+    np.testing.assert_array_equal(read_rgb(tmp_path / "image.jpg")[..., ::-1], cv2.imread(str(tmp_path / "image.jpg")))
+
+
+def test_cmyk_is_near_to_the_colours_that_were_saved(tmp_path: Path) -> None:
+    (tmp_path / "image.jpg").write_bytes(save("CMYK", "JPEG", quality=98))
+    difference = read_rgb(tmp_path / "image.jpg").astype(int) - smooth_picture()
+    assert np.abs(difference).mean() < 3
+
+
+@pytest.mark.parametrize("name", WHOLE)
 def test_cut_files_are_refused_wherever_they_are_cut(name: str, tmp_path: Path) -> None:
     path, data = tmp_path / "image", WHOLE[name]
-    for length in [*range(0, len(data), 97), *range(len(data) - 20, len(data))]:
+    for length in [*range(0, len(data), 1 + len(data) // 60), *range(len(data) - 20, len(data))]:
         path.write_bytes(data[:length])
-        assert read_image(path, COLOR) is None, length
+        with pytest.raises(InputError):
+            read_image(path)
 
 
 def test_png_with_one_wrong_bit_is_refused(tmp_path: Path) -> None:
     data = bytearray(WHOLE["png"])
     data[len(data) // 2] ^= 4
     (tmp_path / "image.png").write_bytes(data)
-    assert read_image(tmp_path / "image.png", COLOR) is None
+    with pytest.raises(InputError, match="it is cut short, or a checksum is wrong"):
+        read_image(tmp_path / "image.png")
 
 
-@pytest.mark.parametrize("content", [b"", b"hello", b"\xff\xd8", b"\x89PNG\r\n\x1a\n"])
-def test_what_is_no_image_is_refused(content: bytes, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "it is not a JPEG, PNG, TIFF, BMP or WebP file"),
+        (b"hello", "it is not a JPEG, PNG, TIFF, BMP or WebP file"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0", "it is not a JPEG, PNG, TIFF, BMP or WebP file"),
+        (b"\xff\xd8", "."),
+        (b"\x89PNG\r\n\x1a\n", "it is cut short"),
+        (b"RIFF0000WAVE", "."),
+        (b"II*\0" + b"\xff" * 40, "."),
+    ],
+)
+def test_what_is_no_image_is_refused(content: bytes, message: str, tmp_path: Path) -> None:
     (tmp_path / "image.png").write_bytes(content)
-    assert read_image(tmp_path / "image.png", COLOR) is None
+    with pytest.raises(InputError, match=message):
+        read_image(tmp_path / "image.png")
 
 
 def test_a_folder_and_nothing_are_refused(tmp_path: Path) -> None:
-    assert read_image(tmp_path, COLOR) is None
-    assert read_image(tmp_path / "absent.png", COLOR) is None
+    with pytest.raises(InputError, match="Is a directory"):
+        read_image(tmp_path)
+    with pytest.raises(InputError, match="No such file"):
+        read_image(tmp_path / "absent.png")
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.int32, np.int16])
+def test_floats_and_signed_numbers_are_no_photo(dtype: type, tmp_path: Path) -> None:
+    assert cv2.imwrite(str(tmp_path / "image.tif"), np.ones((4, 6), dtype))
+    with pytest.raises(InputError, match="its pixels are signed or 32-bit numbers, expected 8 or 16 bits without sign"):
+        read_rgb(tmp_path / "image.tif")
+
+
+@pytest.mark.parametrize("name", ["baseline", "png", "bmp", "tiff"])
+def test_pillows_limit_on_pixels_gives_way_to_ours(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """With limits of some thousand pixels in place of 90 and 1074 megapixels; Pillow would warn, or refuse the file."""
+    (tmp_path / "image").write_bytes(WHOLE[name])
+    monkeypatch.setattr(image_file, "LARGE", 1000)
+    for limit in (120 * 90 - 1, 3000):
+        monkeypatch.setattr(Image, "MAX_IMAGE_PIXELS", limit)
+        assert read_rgb(tmp_path / "image").shape == (90, 120, 3)
+        assert limit == Image.MAX_IMAGE_PIXELS
+    monkeypatch.setattr(image_file, "MAX_PIXELS", 9000)
+    with pytest.raises(InputError, match="it is 120 x 90 pixels, expected at most 9000 in all"):
+        read_image(tmp_path / "image")
+
+
+def test_the_limits_are_in_order() -> None:
+    assert Image.MAX_IMAGE_PIXELS is not None
+    assert image_file.LARGE < Image.MAX_IMAGE_PIXELS
+    assert image_file.MAX_PIXELS > 200e6  # photos of 200 megapixels exist
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
 def test_written_png_reads_back(dtype: type, tmp_path: Path) -> None:
     image = np.arange(24, dtype=dtype).reshape(4, 6) * (2000 if dtype is np.uint16 else 10)
     write_png(tmp_path / "image.png", image)
-    np.testing.assert_array_equal(read_image(tmp_path / "image.png", cv2.IMREAD_UNCHANGED), image)
+    np.testing.assert_array_equal(np.asarray(read_image(tmp_path / "image.png")), image)
 
 
 def test_colours_are_written_as_rgb(tmp_path: Path) -> None:
     write_png(tmp_path / "image.png", np.full((3, 5, 3), (200, 100, 0), np.uint8))
+    assert read_rgb(tmp_path / "image.png")[1, 1].tolist() == [200, 100, 0]
     assert cv2.imread(str(tmp_path / "image.png"))[1, 1].tolist() == [0, 100, 200]  # OpenCV reads BGR
+
+
+@pytest.mark.parametrize("file", ["a.jpg", "./a/../b.jpg", "more/a..b.jpg"])
+def test_sound_file_names(file: str) -> None:
+    assert file_name_problem(file) is None
+
+
+@pytest.mark.parametrize("file", ["../a.jpg", "a/../../b.jpg", "/a.jpg", "", ".", "a\0.jpg"])
+def test_file_names_that_lead_out_or_nowhere(file: str) -> None:
+    assert file_name_problem(file)

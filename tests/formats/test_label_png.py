@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png, write_label_png
@@ -48,8 +49,18 @@ def test_transparency_and_floats_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"alpha.png: has 4 colour channels"):
         read_label_png(tmp_path / "alpha.png", 6, 4)
     assert cv2.imwrite(str(tmp_path / "float.tif"), np.zeros((4, 6), np.float32))
-    with pytest.raises(InputError, match=r"float.tif: holds float32 numbers, expected 8 or 16 bits"):
+    with pytest.raises(InputError, match=r"float.tif: holds signed or 32-bit numbers, expected 8 or 16 bits"):
         read_label_png(tmp_path / "float.tif", 6, 4)
+
+
+def test_palette_pngs_give_their_indices(tmp_path: Path) -> None:
+    """Of 8, 4 and 1 bits, also where two indices have one colour, or a colour is transparent."""
+    for colors, name in ((256, "8"), (16, "4"), (2, "1")):
+        labels = (np.arange(24).reshape(4, 6) % colors).astype(np.uint8)
+        image = Image.fromarray(labels)
+        image.putpalette([value for color in range(colors) for value in (color // 2 * 7 % 256, 90, 30)])
+        image.save(tmp_path / f"{name}.png", transparency=0)
+        np.testing.assert_array_equal(read_label_png(tmp_path / f"{name}.png", 6, 4), labels)
 
 
 def test_missing(tmp_path: Path) -> None:

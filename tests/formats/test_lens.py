@@ -28,7 +28,7 @@ def coefficients(request: pytest.FixtureRequest) -> list[float]:
 
 
 def lens_of(coefficients: list[float]) -> pycolmap.Camera:
-    return opencv_lens(WIDTH, HEIGHT, K, coefficients)
+    return opencv_lens(K, coefficients, width=WIDTH, height=HEIGHT)
 
 
 def fisheye_lens(focal: float = 80.0) -> tuple[pycolmap.Camera, np.ndarray]:
@@ -143,7 +143,7 @@ def test_masks_move_with_the_photo(kind: str) -> None:
 
 def test_a_lens_polynomial_that_turns_back_shows_nothing_twice() -> None:
     matrix = np.array([[70.0, 0, WIDTH / 2], [0, 70.0, HEIGHT / 2], [0, 0, 1]])  # corners beyond r (1 - 0.3 r^2)'s top
-    lens = opencv_lens(WIDTH, HEIGHT, matrix, [-0.3, 0, 0, 0])
+    lens = opencv_lens(matrix, [-0.3, 0, 0, 0], width=WIDTH, height=HEIGHT)
     far = np.array([[0.5, 0.5]])
     folded = photo_from_pinhole(lens, matrix, far)
     assert not np.allclose(pinhole_from_photo(lens, matrix, folded), far, atol=1)  # the corner lands on other rays

@@ -101,7 +101,7 @@ def test_coco_masks_are_the_same_regions(tmp_path: Path) -> None:
 def test_masks_of_distorted_photos_are_undistorted(kind: str, tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
     straight = load_masks(load_scene(folder), folder / "masks")
-    lens = opencv_lens(WIDTH, HEIGHT, K, DISTORTION)
+    lens = opencv_lens(K, DISTORTION, width=WIDTH, height=HEIGHT)
     for view in range(4):
         edit_rig(folder, view, distortion=DISTORTION)
         path = folder / "masks" / f"{view:03d}.png"

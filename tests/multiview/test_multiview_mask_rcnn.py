@@ -127,7 +127,7 @@ def test_masks_and_scores_are_decided_and_low_scores_go(monkeypatch: pytest.Monk
         seen.append(found)
         return decide_masks(found)
 
-    monkeypatch.setattr("mvseg.multiview.mask_rcnn.decide_masks", watch)
+    monkeypatch.setattr("mvseg.detectors.run.decide_masks", watch)
     detector = tiny_detector()
     detector.roi_heads.score_thresh = 0.16
     proposals, _ = MultiViewMaskRCNN(detector, num_iterations=0).find_regions(some_images(), small_cameras())

@@ -63,7 +63,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
     edit_rig(folder, DISTORTED, distortion=DISTORTION)
     for kind in ("masks", "truth"):
         path = folder / kind / f"{DISTORTED:03d}.png"
-        lens = opencv_lens(WIDTH, HEIGHT, K, DISTORTION)
+        lens = opencv_lens(K, DISTORTION, width=WIDTH, height=HEIGHT)
         write_image(path, distort(read_label_png(path, WIDTH, HEIGHT), lens, K))
     return folder
 

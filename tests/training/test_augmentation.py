@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from mvseg.formats.labelled_photo import LabelledPhoto
 from mvseg.training.augmentation import (
     MEAN_COLOR,
     Augmentation,
@@ -20,10 +22,12 @@ from mvseg.training.augmentation import (
     mix_seed,
     order_epoch,
 )
-from mvseg.training.data import LabelledPhoto, list_samples
+from mvseg.training.data import list_samples
 from tiny_training import write_photos
 
-PLAIN = Augmentation(64, "fixed", (1.0, 1.0), 0.0, 0.0)
+PLAIN = Augmentation(
+    image_size=64, orientation="fixed", scale_range=(1.0, 1.0), color_jitter=0.0, blur_probability=0.0
+)
 
 
 def make_sample(height: int = 48, width: int = 64) -> LabelledPhoto:
@@ -32,7 +36,12 @@ def make_sample(height: int = 48, width: int = 64) -> LabelledPhoto:
     layer[5:25, 10:40] = 1
     layer[28:40, 30:60] = 2
     photo = torch.stack([layer == 1, layer == 2, layer < 0]).to(torch.uint8) * 255
-    return LabelledPhoto(photo, layer[None], torch.tensor([1, 2]), torch.zeros((height, width), dtype=torch.bool))
+    return LabelledPhoto(
+        photo=photo,
+        layers=layer[None],
+        classes=torch.tensor([1, 2]),
+        ignore=torch.zeros((height, width), dtype=torch.bool),
+    )
 
 
 def mask_from_photo(photo: Tensor, channel: int) -> Tensor:
@@ -48,7 +57,8 @@ def overlap(a: Tensor, b: Tensor) -> float:
 @pytest.mark.parametrize("scale_range", [(1.0, 1.0), (0.4, 0.9), (1.1, 2.0)])
 def test_masks_follow_the_photo(orientation: Any, scale_range: tuple[float, float]) -> None:
     for seed in range(8):
-        photo, target = augment(make_sample(), Augmentation(64, orientation, scale_range, 0.0, 0.0), seed)
+        augmentation = replace(PLAIN, orientation=orientation, scale_range=scale_range)
+        photo, target = augment(make_sample(), augmentation, seed)
         assert photo.shape == (3, 64, 64)
         for label, mask in zip(target["labels"].tolist(), target["masks"].bool(), strict=True):
             assert overlap(mask_from_photo(photo, label - 1), mask) > 0.85
@@ -59,7 +69,7 @@ def test_orientations() -> None:
     sample = make_sample(64, 64)
     seen = {
         orientation: {
-            tuple(augment(sample, Augmentation(64, orientation, (1.0, 1.0), 0.0, 0.0), seed)[1]["boxes"][0].tolist())
+            tuple(augment(sample, replace(PLAIN, orientation=orientation), seed)[1]["boxes"][0].tolist())
             for seed in range(60)
         }
         for orientation in ("any", "upright", "fixed")
@@ -73,7 +83,12 @@ def test_resizing_does_not_shift_masks() -> None:
     rows, columns = torch.meshgrid(torch.arange(256), torch.arange(256), indexing="ij")
     layer = ((rows + 0.5 - 120) ** 2 + (columns + 0.5 - 140) ** 2 < 60**2).to(torch.int32)
     photo = torch.zeros((3, 256, 256), dtype=torch.uint8)
-    labelled = LabelledPhoto(photo, layer[None], torch.tensor([1]), torch.zeros_like(layer, dtype=torch.bool))
+    labelled = LabelledPhoto(
+        photo=photo,
+        layers=layer[None],
+        classes=torch.tensor([1]),
+        ignore=torch.zeros_like(layer, dtype=torch.bool),
+    )
     mask = augment(labelled, PLAIN, 0)[1]["masks"][0]
     centroid = (mask.nonzero().float() + 0.5).mean(0)
     assert centroid.tolist() == pytest.approx([120 / 4, 140 / 4], abs=0.2)
@@ -91,8 +106,8 @@ def test_ignored_pixels_and_the_frame_have_the_mean_colour() -> None:
 
 def test_colour_and_blur_change_the_photo_only() -> None:
     expected = augment(make_sample(), PLAIN, 3)
-    for how in (Augmentation(64, "fixed", (1.0, 1.0), 0.5, 0.0), Augmentation(64, "fixed", (1.0, 1.0), 0.0, 1.0)):
-        photo, target = augment(make_sample(), how, 3)
+    for augmentation in (replace(PLAIN, color_jitter=0.5), replace(PLAIN, blur_probability=1.0)):
+        photo, target = augment(make_sample(), augmentation, 3)
         assert not torch.equal(photo, expected[0])
         assert torch.equal(target["masks"], expected[1]["masks"])
         assert 0 <= float(photo.min()) <= float(photo.max()) <= 1
@@ -134,17 +149,18 @@ def test_samples_follow_from_seed_epoch_and_index(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("num_samples", "batch_size"), [(12, 4), (10, 4), (3, 8), (1, 1)])
 def test_order_of_an_epoch(num_samples: int, batch_size: int) -> None:
-    batches = order_epoch(num_samples, batch_size, 0, 0)
+    batches = order_epoch(num_samples, batch_size, seed=0, epoch=0)
     assert [len(batch) for batch in batches] == [batch_size] * int(np.ceil(num_samples / batch_size))
     counts = Counter(index for batch in batches for index in batch)
     assert set(counts) == set(range(num_samples))
     assert max(counts.values()) - min(counts.values()) <= 1
-    assert batches == order_epoch(num_samples, batch_size, 0, 0)
+    assert batches == order_epoch(num_samples, batch_size, seed=0, epoch=0)
 
 
 def test_epochs_differ() -> None:
-    assert order_epoch(20, 4, 0, 0) != order_epoch(20, 4, 0, 1)
-    assert order_epoch(20, 4, 0, 0) != order_epoch(20, 4, 1, 0)
+    first = order_epoch(20, 4, seed=0, epoch=0)
+    assert first != order_epoch(20, 4, seed=0, epoch=1)
+    assert first != order_epoch(20, 4, seed=1, epoch=0)
 
 
 def test_seeds_are_well_mixed() -> None:

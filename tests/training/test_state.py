@@ -1,4 +1,4 @@
-"""The parts of a training run: configs, rates, one step of the optimizer, files."""
+"""The parts of a training run: configs, one step of the optimizer, files."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from mvseg.detectors.mask_rcnn import list_architectures
 from mvseg.errors import InputError
 from mvseg.training.config import TrainConfig
 from mvseg.training.data import list_samples
-from mvseg.training.files import append_record, cut_log, write_whole
-from mvseg.training.state import TrainingState, apply_gradients, build_optimizer, learning_rate, start_state
+from mvseg.training.files import append_record, cut_log
+from mvseg.training.state import TrainingState, apply_gradients, build_optimizer, start_state
 from tiny_training import build_tiny, make_config, parse_config, write_photos
 
 # --- configs
@@ -47,25 +47,7 @@ def test_config_problems(changes: dict[str, Any], message: str) -> None:
         make_config(Path(), Path(), **changes)
 
 
-# --- rates and steps
-
-
-def test_learning_rate_warms_up_and_falls() -> None:
-    config = TrainConfig(Path(), Path(), Path(), lr=1.0, batch_size=16, warmup_steps=4)
-    rates = [learning_rate(config, step, 100) for step in range(100)]
-    assert rates[:5] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
-    assert rates[4:] == sorted(rates[4:], reverse=True)
-    assert rates[52] == pytest.approx(0.505)
-    assert 0.01 < rates[-1] < 0.011
-    drops = [learning_rate(dataclasses.replace(config, schedule="multistep"), step, 100) for step in (10, 59, 60, 85)]
-    assert drops == pytest.approx([1.0, 1.0, 0.1, 0.01])
-    assert learning_rate(config, 0, 10) == 0.5  # ten steps: one of warm-up
-
-
-@pytest.mark.parametrize(("optimizer", "factor"), [("sgd", 0.25), ("adamw", 0.5)])
-def test_learning_rate_scales_with_the_global_batch(optimizer: Any, factor: float) -> None:
-    config = TrainConfig(Path(), Path(), Path(), lr=1.0, batch_size=4, warmup_steps=0, optimizer=optimizer)
-    assert learning_rate(config, 0, 100) == pytest.approx(factor)
+# --- steps
 
 
 def step_once(config: TrainConfig, gradient: float, averaged: bool = False) -> tuple[TrainingState, bool]:
@@ -79,7 +61,7 @@ def step_once(config: TrainConfig, gradient: float, averaged: bool = False) -> t
 
 
 def test_gradients_are_clipped_and_followed_by_the_average() -> None:
-    config = TrainConfig(Path(), Path(), Path(), optimizer="sgd", weight_decay=0.0, clip_norm=2.0, ema_decay=0.99)
+    config = make_config(Path(), Path(), optimizer="sgd", weight_decay=0.0, clip_norm=2.0, ema_decay=0.99)
     state, applied = step_once(config, 50.0, averaged=True)
     assert applied
     assert state.step == 1
@@ -90,40 +72,16 @@ def test_gradients_are_clipped_and_followed_by_the_average() -> None:
 
 
 def test_a_gradient_that_is_not_finite_changes_nothing() -> None:
-    state, applied = step_once(TrainConfig(Path(), Path(), Path()), math.nan)
+    state, applied = step_once(make_config(Path(), Path()), math.nan)
     assert not applied
     assert state.step == 0
     assert state.model.weight.item() == 1
 
 
 def test_biases_and_norms_are_not_decayed() -> None:
-    groups = build_optimizer(TrainConfig(Path(), Path(), Path(), weight_decay=0.3), build_tiny()).param_groups
+    groups = build_optimizer(make_config(Path(), Path(), weight_decay=0.3), build_tiny()).param_groups
     decay = {parameter.ndim > 1: group["weight_decay"] for group in groups for parameter in group["params"]}
     assert decay == {True: 0.3, False: 0.0}
-
-
-# --- files
-
-
-def test_a_failing_write_keeps_the_old_file(tmp_path: Path) -> None:
-    def fail(partial: Path) -> None:
-        partial.write_text("half")
-        raise OSError("disk full")
-
-    (tmp_path / "file").write_text("old")
-    with pytest.raises(OSError, match="disk full"):
-        write_whole(tmp_path / "file", fail)
-    assert (tmp_path / "file").read_text() == "old"
-
-
-def test_a_log_is_cut_where_the_run_goes_on(tmp_path: Path) -> None:
-    log = tmp_path / "log.jsonl"
-    for step in (1, 2, 3):
-        append_record(log, {"step": step})
-    log.write_text(log.read_text() + '{"step": 4, "lo')
-    cut_log(log, 2)
-    assert log.read_text() == '{"step": 1}\n{"step": 2}\n'
-    cut_log(tmp_path / "none.jsonl", 2)
 
 
 def test_bfloat16_does_not_collapse_narrow_boxes_far_from_the_origin(tmp_path: Path) -> None:
@@ -138,8 +96,21 @@ def test_bfloat16_does_not_collapse_narrow_boxes_far_from_the_origin(tmp_path: P
     target["masks"][0, 100:140, 303] = 1
     model.transform.min_size, model.transform.max_size = (320,), 320
     plain = copy.deepcopy(model).train()
-    hooked = start_state(config, list_samples(photos, labels), torch.device("cpu"), model).model
+    hooked = start_state(config, list_samples(photos, labels), device=torch.device("cpu"), model=model).model
     with torch.autocast("cpu", torch.bfloat16):
         broken, sound = (network([torch.zeros(3, 320, 320)], [target]) for network in (plain, hooked))
     assert not torch.isfinite(broken["loss_box_reg"])  # what torchvision alone makes of it
     assert all(torch.isfinite(loss) for loss in sound.values())
+
+
+# --- files
+
+
+def test_a_log_is_cut_where_the_run_goes_on(tmp_path: Path) -> None:
+    log = tmp_path / "log.jsonl"
+    for step in (1, 2, 3):
+        append_record(log, {"step": step})
+    log.write_text(log.read_text() + '{"step": 4, "lo')
+    cut_log(log, 2)
+    assert log.read_text() == '{"step": 1}\n{"step": 2}\n'
+    cut_log(tmp_path / "none.jsonl", 2)

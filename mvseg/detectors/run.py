@@ -1,0 +1,86 @@
+"""A Mask R-CNN run on one photo, step by step: torchvision's own forward pass, unrolled.
+
+torchvision pastes all masks into full frames at once (100 detections in a photo of 24 megapixels take some 30 GB), and
+under autocast computes boxes in half precision, too. Here masks stay small until they are asked for, one at a time, and
+autocast ends behind the backbone.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import OrderedDict
+from collections.abc import Iterator
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
+from torchvision.models.detection.roi_heads import paste_masks_in_image
+from torchvision.models.detection.transform import resize_boxes
+
+from mvseg.detectors.mask_cut import decide_masks
+
+
+def run_heads(
+    model: GeneralizedRCNN, photo: Tensor, *, nms_thresh: float | None = None, detections_per_img: int | None = None
+) -> dict[str, Tensor]:
+    """What a detector finds in one photo, before anything is scaled back to the photo.
+
+    Under autocast the backbone may work in half precision; the coordinates of boxes may not, so that everything behind
+    it runs in the precision of the heads' weights.
+
+    Args:
+        model: a torchvision Mask R-CNN in eval mode.
+        photo: (3, H, W) float32 in [0, 1], on the model's device.
+        nms_thresh: IoU above which a box suppresses another; None for the model's own.
+        detections_per_img: so many of the best scores are kept; None for the model's own.
+
+    Returns:
+        The D detections, best score of their boxes first: "boxes" (D, 4) xyxy in the frame of the model's transform,
+        "labels" (D,) int64, "scores" (D,), "masks" (D, 1, S, S) probabilities in the frame of the boxes; masks and
+        scores are decided by `decide_masks`. And "frame" (2,) int64, width and height of the transform's frame.
+    """
+    heads = copy.copy(model.roi_heads)  # shares the weights; the model's own thresholds stay as they are
+    if nms_thresh is not None:
+        heads.nms_thresh = nms_thresh
+    if detections_per_img is not None:
+        heads.detections_per_img = detections_per_img
+    resized, _ = model.transform([photo])
+    features = model.backbone(resized.tensors)
+    if isinstance(features, Tensor):
+        features = {"0": features}
+    with torch.autocast(photo.device.type, enabled=False):
+        dtype = next(heads.parameters()).dtype
+        features = OrderedDict((level, values.to(dtype)) for level, values in features.items())
+        proposals, _ = model.rpn(resized, features)
+        (detections,), _ = heads(features, proposals, resized.image_sizes)
+    height, width = resized.image_sizes[0]
+    floats = {key: detections[key].float() for key in ("boxes", "scores", "masks")}
+    return decide_masks(detections | floats) | {"frame": torch.tensor([width, height])}
+
+
+def detect(model: GeneralizedRCNN, photo: Tensor) -> tuple[dict[str, Tensor], Iterator[Tensor]]:
+    """What `model([photo])[0]` finds, with decided masks, of which one at a time is in memory.
+
+    Args:
+        model: a torchvision Mask R-CNN in eval mode.
+        photo: (3, H, W) float32 in [0, 1], on the model's device.
+
+    Returns:
+        "boxes" (D, 4) xyxy in the frame of the photo, "labels" (D,), "scores" (D,); and D masks (H, W) float32, 0 to 1,
+        to be cut at 0.5.
+    """
+    detections = run_heads(model, photo)
+    size, (frame_width, frame_height) = (photo.shape[1], photo.shape[2]), detections["frame"].tolist()
+    boxes, masks = resize_boxes(detections["boxes"], (frame_height, frame_width), size), detections["masks"]
+    pasted = (paste_masks_in_image(masks[i : i + 1], boxes[i : i + 1], size)[0, 0] for i in range(len(boxes)))
+    return {"boxes": boxes, "labels": detections["labels"], "scores": detections["scores"]}, pasted
+
+
+def leave_autocast(head: nn.Module, inputs: Any, outputs: tuple[list[Tensor], ...]) -> tuple[list[Tensor], ...]:
+    """Forward hook of an RPN's head, for training under autocast: float32 from here on.
+
+    torchvision would decode proposals, and round true boxes, in bfloat16, whose numbers above 256 are even: boxes one
+    pixel wide collapse, and their regression loss is not a number.
+    """
+    return tuple([level.float() for level in levels] for levels in outputs)

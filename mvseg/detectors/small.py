@@ -1,0 +1,77 @@
+"""Two Mask R-CNNs for laptops: pyramids of 96 channels, anchors from 16 px on, light heads, a dilated mask head.
+
+The parameter names are torchvision's. That the mask head is dilated cannot be seen in a state dict: build them here.
+"""
+
+from __future__ import annotations
+
+import torchvision
+from torch import nn
+from torchvision.models.detection import MaskRCNN
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.backbone_utils import BackboneWithFPN
+from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
+from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
+from torchvision.ops import MultiScaleRoIAlign
+
+CHANNELS = 96
+BOX_FEATURES = 512
+IMAGE_SIZE = 512
+MASK_DILATIONS = (1, 2, 4, 1)
+# architecture -> torchvision's classifier that its pyramid stands on
+SMALL_BACKBONES = {"resnet18_fpn": "resnet18", "mobilenet_v3_large_fpn": "mobilenet_v3_large"}
+
+
+def build_small(arch: str, num_classes: int, backbone_weights: str | None = None) -> MaskRCNN:
+    """A small detector with batch norms, as torchvision's classifiers have them; levels "0" to "3" and "pool" (strides
+    4 to 64).
+
+    Args:
+        arch: a key of `SMALL_BACKBONES`.
+        num_classes: classes with the background.
+        backbone_weights: a name of torchvision's weights for the classifier, to be downloaded; None: random.
+    """
+    classifier = torchvision.models.get_model(SMALL_BACKBONES[arch], weights=backbone_weights)
+    if arch == "resnet18_fpn":
+        body, levels, channels = classifier, {f"layer{k + 1}": str(k) for k in range(4)}, [64, 128, 256, 512]
+    else:
+        # the last block at each of the strides 4, 8, 16, 32
+        body, levels, channels = classifier.features, {"3": "0", "6": "1", "12": "2", "16": "3"}, [24, 40, 112, 960]
+    return add_light_heads(BackboneWithFPN(body, levels, channels, CHANNELS), num_classes)
+
+
+def add_light_heads(backbone: nn.Module, num_classes: int) -> MaskRCNN:
+    """Mask R-CNN with light heads on a pyramid of 96 channels."""
+    names = ["0", "1", "2", "3"]
+    return MaskRCNN(
+        backbone,
+        min_size=IMAGE_SIZE,
+        max_size=IMAGE_SIZE,
+        rpn_anchor_generator=AnchorGenerator(
+            sizes=((16,), (32,), (64,), (128,), (256,)), aspect_ratios=((0.5, 1.0, 2.0),) * 5
+        ),
+        rpn_pre_nms_top_n_train=500,
+        rpn_post_nms_top_n_train=300,
+        rpn_pre_nms_top_n_test=500,
+        rpn_post_nms_top_n_test=300,
+        box_roi_pool=MultiScaleRoIAlign(names, output_size=7, sampling_ratio=2),
+        box_head=TwoMLPHead(CHANNELS * 7 * 7, BOX_FEATURES),
+        box_predictor=FastRCNNPredictor(BOX_FEATURES, num_classes),
+        box_batch_size_per_image=96,  # a third of them learn masks, the slowest part to learn
+        box_positive_fraction=1 / 3,
+        mask_roi_pool=MultiScaleRoIAlign(names, output_size=14, sampling_ratio=2),
+        mask_head=build_mask_head(CHANNELS),
+        mask_predictor=MaskRCNNPredictor(CHANNELS, CHANNELS, num_classes),
+    )
+
+
+def build_mask_head(channels: int) -> MaskRCNNHeads:
+    """torchvision's four convolutions, dilated: a pixel of the (D, channels, 14, 14) crops sees 17 x 17, not 9 x 9.
+
+    A box around a thin slanted leaf holds more of other leaves than of its own; which leaf reaches all four of its
+    sides can only be seen from afar.
+    """
+    head = MaskRCNNHeads(channels, (channels,) * len(MASK_DILATIONS), 1)
+    for layer, dilation in zip(head, MASK_DILATIONS, strict=True):
+        layer[0].dilation = layer[0].padding = (dilation, dilation)
+    return head

@@ -1,0 +1,93 @@
+"""Weights files of detectors: read without executing anything in them, written, described.
+
+A file of this project is a .safetensors whose metadata says what it holds: "arch", "categories" (a JSON list, without
+background) and "image_size".
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import safetensors.torch
+import torch
+from safetensors import safe_open
+from torch import Tensor, nn
+
+from mvseg.errors import InputError
+
+
+@dataclass(frozen=True)
+class Description:
+    """What a weights file says about its detector.
+
+    Attributes:
+        arch: architecture, see `list_architectures`.
+        categories: names of the classes, without background.
+        image_size: longer side, in pixels, that photos are scaled to.
+    """
+
+    arch: str
+    categories: tuple[str, ...]
+    image_size: int
+
+
+def encode_weights(state: Mapping[str, Tensor], description: Description) -> bytes:
+    """The content of a .safetensors file. (safetensors itself would write a file that only its owner can read.)"""
+    plain = {key: value.detach().cpu().contiguous() for key, value in state.items()}
+    metadata = {
+        "arch": description.arch,
+        "categories": json.dumps(description.categories),
+        "image_size": str(description.image_size),
+    }
+    return safetensors.torch.save(plain, metadata)
+
+
+def read_weights(path: Path) -> tuple[dict[str, Tensor], Description | None]:
+    """State dict and description of a weights file; None where it has no description.
+
+    Of a checkpoint that holds a moving average, that is what is read.
+
+    Raises:
+        InputError: no such file, neither a .safetensors nor a checkpoint of tensors, or a malformed description.
+    """
+    if not path.is_file():
+        raise InputError(f"weights '{path}' are neither a file nor a name that torchvision has for this architecture")
+    try:
+        if path.suffix == ".safetensors":
+            with safe_open(path, framework="pt") as file:
+                state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
+                return state, _read_description(file.metadata() or {})
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged file may raise anything in torch.load
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise InputError(f"{path} cannot be read as weights ({reason})") from error
+    if isinstance(content, dict):
+        content = content.get("ema") or content.get("model") or content
+    if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
+        raise InputError(f"{path} holds no state dict, expected one, or one under 'ema' or 'model'")
+    return content, None
+
+
+def _read_description(metadata: Mapping[str, str]) -> Description | None:
+    if not {"arch", "categories", "image_size"} <= metadata.keys():
+        return None
+    return Description(metadata["arch"], tuple(json.loads(metadata["categories"])), int(metadata["image_size"]))
+
+
+def load_weights(model: nn.Module, state: Mapping[str, Tensor]) -> None:
+    """Load a state dict that must fit exactly.
+
+    Raises:
+        InputError: a missing, unknown or differently shaped parameter; the message is a reason that names the first.
+    """
+    try:
+        keys = model.load_state_dict(dict(state), strict=False)
+    except RuntimeError as error:
+        detail = str(error).splitlines()[1].strip() if "\n" in str(error) else str(error)
+        raise InputError(detail) from error
+    for kind, names in (("lacks", keys.missing_keys), ("has the unknown", keys.unexpected_keys)):
+        if names:
+            raise InputError(f"it {kind} {names[0]} (and {len(names) - 1} more)")

@@ -1,0 +1,122 @@
+"""Average precision of masks and boxes (AP), with pycocotools.
+
+Measured in the frame of the original photo, as COCO does. Ignored pixels are a crowd: detections that lie mostly there
+count neither for nor against.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+from pycocotools import mask as coco_mask
+from pycocotools.coco import COCO
+from pycocotools.cocoeval import COCOeval
+from torch import Tensor
+
+from mvseg.detectors.mask_cut import CUT
+from mvseg.formats.coco import encode_mask
+from mvseg.formats.labelled_photo import LabelledPhoto
+
+MAX_DETECTIONS = 100  # per photo, the best by score: COCO's limit, and that of torchvision's detectors
+
+Annotations = list[dict[str, Any]]
+
+
+def annotate_truth(labelled: LabelledPhoto, image_id: int, num_categories: int) -> Annotations:
+    """COCO annotations of a photo's instances, and one crowd per category that covers its ignored pixels.
+
+    Args:
+        labelled: the photo; its classes become the categories.
+        image_id: of the photo, from 0 on.
+        num_categories: categories are 1..num_categories.
+    """
+    annotations = []
+    for number, category in enumerate(labelled.classes.tolist(), start=1):
+        mask = (labelled.layers == number).any(0)
+        annotations.append(describe_mask(mask, image_id) | {"category_id": category, "iscrowd": 0})
+    if bool(labelled.ignore.any()):
+        crowd = describe_mask(labelled.ignore, image_id) | {"iscrowd": 1}
+        annotations += [{**crowd, "category_id": category} for category in range(1, num_categories + 1)]
+    return annotations
+
+
+def annotate_detections(detections: dict[str, Tensor], masks: Iterable[Tensor], image_id: int) -> Annotations:
+    """COCO annotations of the detections in one photo.
+
+    Args:
+        detections: "boxes" (D, 4) xyxy, "labels" (D,), "scores" (D,).
+        masks: D masks (H, W) of probabilities, cut at 0.5 here.
+        image_id: of the photo, from 0 on.
+    """
+    annotations = []
+    for box, category, score, mask in zip(
+        detections["boxes"].tolist(), detections["labels"].tolist(), detections["scores"].tolist(), masks, strict=True
+    ):
+        x1, y1, x2, y2 = box
+        described = describe_mask(mask > CUT, image_id)
+        annotations.append(
+            {**described, "category_id": category, "iscrowd": 0, "score": score, "bbox": [x1, y1, x2 - x1, y2 - y1]}
+        )
+    return annotations
+
+
+def describe_mask(mask: Tensor, image_id: int) -> dict[str, Any]:
+    """COCO fields of a (H, W) bool mask: run lengths, area in pixels, box xywh."""
+    encoded = encode_mask(mask.cpu().numpy())
+    return {
+        "image_id": image_id,
+        "segmentation": encoded,
+        "area": float(coco_mask.area(encoded)),
+        "bbox": coco_mask.toBbox(encoded).tolist(),
+    }
+
+
+def average_precision(truth: Annotations, detections: Annotations, num_images: int) -> dict[str, float | None]:
+    """COCO's average precision of masks and of boxes.
+
+    Args:
+        truth: annotations of the true instances, see `annotate_truth`.
+        detections: annotations with "score", see `annotate_detections`.
+        num_images: image ids are 0..num_images - 1; images without any annotation count.
+
+    Returns:
+        "mask_AP", "mask_AP50", "mask_AP75", "mask_AR" and the same for "box": in [0, 1], the mean over classes (AP, AR:
+        and over IoU 0.50:0.05:0.95), with at most 100 detections per photo. None where the truth has no instance.
+    """
+    categories = sorted({annotation["category_id"] for annotation in truth + detections})
+    scores: dict[str, float | None] = {}
+    with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
+        true, found = (_index(annotations, categories, num_images) for annotations in (truth, detections))
+        for name, kind in (("mask", "segm"), ("box", "bbox")):
+            scores |= {f"{name}_{key}": value for key, value in _evaluate(COCOeval(true, found, kind)).items()}
+    return scores
+
+
+def _evaluate(evaluation: COCOeval) -> dict[str, float | None]:
+    evaluation.params.maxDets = [MAX_DETECTIONS]
+    evaluation.evaluate()
+    evaluation.accumulate()
+    precision = evaluation.eval["precision"][..., 0, -1]  # IoU thresholds x recalls x classes, any size
+    recall = evaluation.eval["recall"][..., 0, -1]
+    return {"AP": _mean(precision), "AP50": _mean(precision[0]), "AP75": _mean(precision[5]), "AR": _mean(recall)}
+
+
+def _index(annotations: Annotations, categories: Sequence[int], num_images: int) -> COCO:
+    coco = COCO()
+    coco.dataset = {
+        # pycocotools wants a size, and reads it for polygons only
+        "images": [{"id": index, "height": 1, "width": 1} for index in range(num_images)],
+        "categories": [{"id": category} for category in categories],
+        "annotations": [{**annotation, "id": number} for number, annotation in enumerate(annotations, start=1)],
+    }
+    coco.createIndex()
+    return coco
+
+
+def _mean(values: np.ndarray) -> float | None:
+    defined = values[values > -1]  # -1: a class without truth
+    return float(defined.mean()) if defined.size else None

@@ -1,0 +1,93 @@
+"""The unrolled forward pass against torchvision's own."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+from torchvision.models.detection.roi_heads import paste_masks_in_image
+
+from mvseg.detectors.mask_cut import decide_masks
+from mvseg.detectors.run import detect, run_heads
+from mvseg.evaluation.average_precision import annotate_detections
+from tiny_training import build_tiny
+
+WIDTH, HEIGHT = 90, 50
+
+
+@pytest.fixture
+def photo() -> Tensor:
+    return torch.rand((3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1))
+
+
+@pytest.fixture
+def model() -> torch.nn.Module:
+    model = build_tiny().eval()
+    model.transform.min_size, model.transform.max_size = (64,), 64
+    return model
+
+
+@torch.no_grad()
+def test_detect_is_the_models_own_forward_pass_with_decided_masks(
+    model: torch.nn.Module, photo: Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mvseg.detectors.run.decide_masks", lambda found: found)
+    (expected,) = model([photo])
+    ours, masks = detect(model, photo)
+    assert len(expected["scores"]) > 3
+    torch.testing.assert_close({**ours, "masks": torch.stack(list(masks))[:, None]}, expected)
+
+
+@torch.no_grad()
+def test_masks_are_decided_and_boxes_stay_in_the_frame_of_the_transform(model: torch.nn.Module, photo: Tensor) -> None:
+    found = run_heads(model, photo)
+    assert found["frame"].tolist() == [64, 35]
+    assert found["boxes"][:, 2].max() <= 64
+    assert found["boxes"][:, 3].max() <= 35
+    resized, _ = model.transform([photo])
+    features = {"0": model.backbone(resized.tensors)}
+    proposals, _ = model.rpn(resized, features)
+    expected = decide_masks(model.roi_heads(features, proposals, resized.image_sizes)[0][0])
+    for key, value in expected.items():
+        assert torch.equal(found[key], value)
+
+
+@torch.no_grad()
+def test_masks_come_one_at_a_time_and_are_those_of_torchvision(model: torch.nn.Module, photo: Tensor) -> None:
+    crops = run_heads(model, photo)["masks"]
+    found, masks = detect(model, photo)
+    expected = paste_masks_in_image(crops, found["boxes"], (HEIGHT, WIDTH))[:, 0]
+    for mask, whole in zip(masks, expected, strict=True):
+        assert torch.equal(mask, whole)
+
+
+@torch.no_grad()
+def test_other_thresholds_for_one_call_only(model: torch.nn.Module, photo: Tensor) -> None:
+    heads = model.roi_heads
+    heads.nms_thresh = 0.2
+    before = len(run_heads(model, photo)["scores"])
+    assert len(run_heads(model, photo, nms_thresh=0.9)["scores"]) > before
+    assert len(run_heads(model, photo, detections_per_img=2)["scores"]) == 2 < before
+    assert (heads.nms_thresh, heads.detections_per_img) == (0.2, 100)
+    assert len(run_heads(model, photo)["scores"]) == before
+
+
+@torch.no_grad()
+def test_under_autocast_only_the_backbone_is_in_half_precision(model: torch.nn.Module, photo: Tensor) -> None:
+    seen = []
+    model.backbone.register_forward_hook(lambda module, inputs, output: seen.append(output.dtype))
+    model.rpn.head.register_forward_hook(lambda module, inputs, output: seen.append(output[0][0].dtype))
+    with torch.autocast("cpu", torch.bfloat16):
+        found = run_heads(model, photo)
+    assert seen == [torch.bfloat16, torch.float32]
+    assert {found[key].dtype for key in ("boxes", "scores", "masks")} == {torch.float32}
+    plain = run_heads(model, photo)
+    torch.testing.assert_close(found["scores"][:3], plain["scores"][:3], rtol=0.05, atol=0)
+
+
+@torch.no_grad()
+def test_a_detector_that_finds_nothing(model: torch.nn.Module, photo: Tensor) -> None:
+    model.roi_heads.score_thresh = 1.0
+    found, masks = detect(model, photo)
+    assert found["boxes"].shape == (0, 4)
+    assert annotate_detections(found, masks, 0) == []
