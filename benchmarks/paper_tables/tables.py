@@ -153,8 +153,8 @@ def count_scenes(groups: dict[str, list[Record]], plan: Plan) -> str:
     """One sentence: how many scenes a table shows, out of how many when everything has been run."""
     asked = sum(plant_index(spec) < plan.shape_plants for spec in list_cells(PRESETS[plan.preset]))
     done = len(next(iter(groups.values()), []))
-    remark = "" if done == asked else " The others have not been run yet: columns do not show the same plants."
-    return f"{done} of {asked} scenes.{remark}"
+    caution = "" if done == asked else " The others have not been run yet: columns do not show the same plants."
+    return f"{done} of {asked} scenes.{caution}"
 
 
 def table_error(plan: Plan) -> str:

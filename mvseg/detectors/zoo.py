@@ -4,7 +4,7 @@ A detector is a folder of its name with
 
     weights.safetensors          float16; arch, categories and image_size in the file's metadata
     weights.safetensors.sha256   one line, as `sha256sum` writes and checks it
-    train.yaml                   the recipe: `mvseg train --config train.yaml`
+    recipe/                      the configs that it was trained with: `mvseg train --config recipe/train.yaml`
     metrics.json                 what it reached
     card.md                      data, intended use, limits
 

@@ -97,7 +97,10 @@ def _match_classes(
         counts[number] = parts[-1].num_instances
     if not parts:
         nothing = torch.zeros(0, device=proposals.regions.device)
-        return Matching(nothing.long(), nothing, num_instances=0, method=match.resolved_method), counts
+        empty = Matching(
+            instance_ids=nothing.long(), match_scores=nothing, num_instances=0, method=match.resolved_method
+        )
+        return empty, counts
     joined = Matching.concatenate(parts).reorder(torch.cat(places))
     methods = {part.method for part in parts}
     return (joined if len(methods) == 1 else replace(joined, method=match.resolved_method)), counts

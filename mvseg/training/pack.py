@@ -42,11 +42,11 @@ def pack_detector(run: Path, folder: Path, image_size: int | None = None) -> Non
     except (ValueError, KeyError) as error:
         raise InputError(f"{run / 'metrics.json'}: has no 'best', expected the file of a training run") from error
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        (folder / "recipe").mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"{folder}: cannot be made ({error.strerror}), expected a folder") from error
     write_whole(folder / WEIGHTS, lambda partial: partial.write_bytes(content))
     write_text_whole(folder / "metrics.json", json.dumps({"validation": best}, indent=1) + "\n")
-    write_whole(folder / "train.yaml", lambda partial: shutil.copyfile(run / "config.yaml", partial))
+    write_whole(folder / "recipe" / "train.yaml", lambda partial: shutil.copyfile(run / "config.yaml", partial))
     # last: without it the folder is no entry
     write_text_whole(folder / HASH, f"{hashlib.sha256(content).hexdigest()}  {WEIGHTS}\n")

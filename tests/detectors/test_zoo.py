@@ -40,7 +40,7 @@ def packed(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 def test_what_ships_is_whole_small_and_described(name: str) -> None:
     entry = next(entry for entry in list_detectors() if entry.name == name)
     assert entry.weights.stat().st_size <= 60e6
-    assert {path.name for path in entry.weights.parent.iterdir()} >= {"card.md", "train.yaml", "metrics.json"}
+    assert {path.name for path in entry.weights.parent.iterdir()} >= {"card.md", "recipe", "metrics.json"}
     assert entry.metrics["test"]["mask_AP50"] > 0
     model = load_detector(name)
     assert not model.training

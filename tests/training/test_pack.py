@@ -26,9 +26,9 @@ def test_a_packed_run_is_whole(run: Path, tmp_path: Path) -> None:
     (tmp_path / "zoo" / "card.md").write_text("mine")
     pack_detector(run, tmp_path / "zoo", 160)
     names = {path.name: path for path in (tmp_path / "zoo").iterdir()}
-    assert set(names) == {"card.md", "weights.safetensors", "weights.safetensors.sha256", "train.yaml", "metrics.json"}
+    assert set(names) == {"card.md", "weights.safetensors", "weights.safetensors.sha256", "recipe", "metrics.json"}
     assert names["card.md"].read_text() == "mine"
-    assert names["train.yaml"].read_text() == (run / "config.yaml").read_text()
+    assert (names["recipe"] / "train.yaml").read_text() == (run / "config.yaml").read_text()
     assert json.loads(names["metrics.json"].read_text())["validation"]["mask_AP50"] == 0.75
     weights = names["weights.safetensors"]
     stated, name = names["weights.safetensors.sha256"].read_text().split()

@@ -22,7 +22,11 @@ from tiny_training import build_tiny, make_config, parse_config, write_photos
 # --- configs
 
 
-@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "configs" / "train").glob("*.yaml")))
+ROOT = Path(__file__).parents[2]
+RECIPES = [*(ROOT / "configs" / "train").glob("*.yaml"), *(ROOT / "models").glob("*/recipe/leaf-slim*.yaml")]
+
+
+@pytest.mark.parametrize("path", sorted(RECIPES), ids=lambda path: path.name)
 def test_published_configs_are_sound(path: Path) -> None:
     config = parse_config(path)
     assert config.arch in list_architectures()
