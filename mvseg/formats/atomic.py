@@ -6,14 +6,17 @@ leaves that behind, and never a part under the final name.
 
 from __future__ import annotations
 
+import ctypes
 import os
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 SUFFIX = ".partial"
+AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux; paths are absolute or start where the process runs
 
 
 def is_partial(path: Path) -> bool:
@@ -73,12 +76,28 @@ def _move(folder: Path, place: Path) -> None:
     """Move a folder to a place that may be taken; what was there is deleted after that, or stays if it fails."""
     if not place.exists():
         folder.rename(place)
-        return
+    elif _exchange(folder, place):
+        shutil.rmtree(folder, ignore_errors=True)
+    else:
+        _move_in_two_steps(folder, place)
+
+
+def _exchange(first: Path, second: Path) -> bool:
+    """Let two paths change names at once, so that neither name is ever missing; False where the system cannot."""
+    renameat2 = getattr(ctypes.CDLL(None), "renameat2", None) if sys.platform == "linux" else None
+    if renameat2 is None:
+        return False
+    return bool(renameat2(AT_FDCWD, os.fsencode(first), AT_FDCWD, os.fsencode(second), RENAME_EXCHANGE) == 0)
+
+
+def _move_in_two_steps(folder: Path, place: Path) -> None:
+    """The name is missing for a moment: a process that is killed then leaves both folders under temporary names."""
     earlier = place.with_name(f".{place.name}.{os.getpid()}.earlier{SUFFIX}")
     place.rename(earlier)
     try:
         folder.rename(place)
-    except OSError:
-        earlier.rename(place)
+    except BaseException:  # Ctrl-C, too
+        if not place.exists():
+            earlier.rename(place)
         raise
     shutil.rmtree(earlier, ignore_errors=True)

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import pytest
 
+from mvseg.formats import atomic
 from mvseg.formats.atomic import folder_whole, is_partial, write_text_whole, write_whole
 
 
@@ -62,18 +64,45 @@ def test_a_failed_folder_leaves_the_old_one_and_nothing_else(tmp_path: Path) -> 
     assert list(tmp_path.iterdir()) == [place]
 
 
-def test_a_folder_that_cannot_be_moved_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("can_exchange", [True, False])
+def test_a_folder_is_exchanged_at_once_or_in_two_steps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, can_exchange: bool
+) -> None:
+    if not can_exchange:
+        monkeypatch.setattr(atomic, "_exchange", lambda first, second: False)
+    place = tmp_path / "out"
+    for name in ("first", "second"):
+        with folder_whole(place) as folder:
+            (folder / name).touch()
+        assert [path.name for path in place.iterdir()] == [name]
+        assert list(tmp_path.iterdir()) == [place]
+
+
+def test_linux_exchanges(tmp_path: Path) -> None:
+    first, second = tmp_path / "first", tmp_path / "second"
+    first.mkdir()
+    (second / "inside").mkdir(parents=True)
+    assert atomic._exchange(first, second) == (sys.platform == "linux")
+    assert (first / "inside").exists() == (sys.platform == "linux")
+    assert not atomic._exchange(first, tmp_path / "absent")
+
+
+@pytest.mark.parametrize("error", [OSError("no"), KeyboardInterrupt()])
+def test_a_folder_that_cannot_be_moved_leaves_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
     place, rename = tmp_path / "out", Path.rename
     with folder_whole(place) as folder:
         (folder / "first").touch()
 
     def refuse(path: Path, target: Path) -> Path:
         if target == place and (path / "second").exists():
-            raise OSError("no")
+            raise error
         return rename(path, target)
 
+    monkeypatch.setattr(atomic, "_exchange", lambda first, second: False)
     monkeypatch.setattr(Path, "rename", refuse)
-    with pytest.raises(OSError, match="no"), folder_whole(place) as folder:
+    with pytest.raises(type(error)), folder_whole(place) as folder:
         (folder / "second").touch()
     assert [path.name for path in place.iterdir()] == ["first"]
     assert list(tmp_path.iterdir()) == [place]
