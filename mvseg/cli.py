@@ -11,7 +11,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from jsonargparse import ArgumentParser, Namespace
 
@@ -67,7 +67,7 @@ def build_parser() -> ArgumentParser:
     verbs = parser.add_subcommands(dest="verb")
 
     infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
-    infer.add_argument("scene", nargs="?", type=Path, default=demo_scene(), help="scene folder (the shipped one)")
+    infer.add_argument("scene", nargs="?", type=Path | None, help="scene folder (without: the plant that ships)")
     _add_options(infer, masks=None)
     infer.add_class_arguments(DetectConfig, "detect")
     infer.add_class_arguments(ReconstructConfig, "reconstruct")
@@ -114,18 +114,28 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
     parser.add_argument("--out", type=Path | None, help="folder for the result, or the results (under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that seem to cover two instances")
+    parser.add_argument(
+        "--coco_crowd",
+        type=Literal["mask", "ignore"],
+        default="mask",
+        help="whether COCO annotations with iscrowd are masks like all others, or left out",
+    )
     parser.add_class_arguments(MatchConfig, "match")
 
 
 def _infer(args: Namespace) -> int:
-    out = args.out or DEFAULT_OUT / args.scene.resolve().name
+    if args.scene is None:
+        print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
+    scene = args.scene or demo_scene()
+    out = args.out or DEFAULT_OUT / scene.resolve().name
     config = RunConfig(
         detect=DetectConfig(**vars(args.detect)),
         match=MatchConfig(**vars(args.match)),
         reconstruct=ReconstructConfig(**vars(args.reconstruct)),
         split_merged=args.split_merged,
+        coco_crowd=args.coco_crowd,
     )
-    _run(args.scene, args.masks, out, config=config, quiet=args.quiet)
+    _run(scene, args.masks, out, config=config, quiet=args.quiet)
     return 0
 
 
@@ -137,7 +147,12 @@ def _match(args: Namespace) -> int:
     if args.masks is None:
         raise InputError("masks is null, expected the masks to match; mvseg infer finds them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
-    config = RunConfig(match=MatchConfig(**vars(args.match)), reconstruct=None, split_merged=args.split_merged)
+    config = RunConfig(
+        match=MatchConfig(**vars(args.match)),
+        reconstruct=None,
+        split_merged=args.split_merged,
+        coco_crowd=args.coco_crowd,
+    )
     for scene, name in zip(args.scenes, names, strict=True):
         try:
             _run(scene, args.masks, out / name, config=config, quiet=args.quiet)

@@ -48,7 +48,7 @@ def run_scene(
     with _timed(seconds, "load"):
         scene = load_scene(folder)
         check_photos(scene)
-        regions = load_masks(scene, masks) if masks is not None else None
+        regions = load_masks(scene, masks, crowd=config.coco_crowd) if masks is not None else None
     if masks is None and not scene.views[0].path.is_file():
         raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them")
     if regions is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import os
 import runpy
@@ -60,7 +61,10 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
+        said = io.StringIO()
+        patch.setattr("sys.stderr", said)
         assert main(["infer", "--quiet", "--masks", "masks"]) == 0
+    assert said.getvalue() == "mvseg: no SCENE given: this is the plant that ships with mvseg\n"
     return folder / "results" / "demo_plant"
 
 
@@ -155,6 +159,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "seed": 9,
         },
         "split_merged": False,
+        "coco_crowd": "mask",
         "reconstruct": {"threshold": 0.4, "seen_share": 0.8, "voxel_size": 1.5, "voxel_budget": 250_000},
     }
     assert run["mvseg"] == mvseg.__version__

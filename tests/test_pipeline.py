@@ -95,7 +95,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert (run["scene"], run["warnings"]) == ("plant", ["odd"])
-        assert run["config"].keys() == {"masks", "match", "split_merged"}  # the stages that ran
+        assert run["config"].keys() == {"masks", "match", "split_merged", "coco_crowd"}  # the stages that ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"
         assert run["inputs"].keys() == {str(rig), str(plant / "masks")}

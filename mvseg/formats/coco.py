@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from pycocotools import mask as coco_mask
@@ -52,15 +52,22 @@ class Rle(BaseModel):
     counts: str | list[NonNegativeInt]
 
 
+Crowd = Literal["mask", "ignore"]
 _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(list[list[FiniteFloat]] | Rle)
 
 
-def read_coco(path: Path, scene: Scene) -> list[list[tuple[int, np.ndarray]]]:
+def read_coco(path: Path, scene: Scene, *, crowd: Crowd = "mask") -> list[list[tuple[int, np.ndarray]]]:
     """The masks of a COCO file, view by view, as they stand there (in the frame of the photo).
 
     Images are found by file name: the path of the view's photo, or the view's name with or without suffix; a shorter
-    path will do if it fits one view only. Crowds and images that are not in the scene are left out. Warns
-    (InputWarning) of annotations of images that the file does not list.
+    path will do if it fits one view only. Images that are not in the scene are left out. Warns (InputWarning) of
+    crowds, and of annotations of images that the file does not list.
+
+    Args:
+        path: the file.
+        scene: gives the views and their sizes.
+        crowd: what an annotation with `iscrowd` is: "mask", one like all others (supervision writes so for every mask
+            with holes or several parts, datumaro for all masks), or "ignore", left out as COCO's own evaluation does.
 
     Returns:
         V lists of (annotation id, (height, width) bool mask); a view without annotations has an empty list.
@@ -77,6 +84,7 @@ def read_coco(path: Path, scene: Scene) -> list[list[tuple[int, np.ndarray]]]:
         warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
     view_of = [_find_view(path, image.file_name, scene) for image in coco.images]
     masks: list[list[tuple[int, np.ndarray]]] = []
+    num_crowds = 0
     for index, view in enumerate(scene.views):
         entries = [image for image, image_view in zip(coco.images, view_of, strict=True) if image_view == index]
         if not entries:
@@ -90,7 +98,12 @@ def read_coco(path: Path, scene: Scene) -> list[list[tuple[int, np.ndarray]]]:
                 )
         entry_ids = {image.id for image in entries}
         shown = [annotation for annotation in coco.annotations if annotation.image_id in entry_ids]
-        masks.append([(a.id, _decode(path, a, (width, height))) for a in shown if not a.iscrowd])
+        kept = [annotation for annotation in shown if crowd == "mask" or not annotation.iscrowd]
+        masks.append([(annotation.id, _decode(path, annotation, (width, height))) for annotation in kept])
+        num_crowds += sum(bool(annotation.iscrowd) for annotation in shown)
+    if num_crowds:
+        what = "taken as masks (--coco_crowd ignore leaves them out)" if crowd == "mask" else "left out"
+        warnings.warn(f"{path}: {num_crowds} annotations with iscrowd are {what}", InputWarning, stacklevel=4)
     return masks
 
 

@@ -28,6 +28,7 @@ from mvseg.errors import InputError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MAX_SIDE = 1 << 20  # pixels
+ORIENTATION = 0x0112  # EXIF tag
 MAX_PIXELS = 1 << 30
 LARGE = 1 << 26  # pixels; Pillow's own limit lies above
 
@@ -91,6 +92,15 @@ def read_rgb(path: Path) -> np.ndarray:
         return np.array(image if image.mode == "RGB" else image.convert("RGB"))
     except ValueError as error:
         raise InputError(str(error)) from None
+
+
+def is_turned(path: Path) -> bool:
+    """Whether EXIF asks viewers to turn or mirror a JPEG; other formats are rarely turned so, and not looked at."""
+    try:
+        with path.open("rb") as file:
+            return JpegImageFile(file).getexif().get(ORIENTATION, 1) != 1
+    except Exception:  # no JPEG, or a damaged EXIF block: it says nothing
+        return False
 
 
 def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -11,8 +12,8 @@ import numpy as np
 import pycolmap
 import torch
 
-from mvseg.errors import InputError
-from mvseg.formats.image_file import MAX_SIDE, file_name_problem, read_rgb
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.image_file import MAX_SIDE, file_name_problem, is_turned, read_rgb
 from mvseg.formats.lens import undistort
 from mvseg.scene import Cameras, Scene, View, camera_problem
 
@@ -96,12 +97,22 @@ def _problem(photo: Photo) -> str | None:
 
 
 def check_photos(scene: Scene) -> None:
-    """Raises InputError when some photos of the scene are there and others are missing. None at all is fine: masks
-    are enough for matching and for shapes."""
+    """Are the photos of a scene there? None at all is fine: masks are enough for matching and for shapes.
+
+    Warns (InputWarning) of photos that EXIF asks viewers to turn: cameras and masks must refer to the stored pixels, as
+    those of COLMAP do.
+
+    Raises:
+        InputError: some photos are there and others are missing.
+    """
     present = [view.path.is_file() for view in scene.views]
     if any(present) and not all(present):
         missing = present.index(False)
         raise InputError(f"{scene.views[missing].path}: the image of view {missing} is missing")
+    turned = [view.path for view in scene.views if view.path.is_file() and is_turned(view.path)]
+    if turned:
+        message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
+        warnings.warn(f"{turned[0]}: {message}", InputWarning, stacklevel=2)
 
 
 def load_photos(scene: Scene) -> list[torch.Tensor]:
@@ -117,6 +128,8 @@ def load_photos(scene: Scene) -> list[torch.Tensor]:
 def read_photo(scene: Scene, view: int) -> np.ndarray:
     """(H, W, 3) uint8 RGB, the photo of a view with its lens distortion removed.
 
+    Rows and columns are those that the file stores, whatever EXIF says; see `check_photos`.
+
     Raises:
         InputError: the photo is missing, cannot be read, or is of another size than its camera says.
     """
@@ -124,12 +137,12 @@ def read_photo(scene: Scene, view: int) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path}: the image of view {view} is missing")
     try:
-        image = read_rgb(path)
+        pixels = read_rgb(path)
     except InputError as error:
         message = f"{path}: the image of view {view} cannot be read, expected a whole image file: {error}"
         raise InputError(message) from None
-    if image.shape[:2] != (height, width):
-        size = f"{image.shape[1]} x {image.shape[0]}"
-        raise InputError(f"{path}: the image of view {view} is {size}, its camera says {width} x {height}")
-    K = scene.cameras.K[view].cpu().numpy()
-    return undistort(image, scene.views[view].lens, K)
+    if pixels.shape[:2] != (height, width):
+        size = f"{pixels.shape[1]} x {pixels.shape[0]}"
+        turned = " (as it is stored; EXIF turns it for display)" if is_turned(path) else ""
+        raise InputError(f"{path}: the image of view {view} is {size}{turned}, its camera says {width} x {height}")
+    return undistort(pixels, scene.views[view].lens, scene.cameras.K[view].cpu().numpy())

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.coco import read_coco
+from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import is_colmap_model, read_colmap
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import undistort
@@ -43,12 +43,13 @@ def load_scene(folder: Path | str) -> Scene:
     raise InputError(f"{folder}: no cameras, expected cameras.json, a COLMAP model in sparse/ or transforms.json")
 
 
-def load_masks(scene: Scene, masks: Path | str) -> Regions:
+def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask") -> Regions:
     """Load the masks of every view, with the lens distortion of the scene removed.
 
     Args:
         scene: gives the views and their sizes.
         masks: a folder with one label PNG per view, `<view name>.png` (`IMG_1.jpg`: `IMG_1.png`), or a COCO JSON file.
+        crowd: what COCO annotations with `iscrowd` are: masks like all others, or left out; see `read_coco`.
 
     Returns:
         Regions in the undistorted frame; `labels` holds the numbers in the PNGs or the annotation ids. Warns
@@ -65,7 +66,7 @@ def load_masks(scene: Scene, masks: Path | str) -> Regions:
             warnings.warn(message, InputWarning, stacklevel=2)
         return regions
     if masks.suffix.lower() == ".json" and masks.is_file():
-        return _regions_from_coco(scene, masks)
+        return _regions_from_coco(scene, masks, crowd)
     raise InputError(f"{masks}: no such masks, expected a folder of label PNGs or a COCO .json file")
 
 
@@ -78,9 +79,9 @@ def _read_view(scene: Scene, view: int, folder: Path) -> np.ndarray:
     return undistort(labels, scene.views[view].lens, scene.cameras.K[view].cpu().numpy())
 
 
-def _regions_from_coco(scene: Scene, path: Path) -> Regions:
+def _regions_from_coco(scene: Scene, path: Path, crowd: Crowd) -> Regions:
     parts = []
-    for view, masks in enumerate(read_coco(path, scene)):
+    for view, masks in enumerate(read_coco(path, scene, crowd=crowd)):
         lens, K = scene.views[view].lens, scene.cameras.K[view].cpu().numpy()
         for label, mask in masks:
             crop = regions_from_label_maps([undistort(mask.astype(np.uint8), lens, K)])

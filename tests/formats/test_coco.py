@@ -96,18 +96,28 @@ def test_all_three_encodings_give_one_mask(scene: Scene, tmp_path: Path) -> None
         np.testing.assert_array_equal(mask, expected)
 
 
-def test_annotations_go_to_their_views_and_crowds_are_left_out(scene: Scene, tmp_path: Path) -> None:
+def test_annotations_go_to_their_views(scene: Scene, tmp_path: Path) -> None:
     rles = [encode_mask(random_mask(seed)) for seed in range(4)]
     annotations: list[dict[str, Any]] = [
         {"segmentation": rles[0], "image_id": 11},
         {"segmentation": rles[1], "image_id": 10},
-        {"segmentation": rles[2], "image_id": 11, "iscrowd": 1},
+        {"segmentation": rles[2], "image_id": 11},
         {"segmentation": rles[3], "image_id": 12},
     ]
     first, second = read_coco(write(tmp_path, annotations, ("a.jpg", "b.jpg", "elsewhere.jpg")), scene)
     assert [number for number, _ in first] == [2]
-    assert [number for number, _ in second] == [1]
+    assert [number for number, _ in second] == [1, 3]
     np.testing.assert_array_equal(second[0][1], random_mask(0))
+
+
+def test_crowds_are_masks_unless_told_otherwise(scene: Scene, tmp_path: Path) -> None:
+    """supervision and datumaro mark masks with holes, or all of them, as crowds."""
+    annotations = [{"segmentation": encode_mask(random_mask(seed)), "iscrowd": seed % 2} for seed in range(3)]
+    path = write(tmp_path, annotations)
+    with pytest.warns(InputWarning, match="1 annotations with iscrowd are taken as masks"):
+        assert [number for number, _ in read_coco(path, scene)[0]] == [1, 2, 3]
+    with pytest.warns(InputWarning, match="1 annotations with iscrowd are left out"):
+        assert [number for number, _ in read_coco(path, scene, crowd="ignore")[0]] == [1, 3]
 
 
 def test_a_view_without_annotations_is_empty(scene: Scene, tmp_path: Path) -> None:

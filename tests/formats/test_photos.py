@@ -6,8 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import Photo, build_scene, check_photos, load_photos, read_photo, view_names
 from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
@@ -132,3 +133,33 @@ def test_photos_for_a_detector_and_photos_that_are_missing(tmp_path: Path) -> No
     for path in (folder / "images").iterdir():
         path.unlink()
     check_photos(scene)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_photos_that_exif_turns_are_read_as_stored_and_warned_of(tmp_path: Path, orientation: int) -> None:
+    folder = write_scene(tmp_path / "plant")
+    rig = folder / "cameras.json"
+    rig.write_text(rig.read_text().replace("000.png", "000.jpg"))
+    pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    pixels[: HEIGHT // 2] = 200
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(pixels).save(folder / "images" / "000.jpg", exif=exif, quality=95)
+    scene = load_scene(folder)
+    if orientation == 1:
+        check_photos(scene)  # warnings are errors
+    else:
+        with pytest.warns(InputWarning, match=r"000\.jpg: EXIF turns 1 photos for display"):
+            check_photos(scene)
+    assert np.abs(read_photo(scene, 0).astype(int) - pixels).mean() < 5
+
+
+def test_a_size_that_does_not_fit_names_exif(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    rig = folder / "cameras.json"
+    rig.write_text(rig.read_text().replace("000.png", "000.jpg"))
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    Image.fromarray(np.zeros((WIDTH, HEIGHT, 3), np.uint8)).save(folder / "images" / "000.jpg", exif=exif)
+    with pytest.raises(InputError, match=rf"is {HEIGHT} x {WIDTH} \(as it is stored; EXIF turns it for display\)"):
+        read_photo(load_scene(folder), 0)
