@@ -11,12 +11,14 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.epipolar import is_coincident
-from mvseg.matching.nview.match_nview import match_nview
+from mvseg.matching.nview.match_nview import WIDENINGS, match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.result import Matching
 from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+
+AGREEING = 0.5  # mean score from which the views agree; the least of 24 sound development scenes was 0.52
 
 
 def match_regions(
@@ -49,7 +51,7 @@ def match_regions(
     method = config.resolved_method
     if method == "nview":
         matching = match_nview(regions, cameras, affinity)
-        if matching.method != "nview" and len(cameras) > 2 and len(regions):
+        if len(cameras) > 2 and len(regions):
             _warn_of_disagreement(matching)
         return matching
     if method == "one-per-view":
@@ -129,8 +131,16 @@ def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
 
 
 def _warn_of_disagreement(matching: Matching) -> None:
-    message = (
-        f"the views hardly agree (rays explain {matching.explained:.0%} of the masks; 'one-per-view' matched them): do "
-        "R and t take world points to the camera, and are the masks those of their photos?"
-    )
-    warnings.warn(message, InputWarning, stacklevel=3)
+    """Sound poses never did so on 24 development scenes with true and degraded masks, cameras of the next photo nearly
+    always; cameras shifted by two of many photos may agree well enough to pass."""
+    assert matching.explained is not None
+    assert matching.residual_px is not None
+    if matching.method == "nview" and matching.residual_px < WIDENINGS[-1] and matching.explained >= AGREEING:
+        return
+    facts = f"rays explain {matching.explained:.0%} of the masks"
+    if matching.residual_px == WIDENINGS[-1]:
+        facts += f" at a reprojection error of {matching.residual_px} pixels or more"
+    if matching.method != "nview":
+        facts += f"; '{matching.method}' matched them"
+    question = "do R and t take world points to the camera, and are the masks those of their photos?"
+    warnings.warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}", InputWarning, stacklevel=3)

@@ -130,8 +130,16 @@ def test_views_that_agree_on_nothing_are_warned_of() -> None:
     scene = ball_scene(6, 4, seed=7, radius=0.1)
     order = [2, 0, 3, 1]  # every photo has the pose of another
     cameras = Cameras(scene.cameras.K, scene.cameras.R[order], scene.cameras.t[order], scene.cameras.sizes)
-    with pytest.warns(InputWarning, match="the views hardly agree"):
+    with pytest.warns(InputWarning, match="the views hardly agree .* 'one-per-view' matched them"):
         assert match_regions(scene.regions, cameras).method == "one-per-view"
+
+
+def test_cameras_of_the_previous_photo_are_warned_of(demo_scene: Scene, demo_regions: Regions) -> None:
+    """nview finds clusters all the same, and with high scores."""
+    order = [8, 0, 1, 2, 3, 4, 5, 6, 7]
+    cameras = demo_scene.cameras[order]
+    with pytest.warns(InputWarning, match=r"explain 32% of the masks at a reprojection error of 8 pixels or more\)"):
+        assert match_regions(demo_regions, cameras).method == "nview"
 
 
 def test_empty_masks_are_data() -> None:
