@@ -18,7 +18,7 @@ from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-AGREEING = 0.5  # mean score from which the views agree; the least of 24 sound development scenes was 0.52
+AGREEING = 0.45  # mean score from which the views agree: the least of 24 sound development scenes was 0.52
 
 
 def match_regions(
@@ -131,11 +131,12 @@ def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
 
 
 def _warn_of_disagreement(matching: Matching) -> None:
-    """Sound poses never did so on 24 development scenes with true and degraded masks, cameras of the next photo nearly
-    always; cameras shifted by two of many photos may agree well enough to pass."""
+    """Sound poses never did so on 24 development scenes, with true and with degraded masks. Cameras of the next photo
+    did so in 9 of 12, cameras of the next but one in 3 of 12: the others agree well enough to pass. The residual alone
+    does not tell: it is large where many masks are missing, too."""
     assert matching.explained is not None
     assert matching.residual_px is not None
-    if matching.method == "nview" and matching.residual_px < WIDENINGS[-1] and matching.explained >= AGREEING:
+    if matching.method == "nview" and matching.explained >= AGREEING:
         return
     facts = f"rays explain {matching.explained:.0%} of the masks"
     if matching.residual_px == WIDENINGS[-1]:
