@@ -33,15 +33,15 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one verb.
 
     Args:
-        argv: words after the program's name; None for those of the process.
+        argv: arguments after the program's name; None for those of the process.
 
     Returns:
         The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 130 after Ctrl-C.
     """
-    # Idle threads shall sleep: on a shared machine spinning ones make small tensor work ten times slower. Must be set
+    # Let idle threads sleep: on a shared machine, spinning ones slow small tensor operations tenfold. Must be set
     # before torch is loaded, which the verbs do when they start.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
-    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # what a broken image means is said once, by us
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # mvseg reports a broken image itself, once
     verbs = {"infer": _infer, "match": _match, "eval": _eval, "train": _train, "simulate": _simulate,
              "models": _models}  # fmt: skip
     try:
@@ -67,7 +67,8 @@ def build_parser() -> ArgumentParser:
     verbs = parser.add_subcommands(dest="verb")
 
     infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
-    infer.add_argument("scene", nargs="?", type=Path | None, help="scene folder (without: the plant that ships)")
+    help_scene = "scene folder; without it, the plant that ships with mvseg"
+    infer.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     _add_options(infer, masks=None)
     infer.add_class_arguments(DetectConfig, "detect")
     infer.add_class_arguments(ReconstructConfig, "reconstruct")
@@ -91,7 +92,7 @@ def build_parser() -> ArgumentParser:
     simulate = ArgumentParser(exit_on_error=False, description="Render plants with known answers.")
     simulate.add_argument("preset", help="paper-eval (144 scenes of 3 to 20 photos) or train (888 of 9 photos)")
     simulate.add_argument("--out", type=Path, required=True, help="folder for the scenes; finished ones are kept")
-    simulate.add_argument("--seed", type=int, default=0)
+    simulate.add_argument("--seed", type=int, default=0, help="for everything that is random")
     simulate.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")
     verbs.add_subcommand("simulate", simulate, help="render plants with known answers")
 
@@ -109,11 +110,11 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
         "--masks",
         type=Path | None,
         default=masks,
-        help="folder of label PNGs or COCO .json, in the scene folder or anywhere; infer finds leaves itself without",
+        help="folder of label PNGs or COCO .json, in the scene folder or anywhere; without it, infer detects leaves",
     )
-    parser.add_argument("--out", type=Path | None, help="folder for the result, or the results (under results/)")
+    parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that seem to cover two instances")
+    parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that cover two instances in two")
     parser.add_argument(
         "--coco_crowd",
         type=Literal["mask", "ignore"],
@@ -143,9 +144,9 @@ def _match(args: Namespace) -> int:
     names = [scene.resolve().name for scene in args.scenes]
     for name in names:
         if names.count(name) > 1:
-            raise InputError(f"two scenes are called '{name}', expected different names: each gets a folder in --out")
+            raise InputError(f"two scenes are called '{name}', expected different names: each names a folder in --out")
     if args.masks is None:
-        raise InputError("masks is null, expected the masks to match; mvseg infer finds them in the photos")
+        raise InputError("masks is null, expected the masks to match; use mvseg infer to detect them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
     config = RunConfig(
         match=MatchConfig(**vars(args.match)),
@@ -174,7 +175,7 @@ def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         if masks is not None and config.detect != DetectConfig():
-            warnings.warn("the detect options do nothing: masks are given", InputWarning, stacklevel=1)
+            warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
         result = run_scene(scene, masks, config, progress=not quiet)
     # each matching of a detector's loop may repeat a warning
     messages = list(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning)))
@@ -190,10 +191,10 @@ def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet
 
 
 def _find_masks(scene: Path, masks: Path) -> Path:
-    """A relative path may start at the scene folder or where the command runs, as long as only one of them is there."""
+    """A relative path may start at the scene folder or at the current one, as long as only one of the two exists."""
     inside = scene / masks
     if inside.exists() and masks.exists() and not inside.samefile(masks):
-        raise InputError(f"both {inside} and {masks.resolve()} are there, expected --masks with the whole path of one")
+        raise InputError(f"both {inside} and {masks.resolve()} exist, expected --masks with the full path of one")
     return inside if inside.exists() else masks
 
 
@@ -203,11 +204,11 @@ def _eval(args: Namespace) -> int:
     from mvseg.results.read import read_instances
 
     ids, true = read_instances(args.result, args.truth)
-    judged = (true != 0) & (true != IGNORE_LABEL)
-    metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[judged], true[judged]))
+    is_scored = (true != 0) & (true != IGNORE_LABEL)
+    metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[is_scored], true[is_scored]))
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
     if metrics["no_instance"]:
-        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: they are not judged"
+        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: they are not scored"
         print(f"mvseg: warning: {message}", file=sys.stderr)
     for name, value in metrics.items():
         print(f"{name:15} {value:.4f}" if isinstance(value, float) else f"{name:15} {value}")
@@ -221,7 +222,7 @@ def _eval(args: Namespace) -> int:
 def _train(args: Namespace) -> int:
     from mvseg.training.loop import train
 
-    is_first = os.environ.get("RANK", "0") == "0"  # under torchrun one process speaks
+    is_first = os.environ.get("RANK", "0") == "0"  # under torchrun only one process logs
     logging.basicConfig(level=logging.INFO if is_first else logging.WARNING, format="%(message)s")
     values = {field.name: args[field.name] for field in dataclasses.fields(TrainConfig)}
     train(TrainConfig(**values))

@@ -1,4 +1,4 @@
-"""Everything that a run can be told, in one place: what `mvseg infer` and `run_scene` take."""
+"""All options of a run: what `mvseg infer` and `run_scene` take."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class RunConfig:
     """From photos, or masks, to ids and shapes.
 
     Attributes:
-        detect: how instances are found; does nothing where masks are given.
+        detect: how instances are found in photos; has no effect when masks are given.
         match: how regions are matched across views.
         reconstruct: how instances become shapes; None for ids only.
         split_merged: cut a mask that seems to cover two instances in two.

@@ -1,4 +1,4 @@
-"""Bad input: the exception that ends a run with one sentence, and the warning that does not end it."""
+"""Bad input: an exception that ends a run with one sentence, and a warning that does not."""
 
 
 class InputError(ValueError):

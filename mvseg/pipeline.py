@@ -29,19 +29,19 @@ from mvseg.scene import Scene
 def run_scene(
     folder: Path, masks: Path | None = None, config: RunConfig = RunConfig(), *, progress: bool = False
 ) -> Result:
-    """From a scene folder, with or without masks, to instances, with ids in every view and, if asked for, in 3D.
+    """From a scene folder, with or without masks, to instances with ids in every view and, if asked for, shapes in 3D.
 
     Args:
         folder: the scene, see `load_scene`.
         masks: label PNGs or COCO JSON, see `load_masks`; None: a detector finds them in the photos.
-        config: everything else.
+        config: the options of all stages.
         progress: show progress bars.
 
     Returns:
         The result; nothing is written.
 
     Raises:
-        InputError: the input is wrong; see the stages.
+        InputError: bad input; see the stages.
     """
     seconds: dict[str, float] = {}
     scores = None
@@ -77,7 +77,7 @@ def detect_regions(
 ) -> tuple[Proposals, Matching]:
     """Find and match the instances in the photos of a scene, see `MultiViewMaskRCNN.find_regions`.
 
-    Runs on the first GPU, if there is one. Torch's number of threads and generators stay as they are.
+    Runs on the first GPU, if there is one. Torch's thread count and random generators are left alone.
 
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
@@ -90,8 +90,8 @@ def detect_regions(
     photos = (torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1).float() / 255 for view in views)
     detections, matching = model.find_regions(photos, scene.cameras)
     if not len(detections.regions):
-        nothing = f"the detector finds nothing that scores {detect.min_score:g} or more"
-        warnings.warn(nothing, InputWarning, stacklevel=3)
+        message = f"the detector finds nothing that scores {detect.min_score:g} or more"
+        warnings.warn(message, InputWarning, stacklevel=3)
     return detections, matching
 
 

@@ -1,4 +1,4 @@
-"""The instance masks of all views of a scene, flat, as box crops. Boxes of masks are made here and nowhere else."""
+"""The instance masks of all views of a scene, flat, as box crops. Boxes of masks are computed only here."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from mvseg.errors import InputError
 
-IGNORE_LABEL = 65535  # in label maps: pixels that belong to nothing and are judged by nobody
+IGNORE_LABEL = 65535  # in label maps: pixels that belong to no region and are left out of every score
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +28,7 @@ class Regions:
         boxes: (D, 4) int64, xyxy in pixels, half-open: the crop of region d covers columns x1..x2-1, rows y1..y2-1.
         crops: (sum of box areas,) bool, the crops, each in row-major order.
         num_views: V; views without any region count.
-        labels: (D,) int64, the number each mask had where it came from. It means nothing across views.
+        labels: (D,) int64, the number each mask had in its source. It means nothing across views.
 
     Raises:
         InputError: shapes that disagree, an empty box, a view index outside [0, V).
@@ -104,7 +104,7 @@ class Regions:
     def select(self, index: Tensor) -> Regions:
         """The regions at an int64 index or a bool mask, in that order."""
         if index.dtype == torch.bool and len(index) != len(self):
-            raise InputError(f"a mask of {len(index)} for {len(self)} regions, expected as many")
+            raise InputError(f"a bool index of {len(index)} for {len(self)} regions, expected one per region")
         keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
         parts = self.crops.split(self.crop_sizes.prod(1).tolist())
         crops = torch.cat([parts[number] for number in keep.tolist()]) if len(keep) else self.crops[:0]
@@ -160,7 +160,7 @@ class Regions:
 
 
 def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
-    """x1, y1, x2, y2 (half-open) of the pixels of a mask (h, w), which must have some."""
+    """x1, y1, x2, y2 (half-open) of a mask (h, w), which must have a pixel."""
     x1, y1, x2, y2 = masks_to_boxes(mask[None])[0].tolist()
     return x1, y1, x2, y2
 
@@ -168,7 +168,7 @@ def mask_box(mask: Tensor) -> tuple[int, int, int, int]:
 def masks_to_boxes(masks: Tensor) -> Tensor:
     """(N, 4) int64 xyxy, half-open, of (N, H, W) masks; all 0 for a mask without pixels.
 
-    torchvision's function of this name gives boxes that end on the last pixel, and wants a pixel in every mask.
+    torchvision's function of this name gives boxes that end on the last pixel, and requires a pixel in every mask.
     """
     ends = []
     for axis in (1, 2):  # over the rows, for x; over the columns, for y
@@ -194,13 +194,13 @@ def regions_from_label_maps(label_maps: Sequence[np.ndarray]) -> Regions:
     for view, label_map in enumerate(label_maps):
         numbers, dense = np.unique(label_map, return_inverse=True)
         slices = ndimage.find_objects(dense.reshape(label_map.shape) + 1)
-        for rank, (number, place) in enumerate(zip(numbers.tolist(), slices, strict=True)):
-            if number in (0, IGNORE_LABEL) or place is None:
+        for rank, (number, window) in enumerate(zip(numbers.tolist(), slices, strict=True)):
+            if number in (0, IGNORE_LABEL) or window is None:
                 continue
-            rows, columns = place
+            rows, columns = window
             view_index.append(view)
             boxes.append((columns.start, rows.start, columns.stop, rows.stop))
-            crops.append(torch.from_numpy(dense.reshape(label_map.shape)[place] == rank).flatten())
+            crops.append(torch.from_numpy(dense.reshape(label_map.shape)[window] == rank).flatten())
             labels.append(number)
     return stack_regions(view_index, boxes, crops, labels=labels, num_views=len(label_maps))
 

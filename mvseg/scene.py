@@ -5,7 +5,7 @@ Frames     world, cam (one per view), px. Poses are `cam_from_world`: x_cam = R 
            `px_from_cam`, `world_from_px`.
 Pixels     the centre of the top-left pixel is (0.5, 0.5) (COLMAP); pixel (column c, row r) covers [c, c+1) x [r, r+1).
            Zero-centred habits (OpenCV, torchvision) are converted where they enter, in `formats/` and `detectors/`.
-           Boxes of masks are made in `regions.py`.
+           Boxes of masks are computed in `regions.py`.
 Boxes      xyxy, half-open and continuous: x2 - x1 is the number of pixel columns.
 Lenses     distortion is removed once, on load: `Cameras` are pinholes. `View.lens` keeps the photo's own camera, so
            that labels can be written in the frame of the photo the user took.
@@ -121,7 +121,7 @@ def camera_problem(K: Tensor, R: Tensor, t: Tensor, *, size: Tensor) -> str | No
     if size.min() < 1:
         return f"the image size is {size[0]} x {size[1]}, expected at least 1 x 1"
     if K[0, 0] <= 0 or K[1, 1] <= 0:
-        return f"the focal length is {K[0, 0]:g}, {K[1, 1]:g}, expected numbers above zero"
+        return f"the focal length is {K[0, 0]:g}, {K[1, 1]:g}, expected positive numbers"
     if K[1, 0] != 0 or K[2].tolist() != [0.0, 0.0, 1.0]:
         return "K is not upper triangular with last row 0, 0, 1"
     deviation = (R @ R.T - torch.eye(3).to(R)).abs().max().item()
@@ -168,7 +168,7 @@ class Scene:
 
     def __post_init__(self) -> None:
         if len(self.views) != len(self.cameras):
-            raise InputError(f"{len(self.views)} views with {len(self.cameras)} cameras, expected as many of each")
+            raise InputError(f"{len(self.views)} views with {len(self.cameras)} cameras, expected one per view")
         first_with: dict[str, int] = {}
         for index, view in enumerate(self.views):
             if view.name in first_with:

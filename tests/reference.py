@@ -45,7 +45,7 @@ def draw_points_reference(regions: Regions, index: int, num_points: int, generat
 def affinity_reference(
     regions: Regions, cameras: Cameras, num_points: int = 200, seed: int = 0, senders: list[int] | None = None
 ) -> Tensor:
-    """(D, D) directed weights of Eq. 3: w[n, m] of the band of n and the region m; 0 within a view.
+    """(D, D) directed weights of Eq. 3: w[n, m] from the band of n to the region m; 0 within a view.
 
     Every line is drawn two pixels thick, and counted against the full-frame mask of every region.
     """
@@ -160,13 +160,13 @@ def cluster_aware_nms_reference(boxes: Tensor, scores: Tensor, groups: Tensor, i
 def confirmed_reference(
     boxes: Tensor, groups: Tensor, ids: Tensor, scores: Tensor, iou_threshold: float, min_score: float
 ) -> list[bool]:
-    """Best box first: refused by any box that stayed, overlaps it, and is not surely something else."""
+    """Best box first; one is discarded when a box that stays overlaps it, unless it is surely another instance."""
     stays: list[int] = []
     for box in range(len(boxes)):
-        rivals = [one for one in stays if (groups[one] == groups[box]).all()]
-        over = [one for one in rivals if float(box_iou(boxes[[one]], boxes[[box]])) > iou_threshold]
+        rivals = [rival for rival in stays if (groups[rival] == groups[box]).all()]
+        overlapping = [rival for rival in rivals if float(box_iou(boxes[[rival]], boxes[[box]])) > iou_threshold]
         is_sure = ids[box] > 0 and scores[box] >= min_score
-        if all(is_sure and ids[one] != ids[box] for one in over):
+        if all(is_sure and ids[rival] != ids[box] for rival in overlapping):
             stays.append(box)
     return [box in stays for box in range(len(boxes))]
 
@@ -191,7 +191,7 @@ def back_project_reference(members: Regions, cameras: Cameras, points: Tensor) -
 def seen_share_reference(members: Regions, everything: Regions, cameras: Cameras, points: Tensor) -> Tensor:
     """(P,) of the instance's views that show it at a point or show no region there, the share that show it."""
     pixels, depth = cameras.project(points)
-    own, empty = torch.zeros(len(points)), torch.zeros(len(points))
+    shown, empty = torch.zeros(len(points)), torch.zeros(len(points))
     for view in members.view_index.unique().tolist():
         width, height = cameras.sizes[view].tolist()
         masks = [
@@ -200,9 +200,9 @@ def seen_share_reference(members: Regions, everything: Regions, cameras: Cameras
         ]
         for p, (u, v) in enumerate(pixels[view].tolist()):
             if depth[view, p] > 0 and 0 <= u < width and 0 <= v < height:
-                own[p] += masks[0][int(v), int(u)]
+                shown[p] += masks[0][int(v), int(u)]
                 empty[p] += ~masks[1][int(v), int(u)]
-    return own / (own + empty)
+    return shown / (shown + empty)
 
 
 def ray_distance_reference(first: tuple[Tensor, Tensor], second: tuple[Tensor, Tensor]) -> Tensor:
@@ -255,15 +255,15 @@ def consistent_depth_reference(
     """(H, W): depths of a view that the depth map of another view confirms, one pixel at a time; else 0."""
     kept = np.zeros_like(depths[view])
     for v, u in np.ndindex(*kept.shape):
-        own = depths[view][v, u]
-        if np.isnan(own):
+        depth_here = depths[view][v, u]
+        if np.isnan(depth_here):
             continue
         ray = cameras.world_from_px[view] @ torch.tensor([u + 0.5, v + 0.5, 1.0], dtype=torch.float64)
-        pixels, expected = cameras.project((cameras.centers[view] + float(own) * ray)[None])
+        pixels, expected = cameras.project((cameras.centers[view] + float(depth_here) * ray)[None])
         for j in others:
             (x, y), depth = pixels[j, 0].tolist(), float(expected[j, 0])
             width, height = cameras.sizes[j].tolist()
             is_inside = depth > 0 and 0 <= x < width and 0 <= y < height
             if is_inside and abs(depths[j][int(y), int(x)] - depth) <= error * depth:
-                kept[v, u] = own
+                kept[v, u] = depth_here
     return kept

@@ -104,8 +104,8 @@ def moved(cameras: Cameras, scale: float, rotation: Tensor, shift: Tensor) -> Ca
 
 
 def merged_balls(scene: BallScene) -> tuple[Regions, tuple[int, int], int]:
-    """The regions when two touching balls share one mask in a view, with the number of the second; their numbers; the
-    index of that region."""
+    """The regions when two touching balls share one mask in a view, labelled as the second; the two numbers; the index
+    of that region."""
     (first, second), view = touching_balls(scene)
     maps = [labels.copy() for labels in scene.label_maps]
     maps[view][maps[view] == first] = second

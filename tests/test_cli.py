@@ -293,14 +293,16 @@ def test_masks_only(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("verb", ["infer", "match"])
-def test_two_cameras_at_one_place(verb: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_cameras_that_share_a_centre(
+    verb: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     same = json.loads((plant / "cameras.json").read_text())["views"][0]
     edit_rig(plant, 1, R=same["R"], t=same["t"])
     for kind in ("images", "masks"):
         shutil.copy(plant / kind / "000.png", plant / kind / "001.png")
     coarse = COARSE if verb == "infer" else []
     assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *coarse]) == 0
-    warning = "views 0 and 1 were taken from one place: this pair is skipped"
+    warning = "views 0 and 1 share a camera centre: this pair is skipped"
     assert capsys.readouterr().err == f"mvseg: warning: {warning}\n"
     (run,) = (tmp_path / "out").rglob("run.json")
     assert json.loads(run.read_text())["warnings"] == [warning]
@@ -312,7 +314,7 @@ def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: py
         write_image(path, np.zeros((HEIGHT, WIDTH), np.uint16))
     assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
     captured = capsys.readouterr()
-    assert captured.err == "mvseg: warning: the masks of all views are empty: there is no instance\n"
+    assert captured.err == "mvseg: warning: the masks of all views are empty: there are no instances\n"
     assert captured.out.endswith(": 0 instances from 0 masks in 4 views\n")
     out = tmp_path / "out" if verb == "infer" else tmp_path / "out" / "plant"
     content = json.loads((out / "instances.json").read_text())
@@ -502,7 +504,7 @@ def test_output_that_cannot_be_written(
     (tmp_path / "full" / "thesis.tex").touch()
     before = sorted(tmp_path.rglob("*"))
     assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / place), "--quiet"]) == 2
-    reason = "holds files that are no earlier result" if place == "full" else "the output folder is not writable"
+    reason = "holds files that are not an earlier result" if place == "full" else "the output folder is not writable"
     assert f"{tmp_path / place}: {reason}" in complaint(capsys)
     assert sorted(tmp_path.rglob("*")) == before
 
@@ -549,7 +551,7 @@ def test_masks_are_looked_for_in_two_places(
     shutil.copytree(plant / "masks", plant / "annotations")
     capsys.readouterr()
     assert main(["match", str(plant), "--masks", "annotations", "--out", "two", "--quiet"]) == 2
-    assert "expected --masks with the whole path of one" in capsys.readouterr().err
+    assert "expected --masks with the full path of one" in capsys.readouterr().err
     assert main(["match", str(plant), "--masks", str(tmp_path / "annotations"), "--out", "two", "--quiet"]) == 0
 
 
@@ -596,7 +598,7 @@ def test_detect_options_beside_masks_are_warned_of(
 ) -> None:
     arguments = ["infer", str(plant), "--masks", "masks", "--detect.min_score", "0.9", "--quiet", *COARSE]
     assert main([*arguments, "--out", str(tmp_path / "out")]) == 0
-    assert "the detect options do nothing" in capsys.readouterr().err
+    assert "the detect options have no effect" in capsys.readouterr().err
     assert "detect" in json.loads((tmp_path / "out" / "run.json").read_text())["warnings"][0]
 
 
@@ -636,7 +638,7 @@ def test_a_file_in_the_place_of_a_folder(tmp_path: Path, capsys: pytest.CaptureF
 def test_simulate_keeps_out_of_folders_with_other_things(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = sorted(plant.rglob("*"))
     assert main(["simulate", "paper-eval", "--out", str(plant)]) == 2
-    assert "holds files that are no data set" in complaint(capsys)
+    assert "holds files that are not a data set" in complaint(capsys)
     assert sorted(plant.rglob("*")) == before
 
 

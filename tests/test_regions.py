@@ -57,9 +57,9 @@ def test_select_keeps_order_and_content() -> None:
     regions = regions_from_label_maps(random_maps())
     index = torch.tensor([4, 0, 5])
     chosen = regions.select(index)
-    for place, source in enumerate(index.tolist()):
-        assert torch.equal(chosen.crop(place), regions.crop(source))
-        assert chosen.labels[place] == regions.labels[source]
+    for position, source in enumerate(index.tolist()):
+        assert torch.equal(chosen.crop(position), regions.crop(source))
+        assert chosen.labels[position] == regions.labels[source]
     everything = regions.select(torch.ones(len(regions), dtype=torch.bool))
     assert torch.equal(everything.crops, regions.crops)
     assert len(regions.select(torch.zeros(len(regions), dtype=torch.bool))) == 0

@@ -1,1 +1,1 @@
-"""How right masks, ids and shapes are."""
+"""How good masks, ids and shapes are."""

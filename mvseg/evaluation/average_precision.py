@@ -27,11 +27,11 @@ Annotations = list[dict[str, Any]]
 
 
 def annotate_truth(labelled: LabelledPhoto, image_id: int, num_categories: int) -> Annotations:
-    """COCO annotations of a photo's instances, and one crowd per category that covers its ignored pixels.
+    """COCO annotations of a photo's instances, and, per category, one crowd that covers its ignored pixels.
 
     Args:
         labelled: the photo; its classes become the categories.
-        image_id: of the photo, from 0 on.
+        image_id: number of the photo, from 0 on.
         num_categories: categories are 1..num_categories.
     """
     annotations = []
@@ -50,7 +50,7 @@ def annotate_detections(detections: dict[str, Tensor], masks: Iterable[Tensor], 
     Args:
         detections: "boxes" (D, 4) xyxy, "labels" (D,), "scores" (D,).
         masks: D masks (H, W) of probabilities, cut at 0.5 here.
-        image_id: of the photo, from 0 on.
+        image_id: number of the photo, from 0 on.
     """
     annotations = []
     for box, category, score, mask in zip(
@@ -90,9 +90,9 @@ def average_precision(truth: Annotations, detections: Annotations, num_images: i
     categories = sorted({annotation["category_id"] for annotation in truth + detections})
     scores: dict[str, float | None] = {}
     with contextlib.redirect_stdout(io.StringIO()):  # pycocotools prints its progress
-        true, found = (_index(annotations, categories, num_images) for annotations in (truth, detections))
+        true, detected = (_index(annotations, categories, num_images) for annotations in (truth, detections))
         for name, kind in (("mask", "segm"), ("box", "bbox")):
-            scores |= {f"{name}_{key}": value for key, value in _evaluate(COCOeval(true, found, kind)).items()}
+            scores |= {f"{name}_{key}": value for key, value in _evaluate(COCOeval(true, detected, kind)).items()}
     return scores
 
 
@@ -108,7 +108,7 @@ def _evaluate(evaluation: COCOeval) -> dict[str, float | None]:
 def _index(annotations: Annotations, categories: Sequence[int], num_images: int) -> COCO:
     coco = COCO()
     coco.dataset = {
-        # pycocotools wants a size, and reads it for polygons only
+        # pycocotools requires a size, but uses it for polygons only
         "images": [{"id": index, "height": 1, "width": 1} for index in range(num_images)],
         "categories": [{"id": category} for category in categories],
         "annotations": [{**annotation, "id": number} for number, annotation in enumerate(annotations, start=1)],

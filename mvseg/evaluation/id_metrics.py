@@ -1,7 +1,7 @@
-"""How good are the ids: s_match (Eq. 8), e_k, ARI, pairs.
+"""How good the ids are: s_match (Eq. 8), e_k, ARI, pairs.
 
 Ids are compared as partitions: their numbers mean nothing. A region that is matched to nothing (-1) counts as a cluster
-of its own. Always read s_match together with the others: all regions on their own score s_match = 1.
+of its own. Always read s_match together with the others: if every region is its own cluster, s_match is 1.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class MatchingMetrics:
         pair_recall: of the pairs that belong together, the share put together (1 when there is none).
         pair_f1: their harmonic mean.
         num_regions: D.
-        num_estimated: clusters found, single regions included.
+        num_estimated: estimated clusters, single regions included.
         num_true: true instances.
     """
 
@@ -51,7 +51,8 @@ def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
         InputError: the vectors differ in length.
     """
     if instance_ids.shape != true_ids.shape or instance_ids.ndim != 1:
-        raise InputError(f"{tuple(instance_ids.shape)} estimated ids with {tuple(true_ids.shape)} true ones")
+        shapes = f"{tuple(instance_ids.shape)} estimated ids with {tuple(true_ids.shape)} true ones"
+        raise InputError(f"{shapes}, expected two vectors of equal length")
     estimated, true = separate_unmatched(instance_ids.cpu().numpy()), true_ids.cpu().numpy()
     if not len(true):
         return MatchingMetrics(
@@ -69,7 +70,7 @@ def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
     both, true_pairs, estimated_pairs = (count_pairs(sizes) for sizes in (table, table.sum(1), table.sum(0)))
     precision = both / estimated_pairs if estimated_pairs else 1.0
     recall = both / true_pairs if true_pairs else 1.0
-    # Hubert and Arabie (1985): pairs in both, less what chance gives, over the largest that it could be
+    # Hubert and Arabie (1985): pairs in both, less those expected by chance, over the largest possible difference
     by_chance = true_pairs * estimated_pairs / max(count_pairs(np.array([len(true)])), 1)
     largest = (true_pairs + estimated_pairs) / 2
     return MatchingMetrics(
@@ -86,7 +87,7 @@ def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
 
 
 def contingency_table(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """(J, K) int64: how many of D elements have the j-th smallest label of the one and the k-th of the other (D,)."""
+    """(J, K) int64: how many elements have the j-th smallest label of `first` (D,) and the k-th of `second` (D,)."""
     rows, row = np.unique(first, return_inverse=True)
     columns, column = np.unique(second, return_inverse=True)
     counts = np.bincount(row * len(columns) + column, minlength=len(rows) * len(columns))
@@ -94,5 +95,5 @@ def contingency_table(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def count_pairs(sizes: np.ndarray) -> int:
-    """How many pairs of elements share a group, by the groups' sizes."""
+    """How many pairs of elements share a group, from the group sizes."""
     return int((sizes * (sizes - 1) // 2).sum())

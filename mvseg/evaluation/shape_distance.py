@@ -1,4 +1,4 @@
-"""How far is a shape from the true one: d(I, T) of Sec. 4.3."""
+"""How far a shape is from the true one: d(I, T) of Sec. 4.3."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ def shape_distance(points: Tensor, truth: Tensor) -> float:
     if not len(points) or not len(truth):
         return float("nan")
     first, second = points.double().cpu().numpy(), truth.double().cpu().numpy()
-    there = cKDTree(second).query(first)[0].mean()
-    back = cKDTree(first).query(second)[0].mean()
-    return float((there + back) / 2)
+    to_truth = cKDTree(second).query(first)[0].mean()
+    to_points = cKDTree(first).query(second)[0].mean()
+    return float((to_truth + to_points) / 2)

@@ -1,4 +1,4 @@
-"""Which true instance does a mask show?"""
+"""Which true instance a mask shows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def shown_instance(truth: np.ndarray, mask: np.ndarray, *, count_background: boo
     Args:
         truth: (H, W) integers: 0 = no instance, 65535 = ignore.
         mask: (H, W), not 0 inside the mask.
-        count_background: False for masks that are known to show an instance, and may have outgrown it.
+        count_background: False for masks that are known to show an instance but may extend beyond it.
 
     Returns:
         The label, the smallest of equally frequent ones. 0 for a mask without pixels, for one that mostly covers no

@@ -42,22 +42,22 @@ def region_affinity(
 
     Args:
         regions: D regions in V views.
-        cameras: V cameras. Pairs of views at one place are skipped: their regions get no edge.
-        num_points: how many random pixels of a region send out epipolar lines. None takes all pixels, which is no
-            slower, has no sampling noise and is the default; the paper takes 200.
-        seed: of the random pixels.
+        cameras: V cameras. Pairs of views that share a camera centre are skipped: their regions get no edge.
+        num_points: random pixels per region that send out epipolar lines (the paper: 200). None, the default, uses all
+            pixels: no slower, and without sampling noise.
+        seed: for the random pixels.
         progress: show a progress bar over the pairs of views.
 
     Returns:
-        The graph. A region in a view alone, or whose bands meet nothing, has no edge.
+        The graph. A region of weight 0 to all regions of the other views has no edge.
     """
     samples, members = view_samples(regions)
     senders = None if num_points is None else draw_points(samples, num_points, seed)
     edges, weights = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)], []
     for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):
         i, j = pair.i, pair.j
-        forth, back = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
-        mean = (forth + back.T) / 2
+        j_from_i, i_from_j = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
+        mean = (j_from_i + i_from_j.T) / 2
         first, second = mean.nonzero().unbind(1)
         edges.append(torch.stack((members[i][first], members[j][second]), 1).sort(1).values)
         weights.append(mean[first, second])
@@ -78,8 +78,8 @@ def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Te
     Returns:
         w(i -> j) (N, M) and w(j -> i) (M, N), float32 in [0, 1].
     """
-    forth = _directed(lines[0], pixels[1], band_radius=bins.band_radius(0), half_line=bins.half_line[1])
-    return forth, _directed(lines[1], pixels[0], band_radius=bins.band_radius(1), half_line=bins.half_line[0])
+    j_from_i = _directed(lines[0], pixels[1], band_radius=bins.band_radius(0), half_line=bins.half_line[1])
+    return j_from_i, _directed(lines[1], pixels[0], band_radius=bins.band_radius(1), half_line=bins.half_line[0])
 
 
 def _directed(lines: Tensor, pixels: Tensor, *, band_radius: int, half_line: int) -> Tensor:

@@ -1,4 +1,4 @@
-"""How regions are matched. The fields are keys of the YAML files and of the command line."""
+"""How regions are matched. The fields are keys in YAML files and options on the command line."""
 
 from __future__ import annotations
 
@@ -13,15 +13,16 @@ class MatchConfig:
     """How regions are matched across views.
 
     Attributes:
-        method: nview (evidence of all views at once; the most accurate), one-per-view (epipolar weights of pairs of
-            views, no two regions of a view in one cluster; the fastest), symnmf (the paper's), or auto: nview, but
-            symnmf when the number of instances or a range for it is given.
-        num_points: random pixels per region that send out epipolar lines (the paper: 200); null takes all pixels.
-        num_instances: number of instances, when it is known; symnmf only, the others find it by themselves.
-        search_range: smallest and largest number of instances to try, as in [5, 9]; null for [m, 2 m], m the largest
-            number of masks in any view. The range decides much: equal parts always look good. symnmf only.
-        num_restarts: random starts of each factorisation of symnmf.
-        seed: of the random pixels and starts.
+        method: nview (weighs the evidence of all views at once; the most accurate), one-per-view (pairwise epipolar
+            weights, at most one region per view in a cluster; the fastest), symnmf (the paper's), or auto: symnmf when
+            the number of instances or a range for it is given, else nview.
+        num_points: random pixels per region that send out epipolar lines (the paper: 200); null uses all pixels.
+        num_instances: number of instances, if known; symnmf only, the other methods find it themselves.
+        search_range: smallest and largest number of instances to try, as in [5, 9]; null for [m, 2 m], m being the
+            largest number of masks in any view. Choose it with care: clusters of equal size always look good. symnmf
+            only.
+        num_restarts: random starts per factorisation; symnmf only.
+        seed: for the random pixels and starts.
     """
 
     method: Literal["auto", "nview", "one-per-view", "symnmf"] = "auto"

@@ -6,7 +6,7 @@ of them, and that half-plane is all that epipolar geometry knows about the pixel
 epipolar band (Eq. 2) is the set of occupied bins, and an epipolar map (Eq. 4) is a look-up.
 
 Departure from the paper: half-planes instead of full lines. The half of a line beyond the epipole belongs to points
-behind one of the cameras; where both epipoles lie outside the images the two are the same.
+behind one of the cameras; where both epipoles lie outside the images the two agree.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def view_samples(regions: Regions, max_per_region: int | None = None) -> tuple[l
         max_per_region: see `Regions.pixels`.
 
     Returns:
-        V `Samples`, and V int64 tensors with the indices in `regions` that the owners of a view stand for.
+        V `Samples`, and V int64 tensors: the index in `regions` of each region of the view, in the order of `owner`.
     """
     members = [(regions.view_index == view).nonzero()[:, 0] for view in range(regions.num_views)]
     samples = []
@@ -109,7 +109,7 @@ class Pencil:
         """Mean change of the angle when a pixel moves by one pixel across its epipolar line.
 
         It is the mean of |x grad y - y grad x| / (|x| + |y|)^2 over the pixels; pixels within a pixel of the epipole,
-        where it diverges, count as one pixel away from it.
+        where it diverges, count as if one pixel away.
         """
         x, y = self._plane(side, xy)
         (x_u, x_v, _), (y_u, y_v, _) = self.plane_from_px[side].tolist()
@@ -137,8 +137,8 @@ def is_coincident(cameras: Cameras) -> Tensor:
 def epipolar_pencil(cameras: Cameras, i: int, j: int) -> Pencil:
     """The pencil of two cameras.
 
-    Any baseline will do: an epipole inside an image or at infinity and cameras that look at each other are no special
-    cases.
+    Any baseline will do: an epipole inside an image or at infinity, or cameras that face each other, need no special
+    treatment.
 
     Raises:
         InputError: cameras i and j share a centre (no epipolar geometry).
@@ -146,13 +146,13 @@ def epipolar_pencil(cameras: Cameras, i: int, j: int) -> Pencil:
     baseline = cameras.centers[j] - cameras.centers[i]
     length = torch.linalg.vector_norm(baseline)
     if length == 0:
-        raise InputError(f"views {i} and {j} were taken from one place, expected a baseline between them")
+        raise InputError(f"views {i} and {j} share a camera centre, expected a baseline between them")
     axis = baseline / length
     world_from_px = cameras.world_from_px[[i, j]]
-    # Angle 0 points where both cameras look, so that the jump at +-2 is as far from the regions as it can be.
+    # Angle 0 points where both cameras look, so that the jump at +-2 is as far from the regions as possible.
     forward = cameras.R[[i, j], 2].sum(0)
     forward = forward - (forward @ axis) * axis
-    if torch.linalg.vector_norm(forward) < 1e-9:  # both look along the baseline: any direction across it serves
+    if torch.linalg.vector_norm(forward) < 1e-9:  # both look along the baseline: any direction across it will do
         forward = torch.linalg.cross(axis, torch.eye(3).to(axis)[axis.abs().argmin()])
     e1 = forward / torch.linalg.vector_norm(forward)
     e2 = torch.linalg.cross(axis, e1)
@@ -167,8 +167,8 @@ class Bins:
         low: smallest angle.
         per_unit: bins per unit of angle.
         num_bins: B.
-        half_line: for image i and image j, how many bins half the thickness of a line is there.
-        half_pixel: the same for half a pixel, rounded up.
+        half_line: half the thickness of a line in image i and in image j, in bins.
+        half_pixel: half a pixel in image i and in image j, in bins, rounded up.
     """
 
     low: float
@@ -178,14 +178,14 @@ class Bins:
     half_pixel: tuple[int, int]
 
     def index(self, angles: Tensor) -> Tensor:
-        """(P,) int32 bin of each angle; -1 below the binning and B above it."""
+        """(P,) int32 bin of each angle; -1 below the first bin and B above the last."""
         return ((angles - self.low) * self.per_unit).floor().clamp(-1, self.num_bins).int()
 
     def band_radius(self, source: int) -> int:
-        """Bins that a band of image `source` (0 or 1) reaches beyond its pixels' centres, seen in the other image.
+        """How many bins a band of image `source` (0 or 1) extends beyond its pixels' centres.
 
-        Half a line there; but never less than half a pixel of the source, so that a band of neighbouring pixels has
-        no gaps where the source image is the coarser one.
+        Half a line in the other image, but at least half a pixel of the source: otherwise the lines of neighbouring
+        pixels would leave gaps where the source image is the coarser one.
         """
         return max(self.half_line[1 - source], self.half_pixel[source])
 
@@ -193,8 +193,8 @@ class Bins:
 def choose_bins(pencil: Pencil, xy: tuple[Tensor, Tensor], angles: tuple[Tensor, Tensor]) -> Bins:
     """Bins of half a pixel over the angles of both views' pixels; lines are two pixels thick, as in the paper.
 
-    A line is a wedge of the pencil, so its thickness in pixels varies with the distance to the epipole; two pixels are
-    met on average over the pixels of each image. Both views must hold at least one pixel.
+    A line is a wedge of the pencil, so its thickness in pixels varies with the distance to the epipole; it is two
+    pixels on average over the pixels of each image. Both views need at least one pixel.
 
     Args:
         pencil: of views i and j.
@@ -223,7 +223,7 @@ def bin_histogram(bins: Bins, angles: Tensor, samples: Samples) -> Tensor:
 
     Pixels whose half-plane lies outside the bins are left out.
     """
-    padded = bins.num_bins + 2  # a bin on either side takes what lies outside
+    padded = bins.num_bins + 2  # an extra bin at either end collects what lies outside
     flat = samples.owner * padded + (bins.index(angles) + 1)
     counts = torch.bincount(flat, weights=samples.weight, minlength=samples.num_regions * padded)
     return counts.reshape(samples.num_regions, padded)[:, 1:-1].float()
@@ -257,7 +257,7 @@ def binned_pairs(
     senders: Sequence[Samples] | None = None,
     progress: bool = False,
 ) -> Iterator[BinnedPair]:
-    """All pairs of views i < j that both hold pixels and have a baseline.
+    """All pairs of views i < j that both have pixels, with a baseline between them.
 
     Args:
         samples: pixels of the regions, one entry per view.
@@ -295,9 +295,9 @@ def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor)
     """Which pixels of a view lie in the epipolar band of which region (Eq. 2).
 
     Args:
-        regions: D regions; those of `view` itself, and of views at the same place, have no band there.
+        regions: D regions; those of `view` itself, and of views that share its camera centre, have no band there.
         cameras: V cameras.
-        view: the view that the bands are projected to.
+        view: the view that the bands are projected onto.
         xy: (P, 2) float32 pixel positions in that view.
 
     Returns:

@@ -27,21 +27,21 @@ def match_regions(
     """Give every region an instance id by epipolar region matching (Sec. 3.1).
 
     The weights are the paper's; the clustering is the paper's with `method` "symnmf", and a more accurate one by
-    default (see `MatchConfig.method`), which also leaves regions unmatched (-1) that belong to nothing.
+    default (see `MatchConfig.method`), which also leaves regions that fit no instance unmatched (-1).
 
     Args:
         regions: D regions in V views.
         cameras: V >= 2 cameras.
-        config: how.
+        config: method and options.
         progress: show progress bars.
 
     Returns:
-        The matching, on the device of the regions. Without regions it is empty. Warns (InputWarning) of pairs of views
-        at one place, which are skipped, of a scene without regions, and of one whose views do not agree.
+        The matching, on the device of the regions; empty without regions. Warns (InputWarning) about pairs of views
+        that share a camera centre (they are skipped), a scene without regions, and views that do not agree.
 
     Raises:
-        InputError: fewer than two views, regions and cameras of different numbers of views, or a region that is not
-            inside the image of its camera.
+        InputError: fewer than two views, regions and cameras of different numbers of views, or a region that reaches
+            beyond the image of its camera.
     """
     cameras = cameras.to(regions.device)
     check_views(regions, cameras)
@@ -68,8 +68,8 @@ def match_graph(
     Args:
         graph: of D regions.
         regions: whose numbers per view set the default range for the number of instances.
-        config: num_instances, search_range, num_restarts and seed are used; the rest is about the epipolar weights.
-        method: what the matching calls itself.
+        config: num_instances, search_range, num_restarts and seed are used; the rest concerns the epipolar weights.
+        method: the `Matching.method` of the result.
         progress: show a progress bar.
     """
     clustering = cluster_affinity(
@@ -85,7 +85,7 @@ def match_graph(
 
 
 def matching_of_ids(instance_ids: Tensor, regions: Regions, graph: Affinity, *, method: str) -> Matching:
-    """The matching of ids in [1, K] or -1 that were read off a graph; scores are its mean weights inside clusters."""
+    """The matching for ids in [1, K] or -1 from a graph; the scores are mean weights within clusters."""
     return Matching(
         instance_ids=instance_ids,
         match_scores=mean_affinity(graph, instance_ids, regions),
@@ -104,9 +104,9 @@ def mean_affinity(affinity: Affinity, instance_ids: Tensor, regions: Regions) ->
 def check_views(regions: Regions, cameras: Cameras) -> None:
     """Raises InputError: fewer than two views, or regions and cameras of different numbers of views."""
     if len(cameras) != regions.num_views:
-        raise InputError(f"regions of {regions.num_views} views with {len(cameras)} cameras, expected as many of each")
+        raise InputError(f"regions of {regions.num_views} views with {len(cameras)} cameras, expected equal numbers")
     if len(cameras) < 2:
-        raise InputError("matching needs at least two views, got a single one")
+        raise InputError("matching needs at least two views, got a single view")
 
 
 def _check_sizes(regions: Regions, cameras: Cameras) -> None:
@@ -118,15 +118,15 @@ def _check_sizes(regions: Regions, cameras: Cameras) -> None:
         width, height = cameras.sizes[view].tolist()
         raise InputError(
             f"region {region} of view {view} has the box {box}, expected one inside the {width} x {height} pixels of "
-            "its camera: are the masks of another size than the photos?"
+            "its camera: are the masks and the photos of different sizes?"
         )
 
 
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
     if not len(regions):
-        warnings.warn("the masks of all views are empty: there is no instance", InputWarning, stacklevel=3)
+        warnings.warn("the masks of all views are empty: there are no instances", InputWarning, stacklevel=3)
     for i, j in torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist():
-        message = f"views {i} and {j} were taken from one place: this pair is skipped"
+        message = f"views {i} and {j} share a camera centre: this pair is skipped"
         warnings.warn(message, InputWarning, stacklevel=3)
 
 
@@ -143,5 +143,5 @@ def _warn_of_disagreement(matching: Matching) -> None:
         facts += f" at a reprojection error of {matching.residual_px} pixels or more"
     if matching.method != "nview":
         facts += f"; '{matching.method}' matched them"
-    question = "do R and t take world points to the camera, and are the masks those of their photos?"
+    question = "do R and t map world points to the camera, and does each mask belong to its photo?"
     warnings.warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}", InputWarning, stacklevel=3)

@@ -1,8 +1,8 @@
 """Clusters with at most one region per view, from the epipolar weights alone.
 
-An instance has one mask in a view. SymNMF cannot know that. Average linkage that never joins two regions of one view
-can, and then one assignment problem per view (permutation synchronisation by projected power iteration, Chen and Candes
-2016, with the Hungarian method as the projection). The number of clusters is a result.
+An instance has one mask in a view, which SymNMF cannot know. Average linkage that never joins two regions of one view
+uses it, and so does the assignment problem that is then solved for each view (permutation synchronisation by projected
+power iteration, Chen and Candes 2016, with the Hungarian method as the projection). The number of clusters is a result.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from mvseg.matching.affinity import Affinity
 from mvseg.partition import drop_singletons, number_instances, renumber
 
 STOP = 0.2  # mean weight below which two clusters are not joined
-ALONE = 0.1  # gain of a region in no cluster, in units of the mean weight to a cluster's V - 1 others
+ALONE = 0.1  # gain of a region that stays alone, comparable to its mean weight to the V - 1 other views
 MAX_SWEEPS = 20
-FORBIDDEN = 1e9  # distance of two regions of one view: no mean that contains it is ever small enough
+FORBIDDEN = 1e9  # distance between two regions of one view: a mean that includes it is never small enough
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -72,7 +72,7 @@ def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
 
     Args:
         graph: of D regions.
-        stop: two clusters with a smaller mean weight, or with none, are not joined.
+        stop: two clusters with a smaller mean weight, or with mean weight 0, are not joined.
 
     Returns:
         (D,) cluster of each region in [0, K), numbered by their first region.
@@ -80,19 +80,19 @@ def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
     if len(graph.weights) < 2:
         return np.arange(len(graph.weights))
     is_same_view = graph.view_index[:, None] == graph.view_index
-    farthest = graph.weights.max(initial=1.0)  # the distance of two regions without an edge
+    farthest = graph.weights.max(initial=1.0)  # the distance between two regions without an edge
     distance = np.where(is_same_view, FORBIDDEN, farthest - graph.weights)
     np.fill_diagonal(distance, 0)
     tree = linkage(squareform(distance, checks=False), "average")
-    longest = min(farthest - stop, np.nextafter(farthest, 0))
-    return renumber(fcluster(tree, longest, "distance").astype(np.int64))
+    cut = min(farthest - stop, np.nextafter(farthest, 0))
+    return renumber(fcluster(tree, cut, "distance").astype(np.int64))
 
 
-def power_iteration(graph: ViewGraph, clusters: Ints, *, alone: float = ALONE) -> Ints:
+def power_iteration(graph: ViewGraph, clusters: Ints) -> Ints:
     """Re-assign the regions of one view after another to the clusters of the others, one to one.
 
     The gain of a region from a cluster is its summed weight to the members, divided by V - 1; a region may also stay
-    alone, for a gain of `alone`. The views with the largest total weight come first, whatever their numbers.
+    alone, for a gain of ALONE. The views with the largest total weight come first, whatever their numbers.
 
     Returns:
         (D,) cluster of each region in [0, K), regions that stay alone included.
@@ -103,11 +103,11 @@ def power_iteration(graph: ViewGraph, clusters: Ints, *, alone: float = ALONE) -
         for view in order:
             here = np.flatnonzero(graph.view_index == view)
             rest = np.where(graph.view_index == view, -1, clusters)
-            kept, rest[rest >= 0] = np.unique(rest[rest >= 0], return_inverse=True)
-            members = np.zeros((len(rest), len(kept)))
+            numbers, rest[rest >= 0] = np.unique(rest[rest >= 0], return_inverse=True)
+            members = np.zeros((len(rest), len(numbers)))
             members[rest >= 0, rest[rest >= 0]] = 1
             gain = graph.weights[here] @ members / max(graph.num_views - 1, 1)
-            rest[here] = assign_one_to_one(gain, alone)
+            rest[here] = assign_one_to_one(gain, ALONE)
             clusters = rest
         clusters = renumber(clusters)
         if (clusters == before).all():
@@ -116,10 +116,10 @@ def power_iteration(graph: ViewGraph, clusters: Ints, *, alone: float = ALONE) -
 
 
 def join_alone(graph: ViewGraph, clusters: Ints, *, stop: float) -> Ints:
-    """Give regions that are alone a second chance by their weights only.
+    """Give regions that are alone a second chance, judged by weights only.
 
-    They are linked with each other (average linkage), and those still alone join the cluster of largest mean weight
-    that has no region of their view; never for a mean weight below `stop`. Other regions stay where they are.
+    They are linked with each other (average linkage); those still alone join the cluster of largest mean weight that
+    has no region in their view. Nothing is joined at a mean weight below `stop`. Other regions stay where they are.
 
     Returns:
         (D,) cluster of each region in [0, K).

@@ -36,14 +36,14 @@ class Matching:
 
     Attributes:
         instance_ids: (D,) int64; regions of one instance share a number in [1, K]; -1 = matched to nothing.
-        match_scores: (D,) float32 in [0, 1]. Where "nview" was asked for: the probability that the id is right, as
-            fitted on simulated plants. Else the mean affinity (Eq. 3) of a region to the members of its cluster in
+        match_scores: (D,) float32 in [0, 1]. Where "nview" was asked for, the probability that the id is right, as
+            fitted on simulated plants. Otherwise the mean affinity (Eq. 3) of a region to the members of its cluster in
             other views. 0 for a region that is matched to nothing or alone in its cluster.
         num_instances: K.
-        method: what matched: "nview", "one-per-view" (also what nview falls back to when the views do not agree, or are
-            two) or "symnmf".
-        support: (K,) int64, in how many views each instance, from id 1 on, has a region whose match score is at least
-            0.5; None where the match scores are no probabilities.
+        method: what produced the ids: "nview", "one-per-view" (also what nview falls back to when there are only two
+            views or the views do not agree), "symnmf", or the name of a baseline.
+        support: (K,) int64, number of views in which each instance, from id 1 on, has a region with a match score of at
+            least 0.5; None where the match scores are not probabilities.
         merged: masks that seem to cover two instances. The masks themselves are unchanged (`split_merged` cuts them).
             Only "nview" looks for them.
         residual_px: reprojection error of the matched regions, in pixels; None where it was not estimated.
@@ -69,30 +69,35 @@ class Matching:
         return replace(self, instance_ids=ids, match_scores=scores, support=support)
 
     def select(self, index: Tensor) -> Matching:
-        """The regions at an int64 index, in that order. Instances and their support stay, also those without region."""
-        position = {region: new for new, region in enumerate(index.tolist())}
-        merged = [replace(mask, region=position[mask.region]) for mask in self.merged if mask.region in position]
-        ids, scores = self.instance_ids[index], self.match_scores[index]
-        return replace(self, instance_ids=ids, match_scores=scores, merged=_by_region(merged))
+        """The regions at an int64 index, in that order. All instances stay, even those without regions."""
+        merged_of = {mask.region: mask for mask in self.merged}
+        chosen = [(new, merged_of[region]) for new, region in enumerate(index.tolist()) if region in merged_of]
+        return replace(
+            self,
+            instance_ids=self.instance_ids[index],
+            match_scores=self.match_scores[index],
+            merged=tuple(replace(mask, region=new) for new, mask in chosen),
+        )
 
-    def reorder(self, places: Tensor) -> Matching:
-        """Region n becomes region `places[n]`, the inverse of `select`; `places` (D,) is a permutation."""
-        return self.select(places.argsort())
+    def reorder(self, positions: Tensor) -> Matching:
+        """Region n becomes region `positions[n]`, the inverse of `select`; `positions` (D,) is a permutation."""
+        return self.select(positions.argsort())
 
     def relabel(self, numbers: Tensor) -> Matching:
         """Instance k gets the id `numbers[k - 1]`.
 
         Args:
-            numbers: (K,) int64: each of 1, 2, ... once, and any number of -1, which discard the instance: its regions
-                are then matched to nothing, and what merged masks say of it is forgotten.
+            numbers: (K,) int64: 1, 2, ... in any order, each once, and -1 for every instance to discard: its regions
+                become unmatched, and merged masks that involve it are forgotten.
 
         Raises:
-            InputError: the numbers are no such numbers.
+            InputError: any other numbers.
         """
         kept = int((numbers > 0).sum())
         expected = [-1] * (self.num_instances - kept) + list(range(1, kept + 1))
         if sorted(numbers.tolist()) != expected:
-            raise InputError(f"{self.num_instances} instances get the numbers {numbers.tolist()}, expected 1, 2, ...")
+            message = f"{self.num_instances} instances get the numbers {numbers.tolist()}"
+            raise InputError(f"{message}, expected 1, 2, ... once each, or -1")
         lookup = torch.cat((numbers.to(self.instance_ids), self.instance_ids.new_tensor([-1])))
         ids = lookup[torch.where(self.instance_ids > 0, self.instance_ids - 1, len(numbers))]
         support = self.support
@@ -140,10 +145,6 @@ class Matching:
             residual_px=max(residuals) if len(residuals) == len(parts) else None,
             explained=sum(shares) / max(sum(weights), 1) if len(shares) == len(parts) else None,
         )
-
-
-def _by_region(merged: Sequence[MergedMask]) -> tuple[MergedMask, ...]:
-    return tuple(sorted(merged, key=lambda mask: mask.region))
 
 
 def count_sure_views(matching: Matching, view_index: Tensor) -> Tensor:

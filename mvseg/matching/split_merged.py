@@ -1,4 +1,4 @@
-"""Masks over two instances, cut in two."""
+"""Cutting masks that cover two instances in two."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from mvseg.regions import Regions, mask_box, stack_regions
 
 
 def split_merged(regions: Regions, matching: Matching) -> tuple[Regions, Matching, Tensor]:
-    """Cut the masks that cover two instances in two, each part with its own instance.
+    """Cut each mask that covers two instances in two, one part per instance.
 
     Args:
         regions: the D regions that were matched.
         matching: their matching.
 
     Returns:
-        D' >= D regions in the same order, the second part after the first. Their matching, with the match scores of
-        the masks, the support of before, and nothing merged. And (D',) int64, the region that each comes from. A mask
-        of which one part would be empty stays whole.
+        D' >= D regions in the same order, the second part of a mask right after the first. Their matching: both parts
+        keep the mask's match score, the support is unchanged, `merged` is empty. And (D',) int64, the region that each
+        comes from. A mask stays whole if one part would be empty.
     """
     merged = {mask.region: mask for mask in matching.merged}
     source, boxes, crops, ids = [], [], [], []
-    for region, (own, box) in enumerate(zip(matching.instance_ids.tolist(), regions.boxes.tolist(), strict=True)):
+    for region, (own_id, box) in enumerate(zip(matching.instance_ids.tolist(), regions.boxes.tolist(), strict=True)):
         crop = regions.crop(region)
-        parts = [(own, crop)]
+        parts = [(own_id, crop)]
         if region in merged:
             second = merged[region].part.to(crop.device) & crop
-            halves = [(own, crop & ~second), (merged[region].other, second)]
+            halves = [(own_id, crop & ~second), (merged[region].other, second)]
             parts = halves if all(bool(half.any()) for _, half in halves) else parts
         for instance, part in parts:
             x1, y1, x2, y2 = mask_box(part) if len(parts) > 1 else (0, 0, crop.shape[1], crop.shape[0])

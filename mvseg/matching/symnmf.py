@@ -1,8 +1,8 @@
 """Graph clustering by symmetric NMF, and the number of clusters by Eq. 7, as in the paper (Sec. 3.1, 3.4).
 
 The paper does not state the range in which Eq. 7 looks for |k|, and that range decides everything: Eq. 7 is 0 for every
-partition in equal parts, so that k = 1, k = |V| and, where all leaves are seen in all views, any merging into equal
-groups tie with the truth. The default range here is [max_v n_v, 2 max_v n_v], n_v the number of masks in view v: an
+partition into equal parts, so that k = 1, k = |V| and, where all leaves are seen in all views, any merge into equal
+groups all tie with the truth. The default range here is [max_v n_v, 2 max_v n_v], n_v the number of masks in view v: an
 instance has at most one mask per view, so the lower end holds as long as no mask is split.
 """
 
@@ -30,7 +30,7 @@ class Clustering:
     Attributes:
         instance_ids: (D,) int64 in [1, K], or -1 for a region without an edge. Instances are numbered in the order of
             their first region; none is empty.
-        num_clusters: the |k| asked of the factorisation; K is smaller where SymNMF left a cluster empty.
+        num_clusters: the |k| of the factorisation; K is smaller where SymNMF left a cluster empty.
         criterion: {k: value of Eq. 7} for each k that was tried.
     """
 
@@ -54,16 +54,16 @@ def cluster_affinity(
     Args:
         affinity: the graph of D regions.
         num_per_view: (V,) int64, regions in each view; sets the default range.
-        num_instances: k, when it is known (>= 1).
+        num_instances: k, if known (>= 1).
         search_range: smallest and largest k to try, both included; None for [max_v n_v, 2 max_v n_v]. The smallest k
             wins a tie.
-        num_restarts: random starts of each factorisation; the best objective wins.
-        seed: of the starts.
+        num_restarts: random starts per factorisation; the best objective wins.
+        seed: for the starts.
         progress: show a progress bar over k.
 
     Returns:
         The clustering. Regions without an edge are -1 (the paper does not say; an arg max over a row of zeros would put
-        them all into cluster 0). No region or no edge: no cluster.
+        them all into cluster 0). Without regions or edges there are no clusters.
 
     Raises:
         InputError: a k or a range that is not positive and ordered.
@@ -75,22 +75,22 @@ def cluster_affinity(
     if not 1 <= low <= high:
         raise InputError(f"the number of instances is searched in [{low}, {high}], expected 1 <= low <= high")
     W = affinity.to_dense()
-    tied = W.sum(1) > 0
+    is_linked = W.sum(1) > 0
     labels = torch.full((len(W),), -1, dtype=torch.int64, device=W.device)
-    if not tied.any():
+    if not is_linked.any():
         return Clustering(labels, 0, {})
-    tied_W = W[tied][:, tied]
+    linked_W = W[is_linked][:, is_linked]
     candidates: dict[int, Tensor] = {}
     criterion: dict[int, float] = {}
     with tqdm(total=high - low + 1, desc="number of instances", unit="k", disable=not progress or low == high) as bar:
         for ks in torch.arange(low, high + 1).split(KS_AT_ONCE):
-            factors = factorise(tied_W, ks.tolist(), num_restarts=num_restarts, seed=seed)
+            factors = factorise(linked_W, ks.tolist(), num_restarts=num_restarts, seed=seed)
             for k, H in zip(ks.tolist(), factors, strict=True):
                 candidates[k] = H.argmax(1)
                 criterion[k] = size_spread(candidates[k], k)
             bar.update(len(ks))
     best = min(criterion, key=lambda k: (criterion[k], k))
-    labels[tied] = candidates[best]
+    labels[is_linked] = candidates[best]
     ids = number_instances(labels.cpu().numpy()).to(labels.device)
     return Clustering(instance_ids=ids, num_clusters=best, criterion=criterion)
 
@@ -100,7 +100,7 @@ def factorise(
 ) -> list[Tensor]:
     """Symmetric non-negative matrix factorisation W ~ H H^T (Kuang et al. 2012), by multiplicative updates.
 
-    All numbers of columns are factorised together: the columns that a smaller k has too many start at 0, and a
+    All k are factorised together, padded to the widest: the surplus columns of a smaller k start at 0, and a
     multiplicative update keeps them there.
 
     Args:
@@ -108,7 +108,7 @@ def factorise(
         ks: numbers of columns of H; the result for one k does not depend on the others.
         num_restarts: random starts for each k; the H of the smallest |W - H H^T| is returned.
         num_iterations: updates of each start.
-        seed: of the starts; drawn on the CPU, so that every device starts alike.
+        seed: for the starts, which are drawn on the CPU so that they are the same on every device.
 
     Returns:
         For each k an H, (D, k) float32 >= 0; the arg max of a row is the cluster of that node.

@@ -10,20 +10,16 @@ from mvseg.matching.epipolar import Samples, bin_histogram, binned_pairs, dilate
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-LATTICE = 65_536  # at most about this many pixels of an image measure the area of a band
+MAX_PIXELS = 1024  # of a proposal's mask
+LATTICE = 65_536  # pixels of an image that sample the area of a band, at most about this many
 
 
 class EpipolarAssignment(nn.Module):
     """Assigns each proposal to the instance whose epipolar map it resembles most (Eq. 5). Has no parameters.
 
-    Args:
-        max_pixels: masks of more pixels are thinned to a lattice of about this many (see `Regions.pixels`); the masks
-            of Mask R-CNN carry no more detail than 28 x 28.
+    Masks of more than 1024 pixels are thinned (see `Regions.pixels`); those of Mask R-CNN carry no more detail than
+    28 x 28.
     """
-
-    def __init__(self, max_pixels: int = 1024) -> None:
-        super().__init__()
-        self.max_pixels = max_pixels
 
     @torch.no_grad()
     def forward(
@@ -34,7 +30,7 @@ class EpipolarAssignment(nn.Module):
         Args:
             proposals: R masks in V views.
             regions: D regions of the previous iteration.
-            instance_ids: (D,) int64, their ids in [1, K]; -1 = none.
+            instance_ids: (D,) int64, their ids in [1, K]; -1 = matched to nothing.
             cameras: V cameras.
 
         Returns:
@@ -42,11 +38,11 @@ class EpipolarAssignment(nn.Module):
             that similarity.
         """
         similarity = ruzicka_similarity(
-            proposals, regions, instance_ids, cameras=cameras, max_pixels=self.max_pixels
+            proposals, regions, instance_ids, cameras=cameras, max_pixels=MAX_PIXELS
         )
         if not similarity.shape[1]:
-            nothing = torch.zeros(len(proposals), device=proposals.device)
-            return torch.full_like(proposals.view_index, -1), nothing
+            zeros = torch.zeros(len(proposals), device=proposals.device)
+            return torch.full_like(proposals.view_index, -1), zeros
         best, column = similarity.max(1)
         return torch.where(best > 0, column + 1, -1), best
 
@@ -74,9 +70,12 @@ def ruzicka_similarity(
     Returns:
         (R, K) float32 in [0, 1], the first column for id 1; 0 where an instance has no region in another view: those of
         the proposal's own view have no band there, and do not count in Eq. 4 (the paper does not say).
+
+    Raises:
+        InputError: the ids are not one per region.
     """
     if instance_ids.shape != regions.view_index.shape:
-        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected one per region")
     cameras = cameras.to(regions.device)
     num_clusters = max(int(instance_ids.max()), 0) if len(instance_ids) else 0
     clustered = regions.select(instance_ids > 0)
@@ -100,13 +99,13 @@ def ruzicka_similarity(
             image = bin_histogram(pair.bins, pair.pencil.angles(1 - side, images[target].xy), images[target])
             on_image[target] += (image @ bands.T)[0]
     count = count.clamp(min=1)
-    smallest = on_mask / count[proposals.view_index]
-    largest = (on_image / count)[proposals.view_index] + proposals.areas[:, None] - smallest
-    return smallest / largest.clamp(min=1e-12)
+    sum_min = on_mask / count[proposals.view_index]
+    sum_max = (on_image / count)[proposals.view_index] + proposals.areas[:, None] - sum_min
+    return sum_min / sum_max.clamp(min=1e-12)
 
 
 def _concatenate(first: Samples, second: Samples) -> Samples:
-    """The regions of both sets, first and then second, in one."""
+    """The regions of both sets in one, those of `first` first."""
     return Samples(
         xy=torch.cat((first.xy, second.xy)),
         owner=torch.cat((first.owner, second.owner + first.num_regions)),

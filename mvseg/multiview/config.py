@@ -1,4 +1,4 @@
-"""How instances are found in photos. The fields are keys of the YAML files and of the command line."""
+"""How instances are found in photos. The fields are keys in YAML files and options on the command line."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ class DetectConfig:
 
     Attributes:
         weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
-        min_score: detections that score less are dropped; in [0, 1]. A score is how sure the detector is that it sees a
-            leaf, times the IoU that its mask is expected to have.
-        image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to what the
-            weights say, smaller ones stay as they are.
-        num_iterations: of assignment to epipolar maps and NMS; 0 matches what plain NMS keeps, and no more.
+        min_score: detections that score less are discarded; in [0, 1]. The score is the detector's confidence that it
+            sees a leaf, times the expected IoU of its mask.
+        image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the
+            size given with the weights, smaller ones stay as they are.
+        num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
     """
 
     weights: str = "leaf-slim"

@@ -1,4 +1,4 @@
-"""Match, assign, suppress, and again (Sec. 3.2)."""
+"""Match, assign, suppress, repeat (Sec. 3.2)."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def match_proposals(
     detections_per_view: int = 100,
     match: MatchConfig = MatchConfig(),
 ) -> tuple[Tensor, Matching]:
-    """Match first, alternate assignment and NMS, and ask the other views (steps 2 to 4 of `MultiViewMaskRCNN`).
+    """Match first, alternate assignment and NMS, then discard unconfirmed boxes (steps 2 to 4 of `MultiViewMaskRCNN`).
 
     Args:
         proposals: the excessive set of all V views.
         cameras: V cameras on the same device.
-        num_iterations: of assignment and NMS.
+        num_iterations: rounds of assignment and NMS.
         cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
-        detections_per_view: the best scores stay.
+        detections_per_view: at most this many are kept in a view, best scores first.
         match: how regions are matched.
 
     Returns:
@@ -85,22 +85,22 @@ def _match_classes(
 ) -> tuple[Matching, dict[int, int]]:
     """Match proposals class by class; instances of different classes get different ids.
 
-    `num_instances` holds the numbers of instances of some classes, by class; the others are looked for. Returns the
-    matching and the numbers that it found.
+    `num_instances` maps classes to their numbers of instances; those of the other classes are estimated. Returns the
+    matching and the number of instances of each class.
     """
-    parts, places, counts = [], [], {}
-    for number in proposals.classes.unique().tolist():
-        members = (proposals.classes == number).nonzero()[:, 0]
-        config = replace(match, num_instances=num_instances.get(number) or match.num_instances)
+    parts, indices, counts = [], [], {}
+    for label in proposals.classes.unique().tolist():
+        members = (proposals.classes == label).nonzero()[:, 0]
+        config = replace(match, num_instances=num_instances.get(label) or match.num_instances)
         parts.append(match_regions(proposals.regions.select(members), cameras, config))
-        places.append(members)
-        counts[number] = parts[-1].num_instances
+        indices.append(members)
+        counts[label] = parts[-1].num_instances
     if not parts:
-        nothing = torch.zeros(0, device=proposals.regions.device)
+        zeros = torch.zeros(0, device=proposals.regions.device)
         empty = Matching(
-            instance_ids=nothing.long(), match_scores=nothing, num_instances=0, method=match.resolved_method
+            instance_ids=zeros.long(), match_scores=zeros, num_instances=0, method=match.resolved_method
         )
         return empty, counts
-    joined = Matching.concatenate(parts).reorder(torch.cat(places))
+    joined = Matching.concatenate(parts).reorder(torch.cat(indices))
     methods = {part.method for part in parts}
     return (joined if len(methods) == 1 else replace(joined, method=match.resolved_method)), counts

@@ -19,7 +19,7 @@ from mvseg.scene import Cameras
 
 
 class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
-    """Wraps any torchvision Mask R-CNN; same modules, same state dict, and ids across views when told the cameras.
+    """Wraps any torchvision Mask R-CNN: same modules, same state dict, and ids across views when given the cameras.
 
     In train mode, and in eval mode without cameras, it is the detector it wraps. With cameras, in eval mode:
 
@@ -27,27 +27,27 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        0.7): an excessive set of masks. Each mask is cut where its expected IoU is largest, and its score multiplied by
        that (`mvseg.detectors.mask_cut`); what then scores less than the detector's `roi_heads.score_thresh` is
        discarded.
-    2. Match first: what plain NMS at `cluster_iou` keeps of it is matched across views. Things of different classes
-       are never matched.
+    2. Match first: what plain NMS at `cluster_iou` keeps of it is matched across views. Objects of different
+       classes are never matched.
     3. Alternate `num_iterations` times: every mask of the excessive set takes the id of the instance whose epipolar map
        it resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each instance; match the
        survivors again. Masks that resemble no map form one more group.
-    4. Where match scores are probabilities (`match` names no other method than "nview"): a box that overlaps a better
-       one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
+    4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
+       better one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
 
-    Departures from the paper: it matches the excessive set itself at first, and estimates |k| anew each time; here,
-    where `match` names "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the number of
-    masks per view, from which the search range of |k| follows; that splits leaves, and the pieces then shelter
-    duplicates from NMS. The other methods of matching need no |k|.
+    Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
+    here, where `match` selects "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the
+    number of masks per view, from which the search range of |k| follows; that splits leaves, and the pieces then
+    shelter duplicates from NMS. The other methods of matching need no |k|.
 
     Args:
         detector: a torchvision Mask R-CNN (any builder, any backbone, or `MaskRCNN` itself). Its modules are shared,
             not copied.
-        num_iterations: of assignment and NMS; 0 only matches what the detector finds.
+        num_iterations: rounds of assignment and NMS; 0 only matches what plain NMS keeps.
         proposal_iou: NMS threshold of the excessive set.
         cluster_iou: NMS threshold inside a cluster, and of the set that is matched first.
-        proposals_per_view: size of the excessive set; the best scores stay.
-        match: how regions are matched; a given number of instances holds for each class.
+        proposals_per_view: size of the excessive set; the best scores are kept.
+        match: how regions are matched; a given number of instances applies to each class.
 
     Raises:
         InputError: the detector has no mask head.
@@ -88,25 +88,25 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             cameras: the V undistorted cameras of the images; ignored in train mode.
 
         Returns:
-            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`, which
-            are to be cut at 0.5; with cameras also `instance_ids` (int64, the same number for the same instance in
-            every view, -1 = matched to nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
+            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`
+            (probabilities, to be cut at 0.5); with cameras also `instance_ids` (int64, the same number for the same
+            instance in every view, -1 = matched to nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
 
         Raises:
-            InputError: two or more images are expected, as many cameras, and the cameras' sizes.
+            InputError: fewer than two images, not one camera per image, or an image of another size than its camera.
         """
         if self.training or cameras is None:
             return super().forward(images, targets)
         sizes = [[image.shape[-1], image.shape[-2]] for image in images]
         _check_cameras(cameras, sizes)
         with torch.no_grad():
-            found = [self._propose(image) for image in images]
-        # Counts of pixels need single precision, too.
+            detections = [self._propose(image) for image in images]
+        # Pixel counts need single precision.
         with torch.no_grad(), torch.autocast(images[0].device.type, enabled=False):
-            proposals = gather_proposals(found, sizes)
+            proposals = gather_proposals(detections, sizes)
             keep, matching = self._match(proposals, cameras.to(images[0].device))
             views = proposals.regions.view_index[keep]
-            return self._collect(found, sizes, keep=keep, views=views, matching=matching)
+            return self._collect(detections, sizes, keep=keep, views=views, matching=matching)
 
     @torch.no_grad()
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> tuple[Proposals, Matching]:
@@ -122,13 +122,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         Raises:
             InputError: as `forward`.
         """
-        found, sizes = [], []
+        detections, sizes = [], []
         for image in images:
-            found.append({key: value.cpu() for key, value in self._propose(image).items()})
+            detections.append({key: value.cpu() for key, value in self._propose(image).items()})
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
         with torch.autocast("cpu", enabled=False):
-            proposals = gather_proposals(found, sizes)
+            proposals = gather_proposals(detections, sizes)
             keep, matching = self._match(proposals, cameras.to("cpu"))
         order = proposals.regions.view_index[keep].argsort(stable=True)
         kept = proposals.select(keep[order])
@@ -148,23 +148,23 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         return solid[keep], matching
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
-        """One view's excessive set, as `run_heads`; what scores too little once its mask is decided is discarded."""
-        found = run_heads(self, image, nms_thresh=self.proposal_iou, detections_per_img=self.proposals_per_view)
-        frame, is_good = found.pop("frame"), found["scores"] >= self.roi_heads.score_thresh
-        return {key: value[is_good] for key, value in found.items()} | {"frame": frame}
+        """One view's excessive set, as from `run_heads`, without masks that score too low once they are cut."""
+        detections = run_heads(self, image, nms_thresh=self.proposal_iou, detections_per_img=self.proposals_per_view)
+        frame, is_good = detections.pop("frame"), detections["scores"] >= self.roi_heads.score_thresh
+        return {key: value[is_good] for key, value in detections.items()} | {"frame": frame}
 
     def _collect(
         self,
-        found: list[dict[str, Tensor]],
+        detections: list[dict[str, Tensor]],
         sizes: list[list[int]],
         *,
         keep: Tensor,
         views: Tensor,
         matching: Matching,
     ) -> list[dict[str, Tensor]]:
-        """torchvision's result dicts of the kept proposals, with their ids; `views` (S,) says where each is."""
+        """torchvision's result dicts of the kept proposals, with their ids; `views` (S,) is the view of each."""
         results, start = [], 0
-        for view, (proposals, (width, height)) in enumerate(zip(found, sizes, strict=True)):
+        for view, (proposals, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
             is_here = views == view
             kept = {key: proposals[key][keep[is_here] - start] for key in ("boxes", "labels", "scores", "masks")}
             frame_width, frame_height = proposals["frame"].tolist()
@@ -179,7 +179,7 @@ def _check_cameras(cameras: Cameras, sizes: list[list[int]]) -> None:
     if not isinstance(cameras, Cameras):
         raise InputError(f"cameras is a {type(cameras).__name__}, expected Cameras (of a scene: scene.cameras)")
     if len(sizes) < 2 or len(sizes) != len(cameras):
-        raise InputError(f"{len(sizes)} images with {len(cameras)} cameras, expected as many, two or more")
+        raise InputError(f"{len(sizes)} images with {len(cameras)} cameras, expected one per image, two or more")
     for view, (size, expected) in enumerate(zip(sizes, cameras.sizes.tolist(), strict=True)):
         if size != expected:
             raise InputError(f"image {view} is {size[0]} x {size[1]}, its camera says {expected[0]} x {expected[1]}")

@@ -7,12 +7,13 @@ import torchvision
 from torch import Tensor
 
 from mvseg.errors import InputError
+from mvseg.matching.result import SURE
 
 
 def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float = 0.3) -> Tensor:
     """Non-maximum suppression in which boxes of different groups never suppress each other.
 
-    Takes its arguments as `torchvision.ops.batched_nms` does.
+    The arguments are those of `torchvision.ops.batched_nms`.
 
     Args:
         boxes: (R, 4) xyxy.
@@ -27,11 +28,11 @@ def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_thresho
         InputError: R differs between the arguments.
     """
     if not len(boxes) == len(scores) == len(groups):
-        raise InputError(f"{len(boxes)} boxes with {len(scores)} scores and {len(groups)} groups")
+        raise InputError(f"{len(boxes)} boxes with {len(scores)} scores and {len(groups)} groups, expected as many")
     if not len(boxes):
         return torch.zeros(0, dtype=torch.int64, device=boxes.device)
     _, group = groups.reshape(len(groups), -1).unique(dim=0, return_inverse=True)
-    # batched_nms moves the groups apart by adding to the coordinates: in float32 a thousand groups blur the boxes.
+    # batched_nms separates groups by offsets to the coordinates: in float32 a thousand groups would blur the boxes.
     return torchvision.ops.batched_nms(boxes.double(), scores.double(), group, iou_threshold)
 
 
@@ -42,9 +43,9 @@ def confirmed(
     *,
     match_scores: Tensor,
     iou_threshold: float = 0.3,
-    min_score: float = 0.5,
 ) -> Tensor:
-    """Which boxes stay: those that no better box overlaps, and those that the other views confirm as another instance.
+    """Which boxes stay: those that no better box overlaps, and those that the other views confirm as another instance,
+    by another id with a match score of at least 0.5.
 
     Cluster-aware NMS keeps a duplicate as well as a half-hidden leaf when it takes another cluster than the better box.
     Only the half-hidden leaf finds its match in the other views. Not in the paper.
@@ -55,7 +56,6 @@ def confirmed(
         instance_ids: (S,) int64, -1 = matched to nothing.
         match_scores: (S,) probabilities that the ids are right.
         iou_threshold: an IoU above this is an overlap.
-        min_score: least match score of a box that overlaps a better one; its id must also differ from that one's.
 
     Returns:
         (S,) bool. A discarded box does not count as a better one for the rest.
@@ -64,9 +64,9 @@ def confirmed(
         return torch.ones(0, dtype=torch.bool, device=boxes.device)
     _, group = groups.unique(dim=0, return_inverse=True)
     overlaps = (torchvision.ops.box_iou(boxes, boxes) > iou_threshold) & (group[:, None] == group)
-    other = (instance_ids[:, None] != instance_ids) & ((instance_ids > 0) & (match_scores >= min_score))[:, None]
-    refuses = (overlaps & ~other).tril(-1)
+    is_other = (instance_ids[:, None] != instance_ids) & ((instance_ids > 0) & (match_scores >= SURE))[:, None]
+    rejects = (overlaps & ~is_other).tril(-1)
     stays = torch.ones(len(boxes), dtype=torch.bool, device=boxes.device)
-    for box in refuses.any(1).nonzero()[:, 0].tolist():
-        stays[box] = not bool((refuses[box] & stays).any())
+    for box in rejects.any(1).nonzero()[:, 0].tolist():
+        stays[box] = not bool((rejects[box] & stays).any())
     return stays

@@ -1,4 +1,4 @@
-"""The proposals of all views in one frame each, as regions."""
+"""The proposals of all views as regions, each in the frame of its image."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from mvseg.regions import Regions, stack_regions
 
 @dataclass(frozen=True, eq=False)
 class Proposals:
-    """R scored masks of V views, many of them of the same thing.
+    """R scored masks of V views, many of them of the same object.
 
     Attributes:
         regions: the R masks as box crops, in the frame of the images.
         boxes: (R, 4) float32 xyxy in the frame of the images; what NMS compares.
         scores: (R,) float32.
-        classes: (R,) int64; things of different classes are never matched.
+        classes: (R,) int64; objects of different classes are never matched.
     """
 
     regions: Regions
@@ -39,22 +39,22 @@ class Proposals:
         )
 
 
-def gather_proposals(found: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:
+def gather_proposals(detections: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:
     """Proposals of all views, moved to the frame of the images; masks become box crops, never full frames.
 
     Args:
-        found: per view `boxes` (R_v, 4), `scores`, `labels`, `masks` (R_v, 1, S, S) probabilities, and `frame`, the
-            width and height that the boxes refer to.
+        detections: per view `boxes` (R_v, 4), `scores`, `labels`, `masks` (R_v, 1, S, S) probabilities, and `frame`,
+            the width and height that the boxes refer to.
         sizes: per view the width and height of the image.
 
     Returns:
-        The proposals, view after view. The crops hold the very pixels that torchvision pastes, where they exceed 0.5.
+        The proposals, view after view. The crops are what torchvision pastes, exactly, where it exceeds 0.5.
     """
     boxes, view_index, windows, crops = [], [], [], []
-    for view, (detections, (width, height)) in enumerate(zip(found, sizes, strict=True)):
-        frame_width, frame_height = detections["frame"].tolist()
-        scaled = resize_boxes(detections["boxes"], [frame_height, frame_width], [height, width])
-        masks, scale = expand_masks(detections["masks"], padding=1)
+    for view, (shown, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
+        frame_width, frame_height = shown["frame"].tolist()
+        scaled = resize_boxes(shown["boxes"], [frame_height, frame_width], [height, width])
+        masks, scale = expand_masks(shown["masks"], padding=1)
         for mask, pasted in zip(masks[:, 0], expand_boxes(scaled, scale).to(torch.int64), strict=True):
             x1, y1 = pasted[:2].clamp(min=0).tolist()
             x2, y2 = min(int(pasted[2]) + 1, width), min(int(pasted[3]) + 1, height)
@@ -66,5 +66,5 @@ def gather_proposals(found: list[dict[str, Tensor]], sizes: list[list[int]]) -> 
     device = boxes[0].device
     parts = [crop.cpu() for crop in crops]
     regions = stack_regions(view_index, windows, parts, labels=range(len(crops)), num_views=len(sizes)).to(device)
-    scores, classes = (torch.cat([detections[key] for detections in found]) for key in ("scores", "labels"))
+    scores, classes = (torch.cat([shown[key] for shown in detections]) for key in ("scores", "labels"))
     return Proposals(regions=regions, boxes=torch.cat(boxes), scores=scores, classes=classes)

@@ -1,4 +1,4 @@
-"""How instances become voxels. The fields are keys of the YAML files and of the command line."""
+"""How instances become voxels. The fields are keys in YAML files and options on the command line."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class ReconstructConfig:
             another instance may hide the voxel does not count; what has no mask (stems, missed leaves) hides nothing.
             In [0, 1); 0 is the paper's rule, which leaves thin instances thick.
         voxel_size: edge of a voxel in the scene's unit; null to derive it from the budget.
-        voxel_budget: voxels in an instance's bounding box when no size is given.
+        voxel_budget: number of voxels in an instance's bounding box when no size is given.
     """
 
     threshold: float = 0.5

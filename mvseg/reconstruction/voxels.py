@@ -1,4 +1,4 @@
-"""Back-projection of each instance into voxels (Eq. 6), and from voxels to points and a mesh."""
+"""Back-projection of each instance into voxels (Eq. 6), and their points and mesh."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 SEARCH_CELLS = 24  # cells along the bounding box of an instance when the search for it ends
-MAX_CELLS = 100_000  # or when it holds this many
+MAX_CELLS = 100_000  # or how many cells there are by then
 MAX_VOXELS = 200_000_000
 
 
@@ -81,24 +81,24 @@ def reconstruct_instances(
 ) -> dict[int, VoxelGrid]:
     """Back-project every instance that is seen in at least two views.
 
-    Departs from the paper by `config.seen_share`, which brings shapes nearer to the true leaves (docs/benchmarks.md).
+    Departs from the paper by `config.seen_share`, which brings shapes closer to the true leaves (docs/benchmarks.md).
 
     Args:
         regions: D regions.
-        instance_ids: (D,) int64, from 1 on; -1 = no instance.
+        instance_ids: (D,) int64, from 1 on; -1 = matched to nothing.
         cameras: V cameras.
-        config: how.
+        config: thresholds and voxel size.
         progress: show a progress bar over the instances.
 
     Returns:
         {instance id: grid}. Instances seen in one view only are left out: they have no bounded shape. So are, with an
-        InputWarning, those in which no point has enough votes.
+        InputWarning, those in which no voxel has enough votes.
 
     Raises:
-        InputError: as many ids as regions are expected; see also `back_project`.
+        InputError: the ids are not one per region; see also `back_project`.
     """
     if instance_ids.shape != regions.view_index.shape:
-        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected one per region")
     shapes, free = {}, None
     if config.seen_share > 0:
         ones = torch.ones_like(instance_ids)
@@ -122,7 +122,7 @@ def back_project(
     config: ReconstructConfig = ReconstructConfig(),
     free: list[Tensor] | None = None,
 ) -> VoxelGrid | None:
-    """The voxels of one instance from all of its masks (Eq. 6), in a bounding box of its own.
+    """The voxels of one instance from all of its masks (Eq. 6), in its own bounding box.
 
     Departures from the paper: several masks of one view (pieces of a split mask) vote as one, their union; a voxel
     needs *more* than the threshold, so that of two views both must agree. Voxels behind a camera or outside its image
@@ -137,7 +137,7 @@ def back_project(
 
     Returns:
         The grid, or None for an instance seen in fewer than two views or without a common point. Warns (InputWarning)
-        when the common part has no bounds, as with views that are nearly parallel, and had to be cut off.
+        when the common part is unbounded, as with nearly parallel views, and had to be cut off.
 
     Raises:
         InputError: a voxel size that asks for more than 2e8 voxels.
@@ -158,8 +158,8 @@ def back_project(
         asked = int((last - first).prod())
         raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {MAX_VOXELS}")
     axes = [(first[a] + 0.5 + torch.arange(int(shape[a])).to(low)) * size for a in range(3)]
-    around = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
-    votes = _share_of_masks(masks, axes, free=around, seen_share=config.seen_share)
+    free_maps = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
+    votes = _share_of_masks(masks, axes, free=free_maps, seen_share=config.seen_share)
     return VoxelGrid(
         origin=first * size, voxel_size=size, votes=votes, num_views=len(masks), threshold=config.threshold
     )
@@ -209,9 +209,10 @@ class _ViewMask:
         return self.look_up(axes, self.mask, self.corner)
 
     def look_up(self, axes: list[Tensor], mask: Tensor, corner: tuple[int, int]) -> Tensor:
-        """(X, Y, Z) bool: the same for any crop (h, w) of this view, with its top-left pixel at x, y.
+        """(X, Y, Z) bool: the same for any mask (h, w) of this view whose top-left pixel is `corner` (x, y).
 
-        Computed about the first point, so that float32 keeps a thousandth of a pixel however far the world's origin is.
+        Computed relative to the first point, so that float32 is exact to a thousandth of a pixel wherever the world's
+        origin is.
         """
         first = torch.stack([axis[0] for axis in axes])
         offset = (self.px_from_world[:, :3] @ first + self.px_from_world[:, 3]).float()
@@ -221,7 +222,7 @@ class _ViewMask:
         u, v, depth = (row[0] * x + row[1] * y + (row[2] * z + start) for row, start in zip(rows, offset, strict=True))
         scale = 1 / depth.clamp(min=1e-12)
         height, width = mask.shape
-        # One free pixel around the crop receives everything that falls outside.
+        # A border of one False pixel receives everything that falls outside.
         framed = torch.nn.functional.pad(mask, (1, 1, 1, 1)).flatten()
         column = (u * scale - (corner[0] - 1)).clamp(0, width + 1).long()
         row = (v * scale - (corner[1] - 1)).clamp(0, height + 1).long()
@@ -230,7 +231,7 @@ class _ViewMask:
     def may_meet(self, points: Tensor, reach: float) -> Tensor:
         """(P,) bool: can the mask meet the projection of a ball of radius `reach` about each (P, 3) point?
 
-        The projection is replaced by a square of pixels that contains it, so the answer errs only towards yes.
+        The projection is replaced by a square of pixels that contains it, so the answer errs only towards True.
         """
         u, v, depth = (points @ self.px_from_world[:, :3].T + self.px_from_world[:, 3]).unbind(1)
         distance = torch.linalg.vector_norm(points - self.center, dim=1)
@@ -268,8 +269,8 @@ def _share_of_masks(
         share = votes / len(masks)
         if free is not None:
             empty = torch.zeros_like(votes)
-            for mask, around in zip(masks, free, strict=True):
-                empty += mask.look_up(part, around, (0, 0))
+            for mask, free_map in zip(masks, free, strict=True):
+                empty += mask.look_up(part, free_map, (0, 0))
             share = share.where(votes > seen_share * (votes + empty) + 1e-6, 0)
         parts.append(share)
     return torch.cat(parts)
@@ -280,8 +281,8 @@ def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Ten
 
     A cube about the point nearest to all centroid rays, twice as far as the farthest camera, is halved again and again;
     cells in which no point can exceed the threshold are discarded, until the box of the rest is `SEARCH_CELLS` cells
-    long and hardly shrinks any more. Cells are judged by balls about them, so nothing is lost, however thin. None when
-    no cell is left. Masks of nearly parallel views may have no bounded common part: it is cut off at the cube.
+    long and hardly shrinks any more. Cells are judged by the balls around them, so nothing is lost, however thin. None
+    when no cell is left. Masks of nearly parallel views may have no bounded common part: it is cut off at the cube.
     """
     centers, rays = torch.stack([m.center for m in masks]), torch.stack([m.ray for m in masks])
     across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
@@ -301,6 +302,6 @@ def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Ten
         low, high = cells.amin(0) - half, cells.amax(0) + half
         shrinks = bool((high - low).prod() < 0.8 * before)
     if (low - half < root_low).any() or (high + half > root_high).any():
-        message = f"the {len(masks)} masks of an instance have no bounded common part (the views are too alike)"
+        message = f"the {len(masks)} masks of an instance have no bounded common part (the views are too similar)"
         warnings.warn(f"{message}: its shape is cut off", InputWarning, stacklevel=4)
     return low, high

@@ -1,1 +1,1 @@
-"""What a person looks at."""
+"""The result folder: what a person looks at."""

@@ -1,4 +1,4 @@
-"""An earlier result in the place of a new one: only what mvseg wrote there, and nobody changed, is replaced.
+"""Replacing an earlier result: only files that mvseg wrote, and nobody changed since, are replaced.
 
 A result's run.json lists the files that were written with it and their SHA-256. Everything else in the folder belongs
 to the user (notes, the metrics.json of `mvseg eval`) and moves on into the new result.
@@ -18,23 +18,23 @@ RUN_FILE = "run.json"
 
 
 def check_out(out: Path) -> None:
-    """Is this a place for a result?
+    """Check that a result can be written to `out`.
 
     Raises:
         InputError: `out` is a file, lies where nothing can be written, or is a folder that is neither empty nor an
             earlier result, or an earlier result in which a file was changed.
     """
-    place = out.resolve()
+    resolved = out.resolve()
     if out.is_dir():
-        if not os.access(place, os.R_OK):
-            raise InputError(f"{out}: cannot be read, expected a new or an empty folder, or an earlier result")
-        if any(place.iterdir()):
+        if not os.access(resolved, os.R_OK):
+            raise InputError(f"{out}: cannot be read, expected a new or empty folder, or an earlier result")
+        if any(resolved.iterdir()):
             _check_unchanged(out, _read_listed(out))
-    elif out.exists() or any(parent.is_file() for parent in place.parents):
-        raise InputError(f"{out}: the output folder is not writable (a file is in its place)")
-    nearest = next((parent for parent in place.parents if parent.exists()), place)
+    elif out.exists() or any(parent.is_file() for parent in resolved.parents):
+        raise InputError(f"{out}: the output folder is not writable (a file is in the way)")
+    nearest = next((parent for parent in resolved.parents if parent.exists()), resolved)
     if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"{out}: the output folder is not writable (no right to write in {nearest})")
+        raise InputError(f"{out}: the output folder is not writable (no permission to write in {nearest})")
 
 
 def list_files(folder: Path) -> dict[str, str]:
@@ -52,7 +52,7 @@ def keep_user_files(out: Path, folder: Path) -> None:
         return
     for name in sorted(_names_below(out) - _read_listed(out).keys() - {RUN_FILE}):
         if os.path.lexists(folder / name):
-            message = "is not from mvseg, but the new result has a file of this name: move it away"
+            message = "was not written by mvseg, but the new result has a file of this name: move it away"
             raise InputError(f"{out / name}: {message}")
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         shutil.copy2(out / name, folder / name, follow_symlinks=False)
@@ -69,7 +69,7 @@ def _read_listed(out: Path) -> dict[str, str]:
         files = json.loads((out / RUN_FILE).read_text(encoding="utf-8"))["files"]
         return {str(name): str(sha256) for name, sha256 in files.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # no run.json, or another program's
-        message = "holds files that are no earlier result, expected a new or an empty folder"
+        message = "holds files that are not an earlier result, expected a new or empty folder"
         raise InputError(f"{out}: {message}") from None
 
 
@@ -77,4 +77,4 @@ def _check_unchanged(out: Path, listed: dict[str, str]) -> None:
     for name, sha256 in listed.items():
         path = out / name
         if path.is_file() and hash_files(path) != sha256:
-            raise InputError(f"{path}: was changed after mvseg wrote it: move it away, or choose another --out")
+            raise InputError(f"{path}: was changed after mvseg wrote it, move it away, or choose another --out")

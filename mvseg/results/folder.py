@@ -29,20 +29,20 @@ from mvseg.results.result import Result
 
 
 def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False) -> None:
-    """Write a result folder; an earlier result at the same place is replaced, what the user put there stays.
+    """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
-    The folder appears complete or not at all: it is written beside its place and moved there at the end; until then an
-    earlier result stays. The overlays are drawn on the photos, or on grey when the scene has none at all.
+    The folder appears complete or not at all: it is written next to `out` and moved there at the end; until then an
+    earlier result stays. The overlays are drawn on the photos, or on grey when the scene has none.
 
     Args:
         result: the result.
         out: the folder.
-        run: what goes to run.json, beside the timings and counts: version, config, inputs, warnings.
+        run: what goes into run.json besides timings and counts: version, config, inputs, warnings.
         progress: show a progress bar over the views.
 
     Raises:
-        InputError: the place cannot be written or holds something that is no result (see `check_out`), or a photo is
-            broken or, when others are there, missing.
+        InputError: `out` cannot be written or holds something that is not a result (see `check_out`), or a photo is
+            broken, or missing while others exist.
     """
     check_out(out)
     try:
@@ -53,9 +53,9 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
                 _write_shapes(result, folder)
             counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
             seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
-            how = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
-            more = {"counts": counts, "seconds": seconds, "files": list_files(folder)}
-            text = json.dumps(run | how | more, indent=1, default=str)
+            matched = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
+            written = {"counts": counts, "seconds": seconds, "files": list_files(folder)}
+            text = json.dumps(run | matched | written, indent=1, default=str)
             (folder / RUN_FILE).write_text(text + "\n", encoding="utf-8")
             keep_user_files(out, folder)
     except OSError as error:
@@ -97,7 +97,7 @@ def _write_instances(result: Result, folder: Path) -> None:
 
 
 def _annotate(result: Result, region: int) -> dict[str, Any]:
-    """The entry of one region in instances.json, but for what COCO itself asks for."""
+    """The entry of one region in instances.json, without what COCO itself requires."""
     view = int(result.regions.view_index[region])
     width, height = result.scene.cameras.sizes[view].tolist()
     mask = result.regions.mask(region, width, height).cpu().numpy().astype(np.uint8)
@@ -140,7 +140,7 @@ def _write_shapes(result: Result, folder: Path) -> None:
 
 
 def _shape_traits(grid: VoxelGrid) -> dict[str, str]:
-    """Volume in cubed, corners of the bounding box in world units."""
+    """Volume in cubed world units, and the corners of the bounding box in world units."""
     points, half = grid.points, grid.voxel_size / 2
     low, high = points.amin(0) - half, points.amax(0) + half
     corners = [*zip(("x_min", "y_min", "z_min"), low.tolist(), strict=True)]

@@ -33,8 +33,8 @@ def draw_overlay(photo: np.ndarray, regions: Regions, matching: Matching, *, vie
     Args:
         photo: (H, W, 3) uint8 RGB, undistorted.
         regions: D regions.
-        matching: of the regions. One that is matched to nothing is grey and has no number; the number of one whose
-            match score is below 0.5 gets a question mark.
+        matching: of the regions. Unmatched regions are grey and have no number; numbers get a question mark where the
+            match score is below 0.5.
         view: index of the view.
 
     Returns:
@@ -56,7 +56,7 @@ def draw_overlay(photo: np.ndarray, regions: Regions, matching: Matching, *, vie
         outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(painted, outlines, -1, color, max(1, round(max(size) / 600)))
         if instance > 0 and mask.any():
-            # The number goes to the thickest place of the mask, which is always inside it.
+            # The number goes where the mask is thickest, which is always inside it.
             depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
             row, column = np.unravel_index(depth.argmax(), depth.shape)
             doubt = "?" if matching.match_scores[index] < SURE else ""

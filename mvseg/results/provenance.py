@@ -1,4 +1,4 @@
-"""Where a result comes from: what goes to run.json."""
+"""Where a result comes from, for run.json."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ def describe_run(
     """Version, inputs with their SHA-256, resolved options, warnings.
 
     Args:
-        result: of the run.
-        masks: the masks that were given; None for a result of a detector, whose weights are hashed instead.
+        result: what the run produced.
+        masks: the masks that were given; None where a detector found them: its weights are hashed instead.
         config: of the run; options of stages that did not run are left out.
         messages: the warnings of the run.
     """

@@ -1,4 +1,4 @@
-"""A result folder read back, with the true ids of its regions."""
+"""Reading a result folder back, with the true ids of its regions."""
 
 from __future__ import annotations
 

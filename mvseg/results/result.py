@@ -22,7 +22,7 @@ class Result:
         matching: their ids.
         shapes: {instance id: voxels}; None when only ids were asked for.
         seconds: {stage: wall time}.
-        detection_scores: (D,) float32, how sure a detector was of each mask; None when the masks were given.
+        detection_scores: (D,) float32, the detector's score of each mask; None when the masks were given.
     """
 
     scene: Scene

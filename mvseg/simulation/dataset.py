@@ -151,7 +151,7 @@ def claim_folder(folder: Path, *, recipe: str) -> None:
     """Make the folder of a data set, or go on with the one that is there, minus what a killed run left unfinished."""
     made_from = folder / "dataset.json"
     if folder.is_dir() and not made_from.is_file() and not all(is_partial(path) for path in folder.iterdir()):
-        raise InputError(f"{folder}: holds files that are no data set, expected a new or an empty folder")
+        raise InputError(f"{folder}: holds files that are not a data set, expected a new or empty folder")
     if made_from.exists() and made_from.read_text(encoding="utf-8") != recipe:
         raise InputError(f"{folder} holds a data set of another preset or seed, expected an empty folder")
     folder.mkdir(parents=True, exist_ok=True)

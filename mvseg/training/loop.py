@@ -118,7 +118,7 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
     """
     names = {path.name for path in config.output.glob("*") if not is_partial(path)}
     if names and not names & {"config.yaml", "broken_samples.txt"}:
-        raise InputError(f"{config.output}: holds files that no training run wrote, expected a new or an empty folder")
+        raise InputError(f"{config.output}: holds files that no training run wrote, expected a new or empty folder")
     samples, held_out = list_samples(config.photos, config.labels), None
     if config.val_photos is not None and config.val_labels is not None:
         held_out = list_samples(config.val_photos, config.val_labels)

@@ -44,15 +44,15 @@ def test_agrees_with_drawn_lines_better_than_two_samplings_do(two_views: tuple[R
 def test_random_points_agree_with_all_points(two_views: tuple[Regions, Scene]) -> None:
     regions, scene = two_views
     everything = region_affinity(regions, scene.cameras).to_dense()
-    one = region_affinity(regions, scene.cameras, num_points=200, seed=1).to_dense()
+    first = region_affinity(regions, scene.cameras, num_points=200, seed=1).to_dense()
     again = region_affinity(regions, scene.cameras, num_points=200, seed=1).to_dense()
     other = region_affinity(regions, scene.cameras, num_points=200, seed=2).to_dense()
-    assert torch.equal(one, again)
-    assert not torch.equal(one, other)
-    assert (one - everything).abs().mean() < 0.01
+    assert torch.equal(first, again)
+    assert not torch.equal(first, other)
+    assert (first - everything).abs().mean() < 0.01
 
 
-def test_dense_form_is_symmetric_and_ties_different_views_only() -> None:
+def test_dense_form_is_symmetric_with_edges_between_views_only() -> None:
     scene = ball_scene(8, 4)
     affinity = region_affinity(scene.regions, scene.cameras)
     W = affinity.to_dense()
@@ -85,7 +85,7 @@ def test_views_and_regions_may_come_in_any_order() -> None:
     first = {(v, n): d for d, (v, n) in enumerate(_keys(scene.regions))}
     index = torch.tensor([first[(order[v], n)] for v, n in _keys(turned.regions)])
     W_turned = region_affinity(turned.regions, turned.cameras).to_dense()
-    # Taking a pair the other way round mirrors its bins, so that pixels on a rim may change bins.
+    # Swapping the two views of a pair mirrors its bins, so that pixels on a rim may change bins.
     torch.testing.assert_close(W_turned, W[index][:, index], atol=0.03, rtol=0)
 
 

@@ -64,10 +64,10 @@ def test_pixels_on_an_opencv_epipolar_line_share_its_half_plane(name: str) -> No
         u = torch.linspace(-500, 900, 50).double()
         a, b, c = line
         on_line = torch.stack((u, -(c + a * u) / b) if abs(b) > abs(a) else (-(c + b * u) / a, u), 1)
-        there = _angle(pencil.angles(1, on_line))
-        here = _angle(pencil.angles(0, pixel[None].double()))
+        line_angles = _angle(pencil.angles(1, on_line))
+        pixel_angle = _angle(pencil.angles(0, pixel[None].double()))
         # The line is one plane: its two halves differ by half a turn.
-        half_turn = torch.remainder(there - here + math.pi / 2, math.pi) - math.pi / 2
+        half_turn = torch.remainder(line_angles - pixel_angle + math.pi / 2, math.pi) - math.pi / 2
         assert half_turn.abs().max() < 1e-6
 
 
@@ -110,7 +110,7 @@ def test_pencil_does_not_depend_on_the_world() -> None:
         torch.testing.assert_close(epipolar_pencil(other, 0, 1).angles(side, xy), expected, atol=1e-9, rtol=0)
 
 
-def test_views_of_one_place_have_no_pencil() -> None:
+def test_views_that_share_a_centre_have_no_pencil() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
     assert is_coincident(cameras).tolist() == [[True, True, False], [True, True, False], [False, False, True]]
     with pytest.raises(InputError, match="views 0 and 1"):
@@ -147,7 +147,7 @@ def test_histograms_hold_every_pixel_once() -> None:
 
 @pytest.mark.parametrize("name", RIGS)
 def test_epipolar_map_agrees_with_drawn_lines(name: str) -> None:
-    """All pixels of a ball send out lines; the map and the drawing may differ along the rim of the band only."""
+    """All pixels of a ball send out lines; the map and the drawing may differ only along the rim of a band."""
     scene = ball_scene(5, 3, seed=4)
     cameras = Cameras(*(torch.cat(pair) for pair in _with_third(rig(name))))
     members = scene.regions.select((scene.regions.labels == 1) & (scene.regions.view_index < 2))
@@ -172,7 +172,7 @@ def _with_third(pair: Cameras) -> list[tuple[torch.Tensor, torch.Tensor]]:
     return [(getattr(pair, name), getattr(third, name)) for name in ("K", "R", "t", "sizes")]
 
 
-def test_bands_of_the_own_view_are_empty_and_true_matches_lie_in_each_others_bands() -> None:
+def test_a_region_has_no_band_in_its_own_view_and_true_matches_lie_in_each_others_bands() -> None:
     scene = ball_scene(8, 4, seed=2)
     regions = scene.regions
     for view in range(4):

@@ -51,9 +51,9 @@ def test_same_seed_same_answer_and_any_order_of_views() -> None:
     first, second = (match_regions(scene.regions, scene.cameras) for _ in range(2))
     assert torch.equal(first.instance_ids, second.instance_ids)
     turned = permute_views(scene, [3, 1, 5, 4, 0, 2])
-    found = match_regions(turned.regions, turned.cameras)
+    matching = match_regions(turned.regions, turned.cameras)
     assert adjusted_rand_score(scene.regions.labels, first.instance_ids) == 1
-    assert adjusted_rand_score(turned.regions.labels, found.instance_ids) == 1
+    assert adjusted_rand_score(turned.regions.labels, matching.instance_ids) == 1
 
 
 def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
@@ -83,9 +83,9 @@ def test_a_given_number_of_instances_is_for_symnmf() -> None:
 
 def test_a_single_view_is_refused() -> None:
     scene = ball_scene(2, 3)
-    one = dataclasses.replace(scene.regions.select(scene.regions.view_index == 0), num_views=1)
+    single_view = dataclasses.replace(scene.regions.select(scene.regions.view_index == 0), num_views=1)
     with pytest.raises(InputError, match="single"):
-        match_regions(one, scene.cameras[:1])
+        match_regions(single_view, scene.cameras[:1])
     with pytest.raises(InputError, match="3 views with 2 cameras"):
         match_regions(scene.regions, scene.cameras[:2])
 
@@ -151,16 +151,16 @@ def test_empty_masks_are_data() -> None:
     assert matching.instance_ids.shape == (0,)
 
 
-def test_two_cameras_at_one_place_are_warned_of() -> None:
+def test_two_cameras_that_share_a_centre_are_warned_of() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0]]))
     centers, radii = torch.tensor([[0.0, 1, 0], [0.0, -1, 1]]).double(), torch.tensor([0.5, 0.5]).double()
     regions = regions_from_label_maps(render_balls(cameras, centers, radii))
-    with pytest.warns(InputWarning, match="views 0 and 1 were taken from one place"):
+    with pytest.warns(InputWarning, match="views 0 and 1 share a camera centre"):
         matching = match_regions(regions, cameras)
     assert adjusted_rand_score(regions.labels, matching.instance_ids) == 1
 
 
-def test_all_cameras_at_one_place_match_nothing() -> None:
+def test_cameras_that_all_share_a_centre_match_nothing() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0]]))
     regions = regions_from_label_maps(
         render_balls(cameras, torch.tensor([[0.0, 0, 0]]).double(), torch.tensor([0.5]).double())

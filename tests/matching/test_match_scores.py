@@ -41,5 +41,6 @@ def test_by_hand_and_limited_to_what_the_plants_fill() -> None:
 def test_regions_do_not_affect_each_other() -> None:
     both = [evidence(), evidence(margin=0.1)]
     names = [field.name for field in dataclasses.fields(IdEvidence) if field.name != "num_views"]
-    joined = IdEvidence(**{name: np.concatenate([getattr(one, name) for one in both]) for name in names}, num_views=5)
-    np.testing.assert_allclose(match_scores(joined), np.concatenate([match_scores(one) for one in both]))
+    fields = {name: np.concatenate([getattr(single, name) for single in both]) for name in names}
+    joined = IdEvidence(**fields, num_views=5)
+    np.testing.assert_allclose(match_scores(joined), np.concatenate([match_scores(single) for single in both]))

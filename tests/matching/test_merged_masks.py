@@ -1,4 +1,4 @@
-"""Masks that cover two instances: found, told apart from sound ones, and parted about where the two meet."""
+"""Masks that cover two instances: found, told apart from sound ones, and split about where the two meet."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ def test_a_mask_that_covers_two_instances_is_found_and_no_other() -> None:
     scene = ball_scene(6, 8, seed=3)
     regions, numbers, region = merged_balls(scene)
     rest = torch.arange(len(regions)) != region
-    found = match_nview(regions, scene.cameras, region_affinity(regions, scene.cameras))
-    assert adjusted_rand_score(found.instance_ids[rest], regions.labels[rest]) == 1
-    assert found.num_instances == 6
-    instances = [int(found.instance_ids[rest][regions.labels[rest] == number][0]) for number in numbers]
-    (merged,) = found.merged
+    matching = match_nview(regions, scene.cameras, region_affinity(regions, scene.cameras))
+    assert adjusted_rand_score(matching.instance_ids[rest], regions.labels[rest]) == 1
+    assert matching.num_instances == 6
+    instances = [int(matching.instance_ids[rest][regions.labels[rest] == number][0]) for number in numbers]
+    (merged,) = matching.merged
     assert merged.region == region
     assert sorted((merged.own, merged.other)) == sorted(instances)
-    assert merged.own == found.instance_ids[region]
+    assert merged.own == matching.instance_ids[region]
     assert merged.part.shape == regions.crop(region).shape
 
 

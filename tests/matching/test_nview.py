@@ -93,36 +93,37 @@ def some_ids(table: RowTable, seed: int) -> np.ndarray:
 def test_scores_agree_with_the_definition(table: RowTable, scores: ClusterScores) -> None:
     clusters = some_ids(table, 0)
     for view in (0, 3):
-        found = scores.scores(view, clusters)
+        view_scores = scores.scores(view, clusters)
         for row, region in enumerate(np.flatnonzero(table.view_index == view).tolist()):
             for cluster in range(clusters.max() + 1):
                 members = set(np.flatnonzero((clusters == cluster) & (table.view_index != view)).tolist())
-                assert found[row, cluster] == pytest.approx(score_reference(table, region, members), abs=1e-5)
+                assert view_scores[row, cluster] == pytest.approx(score_reference(table, region, members), abs=1e-5)
 
 
 def test_own_scores_agree_with_the_definition(table: RowTable, scores: ClusterScores) -> None:
     ids = some_ids(table, 1)
-    own = scores.own(ids)
+    own_scores = scores.own(ids)
     for region in range(0, len(ids), 3):
         members = {m for m in np.flatnonzero(ids == ids[region]).tolist() if m != region}
-        assert own[region] == pytest.approx(score_reference(table, region, members | {region}), abs=1e-5)
+        assert own_scores[region] == pytest.approx(score_reference(table, region, members | {region}), abs=1e-5)
 
 
 def test_landing_agrees_with_the_definition(table: RowTable, scores: ClusterScores) -> None:
     ids = some_ids(table, 2)
-    found = scores.landings(ids)
+    cluster_landings = scores.landings(ids)
     view, cluster = 2, int(ids[0])
     hits, pixels = np.zeros(len(ids)), 0
     members = set(np.flatnonzero(ids == cluster).tolist())
-    hidden = dataclasses.replace(table, labels=np.where(np.arange(table.num_views) == view, OUTSIDE, table.labels))
+    labels = np.where(np.arange(table.num_views) == view, OUTSIDE, table.labels)
+    masked_table = dataclasses.replace(table, labels=labels)
     for pixel, region in enumerate(table.pixel_region.tolist()):
         rows = np.flatnonzero(table.pixel == pixel)
         if region not in members or table.view_index[region] == view or not len(rows):
             continue
         values = []
         for row in rows.tolist():
-            is_alone = (hidden.labels[row] == OUTSIDE).all()
-            values.append(0.0 if is_alone else row_score_reference(hidden, row, members))
+            is_alone = (masked_table.labels[row] == OUTSIDE).all()
+            values.append(0.0 if is_alone else row_score_reference(masked_table, row, members))
         best = [row for row, value in zip(rows.tolist(), values, strict=True) if value >= max(values) - 1e-6]
         if max(values) >= 0:
             pixels += 1
@@ -130,12 +131,12 @@ def test_landing_agrees_with_the_definition(table: RowTable, scores: ClusterScor
                 if table.labels[row, view] >= 0:
                     hits[table.labels[row, view]] += 1 / len(best)
     np.testing.assert_allclose(
-        found[cluster, table.view_index == view], (hits / pixels)[table.view_index == view], atol=1e-5
+        cluster_landings[cluster, table.view_index == view], (hits / pixels)[table.view_index == view], atol=1e-5
     )
 
 
 def test_cached_scores_are_what_computing_again_gives(table: RowTable, scores: ClusterScores) -> None:
-    """Scores are cached while the members of a cluster stay; then some regions change their cluster."""
+    """Scores are cached by members; between the steps, some regions change their cluster."""
     clusters = some_ids(table, 3)
     for step in range(3):
         clusters = renumber(np.where(np.arange(len(clusters)) % 7 == step, np.roll(clusters, 1), clusters))
@@ -150,8 +151,8 @@ def test_cached_scores_are_what_computing_again_gives(table: RowTable, scores: C
 
 def test_regions_of_the_view_itself_do_not_matter(table: RowTable, scores: ClusterScores) -> None:
     clusters = some_ids(table, 4)
-    moved_ones = np.where(table.view_index == 1, 0, clusters)
-    np.testing.assert_array_equal(scores.scores(1, clusters), scores.scores(1, moved_ones))
+    reassigned = np.where(table.view_index == 1, 0, clusters)
+    np.testing.assert_array_equal(scores.scores(1, clusters), scores.scores(1, reassigned))
     left_out = np.where(clusters == 0, -1, clusters)
     np.testing.assert_array_equal(scores.scores(1, clusters)[:, 1:], scores.scores(1, left_out)[:, 1:])
     assert scores.scores(1, np.full(len(clusters), -1)).shape == (int((table.view_index == 1).sum()), 0)
@@ -200,19 +201,17 @@ def test_members_are_in_rising_order_and_the_unmatched_are_left_out() -> None:
 
 
 def test_balls_are_solved_and_scored(balls: BallScene) -> None:
-    found = solve(balls.regions, balls.cameras)
-    assert same_partition(found.instance_ids, balls.regions.labels)
-    assert found.method == "nview"
-    assert found.residual_px == 1
-    assert found.explained is not None
-    assert found.explained > 0.7
-    assert found.match_scores.min() >= 0
-    assert found.match_scores.max() <= 1
-    assert found.match_scores.median() > 0.9
-    sure = found.match_scores >= 0.5
-    seen = [len(set(balls.regions.view_index[sure & (found.instance_ids == k)].tolist())) for k in range(1, 8)]
-    assert found.support.tolist() == seen
-    assert found.merged == ()
+    matching = solve(balls.regions, balls.cameras)
+    assert same_partition(matching.instance_ids, balls.regions.labels)
+    assert matching.method == "nview"
+    assert matching.residual_px == 1
+    assert matching.explained is not None
+    assert matching.explained > 0.7
+    assert matching.match_scores.median() > 0.9
+    sure = matching.match_scores >= 0.5
+    seen = [len(set(balls.regions.view_index[sure & (matching.instance_ids == k)].tolist())) for k in range(1, 8)]
+    assert matching.support.tolist() == seen
+    assert matching.merged == ()
 
 
 def test_shipped_scene_is_solved(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
@@ -230,10 +229,10 @@ def test_same_answer_twice_and_in_any_order_of_views_and_regions() -> None:
     torch.testing.assert_close(shuffled.match_scores, first.match_scores[order], atol=1e-4, rtol=0)
     views = [2, 0, 3, 1]
     turned = permute_views(scene, views)
-    place = {(v, n): i for i, (v, n) in enumerate(zip(*labels_of(scene.regions), strict=True))}
-    back = [place[views[v], n] for v, n in zip(*labels_of(turned.regions), strict=True)]
-    found = solve(turned.regions, turned.cameras)
-    assert same_partition(found.instance_ids, first.instance_ids[back])
+    region_of = {(v, n): i for i, (v, n) in enumerate(zip(*labels_of(scene.regions), strict=True))}
+    index = [region_of[views[v], n] for v, n in zip(*labels_of(turned.regions), strict=True)]
+    matching = solve(turned.regions, turned.cameras)
+    assert same_partition(matching.instance_ids, first.instance_ids[index])
 
 
 def labels_of(regions: Regions) -> tuple[list[int], list[int]]:
@@ -245,16 +244,16 @@ def test_the_world_may_be_moved_turned_and_scaled() -> None:
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(2)).double())[0]
     rotation = rotation * torch.linalg.det(rotation).sign()
     expected = solve(scene.regions, scene.cameras)
-    found = solve(scene.regions, moved(scene.cameras, 250.0, rotation, torch.tensor([9.0, -4.0, 70.0]).double()))
-    assert same_partition(found.instance_ids, expected.instance_ids)
-    torch.testing.assert_close(found.match_scores, expected.match_scores, atol=0.02, rtol=0)
+    matching = solve(scene.regions, moved(scene.cameras, 250.0, rotation, torch.tensor([9.0, -4.0, 70.0]).double()))
+    assert same_partition(matching.instance_ids, expected.instance_ids)
+    torch.testing.assert_close(matching.match_scores, expected.match_scores, atol=0.02, rtol=0)
 
 
 def test_twice_the_resolution() -> None:
     scene = ball_scene(10, 5, seed=6)
     big = ball_scene(10, 5, seed=6, focal=800.0, width=640, height=480)
-    found, expected = solve(big.regions, big.cameras), solve(scene.regions, scene.cameras)
-    assert same_partition(found.instance_ids, big.regions.labels)
+    matching, expected = solve(big.regions, big.cameras), solve(scene.regions, scene.cameras)
+    assert same_partition(matching.instance_ids, big.regions.labels)
     assert same_partition(expected.instance_ids, scene.regions.labels)
 
 
@@ -276,8 +275,8 @@ def test_pieces_of_a_split_mask_are_joined() -> None:
     assert same_partition(solve(regions, scene.cameras).instance_ids, truth)
 
 
-def test_pieces_do_not_make_up_an_instance() -> None:
-    """One ball is cut in two in most views: the parts on one side are seen by too few views to stand for something."""
+def test_pieces_do_not_form_a_spurious_instance() -> None:
+    """One ball is cut in two in two of ten views: too few for the parts on one side to be an instance of their own."""
     scene = ball_scene(6, 10, seed=2)
     maps = [labels.copy() for labels in scene.label_maps]
     for view in (1, 5):
@@ -286,9 +285,9 @@ def test_pieces_do_not_make_up_an_instance() -> None:
     regions = regions_from_label_maps(maps)
     assert int((regions.labels == 90).sum()) == 2
     truth = torch.where(regions.labels == 90, 2, regions.labels)
-    found = solve(regions, scene.cameras)
-    assert same_partition(found.instance_ids, truth)
-    assert found.num_instances == 6
+    matching = solve(regions, scene.cameras)
+    assert same_partition(matching.instance_ids, truth)
+    assert matching.num_instances == 6
 
 
 def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
@@ -296,19 +295,19 @@ def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
     free = np.argwhere(labels[:20, :20] == 0)
     labels[free[:, 0], free[:, 1]] = 77
     regions = regions_from_label_maps([labels, *balls.label_maps[1:]])
-    found = solve(regions, balls.cameras)
+    matching = solve(regions, balls.cameras)
     alone = regions.labels == 77
-    assert found.instance_ids[alone].tolist() == [-1]
-    assert found.match_scores[alone].tolist() == [0]
-    assert same_partition(found.instance_ids[~alone], regions.labels[~alone])
+    assert matching.instance_ids[alone].tolist() == [-1]
+    assert matching.match_scores[alone].tolist() == [0]
+    assert same_partition(matching.instance_ids[~alone], regions.labels[~alone])
 
 
 def test_refinement_never_ends_below_the_truth_on_clear_scenes(balls: BallScene, scores: ClusterScores) -> None:
     truth = renumber(balls.regions.labels.numpy())
     np.testing.assert_array_equal(refine(scores, truth), truth)
-    found = search(scores, np.arange(len(truth)))
+    partition = search(scores, np.arange(len(truth)))
     np.testing.assert_array_equal(search(scores, truth), truth)
-    assert scores.value(found) >= scores.value(truth) - 1e-6
+    assert scores.value(partition) >= scores.value(truth) - 1e-6
 
 
 def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, table: RowTable) -> None:
@@ -357,65 +356,65 @@ def test_epipoles_inside_the_images() -> None:
 
 def test_two_views_fall_back_on_the_pairs() -> None:
     scene = ball_scene(3, 2, seed=1)
-    found = solve(scene.regions, scene.cameras)
-    assert found.method == "one-per-view"
-    assert same_partition(found.instance_ids, scene.regions.labels)
+    matching = solve(scene.regions, scene.cameras)
+    assert matching.method == "one-per-view"
+    assert same_partition(matching.instance_ids, scene.regions.labels)
 
 
 def test_nothing_to_match() -> None:
     cameras = cameras_at(arc_positions(3))
-    found = solve(regions_from_label_maps([np.zeros((240, 320), int)] * 3), cameras)
-    assert found.instance_ids.shape == found.match_scores.shape == (0,)
-    assert found.support is not None
-    assert found.support.shape == (0,)
-    one = render_balls(cameras[[0]], torch.zeros(1, 3), torch.ones(1))[0]
-    found = solve(regions_from_label_maps([one, np.zeros_like(one), np.zeros_like(one)]), cameras)
-    assert found.instance_ids.tolist() == [-1]
+    matching = solve(regions_from_label_maps([np.zeros((240, 320), int)] * 3), cameras)
+    assert matching.instance_ids.shape == matching.match_scores.shape == (0,)
+    assert matching.support is not None
+    assert matching.support.shape == (0,)
+    labels = render_balls(cameras[[0]], torch.zeros(1, 3), torch.ones(1))[0]
+    matching = solve(regions_from_label_maps([labels, np.zeros_like(labels), np.zeros_like(labels)]), cameras)
+    assert matching.instance_ids.tolist() == [-1]
 
 
-def test_cameras_at_one_place() -> None:
+def test_two_cameras_that_share_a_centre() -> None:
     cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0], [0.0, 10, 0], [7.0, 7, 3]]))
     scene = ball_scene(4, 3, seed=3)
     regions = regions_from_label_maps(render_balls(cameras, scene.centers, scene.radii))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        found = solve(regions, cameras)
-    assert adjusted_rand_score(regions.labels, found.instance_ids) > 0.9
+        matching = solve(regions, cameras)
+    assert adjusted_rand_score(regions.labels, matching.instance_ids) > 0.9
 
 
 def test_wrong_poses_are_noticed() -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.25)
-    found = solve(scene.regions, turned_a_little(scene.cameras, 0.004))
-    assert same_partition(found.instance_ids, scene.regions.labels)
-    assert found.explained < solve(scene.regions, scene.cameras).explained
+    matching = solve(scene.regions, turned_a_little(scene.cameras, 0.004))
+    assert same_partition(matching.instance_ids, scene.regions.labels)
+    assert matching.explained < solve(scene.regions, scene.cameras).explained
 
 
-def test_large_pose_errors_are_measured_and_endured() -> None:
+def test_large_pose_errors_are_measured_and_tolerated() -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.1)
-    found = solve(scene.regions, turned_a_little(scene.cameras, 0.008))
-    assert found.residual_px > 1
-    assert found.method == "nview"
-    assert same_partition(found.instance_ids, scene.regions.labels)
+    matching = solve(scene.regions, turned_a_little(scene.cameras, 0.008))
+    assert matching.residual_px > 1
+    assert matching.method == "nview"
+    assert same_partition(matching.instance_ids, scene.regions.labels)
 
 
 def test_where_the_views_agree_on_nothing_the_pairs_answer() -> None:
     scene = ball_scene(6, 4, seed=7, radius=0.1)
     cameras = turned_a_little(scene.cameras, 0.3)
-    found = solve(scene.regions, cameras)
-    assert found.method == "one-per-view"
-    assert found.explained < 0.3
+    matching = solve(scene.regions, cameras)
+    assert matching.method == "one-per-view"
+    assert matching.explained < 0.3
     affinity = region_affinity(scene.regions, cameras)
     pairwise = one_per_view_clusters(affinity, scene.regions.view_index, 4)
-    assert same_partition(found.instance_ids, pairwise)
+    assert same_partition(matching.instance_ids, pairwise)
 
 
 def test_regions_without_a_pixel_and_very_many_views(balls: BallScene, monkeypatch: pytest.MonkeyPatch) -> None:
     empty = balls.regions.crop(0).clone().flatten().fill_(False)
     size = len(empty)
     regions = dataclasses.replace(balls.regions, crops=torch.cat((empty, balls.regions.crops[size:])))
-    found = solve(regions, balls.cameras)
-    assert found.instance_ids[0] == -1
-    assert same_partition(found.instance_ids[1:], regions.labels[1:])
+    matching = solve(regions, balls.cameras)
+    assert matching.instance_ids[0] == -1
+    assert same_partition(matching.instance_ids[1:], regions.labels[1:])
     # as with 500 times as many views: still one pixel per region
     monkeypatch.setattr("mvseg.matching.nview.label_rows.PLENTY", 0.01)
     table = row_table(balls.regions, balls.cameras)
@@ -424,7 +423,7 @@ def test_regions_without_a_pixel_and_very_many_views(balls: BallScene, monkeypat
 
 
 def turned_a_little(cameras: Cameras, radians: float) -> Cameras:
-    """Cameras whose orientation is off by about so much."""
+    """Cameras whose orientation is off by about `radians`."""
     noise = radians * torch.randn(len(cameras), 3, generator=torch.Generator().manual_seed(3)).double()
     turn = torch.linalg.matrix_exp(torch.stack([skew(axis) for axis in noise]))
     return Cameras(cameras.K, turn @ cameras.R, (turn @ cameras.t[:, :, None])[:, :, 0], cameras.sizes)

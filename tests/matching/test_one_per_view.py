@@ -54,7 +54,7 @@ def mean_weights_reference(W: np.ndarray, views: np.ndarray, stop: float) -> np.
 
 
 def test_hand_made_triangle() -> None:
-    """0 and 1 are of one view, 2 of another; 2 prefers 1."""
+    """0 and 1 are in one view, 2 in another; 2 prefers 1."""
     W = np.array([[0, 0, 0.5], [0, 0, 0.6], [0.5, 0.6, 0]])
     assert one_per_view_clusters(graph_of(W), torch.tensor([0, 0, 1]), 2).tolist() == [-1, 1, 1]
 
@@ -104,11 +104,11 @@ def test_never_two_regions_of_one_view() -> None:
 
 
 def test_second_chance_for_those_alone() -> None:
-    """Cluster 0 holds views 0 and 1. Region 2 fits it; 3 is of a taken view; 4 and 5 only fit each other; 6 nothing."""
+    """Cluster 0 holds views 0 and 1. Region 2 fits it; 3 is in a taken view; 4 and 5 only fit each other; 6 nothing."""
     views, W = np.array([0, 1, 2, 0, 1, 2, 3]), np.zeros((7, 7))
     W[0, 1], W[0, 2], W[1, 2], W[1, 3], W[4, 5], W[6, 0] = 0.9, 0.8, 0.6, 0.9, 0.5, 0.3
-    found = join_alone(ViewGraph(W + W.T, views, 4), np.array([0, 0, 1, 2, 3, 4, 5]), stop=0.4)
-    assert found.tolist() == [0, 0, 0, 1, 2, 2, 3]
+    joined = join_alone(ViewGraph(W + W.T, views, 4), np.array([0, 0, 1, 2, 3, 4, 5]), stop=0.4)
+    assert joined.tolist() == [0, 0, 0, 1, 2, 2, 3]
 
 
 def test_sweeps_settle() -> None:

@@ -49,6 +49,7 @@ def test_selected_regions_keep_what_is_known_of_them() -> None:
     assert merged_of(chosen) == [(1, 2, 3)]
     assert chosen.num_instances == 3
     assert matching().select(torch.tensor([0])).merged == ()
+    assert merged_of(matching().select(torch.tensor([2, 0, 2]))) == [(0, 2, 3), (2, 2, 3)]
 
 
 def test_reordering_is_the_inverse_of_selecting() -> None:

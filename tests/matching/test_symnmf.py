@@ -23,11 +23,11 @@ def block_graph(sizes: list[int], noise: float = 0.15, seed: int = 0) -> tuple[A
 
 def test_finds_the_blocks_and_their_number() -> None:
     affinity, truth = block_graph([5, 5, 5, 5, 5, 5])
-    found = cluster_affinity(affinity, torch.tensor([6, 6, 6, 6, 6]))
-    assert found.num_clusters == 6
-    assert adjusted_rand_score(truth, found.instance_ids) == 1
-    assert sorted(found.criterion) == [6, 7, 8, 9, 10, 11, 12]
-    assert found.criterion[6] == 0
+    clustering = cluster_affinity(affinity, torch.tensor([6, 6, 6, 6, 6]))
+    assert clustering.num_clusters == 6
+    assert adjusted_rand_score(truth, clustering.instance_ids) == 1
+    assert sorted(clustering.criterion) == [6, 7, 8, 9, 10, 11, 12]
+    assert clustering.criterion[6] == 0
 
 
 def test_given_k_and_given_range() -> None:
@@ -46,19 +46,19 @@ def test_the_search_range_decides() -> None:
     assert cluster_affinity(affinity, torch.tensor([3]), search_range=(1, 6)).num_clusters == 1
 
 
-def test_regions_tied_to_nothing_are_unmatched() -> None:
+def test_regions_without_an_edge_are_unmatched() -> None:
     affinity, truth = block_graph([4, 4])
     wider = Affinity(affinity.edges, affinity.weights, len(truth) + 2)
-    found = cluster_affinity(wider, torch.tensor([4, 4]), num_instances=2)
-    assert found.instance_ids[-2:].tolist() == [-1, -1]
-    assert adjusted_rand_score(truth, found.instance_ids[:-2]) == 1
+    clustering = cluster_affinity(wider, torch.tensor([4, 4]), num_instances=2)
+    assert clustering.instance_ids[-2:].tolist() == [-1, -1]
+    assert adjusted_rand_score(truth, clustering.instance_ids[:-2]) == 1
 
 
 def test_no_edges_no_clusters() -> None:
     none = Affinity(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 3)
-    found = cluster_affinity(none, torch.tensor([2, 1]))
-    assert found.instance_ids.tolist() == [-1, -1, -1]
-    assert found.num_clusters == 0
+    clustering = cluster_affinity(none, torch.tensor([2, 1]))
+    assert clustering.instance_ids.tolist() == [-1, -1, -1]
+    assert clustering.num_clusters == 0
 
 
 def test_order_of_the_nodes_does_not_matter_for_clear_clusters() -> None:
@@ -67,8 +67,8 @@ def test_order_of_the_nodes_does_not_matter_for_clear_clusters() -> None:
     W = affinity.to_dense()[shuffle][:, shuffle]
     edges = torch.combinations(torch.arange(len(truth)))
     shuffled = Affinity(edges, W[edges[:, 0], edges[:, 1]], len(truth))
-    found = cluster_affinity(shuffled, torch.tensor([3]), num_instances=3)
-    assert adjusted_rand_score(truth[shuffle], found.instance_ids) == 1
+    clustering = cluster_affinity(shuffled, torch.tensor([3]), num_instances=3)
+    assert adjusted_rand_score(truth[shuffle], clustering.instance_ids) == 1
 
 
 @pytest.mark.parametrize("search_range", [(0, 3), (4, 3)])

@@ -60,7 +60,7 @@ def test_many_views_carve_the_ball_and_half_of_them_leave_more() -> None:
     assert strict is not None
     assert half is not None
     assert strict.volume == pytest.approx(ball, rel=0.12)
-    assert strict.volume > 0.98 * ball  # a hull never loses what all see
+    assert strict.volume > 0.98 * ball  # a hull never loses what all views see
     assert half.volume > 1.3 * strict.volume  # the paper's 0.5 keeps what half of the views see
 
 
@@ -78,7 +78,7 @@ def test_votes_agree_with_points_projected_one_by_one() -> None:
 
 
 def test_seen_share_agrees_with_points_projected_one_by_one() -> None:
-    """It takes voxels away, none where another instance may hide the point, and changes no vote of the others."""
+    """It removes voxels, but none where another instance may hide the point, and leaves all other votes unchanged."""
     scene = ball_scene(4, 6, seed=2, focal=200.0, width=160, height=120)
     ids = scene.regions.labels
     plain, seen = (
@@ -101,7 +101,7 @@ def test_seen_share_agrees_with_points_projected_one_by_one() -> None:
 
 
 def test_what_stands_behind_something_is_not_carved_away() -> None:
-    """Two of six views see half of a ball: to ask all masks for a voxel loses half of it, seen_share does not."""
+    """Two of six views see half of a ball: requiring all masks loses much of it, seen_share does not."""
     cameras = cameras_at(arc_positions(6, distance=40.0), focal=800.0)
     maps = render_balls(cameras, torch.zeros(1, 3).double(), torch.ones(1).double())
     for labels in maps[:2]:
@@ -133,7 +133,7 @@ def test_without_free_pixels_the_paper_rule_is_left() -> None:
 
 
 def test_the_box_holds_all_that_exceeds_the_threshold() -> None:
-    """The found box against a search of ten times its volume."""
+    """The box against random points in ten times its volume."""
     scene = ball_scene(2, 6, seed=1, focal=200.0, width=160, height=120)
     members = scene.regions.select(scene.regions.labels == 1)
     grid = back_project(members, scene.cameras, config=ReconstructConfig(voxel_budget=3000))

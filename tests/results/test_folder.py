@@ -94,12 +94,12 @@ def read_rows(folder: Path) -> list[dict[str, str]]:
 
 def label_of_balls(folder: Path, plant: Path) -> list[list[int]]:
     """Per view, the label that covers most of each ball."""
-    found = []
+    labels_of_balls = []
     for view in range(4):
         truth = read_label_png(plant / "truth" / f"{view:03d}.png", WIDTH, HEIGHT)
         labels = read_label_png(folder / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
-        found.append([int(np.bincount(labels[truth == ball]).argmax()) for ball in (1, 2, 3)])
-    return found
+        labels_of_balls.append([int(np.bincount(labels[truth == ball]).argmax()) for ball in (1, 2, 3)])
+    return labels_of_balls
 
 
 class TestContent:
@@ -112,16 +112,16 @@ class TestContent:
         merged = (MergedMask(region=3, own=1, other=3, part=part),)
         matching = replace(result.matching, merged=merged, support=torch.tensor([4, 3, 2]), residual_px=2)
         save_result(replace(result, matching=matching), tmp_path / "out", {})
-        found = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
-        others = {index: one["other_instance_id"] for index, one in enumerate(found) if "other_instance_id" in one}
+        annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
+        others = {n: entry["other_instance_id"] for n, entry in enumerate(annotations) if "other_instance_id" in entry}
         assert others == {3: 3}
         assert [row["sure_views"] for row in read_rows(tmp_path / "out")] == ["4", "3", "2"]
         assert json.loads((tmp_path / "out" / "run.json").read_text())["residual_px"] == 2
 
     def test_same_label_in_every_view(self, saved: Path, plant: Path) -> None:
-        found = label_of_balls(saved, plant)
-        assert sorted(found[0]) == [1, 2, 3]
-        assert found == [found[0]] * 4
+        per_view = label_of_balls(saved, plant)
+        assert sorted(per_view[0]) == [1, 2, 3]
+        assert per_view == [per_view[0]] * 4
         image = cv2.imread(str(saved / "labels" / "000.png"), cv2.IMREAD_UNCHANGED)
         assert (image.dtype, image.shape) == (np.uint16, (HEIGHT, WIDTH))
 
@@ -141,13 +141,13 @@ class TestContent:
         content = json.loads((saved / "instances.json").read_text())
         assert [image["file_name"] for image in content["images"]] == [f"{view:03d}.png" for view in range(4)]
         assert len(content["annotations"]) == len(result.regions) == 12
-        for index, one in enumerate(content["annotations"]):
-            view = one["image_id"] - 1
+        for index, entry in enumerate(content["annotations"]):
+            view = entry["image_id"] - 1
             labels = read_label_png(saved / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
-            assert one["instance_id"] == result.matching.instance_ids[index]
-            assert (labels == one["instance_id"]).sum() == one["area"]
-            assert 0 < one["match_score"] <= 1
-            assert one["source_label"] == result.regions.labels[index]
+            assert entry["instance_id"] == result.matching.instance_ids[index]
+            assert (labels == entry["instance_id"]).sum() == entry["area"]
+            assert 0 < entry["match_score"] <= 1
+            assert entry["source_label"] == result.regions.labels[index]
 
     def test_instances_are_masks_to_read(self, saved: Path, result: Result) -> None:
         again = load_masks(result.scene, saved / "instances.json")
@@ -207,10 +207,11 @@ class TestVariants:
         matching = replace(result.matching, instance_ids=ids)
         save_result(replace(result, matching=matching, shapes=None), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
-        assert [one["instance_id"] for one in annotations].count(-1) == 4
-        assert {one["instance_id"] for one in annotations} == {-1, 1, 3}
-        found = [np.unique(read_label_png(path, WIDTH, HEIGHT)) for path in (tmp_path / "out" / "labels").iterdir()]
-        assert [numbers.tolist() for numbers in found] == [[0, 1, 3]] * 4
+        assert [entry["instance_id"] for entry in annotations].count(-1) == 4
+        assert {entry["instance_id"] for entry in annotations} == {-1, 1, 3}
+        paths = (tmp_path / "out" / "labels").iterdir()
+        numbers_per_view = [np.unique(read_label_png(path, WIDTH, HEIGHT)) for path in paths]
+        assert [numbers.tolist() for numbers in numbers_per_view] == [[0, 1, 3]] * 4
 
     def test_an_instance_without_shape_has_a_row_but_no_mesh(self, result: Result, tmp_path: Path) -> None:
         assert result.shapes is not None
@@ -347,7 +348,7 @@ class TestWholeOrNotAtAll:
         out = tmp_path / "out"
         save_result(ids_only(result), out, {})
         (out / "labels" / "001.png").write_bytes(b"painted by hand")
-        with pytest.raises(InputError, match=r"001\.png: was changed after mvseg wrote it"):
+        with pytest.raises(InputError, match=r"001\.png: was changed after mvseg wrote it, move"):
             save_result(result, out, {})
         assert (out / "labels" / "001.png").read_bytes() == b"painted by hand"
         assert files_below(out) == IDS_FILES
@@ -356,7 +357,7 @@ class TestWholeOrNotAtAll:
         out = tmp_path / "out"
         save_result(ids_only(result), out, {})
         (out / "traits.csv").write_text("mine")
-        with pytest.raises(InputError, match=r"traits\.csv: is not from mvseg, but the new result has a file"):
+        with pytest.raises(InputError, match=r"traits\.csv: was not written by mvseg, but the new result has a file"):
             save_result(result, out, {})
         assert (out / "traits.csv").read_text() == "mine"
         assert [path.name for path in tmp_path.iterdir()] == ["out"]
@@ -381,19 +382,19 @@ class TestPlaces:
         for run in (None, "", "{}", "[1]", '{"files": 3}', '{"mvseg": "0.1.0"}'):  # other programs write run.json, too
             if run is not None:
                 (tmp_path / "run.json").write_text(run)
-            with pytest.raises(InputError, match="holds files that are no earlier result, expected a new or an empty"):
+            with pytest.raises(InputError, match="holds files that are not an earlier result, expected a new or empty"):
                 save_result(result, tmp_path, {})
             assert (tmp_path / "thesis.tex").read_text() == "ten years of work"
 
     def test_a_file_is_refused(self, tmp_path: Path) -> None:
         (tmp_path / "out").touch()
         for place in (tmp_path / "out", tmp_path / "out" / "below", tmp_path / "out" / "far" / "below"):
-            with pytest.raises(InputError, match=r"the output folder is not writable \(a file is in its place\)"):
+            with pytest.raises(InputError, match=r"the output folder is not writable \(a file is in the way\)"):
                 check_out(place)
 
     def test_no_right_to_write(self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(mvseg.results.earlier.os, "access", lambda path, mode: path != tmp_path)
-        with pytest.raises(InputError, match=r"new/out: the output folder is not writable \(no right to write in"):
+        with pytest.raises(InputError, match=r"new/out: the output folder is not writable \(no permission to write in"):
             check_out(tmp_path / "new" / "out")
 
     def test_a_device_is_refused(self) -> None:

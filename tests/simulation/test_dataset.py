@@ -82,7 +82,7 @@ def test_what_a_killed_run_left_unfinished_is_removed(tmp_path: Path) -> None:
 
 def test_other_files_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").touch()
-    with pytest.raises(InputError, match="holds files that are no data set"):
+    with pytest.raises(InputError, match="holds files that are not a data set"):
         write_dataset(TINY, tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
 

@@ -1,8 +1,7 @@
 """How well clusters of regions explain what all views show.
 
 A cluster explains a pixel of a region when some point of the pixel's ray shows members of the cluster in the other
-views: the rows of `label_rows.py`, so that neither a volume nor a surface is needed. A region's own view never counts
-for it.
+views: the rows of `label_rows.py`, so that neither a volume nor a surface is needed. A region's own view never counts.
 """
 
 from __future__ import annotations
@@ -19,17 +18,17 @@ from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.label_rows import EMPTY, RowTable, run_starts
 from mvseg.matching.one_per_view import ViewGraph
 
-# Log-odds that two regions show one instance against their epipolar weight, on degraded masks of development plants.
+# Log-odds that two regions show one instance, by epipolar weight; measured on degraded masks of development plants.
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
 LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
-PRIOR, SPAN = 2.5, 6.0  # added to the log-odds; what divides them
+PRIOR, SPAN = 2.5, 6.0  # evidence = (log-odds + PRIOR) / SPAN
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
 def members_of(clusters: Ints, num_clusters: int) -> list[Ints]:
-    """The members of clusters 0 .. K - 1 in rising order; an unused number has none, -1 is left out."""
+    """The members of clusters 0 .. K - 1 in ascending order; an unused number has none, -1 is left out."""
     order = np.argsort(clusters, kind="stable")
     starts = np.searchsorted(clusters[order], np.arange(num_clusters + 1))
     return [order[start:stop] for start, stop in pairwise(starts)]
@@ -37,13 +36,13 @@ def members_of(clusters: Ints, num_clusters: int) -> list[Ints]:
 
 @dataclass(frozen=True, eq=False)
 class ViewGains:
-    """What the N regions of one view gain from the K clusters that the other views form.
+    """What the N regions of one view would gain by joining the K clusters that the other views form.
 
     Attributes:
         clusters: (K,) int64, their numbers.
         score: (N, K), S(n, c): see `ClusterScores.scores`.
         landing: (N, K), share of the best rows of c that land on n.
-        total: (N, K), both and the epipolar evidence.
+        total: (N, K), the gain: score, weighted landing and epipolar evidence.
     """
 
     clusters: Ints
@@ -56,8 +55,8 @@ class ViewGains:
 class ClusterScores:
     """Scores of any clusters of the D regions of one table.
 
-    What is computed depends on nothing but the members of a cluster, so it is cached by members: while the search moves
-    some regions, clusters that stay as they are cost nothing.
+    Results depend only on the members of a cluster and are cached by members: while the search moves some regions,
+    unchanged clusters cost nothing.
 
     Attributes:
         table: rows of D regions, ordered by view.
@@ -74,26 +73,26 @@ class ClusterScores:
 
     @cached_property
     def evidence(self) -> Floats:
-        """(D, D) for (> 0) or against (< 0) each pair of regions being one instance, from its epipolar weight."""
+        """(D, D) evidence for (> 0) or against (< 0) a pair of regions being one instance, from its epipolar weight."""
         return (np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + PRIOR) / SPAN
 
     def scores(self, view: int, clusters: Ints) -> Floats:
         """Leave-one-out scores of the regions of one view in clusters, S(n, c).
 
         A row scores (views that show c - hidden * views that show others - missing or absent * views that show nothing)
-        / (views that the point lies in); a pixel scores as its best row, but not below -hidden; a region as the mean of
-        its pixels, and -hidden without pixels.
+        / (views that the point lies in); a pixel takes the score of its best row, but at least -hidden; a region
+        takes the mean of its pixels, or -hidden without pixels.
 
         Args:
             view: the view.
-            clusters: (D,) cluster of each region in [0, K), -1 for regions in no cluster that is asked for. Those of
-                the view itself do not matter.
+            clusters: (D,) cluster of each region in [0, K), -1 for regions to leave out. Regions of the view itself do
+                not count.
 
         Returns:
             (N, K) float32 in [-hidden, 1].
         """
         members = self._members_elsewhere(view, clusters)
-        keys = [(view, one.tobytes()) for one in members]
+        keys = [(view, cluster.tobytes()) for cluster in members]
         new = [k for k, key in enumerate(keys) if key not in self._scores]
         if new:
             fresh = self._score_clusters(view, [members[k] for k in new])
@@ -113,8 +112,8 @@ class ClusterScores:
 
         Returns:
             (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best row shows n. The
-            best row is chosen without n's view; pixels whose best row scores below 0 do not count, and equal rows
-            share.
+            best row is chosen without n's view; pixels whose best row scores below 0 do not count, and rows that
+            tie share the pixel.
         """
         keys = [members.tobytes() for members in members_of(clusters, int(clusters.max(initial=-1)) + 1)]
         new = np.array([k for k, key in enumerate(keys) if key not in self._landings], np.int64)
@@ -136,7 +135,7 @@ class ClusterScores:
 
     def value(self, clusters: Ints) -> float:
         """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all
-        pairs that are put together; `clusters` (D,) in [0, K)."""
+        pairs in one cluster; `clusters` (D,) in [0, K)."""
         is_alone = np.bincount(clusters)[clusters] < 2
         pairs = self.pair_factor * float((self.evidence * self.together(clusters)).sum()) / 2
         return float(self.own(clusters)[~is_alone].sum()) + pairs
@@ -147,12 +146,12 @@ class ClusterScores:
         return float(self.own(clusters)[is_together].mean()) if is_together.any() else 0.0
 
     def gains(self, view: int, clusters: Ints, landings: Floats) -> ViewGains:
-        """What the regions of one view gain from the clusters of the others.
+        """What the regions of one view would gain by joining the clusters of the other views.
 
         Args:
             view: the view.
             clusters: (D,) cluster of each region in [0, K).
-            landings: `landings` of an earlier partition: may have fewer rows; newer clusters expect to land nowhere.
+            landings: `landings` of an earlier partition; newer clusters, which have no row there, land nowhere.
         """
         here = self.table.bounds.regions(view)
         is_other = self.table.view_index != view
@@ -164,13 +163,13 @@ class ClusterScores:
         has_landing = numbers < len(landings)
         landing[:, has_landing] = landings[numbers[has_landing], here].T
         members = np.zeros((len(clusters), len(numbers) + 1))
-        members[np.arange(len(clusters)), compact] = 1  # the last column takes the view itself
+        members[np.arange(len(clusters)), compact] = 1  # the last column collects the view itself
         pairs = self.pair_factor * (self.evidence[here] @ members[:, :-1])
         return ViewGains(numbers, score, landing, score + self.config.gains.landing * landing + pairs)
 
     @property
     def pair_factor(self) -> float:
-        """What an epipolar weight of 1.5 in place of 0.5 gains in this number of views."""
+        """Gain per unit of epipolar evidence for a pair, in this number of views."""
         return self.config.gains.pair_factor(self.table.num_views)
 
     def together(self, clusters: Ints) -> NDArray[np.bool_]:
@@ -202,10 +201,10 @@ class ClusterScores:
         number_of = np.full(len(table.view_index) + 2, num_clusters)  # the last two for EMPTY and OUTSIDE
         for number, regions in enumerate(members):
             number_of[regions] = number
-        # torch on the CPU: its scatter_add has no equal in NumPy
+        # torch on the CPU: NumPy has no match for its scatter_add
         labels = torch.from_numpy(table.labels[rows].T.astype(np.int64))
         cluster = torch.from_numpy(number_of)[labels]
-        shown = torch.zeros(num_clusters + 1, labels.shape[1])  # rows run fastest: they are what is maximised over
+        shown = torch.zeros(num_clusters + 1, labels.shape[1])  # rows vary fastest: the maximum runs over them
         shown.scatter_add_(0, cluster, torch.ones(1).expand(cluster.shape))
         is_empty = (labels == EMPTY).float()
         num_labels = (labels >= 0).sum(0).float()
@@ -227,7 +226,7 @@ class ClusterScores:
         return np.where(has_mask, self.config.costs.missing, self.config.costs.absent).astype(np.float32)
 
     def _land(self, clusters: Ints, asked: Ints) -> Floats:
-        """(C, D) float32: the landings of the clusters that are asked for."""
+        """(C, D) float32: the landings of the C clusters in `asked`."""
         table = self.table
         row_of = np.full(int(clusters.max(initial=-1)) + 1, -1)
         row_of[asked] = np.arange(len(asked))

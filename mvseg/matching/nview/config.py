@@ -1,4 +1,4 @@
-"""The numbers of the N-view matcher by what they are: costs of a row, gains of a region, thresholds of the search.
+"""Parameters of the N-view matcher: costs of a row, gains of a region, thresholds of the search.
 
 They were chosen on simulated development plants, with true and degraded masks (`benchmarks/matching.py --split dev`).
 """
@@ -10,12 +10,12 @@ from dataclasses import dataclass, field, replace
 
 @dataclass(frozen=True)
 class RowCosts:
-    """What a view counts in a row of a cluster, when one that shows the cluster counts 1.
+    """What a view that does not show the cluster costs in a row, where one that shows it scores 1.
 
     Attributes:
         missing: cost of no region there, although the cluster has one in this view.
         absent: cost of no region there when the cluster has none in this view (its mask may be missed).
-        hidden: cost of a region of another cluster there; also the most that a pixel without any good row costs.
+        hidden: cost of a region of another cluster there; also the most that a pixel can cost.
     """
 
     missing: float = 0.7
@@ -25,14 +25,14 @@ class RowCosts:
 
 @dataclass(frozen=True)
 class Gains:
-    """What a region gains from a cluster beside its score there.
+    """What a region gains from a cluster in addition to its score there.
 
     Attributes:
         landing: gain of a region on which all best rows of the cluster land.
-        weight: gain from each region of the cluster whose epipolar weight exceeds 0.5 by 1, over V - 1. With few views
-            there is little other evidence; there it is larger by `weight_few` / (V - 1).
+        weight: gain per unit of epipolar evidence for a pair of regions (`ClusterScores.evidence`), over V - 1. With
+            few views there is little other evidence: `weight_few` / (V - 1) is added to it.
         weight_few: see `weight`.
-        alone: gain of a region in no cluster.
+        alone: gain of a region that stays alone.
     """
 
     landing: float = 0.5
@@ -41,20 +41,20 @@ class Gains:
     alone: float = 0.0
 
     def pair_factor(self, num_views: int) -> float:
-        """What an epipolar weight of 1.5 in place of 0.5 gains."""
+        """Gain per unit of epipolar evidence for a pair."""
         others = max(num_views - 1, 1)
         return (self.weight + self.weight_few / others) / others
 
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When regions join a cluster whose place in their view is taken, and when a mask covers two instances.
+    """When regions join a cluster that has a region in their view already, and when a mask covers two instances.
 
     Attributes:
-        piece_landing: least landing on a left-over region that joins a cluster whose place is taken.
-        piece_score: least score of such a region, as a share of the score of the region that holds the place.
-        few: share of the views; clusters that no more of them show are doubted.
-        few_landing: least landing of a cluster on a region of a doubted one that it takes over.
+        piece_landing: least landing of such a cluster on a left-over region that joins it.
+        piece_score: least score of the left-over region, as a share of the score of the region already there.
+        few: clusters that at most this share of the views show are doubted.
+        few_landing: least landing of a cluster on a region that it takes over from a doubted one.
         merged_landing: least landing of a cluster on a region that it may share with another cluster.
         merged_share: least share of the pixels of such a region that only the second cluster explains.
     """
@@ -69,14 +69,14 @@ class Thresholds:
 
 @dataclass(frozen=True)
 class NViewConfig:
-    """All of them."""
+    """All parameters of the N-view matcher."""
 
     costs: RowCosts = field(default_factory=RowCosts)
     gains: Gains = field(default_factory=Gains)
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def for_views(self, num_views: int) -> NViewConfig:
-        """The same for a number of views: of three views, two do not suffice to tell a piece from a neighbour."""
+        """The parameters for V views: stricter about pieces up to three, too few to tell a piece from a neighbour."""
         if num_views > 3:
             return self
         piece_landing, piece_score = max(self.thresholds.piece_landing, 0.1), max(self.thresholds.piece_score, 0.8)

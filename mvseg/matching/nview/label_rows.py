@@ -1,8 +1,8 @@
 """What the other views show along the ray of a pixel, as rows of region labels (a plane sweep of label maps).
 
-Every hypothesis about a pixel's depth makes one statement per view: there the point shows this region, or no region, or
-it is outside of the image. Such a tuple is a row. Most depths make the same statement as their neighbours, so that few
-distinct rows are left per pixel and per region; everything later works on those.
+Every hypothesis about a pixel's depth predicts one label per view: the point projects onto this region, onto no region,
+or outside the image. These labels form a row. Most depths give the same row as their neighbours, so that few distinct
+rows are left per pixel; everything later works on those.
 
 This is the one border between torch and NumPy in the N-view matcher: regions and cameras come in as tensors on any
 device, everything from the table on is NumPy.
@@ -21,9 +21,9 @@ from torch import Tensor
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-EMPTY, OUTSIDE = -1, -2  # labels of a row: no region there; outside of the image, behind the camera, or the own view
-PIXELS = 24  # at most so many per region cast a ray
-PLENTY = 10  # with more views than this fewer do: each ray shows more
+EMPTY, OUTSIDE = -1, -2  # labels of a row: no region there; outside the image, behind the camera, or the own view
+PIXELS = 24  # rays per region, at most
+PLENTY = 10  # with more views than this fewer rays are cast: each shows more
 DEPTHS = 96  # along a ray
 NEAREST = 0.05  # no depth below this fraction of the longest baseline
 MAX_EMPTY = 0.5  # share of the other views that may show no region
@@ -36,7 +36,7 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class ViewBounds:
-    """Where the views stand in a `RowTable`: (V + 1,) starts of their regions, pixels and rows."""
+    """Where each view starts in a `RowTable`: (V + 1,) offsets of its regions, pixels and rows."""
 
     region_starts: Ints
     pixel_starts: Ints
@@ -79,7 +79,7 @@ class RowTable:
 
     @cached_property
     def bounds(self) -> ViewBounds:
-        """Where the views stand in the table."""
+        """Where each view starts in the table."""
         numbers = np.arange(self.num_views + 1)
         pixel_starts = np.searchsorted(self.view_index[self.pixel_region], numbers)
         return ViewBounds(
@@ -95,11 +95,11 @@ def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1) -> RowTa
     Args:
         regions: D regions ordered by view (int64 `view_index` must not decrease).
         cameras: V cameras.
-        widen_px: labels also count this far into unlabelled pixels; about the reprojection error to expect.
+        widen_px: regions grow this far into unlabelled pixels; about the expected reprojection error.
 
     Returns:
-        The table. A row is kept when at least one view shows a region, and at most half of the views that the point
-        lies in (but always one) show none; and when its neighbours on the ray do not say the same and more.
+        The table. A row is kept when at least one view shows a region, at most half of the views that the point lies in
+        show none (one always may), and no neighbour on the ray shows the same regions and more.
     """
     sizes = cameras.sizes.tolist()
     maps = [_padded_labels(regions, view, size, widen_px=widen_px) for view, size in enumerate(sizes)]
@@ -160,7 +160,7 @@ def _padded_labels(regions: Regions, view: int, size: list[int], *, widen_px: in
 def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
     """x1, y1, x2, y2 of all regions of a padded label map in pixels; None without any.
 
-    Where a region touches the border of the image its instance may go on, so that the box does so without end.
+    Where a region touches the border of the image its instance may continue, so the box extends to infinity there.
     """
     inner = labels[1:-1, 1:-1] >= 0
     ends = []
@@ -262,7 +262,7 @@ def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tens
 
 
 def _join_equal(pixel: Tensor, labels: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Join runs of equal rows on a ray; discard rows that only lack regions which a neighbour on the ray shows."""
+    """Join runs of equal rows on a ray; discard rows that equal a neighbour's but lack some of its regions."""
     if not len(pixel):
         return pixel, labels, inverse
     is_new = torch.ones(len(pixel), dtype=torch.bool, device=pixel.device)

@@ -1,9 +1,9 @@
 """Matching by what all views show, from start to finish.
 
-Pairs of views cannot tell leaves apart that share their epipolar lines; a third view can. What the views show along the
+Pairs of views cannot tell apart leaves that share their epipolar lines; a third view can. What the views show along the
 rays of each region (`label_rows.py`) gives a start (`soft_start.py`); the search (`search.py`) improves it by how well
-clusters explain all views (`cluster_scores.py`); then every id gets a probability (`match_scores.py`), and masks over
-two instances are found (`merged_masks.py`).
+clusters explain all views (`cluster_scores.py`); then every id gets a probability (`match_scores.py`), and masks that
+cover two instances are found (`merged_masks.py`).
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from mvseg.scene import Cameras
 
 Ints = NDArray[np.int64]
 
-WIDENINGS = (1, 2, 4, 8)  # pixels of reprojection error that are tried
-EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean scores above which the poses are sound, below which the rows are of no use
+WIDENINGS = (1, 2, 4, 8)  # reprojection errors that are tried, pixels
+EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean score above which the poses are sound; below which the rows are useless
 
 
 def match_nview(
@@ -46,8 +46,8 @@ def match_nview(
 
     Returns:
         The matching, on the device of the regions. Its method is "one-per-view" where the rows do not explain the
-        regions (poses too far off) or there are two views. It does not depend on the order of views and regions, unless
-        two choices are worth exactly the same, and there is no randomness in it. Without regions or edges all are -1.
+        regions (poses too far off) or there are two views. It is deterministic and does not depend on the order of
+        views and regions unless two choices tie exactly. Without regions or edges all ids are -1.
     """
     order = regions.view_index.argsort(stable=True)
     ordered = regions.select(order)

@@ -26,9 +26,9 @@ class IdEvidence:
     """The evidence for the ids of D regions.
 
     Attributes:
-        score: (D,) leave-one-out score in the own cluster.
-        margin: (D,) gain of the own cluster less the gain of the best other choice, being alone included.
-        landing: (D,) share of the cluster's pixels in other views that expect to be seen on the region.
+        score: (D,) leave-one-out score in the region's cluster.
+        margin: (D,) gain of the region's cluster minus that of the best alternative: another cluster, or being alone.
+        landing: (D,) share of the cluster's pixels in other views that land on the region.
         weight: (D,) mean epipolar weight to the members in other views.
         num_partners: (D,) int64, members of the cluster in other views; 0 for a region that is alone.
         num_pieces: (D,) int64, members of the cluster in the region's own view, itself included.
@@ -75,7 +75,7 @@ def collect_evidence(scores: ClusterScores, clusters: Ints) -> IdEvidence:
 
 
 def features(evidence: IdEvidence) -> Floats:
-    """(D, 7) what the probability depends on, each clipped to a range that the plants fill."""
+    """(D, 7): what the probability depends on, clipped to the range seen on the development plants."""
     others = max(evidence.num_views - 1, 1)
     return np.stack(
         [

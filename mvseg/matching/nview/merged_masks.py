@@ -12,7 +12,7 @@ from mvseg.matching.result import MergedMask
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]
-NEIGHBOURS = 3  # sampled pixels that decide for the pixels around them
+NEIGHBOURS = 3  # nearest sampled pixels that decide for a pixel
 HALF_AS_GOOD = 0.5  # share of a cluster's median score from which it explains a pixel
 
 
@@ -20,8 +20,8 @@ def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tupl
     """Masks that cover two instances: two clusters explain disjoint parts of them.
 
     A cluster that has no region in a view, but lands on one that belongs to another cluster, may share it. A pixel is
-    explained by a cluster when it scores at least half of what the cluster's regions score in the median. Of several
-    such clusters that one shares it which explains most pixels that the region's own cluster does not.
+    explained by a cluster when it scores at least half of the median score of the cluster's regions. Of several such
+    clusters, the one that explains most of the pixels that the region's own cluster does not is its second.
 
     Args:
         scores: of D regions, ordered by view.
@@ -31,42 +31,48 @@ def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tupl
     Returns:
         One entry per such mask, by view; the ids are cluster numbers plus one.
     """
-    pairs = [pair for view in range(scores.table.num_views) for pair in _shared_in_view(scores, clusters, view)]
+    is_second = _may_be_second(scores, clusters)
     merged = []
-    for region, second in pairs:
-        part = second_part(scores, clusters, regions, region=region, second=second)
-        merged.append(MergedMask(region=region, own=int(clusters[region]) + 1, other=second + 1, part=part))
+    for view in range(scores.table.num_views):
+        for region, second in _shared_in_view(scores, clusters, view, is_second=is_second):
+            part = second_part(scores, clusters, regions, region=region, second=second)
+            merged.append(MergedMask(region=region, own=int(clusters[region]) + 1, other=second + 1, part=part))
     return tuple(merged)
 
 
-def _shared_in_view(scores: ClusterScores, clusters: Ints, view: int) -> list[tuple[int, int]]:
+def _may_be_second(scores: ClusterScores, clusters: Ints) -> NDArray[np.bool_]:
+    """(K, D) bool: the cluster is seen in enough views, has no region in the region's view, and lands on the region."""
+    views, thresholds = scores.table.view_index, scores.config.thresholds
+    landings = scores.landings(clusters)
+    is_shown = np.zeros((len(landings), scores.table.num_views), bool)
+    is_shown[clusters, views] = True
+    is_seen_enough = is_shown.sum(1) >= max(2, thresholds.few * scores.table.num_views)
+    is_second = (landings >= thresholds.merged_landing) & is_seen_enough[:, None] & is_seen_enough[clusters]
+    return is_second & ~is_shown[:, views]
+
+
+def _shared_in_view(
+    scores: ClusterScores, clusters: Ints, view: int, *, is_second: NDArray[np.bool_]
+) -> list[tuple[int, int]]:
     """Regions of one view that two clusters share, with the second cluster."""
-    table, thresholds = scores.table, scores.config.thresholds
-    landings, own = scores.landings(clusters), scores.own(clusters)
-    members = members_of(clusters, len(landings))
-    is_seen_enough = np.array(
-        [len(np.unique(table.view_index[one])) >= max(2, thresholds.few * table.num_views) for one in members], bool
-    )
-    here = np.flatnonzero(table.view_index == view)
-    is_second = (landings[:, here] >= thresholds.merged_landing) & is_seen_enough[:, None]
-    is_second &= is_seen_enough[clusters[here]]
-    is_second[clusters[here]] = False
-    shared = here[is_second.any(0)]
+    here = np.flatnonzero(scores.table.view_index == view)
+    shared = here[is_second[:, here].any(0)]
     if not len(shared):
         return []
-    asked = np.union1d(np.flatnonzero(is_second.any(1)), clusters[shared])
-    column = np.full(len(members), -1)
+    asked = np.union1d(np.flatnonzero(is_second[:, here].any(1)), clusters[shared])
+    column = np.full(len(is_second), -1)
     column[asked] = np.arange(len(asked))
-    usual = np.array([np.median(own[members[number]]) for number in asked])
-    is_explained = scores.pixel_scores(view, column[clusters]) >= HALF_AS_GOOD * usual
-    pixel_region = table.pixel_region[table.bounds.pixels(view)]
+    own, members = scores.own(clusters), members_of(clusters, len(is_second))
+    median_score = np.array([np.median(own[members[number]]) for number in asked])
+    is_explained = scores.pixel_scores(view, column[clusters]) >= HALF_AS_GOOD * median_score
+    pixel_region = scores.table.pixel_region[scores.table.bounds.pixels(view)]
     pairs = []
     for region in shared.tolist():
-        candidates = np.append(clusters[region], np.flatnonzero(is_second[:, region - here[0]]))
+        candidates = np.append(clusters[region], np.flatnonzero(is_second[:, region]))
         part = is_explained[pixel_region == region][:, column[candidates]]
         share = (part & ~part[:, :1]).mean(0)
         best = int(share.argmax())
-        if share[best] >= thresholds.merged_share:
+        if share[best] >= scores.config.thresholds.merged_share:
             pairs.append((region, int(candidates[best])))
     return pairs
 
@@ -89,13 +95,13 @@ def second_part(scores: ClusterScores, clusters: Ints, regions: Regions, *, regi
     pixels = table.bounds.pixels(view)
     is_here = table.pixel_region[pixels] == region
     mask = regions.crop(region).cpu()
-    part, spots = torch.zeros_like(mask), mask.nonzero()
+    part, mask_pixels = torch.zeros_like(mask), mask.nonzero()
     if not is_here.any():
         return part
     pair = np.where(clusters == clusters[region], 0, np.where(clusters == second, 1, -1))
     pixel_scores = scores.pixel_scores(view, pair)[is_here]
     sampled = torch.from_numpy(table.pixel_xy[pixels][is_here]) - regions.boxes[region, :2].cpu()
-    nearest = torch.cdist(spots.flip(1) + 0.5, sampled).topk(min(NEIGHBOURS, len(sampled)), largest=False).indices
+    nearest = torch.cdist(mask_pixels.flip(1) + 0.5, sampled).topk(min(NEIGHBOURS, len(sampled)), largest=False).indices
     advantage = torch.from_numpy(pixel_scores[:, 1] - pixel_scores[:, 0])[nearest].mean(1)
-    part[spots[:, 0], spots[:, 1]] = advantage > 0
+    part[mask_pixels[:, 0], mask_pixels[:, 1]] = advantage > 0
     return part

@@ -1,8 +1,8 @@
 """The search for the partition that explains all views best.
 
-From each start one assignment problem per view, as in `one_per_view.py`, but decided by how well the clusters explain
-the regions in all views. Regions that are left over may join a cluster whose place in their view is taken, if it
-expects to be seen there too: the pieces of an instance that the segmenter split, or that a stem in front of it divides.
+Each start is refined by one assignment problem per view, as in `one_per_view.py`, but decided by how well the clusters
+explain the regions in all views. A left-over region may join a cluster that has a region in its view already, if the
+cluster lands there too: pieces of an instance that the segmenter split, or that a stem in front of it divides.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_orde
 from mvseg.partition import renumber
 
 MAX_SWEEPS = 3
-AS_GOOD = 0.99  # share of the best value that pairwise clusters must reach
-SECOND_CHANCE = 0.4  # mean epipolar weight with which regions that are left alone join after all
+AS_GOOD = 0.99  # share of the best value that pairwise clusters must reach to be kept
+SECOND_CHANCE = 0.4  # mean epipolar weight from which regions left alone are joined after all
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -28,7 +28,7 @@ def search(scores: ClusterScores, pairwise: Ints) -> Ints:
     """The best partition that refinement finds from one start, or, with few views, two.
 
     Clusters from the weights alone are kept when they are worth nearly as much: then the masks are sound, and the
-    weights know better what becomes of slivers that few views show.
+    weights decide better about slivers that few views show.
 
     Args:
         scores: of D regions in three views or more.
@@ -54,7 +54,7 @@ def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False) 
     Args:
         scores: of D regions.
         clusters: (D,) clusters to start from.
-        join_pieces: left-over regions may join a cluster whose place in their view is taken.
+        join_pieces: left-over regions may join a cluster that has a region in their view already.
 
     Returns:
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
@@ -81,19 +81,18 @@ def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False) 
 
 
 def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
-    """Dissolve clusters that few views show into those that expect to be seen where they are.
+    """Dissolve clusters that few views show into larger ones that land on their regions.
 
     Pieces of split masks, and masks that are merged with something else, find each other across views and form spurious
-    instances. A region of such a cluster joins the larger one that expects most to be seen on it and explains some of
-    it, whether its place is taken or not; if there is one. With three views no cluster is seen often enough to be
-    doubted.
+    instances. A region of such a cluster joins the larger one that lands most on it and explains some of it, if there
+    is one, whether or not that one has a region in the view already. With fewer than four views nothing is dissolved.
 
     Args:
         scores: of D regions.
         clusters: (D,) cluster of each region in [0, K), numbered by their first region.
 
     Returns:
-        (D,) int64, the same for what is left.
+        (D,) int64, the remaining clusters, numbered likewise.
     """
     table, thresholds = scores.table, scores.config.thresholds
     is_shown = np.zeros((int(clusters.max(initial=-1)) + 1, table.num_views), bool)
@@ -113,14 +112,14 @@ def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
 
 
 def _join_pieces(chosen: Ints, gains: ViewGains, config: NViewConfig) -> Ints:
-    """Put left-over regions into taken clusters that expect to be seen on them and explain them well."""
-    is_in = chosen < len(gains.clusters)
-    holder = np.full(len(gains.clusters), np.inf)
-    holder[chosen[is_in]] = gains.score[is_in, chosen[is_in]]
+    """Put left-over regions into taken clusters that land on them and explain them well."""
+    is_assigned = chosen < len(gains.clusters)
+    holder_score = np.full(len(gains.clusters), np.inf)
+    holder_score[chosen[is_assigned]] = gains.score[is_assigned, chosen[is_assigned]]
     fits = (gains.landing >= config.thresholds.piece_landing) & (gains.score > 0)
-    fits &= gains.score >= config.thresholds.piece_score * holder
+    fits &= gains.score >= config.thresholds.piece_score * holder_score
     value = np.where(fits, gains.score + config.gains.landing * gains.landing, -np.inf)
-    joins = ~is_in & fits.any(1)
+    joins = ~is_assigned & fits.any(1)
     chosen = chosen.copy()
     if joins.any():
         chosen[joins] = value[joins].argmax(1)

@@ -1,7 +1,7 @@
 """Starts of the search: soft multi-view stereo on region labels, before there is any cluster.
 
-How likely two regions are one instance, and which row of a ray is the right one, explain each other. Average linkage of
-that affinity gives the clusters that the search refines.
+How likely two regions are one instance follows from which row of each ray is right, and the reverse: EM estimates both.
+Average linkage of the affinity gives the clusters that the search refines.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from mvseg.matching.one_per_view import ViewGraph, link_average
 
 SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the rows of a pixel, one per iteration
 EMPTY_COST = 0.7  # of a row in which all views show no region
-EM_PIXELS = 12  # at most so many per region
+EM_PIXELS = 12  # pixels per region, at most
 STARTS = ((-1, 0.3), (1, 0.1))  # iteration whose affinity is clustered, and where the linkage stops
-MANY_VIEWS = 8  # more than these need no second start
+MANY_VIEWS = 8  # with more than this, one start will do
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -42,7 +42,7 @@ def em_affinities(table: RowTable) -> list[NDArray[np.floating]]:
         table: rows of D regions.
 
     Returns:
-        After each iteration (D, D) float64 in [0, 1], symmetric, 0 for regions of one view.
+        The affinity after each iteration: (D, D) float64 in [0, 1], symmetric, 0 within a view.
     """
     num, owner_of = len(table.view_index), table.pixel_region
     most = max(1, round(EM_PIXELS * min(1, PLENTY / table.num_views)))
@@ -60,9 +60,9 @@ def em_affinities(table: RowTable) -> list[NDArray[np.floating]]:
     cell = owner * (num + 1) + labels
     if not len(start):
         return [np.zeros((num, num))] * len(SHARPNESS)
-    seen = torch.unique(run * (num + 1) + labels)
-    first = owner[torch.from_numpy(start)][seen // (num + 1)] * (num + 1) + seen % (num + 1)
-    A = torch.bincount(first, minlength=num * (num + 1)).reshape(num, num + 1)[:, :num] / pixels
+    shown = torch.unique(run * (num + 1) + labels)
+    first_cell = owner[torch.from_numpy(start)][shown // (num + 1)] * (num + 1) + shown % (num + 1)
+    A = torch.bincount(first_cell, minlength=num * (num + 1)).reshape(num, num + 1)[:, :num] / pixels
     history = []
     for beta in SHARPNESS:
         flat = torch.nn.functional.pad((A + A.T).float() / 2, (0, 1, 0, 1)).flatten()
@@ -76,5 +76,5 @@ def em_affinities(table: RowTable) -> list[NDArray[np.floating]]:
         belief /= torch.bincount(run, belief)[run]
         mass = torch.bincount(cell.flatten(), belief.expand(cell.shape).flatten(), minlength=num * (num + 1))
         A = mass.reshape(num, num + 1)[:, :num] / pixels
-        history.append(((A + A.T) / 2).double().numpy())
+        history.append(((A + A.T) / 2).numpy())
     return history
