@@ -1,0 +1,185 @@
+"""How good are areas, lengths and widths? `python benchmarks/traits.py --cache ~/mvseg-cells [--views 10] [--plants 6]`
+
+Surfaces of simulated leaves against their meshes, by family, number of views and kind of masks ("true": the visible
+parts; "degraded": with the faults of a segmenter; ids are the true ones). Plants of 8 leaves, 480 x 480, cameras on a
+200 degree arc, as in the preset "paper-eval". Rows are median / 90th percentile of |error| over all leaves, also those
+that the quality flag doubts; leaves without a surface are counted, not averaged. Width is the simulator's without the
+teeth of the edge. "distance" is the symmetric mean distance of the two surfaces in % of the length, "inside" the share
+of true areas, lengths and widths inside their 95 % intervals, "base" the share of oriented leaves whose base is right.
+
+`--real FOLDER` is a scene with true label images in `truth/`: every view is left out in turn, the surfaces of the
+others are projected into it, and the mean IoU with the true masks is printed: with all that the surface covers, and
+without the pixels that show other instances or are ignored.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import time
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import trimesh
+from scipy.spatial import cKDTree
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.label_maps import KINDS, load_maps
+from mvseg.formats.label_png import read_label_png
+from mvseg.formats.scene_folder import load_scene
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import regions_from_label_maps
+from mvseg.simulation.blades import Leaf
+from mvseg.simulation.dataset import EVALUATED_FAMILIES, Preset, SceneSpec, list_scenes, run_all
+from mvseg.simulation.families import FAMILIES
+from mvseg.simulation.growth import grow_plant
+
+MEASURES = ("area", "length", "width", "inclination", "distance")
+NUM_LEAVES = 8
+
+
+def run_scene(spec: SceneSpec, *, cache: Path, kinds: list[str]) -> list[dict[str, Any]]:
+    """One record per kind of masks and leaf of a plant that at least one view shows."""
+    torch.set_num_threads(1)
+    scene = load_maps(spec, cache)
+    plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
+    records = []
+    for kind in kinds:
+        regions, ids = scene.masks(kind)
+        start = time.perf_counter()
+        surfaces = fit_surfaces(regions, torch.where(ids > 0, ids, -1), scene.cameras)
+        seconds = (time.perf_counter() - start) / max(len(surfaces), 1)
+        cell = {"family": spec.family, "views": spec.num_views, "masks": kind, "scene": spec.folder}
+        for leaf in plant.leaves:
+            if leaf.leaf_id in surfaces:
+                errors = compare(surfaces[leaf.leaf_id], leaf, FAMILIES[spec.family].teeth)
+                records.append({**cell, "leaf": leaf.leaf_id, "seconds": seconds, **errors})
+    return records
+
+
+def compare(surface: LeafSurface, leaf: Leaf, teeth: float) -> dict[str, Any]:
+    """Signed errors in %, degrees and % of the length; what the surface says of itself."""
+    record: dict[str, Any] = {"exists": surface.exists, "reasons": list(surface.quality.reasons)}
+    if not surface.exists:
+        return record
+    truth = (leaf.area, leaf.length, leaf.width / (1 + teeth))
+    for name, deviation, value in zip(("area", "length", "width"), surface.deviations, truth, strict=True):
+        error = getattr(surface, name) - value
+        record |= {name: 100 * error / value, f"{name}_inside": bool(abs(error) <= 1.96 * deviation)}
+    mesh = trimesh.Trimesh(leaf.vertices, leaf.faces, process=False)
+    record["inclination"] = tilt(surface.mesh()) - tilt(mesh)
+    record["distance"] = 100 * surface_distance(surface.mesh(), mesh) / leaf.length
+    record["oriented"] = surface.is_oriented
+    ends = np.linalg.norm(surface.midrib[[0, -1]].numpy() - leaf.vertices[0], axis=1)
+    record["base"] = bool(ends[0] < ends[1])
+    return record
+
+
+def tilt(mesh: trimesh.Trimesh) -> float:
+    """Degrees between the mean normal of a blade and the vertical."""
+    corners = mesh.vertices[mesh.faces]
+    mean = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
+    return float(np.degrees(np.arccos(min(1.0, abs(mean[2]) / np.linalg.norm(mean)))))
+
+
+def surface_distance(first: trimesh.Trimesh, second: trimesh.Trimesh) -> float:
+    """Mean of the two mean distances from points of one surface to the other, by dense samples."""
+    distances = []
+    for here, there in ((first, second), (second, first)):
+        few, _ = trimesh.sample.sample_surface(here, 2000, seed=0)
+        many, _ = trimesh.sample.sample_surface(there, 40_000, seed=1)
+        distances.append(cKDTree(many).query(few)[0].mean())
+    return float(np.mean(distances))
+
+
+def print_table(records: list[dict[str, Any]]) -> None:
+    """One row per kind of masks, number of views and family; the last of each group is over all but the straps."""
+    columns = "".join(f"{name:>16}" for name in MEASURES)
+    print(f"{'masks':10}views {'family':16}   n none{columns} flagged inside  base     s")
+    for kind, views in sorted({(r["masks"], r["views"]) for r in records}, key=lambda key: (key[0] != "true", key[1])):
+        group = [r for r in records if r["masks"] == kind and r["views"] == views]
+        for family in [*sorted({r["family"] for r in group}), "all but strap"]:
+            rows = [r for r in group if r["family"] == family or (family == "all but strap" and r["family"] != "strap")]
+            fitted = [r for r in rows if r["exists"]]
+            if not fitted:
+                continue
+            cells = ""
+            for name in MEASURES:
+                errors = np.abs([r[name] for r in fitted])
+                cells += f"{np.median(errors):9.2f} /{np.quantile(errors, 0.9):5.1f}"
+            inside = np.mean([[r[f"{name}_inside"] for name in ("area", "length", "width")] for r in fitted])
+            oriented = [r["base"] for r in fitted if r["oriented"]]
+            base = f"{np.mean(oriented):6.2f}" if oriented else "     -"
+            flagged = np.mean([bool(r["reasons"]) for r in rows])
+            seconds = np.mean([r["seconds"] for r in rows])
+            print(
+                f"{kind:10}{views:5} {family:16}{len(fitted):4}{len(rows) - len(fitted):5}{cells}"
+                f"{flagged:8.2f}{inside:7.2f}{base}{seconds:6.2f}"
+            )
+
+
+def leave_one_out(folder: Path) -> None:
+    """IoU of surfaces with the masks of a view that they were not fitted to."""
+    torch.set_num_threads(1)
+    scene = load_scene(folder)
+    sizes = scene.cameras.sizes.tolist()
+    maps = [
+        read_label_png(folder / "truth" / f"{view.name}.png", *size)
+        for view, size in zip(scene.views, sizes, strict=True)
+    ]
+    regions = regions_from_label_maps(maps)
+    records = []
+    for view, labels in enumerate(maps):
+        others = regions.select(regions.view_index != view)
+        surfaces = fit_surfaces(others, others.labels, scene.cameras)
+        for instance in regions.labels[regions.view_index == view].tolist():
+            if instance not in surfaces or not surfaces[instance].exists:
+                continue
+            seen = surfaces[instance].project(scene.cameras[[view]])[0].numpy()
+            mask = labels == instance
+            free = mask | (labels == 0)
+            ious = [(part & mask).sum() / max((part | mask).sum(), 1) for part in (seen, seen & free)]
+            records.append((instance, int(mask.sum()), *ious))
+    _, sizes_px, covered, visible = np.array(records).T
+    large = sizes_px >= np.median(sizes_px)
+    for name, ious in (("all that is covered", covered), ("without other instances", visible)):
+        means = f"{ious.mean():.3f}, larger half {ious[large].mean():.3f}"
+        print(f"{folder.name}: leave one view out, IoU {name}: {means}, {len(ious)} masks")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, help="folder for label maps")
+    parser.add_argument("--split", choices=("dev", "test"), default="dev")
+    parser.add_argument("--seed", type=int, default=0, help="of the plants; another one for plants never looked at")
+    parser.add_argument("--families", nargs="+", choices=EVALUATED_FAMILIES, default=EVALUATED_FAMILIES)
+    parser.add_argument("--views", nargs="+", type=int, default=(5, 10, 20))
+    parser.add_argument("--masks", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--plants", type=int, default=1, help="per family")
+    parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--json", type=Path, help="write the records here")
+    parser.add_argument("--real", type=Path, help="leave-one-view-out IoU on this scene folder, and nothing else")
+    args = parser.parse_args()
+    if args.real:
+        leave_one_out(args.real)
+        return
+    if args.cache is None:
+        parser.error("expected --cache DIR or --real FOLDER")
+    plants = args.plants * len(EVALUATED_FAMILIES)
+    preset = Preset(plants=((args.split, plants),), leaves=(NUM_LEAVES,), views=tuple(args.views))
+    scenes = [spec for spec in list_scenes(preset, args.seed) if spec.family in args.families]
+    work = partial(run_scene, cache=args.cache, kinds=args.masks)
+    records = [record for found in run_all(work, scenes, num_workers=args.workers) for record in found]
+    if args.json:
+        args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")
+    print_table(records)
+
+
+if __name__ == "__main__":
+    main()

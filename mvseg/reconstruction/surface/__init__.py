@@ -1,0 +1,1 @@
+"""A leaf as a spline surface, fitted to the outlines of its masks in all views."""

@@ -1,0 +1,154 @@
+"""The fit of one leaf patch to the outlines of its masks: reweighted Gauss-Newton."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid, patch_prior
+from mvseg.reconstruction.surface.mask_stack import MaskStack
+from mvseg.reconstruction.surface.outline import Distances, outline_distances
+
+FIT_GRID = (36, 9)
+NUM_STEPS, NUM_WARM_STEPS = 18, 7
+NUM_IMAGED = 8  # last steps, in which patches are drawn as the masks are
+FAR_REACH, NEAR_REACH, REACH_STEPS = 14.0, 6.0, 10  # pixels; the reach shrinks over so many steps
+SAMPLE_WEIGHT = 0.35  # neighbouring samples are alike
+FAR_SCALE_PX, LEAST_SCALE_PX = 4.0, 0.7  # of the Cauchy weights, at first and in the end
+SCALE_FACTOR = 4.0  # or so many median distances, where masks contradict each other by more
+OFFSET_FROM, OFFSET_SHARE = 6, 0.8  # step from which masks may be too large or small, and the share that is believed
+CLEAN_PX = 1.0  # deviation of the distances up to which masks are clean; beyond it fold and curl stay nearer to none
+NARROW = 0.15  # of the length: steps along narrow leaves may be as long as those of a leaf with this half-width
+NOISY_VIEW = 1.5  # times the usual spread: such views count less
+
+
+@dataclass(frozen=True, eq=False)
+class PatchFit:
+    """A fitted patch, in the world of `masks` (moved and scaled to the leaf).
+
+    Attributes:
+        coefficients: (26, 3).
+        covariance: (78, 78).
+        residual_px: (S,) root mean square distance per view, robustly weighted.
+    """
+
+    coefficients: Floats
+    covariance: Floats
+    residual_px: Floats
+
+    @property
+    def rms_px(self) -> float:
+        """Median over the views; NaN when no outline meets a mask's edge."""
+        return float(np.nanmedian(self.residual_px)) if np.isfinite(self.residual_px).any() else float("nan")
+
+
+def fit_patch(masks: MaskStack, start: Floats, *, num_steps: int) -> PatchFit:
+    """Move a patch until its outlines are those of the masks: reweighted Gauss-Newton.
+
+    Works in a world moved and scaled to the start, so nothing depends on the scene's origin and unit.
+    """
+    centre, scale = start[MIDRIB].mean(0), measure_patch(start).length
+    moved = masks.move_world(centre, scale)
+    coefficients = start.copy()
+    coefficients[MIDRIB] -= centre
+    coefficients /= scale
+    grid = patch_grid(*FIT_GRID)
+    is_warm = num_steps <= NUM_WARM_STEPS
+    for step in range(num_steps):
+        progress = 1.0 if is_warm else min(1.0, step / REACH_STEPS)
+        reach = masks.enlargement * (FAR_REACH + (NEAR_REACH - FAR_REACH) * progress)
+        is_near = is_warm or step >= NUM_STEPS - NUM_IMAGED
+        distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=is_near)
+        has_offsets = is_warm or step >= OFFSET_FROM
+        scale_px = FAR_SCALE_PX + (LEAST_SCALE_PX - FAR_SCALE_PX) * progress
+        equations = _weigh(distances, len(masks), has_offsets=has_offsets, scale_px=scale_px)
+        is_late = is_warm or step >= NUM_STEPS // 2
+        coefficients = _step(coefficients, equations, damping=0.005 if is_late else 0.05, cap=0.12 if is_late else 0.25)
+    distances = outline_distances(moved, grid, coefficients, reach=NEAR_REACH * masks.enlargement, is_imaged=True)
+    equations = _weigh(distances, len(masks), has_offsets=True, scale_px=LEAST_SCALE_PX)
+    covariance = np.linalg.inv(_normal_matrix(coefficients, equations)[0])
+    coefficients = coefficients * scale
+    coefficients[MIDRIB] += centre
+    return PatchFit(
+        coefficients=coefficients,
+        covariance=np.asarray(covariance * scale**2, dtype=float),
+        residual_px=_rms_per_view(distances, equations, len(masks)),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Equations:
+    """What the outlines ask of the coefficients.
+
+    Jacobian (N, 78), distance (N,) in pixels, weight (N,), and by how much the masks are worse than clean ones (>= 1).
+    """
+
+    jacobian: Floats
+    px: Floats
+    weight: Floats
+    noise: float
+
+
+def _weigh(distances: Distances, num_views: int, *, has_offsets: bool, scale_px: float) -> _Equations:
+    """Robust weights, after what the masks of a view are all too large or too small by is taken off."""
+    px = distances.px
+    if has_offsets and len(px):
+        px = px - OFFSET_SHARE * _view_offsets(distances, num_views)[distances.stack]
+    spread = float(np.median(np.abs(px))) if len(px) else 0.0
+    scale = max(scale_px, SCALE_FACTOR * spread)
+    weight = SAMPLE_WEIGHT * distances.weight / (1 + (px / scale) ** 2)
+    weight = weight * _view_weights(px, distances.stack, num_views)[distances.stack]
+    noise = max(1.0, 1.48 * spread / CLEAN_PX)
+    return _Equations(jacobian=distances.jacobian, px=px, weight=weight, noise=noise)
+
+
+def _view_offsets(distances: Distances, num_views: int) -> Floats:
+    """(S,) median distance of each view beyond the winsorised mean of all views."""
+    medians = _per_view(distances.px, distances.stack, num_views)
+    ordered = np.sort(medians)
+    cut = num_views // 5
+    return medians - np.clip(medians, ordered[cut], ordered[-1 - cut]).mean()
+
+
+def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
+    """(S,) 1, or less for views whose distances spread more than is usual in the others."""
+    spreads = _per_view(np.abs(px), stack, num_views)
+    usual = NOISY_VIEW * max(float(np.median(spreads)), 0.3)
+    return np.minimum(1.0, (usual / np.maximum(spreads, 1e-9)) ** 2)
+
+
+def _per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
+    """(S,) medians; 0 for a view without samples."""
+    picks = [values[stack == index] for index in range(num_views)]
+    return np.array([np.median(pick) if len(pick) else 0.0 for pick in picks])
+
+
+def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats, Floats]:
+    """(78, 78) and (78,): outlines and prior together, about the present coefficients."""
+    prior, target = patch_prior(coefficients, measure_patch(coefficients), noise=equations.noise)
+    weighted = equations.jacobian * equations.weight[:, None]
+    matrix = weighted.T @ equations.jacobian + prior.T @ prior
+    return matrix, weighted.T @ equations.px + prior.T @ (target - prior @ coefficients.ravel())
+
+
+def _step(coefficients: Floats, equations: _Equations, *, damping: float, cap: float) -> Floats:
+    """One damped Gauss-Newton step; no point of the patch moves by more than `cap` half-widths."""
+    matrix, right = _normal_matrix(coefficients, equations)
+    matrix[np.diag_indices_from(matrix)] *= 1 + damping
+    step = np.linalg.solve(matrix, right).reshape(-1, 3)
+    longest = np.linalg.norm(patch_grid(*FIT_GRID).basis @ step, axis=1).max()
+    size = measure_patch(coefficients)
+    limit = cap * max(size.half_width, NARROW * size.length)
+    return coefficients + step * min(1.0, limit / max(longest, 1e-12))
+
+
+def _rms_per_view(distances: Distances, equations: _Equations, num_views: int) -> Floats:
+    """(S,) NaN for a view without samples."""
+    rms = np.full(num_views, np.nan)
+    for index in range(num_views):
+        here = distances.stack == index
+        if here.any():
+            weight = equations.weight[here]
+            rms[index] = np.sqrt((weight * distances.px[here] ** 2).sum() / weight.sum())
+    return rms

@@ -1,0 +1,173 @@
+"""Leaves as surfaces: spline patches fitted to the outlines of their masks in all views."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mvseg.errors import InputError
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.surface.fit_patch import (
+    FIT_GRID,
+    NUM_STEPS,
+    NUM_WARM_STEPS,
+    PatchFit,
+    fit_patch,
+)
+from mvseg.reconstruction.surface.leaf_patch import measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
+from mvseg.reconstruction.surface.orientation import orient_surfaces
+from mvseg.reconstruction.surface.patch_image import pixels_behind, view_ious
+from mvseg.reconstruction.surface.patch_start import start_patches
+from mvseg.reconstruction.voxels import back_project
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+HULL = ReconstructConfig(voxel_budget=25_000)
+HULL_BY_VOTE = ReconstructConfig(voxel_budget=25_000, seen_share=0.0)  # where faulty masks leave nothing of the first
+GOOD_IOU, IOU_PER_PX = 0.92, 0.2  # of a fit after which no other start is tried; less where the masks are noisy
+CLEAN_RMS_PX = 0.5  # up to which masks are not noisy
+LEAST_GAIN = 0.03  # in IoU, for another start to be better
+BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
+
+# What a surface must reach not to be doubted.
+LEAST_IOU, MOST_RMS_PX, MOST_AREA_SHARE = 0.8, 0.6, 0.06
+
+
+def fit_surfaces(
+    regions: Regions, instance_ids: Tensor, cameras: Cameras, *, has_second_pass: bool = True, progress: bool = False
+) -> dict[int, LeafSurface]:
+    """Fit a surface to every instance.
+
+    Args:
+        regions: D regions. Those matched to nothing hide leaves as well.
+        instance_ids: (D,) int64, from 1 on; -1 = no instance.
+        cameras: V cameras.
+        has_second_pass: fit again once it is known which leaf lies in front of which.
+        progress: show a progress bar over the instances.
+
+    Returns:
+        {instance id: surface} for every instance. Where no surface can be fitted (one view, masks that agree on no
+        point) its coefficients are NaN and its `quality` says why.
+
+    Raises:
+        InputError: as many ids as regions are expected.
+    """
+    if instance_ids.shape != regions.view_index.shape:
+        raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+    regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
+    frames = _instance_frames(regions, instance_ids, cameras)
+    free = [torch.from_numpy(frame == 0) for frame in frames]
+    stacks: dict[int, MaskStack] = {}
+    fits: dict[int, PatchFit] = {}
+    surfaces: dict[int, LeafSurface] = {}
+    for instance in tqdm(_ids(instance_ids), desc="surfaces", unit="instance", disable=not progress):
+        members = regions.select((instance_ids == instance) & (regions.areas > 0))
+        views = members.view_index.unique()
+        if len(views) < 2:
+            surfaces[instance] = LeafSurface.none(views, "seen in one view only")
+            continue
+        stacks[instance] = _stack(members, instance, frames, cameras)
+        fit = _fit_from_hull(stacks[instance], members, cameras, free)
+        if fit is None:
+            surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
+        else:
+            fits[instance] = fit
+    if has_second_pass:
+        stacks, fits = _fit_again(stacks, fits)
+    for instance, fit in fits.items():
+        surfaces[instance] = _surface(stacks[instance], fit)
+    return orient_surfaces(dict(sorted(surfaces.items())), cameras)
+
+
+def _ids(instance_ids: Tensor) -> list[int]:
+    return instance_ids[instance_ids > 0].unique().tolist()
+
+
+def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
+    """V frames (H, W) int32: the instance that each pixel shows, higher numbers for unmatched regions, 0 = none."""
+    last = int(instance_ids.max()) if len(instance_ids) else 0
+    values = torch.where(instance_ids > 0, instance_ids, max(last, 0) + 1 + torch.arange(len(instance_ids)))
+    sizes = cameras.sizes.tolist()
+    return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
+
+
+def _fit_from_hull(masks: MaskStack, members: Regions, cameras: Cameras, free: list[Tensor]) -> PatchFit | None:
+    """The best of the fits from several starts, which are tried until one explains the masks.
+
+    The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
+    """
+    best, best_iou = None, -1.0
+    for config in (HULL, HULL_BY_VOTE):
+        hull = back_project(members, cameras, config=config, free=free)
+        for start in [] if hull is None else start_patches(hull.points.numpy()):
+            fit = fit_patch(masks, start, num_steps=NUM_STEPS)
+            iou = float(np.median(view_ious(masks, patch_grid(*FIT_GRID).points(fit.coefficients))))
+            if iou > best_iou + LEAST_GAIN:
+                best, best_iou = fit, iou
+            if best is not None and best_iou > GOOD_IOU - IOU_PER_PX * max(0.0, best.rms_px - CLEAN_RMS_PX):
+                return best
+    return best
+
+
+def _stack(members: Regions, instance: int, frames: list[np.ndarray], cameras: Cameras) -> MaskStack:
+    """The outlines of one instance; its masks of one view are united."""
+    views = members.view_index.unique().tolist()
+    masks = []
+    for view in views:
+        ones = torch.ones_like(members.view_index)
+        masks.append(members.label_map(view, ones, cameras.sizes[view].tolist()).numpy() > 0)
+    others = [np.where(frames[view] == instance, 0, frames[view]) for view in views]
+    px_from_world = cameras.K[views] @ torch.cat((cameras.R[views], cameras.t[views][:, :, None]), 2)
+    return stack_masks(masks, others, views, px_from_world=px_from_world.numpy())
+
+
+def _fit_again(
+    stacks: dict[int, MaskStack], fits: dict[int, PatchFit]
+) -> tuple[dict[int, MaskStack], dict[int, PatchFit]]:
+    """Leaves whose neighbours turn out to lie behind them, fitted to what is then a rim."""
+    points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
+    again: dict[int, PatchFit] = {}
+    for instance, fit in fits.items():
+        margin = BEHIND * measure_patch(fit.coefficients).length
+        behind = pixels_behind(stacks[instance], points[instance], points, margin=margin)
+        if behind.any():
+            stacks[instance] = stacks[instance].with_background(behind)
+            fit = fit_patch(stacks[instance], fit.coefficients, num_steps=NUM_WARM_STEPS)
+        again[instance] = fit
+    return stacks, again
+
+
+def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
+    iou = view_ious(masks, patch_grid(*FIT_GRID).points(fit.coefficients))
+    surface = LeafSurface(
+        coefficients=torch.from_numpy(fit.coefficients),
+        covariance=torch.from_numpy(fit.covariance),
+        views=torch.from_numpy(masks.views),
+        residual_px=torch.from_numpy(fit.residual_px),
+        iou=torch.from_numpy(iou),
+        is_oriented=False,
+        quality=Quality(),
+    )
+    return replace(surface, quality=_judge(surface, fit))
+
+
+def _judge(surface: LeafSurface, fit: PatchFit) -> Quality:
+    """What speaks against a fit."""
+    reasons = []
+    if len(surface.views) == 2:
+        reasons.append("seen in two views only")
+    iou = float(surface.iou.median())
+    if iou < LEAST_IOU:
+        reasons.append(f"the surface explains its masks badly (median IoU {iou:.2f})")
+    if not fit.rms_px <= MOST_RMS_PX:
+        reasons.append(f"its outline is {fit.rms_px:.1f} px from those of its masks")
+    share = surface.deviations[0] / surface.area
+    if share > MOST_AREA_SHARE:
+        reasons.append(f"its area is uncertain by {100 * share:.0f} %")
+    return Quality(tuple(reasons))

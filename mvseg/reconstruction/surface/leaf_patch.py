@@ -1,0 +1,200 @@
+"""A leaf as a spline patch: the surface, linear in its coefficients, and what is expected of leaves.
+
+    x(u, v) = m(u) + f(u) [v Q(u) + |v| R(u) + v^2 S(u)],    f(u) = sqrt(4 u (1 - u))
+
+u in [0, 1] runs along the leaf, v in [-1, 1] across it. m is the midrib, Q points to the side, R folds the two halves
+about the midrib (and tells them apart), S curls them. m, Q, R and S are clamped B-splines with vector coefficients,
+26 in all; f closes the outline at both ends. Coefficients are (26, 3) float64 arrays in the order m, Q, R, S.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BSpline
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+COUNTS = (7, 12, 4, 3)  # coefficients of m, Q, R, S; fewer for Q cannot follow lobes
+NUM_COEFFICIENTS = sum(COUNTS)
+MIDRIB, SIDE, FOLD, CURL = (
+    slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS))
+)
+
+# Standard deviations of the prior, in leaf lengths (SPEED, BEND) or half-widths.
+BEND_SD = 0.06  # third differences of m
+SPEED_SD = 0.05  # of the speed along the midrib about its mean
+SIDE_SD = 1.0  # second differences of Q
+FOLD_SD, FOLD_STEP_SD = 0.35, 0.2  # R along the normal, and its differences
+CURL_SD = 0.35  # S along the normal
+SHEAR_SD = 0.15  # Q along the midrib, R and S within the blade
+
+
+def place_stations(num_rows: int) -> Floats:
+    """(num_rows,) places u from 0 to 1, denser at both ends, where the outline is round."""
+    t = np.linspace(0, 1, num_rows)
+    return 0.3 * t + 0.35 * (1 - np.cos(np.pi * t))
+
+
+def spline_basis(u: Floats, count: int) -> Floats:
+    """(P, count) values of the clamped B-splines on [0, 1], cubic, or of degree count - 1 where that is less."""
+    degree = min(3, count - 1)
+    knots = np.concatenate([np.zeros(degree), np.linspace(0, 1, count - degree + 1), np.ones(degree)])
+    return BSpline.design_matrix(np.clip(u, 0, 1), knots, degree).toarray()
+
+
+def patch_basis(u: Floats, v: Floats) -> Floats:
+    """(P, 26) matrix B of the points (u, v), both (P,): their positions are `B @ coefficients`."""
+    f = np.sqrt(np.clip(4 * u * (1 - u), 0, None))
+    factors = (np.ones_like(u), f * v, f * np.abs(v), f * v**2)
+    return np.concatenate(
+        [factor[:, None] * spline_basis(u, count) for factor, count in zip(factors, COUNTS, strict=True)], 1
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class PatchGrid:
+    """A grid of (rows, columns) points on the patch.
+
+    Attributes:
+        u: (rows,) places along the leaf, 0 and 1 included. There f is 0: the ends of the grid are single points.
+        v: (columns,) places across, -1 to 1, an odd number, so that the midrib is a grid line.
+        basis: (rows * columns, 26).
+    """
+
+    u: Floats
+    v: Floats
+    basis: Floats
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        return len(self.u), len(self.v)
+
+    def points(self, coefficients: Floats) -> Floats:
+        """(rows, columns, 3) positions."""
+        return (self.basis @ coefficients).reshape(*self.shape, 3)
+
+
+@cache
+def patch_grid(num_rows: int, num_columns: int) -> PatchGrid:
+    """The grid that many functions share; treat its arrays as constants."""
+    u, v = place_stations(num_rows), np.linspace(-1, 1, num_columns)
+    rows, columns = np.meshgrid(u, v, indexing="ij")
+    return PatchGrid(u=u, v=v, basis=patch_basis(rows.ravel(), columns.ravel()))
+
+
+def grid_triangles(num_rows: int, num_columns: int) -> Ints:
+    """(F, 3) triangles of a patch grid whose first and last row are one vertex each.
+
+    Vertex 0 is the base, vertex 1 + (row - 1) * num_columns + column an inner point, the last vertex the tip.
+    """
+    inner = 1 + np.arange((num_rows - 2) * num_columns).reshape(num_rows - 2, num_columns)
+    a, b, c, d = (x.ravel() for x in (inner[:-1, :-1], inner[:-1, 1:], inner[1:, 1:], inner[1:, :-1]))
+    base, tip = np.zeros(num_columns - 1, int), np.full(num_columns - 1, inner[-1, -1] + 1)
+    return np.concatenate([
+        np.stack([base, inner[0, :-1], inner[0, 1:]], 1),
+        np.stack([a, d, c], 1),
+        np.stack([a, c, b], 1),
+        np.stack([tip, inner[-1, 1:], inner[-1, :-1]], 1),
+    ])  # fmt: skip
+
+
+def grid_vertices(points: Floats) -> Floats:
+    """(P, n) vertices of `grid_triangles` from (rows, columns, n) grid points, n = 3 in space and 2 in pixels."""
+    return np.concatenate([points[0, :1], points[1:-1].reshape(-1, points.shape[-1]), points[-1, :1]])
+
+
+@dataclass(frozen=True, eq=False)
+class PatchSize:
+    """What the prior and the steps of the fit are measured by: length of the midrib and largest half-width."""
+
+    length: float
+    half_width: float
+
+
+def measure_patch(coefficients: Floats) -> PatchSize:
+    """Length and largest half-width of a patch, world units."""
+    points = patch_grid(36, 9).points(coefficients)
+    length = np.linalg.norm(np.diff(points[:, 4], axis=0), axis=1).sum()
+    width = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(1).max()
+    return PatchSize(length=float(length), half_width=float(width / 2))
+
+
+def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple[Floats, Floats]:
+    """What is expected of leaves, as linear equations about the present coefficients.
+
+    Directions (along the midrib, normal) are those of the present patch, so the answer does not depend on how the
+    world is turned.
+
+    Args:
+        coefficients: (26, 3).
+        size: length and half-width that the standard deviations are relative to.
+        noise: >= 1; fold, curl and shear, which faulty masks say little about, are held nearer to none by it.
+
+    Returns:
+        A (E, 78) and b (E,): A @ coefficients.ravel() should be b with standard deviation 1.
+    """
+    length, half = size.length, size.half_width
+    equations: list[NDArray] = []
+    targets: list[NDArray] = []
+
+    def expect(rows: Floats, directions: Floats | None, sd: float, target: Floats | float = 0.0) -> None:
+        """Rows (E, 26) along directions (E, 3), or along all three axes."""
+        if directions is None:
+            equations.append(np.kron(rows, np.eye(3)) / sd)
+        else:
+            equations.append((rows[:, :, None] * directions[:, None, :]).reshape(len(rows), -1) / sd)
+        targets.append(np.broadcast_to(np.asarray(target) / sd, len(equations[-1])))
+
+    expect(_differences(MIDRIB, 3), None, BEND_SD * length)
+    expect(_differences(SIDE, 2), None, SIDE_SD * half)
+    frames = [_frames(coefficients, count) for count in COUNTS]
+    for part, place in ((1, SIDE), (2, FOLD), (3, CURL)):
+        along, _, _ = frames[part]
+        expect(_rows(place), along, SHEAR_SD * half / noise)
+    for part, place, sd in ((2, FOLD, FOLD_SD), (3, CURL, CURL_SD)):
+        _, across, normal = frames[part]
+        expect(_rows(place), across, SHEAR_SD * half / noise)
+        expect(_rows(place), normal, sd * half / noise)
+    expect(_differences(FOLD, 1), None, FOLD_STEP_SD * half / noise)
+    speed, tangents = _speed(coefficients)
+    expect(speed, tangents, SPEED_SD * length, length)
+    return np.concatenate(equations), np.concatenate(targets)
+
+
+def _rows(part: slice) -> Floats:
+    return np.eye(NUM_COEFFICIENTS)[part]
+
+
+def _differences(part: slice, order: int) -> Floats:
+    return np.diff(np.eye(NUM_COEFFICIENTS)[part], order, axis=0)
+
+
+def _speed(coefficients: Floats) -> tuple[Floats, Floats]:
+    """(10, 26) rows that give dm/du on ten pieces of the midrib, and the present directions (10, 3) of these."""
+    u = np.linspace(0, 1, 11)
+    rows = np.diff(patch_basis(u, np.zeros_like(u)), axis=0) / 0.1
+    tangents = rows @ coefficients
+    return rows, _unit(tangents)
+
+
+def _frames(coefficients: Floats, count: int) -> tuple[Floats, Floats, Floats]:
+    """Directions along, across and normal to the blade, (count, 3) each, at the places of `count` coefficients."""
+    u = np.linspace(0, 1, count)
+    middle = np.clip(u, 0.02, 0.98)
+    zeros = np.zeros_like(u)
+    ahead = patch_basis(middle + 0.02, zeros) - patch_basis(middle - 0.02, zeros)
+    along = _unit(ahead @ coefficients)
+    side = spline_basis(middle, COUNTS[1]) @ coefficients[SIDE]
+    # Where the side vector vanishes (pointed ends) the mean one stands in.
+    side = side + 1e-3 * coefficients[SIDE].mean(0)
+    across = _unit(side - (side * along).sum(1, keepdims=True) * along)
+    return along, across, np.cross(along, across)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12)

@@ -1,0 +1,198 @@
+"""A leaf as a surface: the fitted patch, its measures and how far they can be trusted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+import torch
+import trimesh
+from torch import Tensor
+
+from mvseg.reconstruction.surface.leaf_patch import (
+    NUM_COEFFICIENTS,
+    Floats,
+    grid_triangles,
+    grid_vertices,
+    measure_patch,
+    patch_grid,
+)
+from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
+from mvseg.scene import Cameras
+
+MESH_SHAPE = (64, 17)
+# The covariance of the fit knows nothing of the model's own errors: factors that give its deviations 68 % coverage.
+AREA_FACTOR, LENGTH_FACTOR, WIDTH_FACTOR = 3.0, 2.3, 1.7
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Is the surface to be trusted?
+
+    Attributes:
+        is_good: no reason speaks against it.
+        reasons: what does, in words, the gravest first; empty for a good one.
+    """
+
+    reasons: tuple[str, ...] = ()
+
+    @property
+    def is_good(self) -> bool:
+        return not self.reasons
+
+
+@dataclass(frozen=True, eq=False)
+class LeafSurface:
+    """One leaf (of a compound leaf: one leaflet) as a surface with a rim; world frame and units.
+
+    Attributes:
+        coefficients: (26, 3) float64 of the patch (`leaf_patch`); NaN for an instance that has no surface.
+        covariance: (78, 78) float64 of `coefficients.ravel()`, of the fit alone.
+        views: (S,) int64, the views whose masks it was fitted to.
+        residual_px: (S,) float64, root mean square distance between its outline and the mask's edge in each view.
+        iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it; NaN where the
+            fit did not get that far.
+        is_oriented: u runs from the stem to the tip; False where the stem's side cannot be told.
+        quality: good, or what speaks against it.
+    """
+
+    coefficients: Tensor
+    covariance: Tensor
+    views: Tensor
+    residual_px: Tensor
+    iou: Tensor
+    is_oriented: bool
+    quality: Quality
+
+    @staticmethod
+    def none(views: Tensor, reason: str) -> LeafSurface:
+        """An instance without a surface, and why."""
+        nothing = torch.full((len(views),), torch.nan, dtype=torch.float64)
+        return LeafSurface(
+            coefficients=torch.full((NUM_COEFFICIENTS, 3), torch.nan, dtype=torch.float64),
+            covariance=torch.full((3 * NUM_COEFFICIENTS,) * 2, torch.nan, dtype=torch.float64),
+            views=views,
+            residual_px=nothing,
+            iou=nothing,
+            is_oriented=False,
+            quality=Quality((reason,)),
+        )
+
+    @property
+    def exists(self) -> bool:
+        """Is there a surface at all?"""
+        return bool(self.coefficients.isfinite().all())
+
+    def points(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> Tensor:
+        """(rows, columns, 3) float64 grid from base to tip and from edge to edge; odd columns have the midrib."""
+        return torch.from_numpy(patch_grid(num_rows, num_columns).points(self.coefficients.numpy()))
+
+    @cached_property
+    def area(self) -> float:
+        """One-sided area of the mesh; NaN without a surface."""
+        return _measures(self.coefficients.numpy())[0]
+
+    @cached_property
+    def length(self) -> float:
+        """Along the midrib from base to tip."""
+        return _measures(self.coefficients.numpy())[1]
+
+    @cached_property
+    def width(self) -> float:
+        """From edge to edge along the surface, at the widest place."""
+        return _measures(self.coefficients.numpy())[2]
+
+    @cached_property
+    def deviations(self) -> tuple[float, float, float]:
+        """Standard deviations of area, length and width: those of the fit, times a factor found on simulated leaves."""
+        if not self.exists:
+            return (float("nan"),) * 3
+        slopes = measure_slopes(self.coefficients.numpy())
+        variance = np.einsum("ij,jk,ik->i", slopes, self.covariance.numpy(), slopes)
+        area, length, width = np.sqrt(np.maximum(variance, 0)) * (AREA_FACTOR, LENGTH_FACTOR, WIDTH_FACTOR)
+        return float(area), float(length), float(width)
+
+    @property
+    def midrib(self) -> Tensor:
+        """(rows, 3) from base to tip."""
+        return self.points()[:, MESH_SHAPE[1] // 2]
+
+    @property
+    def rim(self) -> Tensor:
+        """(P, 3) once around, closed: the last point is not the first."""
+        points = self.points()
+        return torch.cat((points[:, 0], points[1:-1, -1].flip(0)))
+
+    @property
+    def normal(self) -> Tensor:
+        """(3,) unit mean normal of the mesh, weighted by area."""
+        mesh = self.mesh()
+        corners = mesh.vertices[mesh.faces]
+        mean = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
+        return torch.from_numpy(mean / max(float(np.linalg.norm(mean)), 1e-300))
+
+    def mesh(self) -> trimesh.Trimesh:
+        """Open mesh whose first vertex is the base and whose last one is the tip; empty without a surface.
+
+        Its normals point to the side that most cameras of the fit saw.
+        """
+        if not self.exists:
+            return trimesh.Trimesh()
+        vertices = grid_vertices(self.points().numpy())
+        return trimesh.Trimesh(vertices, grid_triangles(*MESH_SHAPE), process=False)
+
+    def project(self, cameras: Cameras) -> list[Tensor]:
+        """V masks (H, W) bool: the pixels that the surface covers half or more of, as if nothing hid it.
+
+        Parts behind a camera are left out.
+        """
+        sizes = cameras.sizes.tolist()
+        if not self.exists:
+            return [torch.zeros(height, width, dtype=torch.bool) for width, height in sizes]
+        points = self.points()
+        px, depth = cameras.project(points.reshape(-1, 3))
+        masks = []
+        for view, (width, height) in enumerate(sizes):
+            is_ahead = (grid_quads(depth[view].reshape(*MESH_SHAPE, 1).numpy()) > 0).all((1, 2))
+            quads = grid_quads(px[view].reshape(*MESH_SHAPE, 2).numpy())[is_ahead]
+            masks.append(torch.from_numpy(draw_polygons(quads, (width, height), np.zeros(2)) >= 0.5))
+        return masks
+
+
+def _measures(coefficients: Floats) -> tuple[float, float, float]:
+    """Area, length and width."""
+    corners = grid_vertices(patch_grid(*MESH_SHAPE).points(coefficients))[grid_triangles(*MESH_SHAPE)]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = measure_patch(coefficients)
+    return float(np.linalg.norm(normals, axis=1).sum() / 2), size.length, 2 * size.half_width
+
+
+def measure_slopes(coefficients: Floats) -> Floats:
+    """(3, 78) derivatives of area, length and width by `coefficients.ravel()`."""
+    grid = patch_grid(*MESH_SHAPE)
+    points = grid.points(coefficients)
+    rows, columns = grid.shape
+    by_point = np.zeros((3, rows, columns, 3))
+    along = _unit(np.diff(points[:, columns // 2], axis=0))
+    by_point[1, 1:, columns // 2] += along
+    by_point[1, :-1, columns // 2] -= along
+    pieces = np.diff(points, axis=1)
+    widest = np.linalg.norm(pieces, axis=2).sum(1).argmax()
+    across = _unit(pieces[widest])
+    by_point[2, widest, 1:] += across
+    by_point[2, widest, :-1] -= across
+    # Of each cell's two triangles; those at the ends of the grid that have no area have no normal either.
+    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
+    places = ((slice(None, -1), slice(None, -1)), (slice(None, -1), slice(1, None)),
+              (slice(1, None), slice(1, None)), (slice(1, None), slice(None, -1)))  # fmt: skip
+    for corners, at in (((a, d, c), (0, 3, 2)), ((a, c, b), (0, 2, 1))):
+        normal = _unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
+        for index in range(3):
+            opposite = corners[(index + 2) % 3] - corners[(index + 1) % 3]
+            by_point[(0, *places[at[index]])] += np.cross(normal, opposite) / 2
+    return np.einsum("kpc,pb->kbc", by_point.reshape(3, -1, 3), grid.basis).reshape(3, -1)
+
+
+def _unit(vectors: Floats) -> Floats:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

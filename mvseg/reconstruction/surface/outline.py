@@ -1,0 +1,263 @@
+"""The outlines of one leaf's masks, and how far the outline of a patch is from them, in pixels.
+
+Both ways: from samples of the patch's outline along their image normal to the mask's edge, and from samples of the
+mask's edge to the nearest outline sample with a similar normal. Distances are signed: positive where the patch has to
+grow. Where the mask ends because ANOTHER instance or the frame of the image hides the rest, its edge is not the leaf's
+rim: there the patch only has to cover the mask, and a negative distance does not count.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.reconstruction.surface.leaf_patch import Floats, PatchGrid
+from mvseg.reconstruction.surface.mask_stack import MaskStack
+from mvseg.reconstruction.surface.patch_image import (
+    DRAWN_TOO_FAR,
+    SUPERSAMPLED,
+    Projection,
+    cover_crop,
+    draw_patch,
+    project_points,
+)
+
+BEYOND_PX = (1.0, 2.0)  # beyond an edge, where another instance may begin
+OUTSIDE_PX = 1.6  # beyond the patch's outline, where the patch must not be: the filled quads are half a pixel too wide
+REVERSE_WEIGHT = 0.5  # of the samples of the masks' edges
+PULL_FROM_PX = 4.0  # an edge farther than this outside the patch pulls at its nearest sample
+SIMILAR = 0.5  # least cosine between the normals of matched samples
+MOST_SHIFT_PX = 5.0  # between the outline of a patch and the edge of its image
+
+
+@dataclass(frozen=True, eq=False)
+class OutlineSamples:
+    """K samples on the outline of a projected patch.
+
+    Attributes:
+        stack: (K,) place in `MaskStack.views`.
+        px: (K, 2).
+        normals: (K, 2) unit, outwards.
+        basis: (K, 26) of the patch points.
+        depth: (K,).
+    """
+
+    stack: NDArray[np.int64]
+    px: Floats
+    normals: Floats
+    basis: Floats
+    depth: Floats
+
+    def select(self, keep: NDArray) -> OutlineSamples:
+        return OutlineSamples(
+            stack=self.stack[keep],
+            px=self.px[keep],
+            normals=self.normals[keep],
+            basis=self.basis[keep],
+            depth=self.depth[keep],
+        )
+
+
+def outline_samples(
+    masks: MaskStack, grid: PatchGrid, projection: Projection
+) -> tuple[OutlineSamples, NDArray[np.uint8]]:
+    """The visible outline of a patch in every view: its rim, and the folds that stand out against the background.
+
+    Also (pixels,) uint8, 1 where the patch covers a pixel, as a flat array of `masks`.
+    """
+    samples = _concatenate(_rim_samples(grid, projection), _fold_samples(grid, projection))
+    outside = samples.px + OUTSIDE_PX * samples.normals
+    covered = np.concatenate([cover_crop(masks, projection, index).ravel() for index in range(len(masks))])
+    return samples.select(masks.look_up(covered, samples.stack, outside) == 0), covered
+
+
+def _concatenate(first: OutlineSamples, second: OutlineSamples) -> OutlineSamples:
+    return OutlineSamples(
+        stack=np.concatenate([first.stack, second.stack]),
+        px=np.concatenate([first.px, second.px]),
+        normals=np.concatenate([first.normals, second.normals]),
+        basis=np.concatenate([first.basis, second.basis]),
+        depth=np.concatenate([first.depth, second.depth]),
+    )
+
+
+def _rim_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
+    """All points of the rim: down one side of the grid and up the other."""
+    rows, columns = grid.shape
+    down, up = np.arange(rows), np.arange(rows - 2, 0, -1)
+    row = np.concatenate([down, up])
+    column = np.concatenate([np.zeros(rows, int), np.full(rows - 2, columns - 1)])
+    inner_row = np.clip(row, 1, rows - 2)
+    inner_column = np.where(column == 0, 1, columns - 2)
+    inner_column[[0, rows - 1]] = columns // 2
+    px = projection.px[:, row, column]
+    tangent = np.roll(px, -1, 1) - np.roll(px, 1, 1)
+    normals = _outwards(tangent, px - projection.px[:, inner_row, inner_column])
+    num_views, count = px.shape[:2]
+    return OutlineSamples(
+        stack=np.repeat(np.arange(num_views), count),
+        px=px.reshape(-1, 2),
+        normals=normals.reshape(-1, 2),
+        basis=np.tile(grid.basis[row * columns + column], (num_views, 1)),
+        depth=projection.depth[:, row, column].ravel(),
+    )
+
+
+def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
+    """Middles of the grid edges between quads that are seen from different sides."""
+    px = projection.px
+    first, second = px[:, 1:, 1:] - px[:, :-1, :-1], px[:, 1:, :-1] - px[:, :-1, 1:]
+    is_front = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0] > 0
+    centres = (px[:, 1:, 1:] + px[:, :-1, :-1] + px[:, 1:, :-1] + px[:, :-1, 1:]) / 4
+    columns = grid.shape[1]
+    parts = []
+    for along_rows in (True, False):
+        if along_rows:  # edges from row to row, between quads side by side
+            stack, row, column = np.nonzero(is_front[:, :, 1:] != is_front[:, :, :-1])
+            a, b = (row, column + 1), (row + 1, column + 1)
+            inner = (centres[stack, row, column] + centres[stack, row, column + 1]) / 2
+        else:
+            stack, row, column = np.nonzero(is_front[:, 1:] != is_front[:, :-1])
+            a, b = (row + 1, column), (row + 1, column + 1)
+            inner = (centres[stack, row, column] + centres[stack, row + 1, column]) / 2
+        middle = (px[stack, *a] + px[stack, *b]) / 2
+        parts.append(
+            OutlineSamples(
+                stack=stack,
+                px=middle,
+                normals=_outwards(px[stack, *b] - px[stack, *a], middle - inner),
+                basis=(grid.basis[a[0] * columns + a[1]] + grid.basis[b[0] * columns + b[1]]) / 2,
+                depth=projection.depth[stack, *a],
+            )
+        )
+    return _concatenate(*parts)
+
+
+def _outwards(tangent: Floats, away: Floats) -> Floats:
+    """Unit normals of tangents (..., 2) on the side that `away` points to."""
+    normal = np.stack([tangent[..., 1], -tangent[..., 0]], -1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    return np.where((normal * away).sum(-1, keepdims=True) < 0, -normal, normal)
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """N signed distances and what they depend on.
+
+    Attributes:
+        stack: (N,) place in `MaskStack.views`.
+        px: (N,) how far the patch has to move outwards, pixels.
+        basis: (N, 26) of the patch points.
+        gradient: (N, 3) change of the pixel position along the normal per world unit.
+        weight: (N,).
+    """
+
+    stack: NDArray[np.int64]
+    px: Floats
+    basis: Floats
+    gradient: Floats
+    weight: Floats
+
+    @property
+    def jacobian(self) -> Floats:
+        """(N, 78) change along the normal per coefficient."""
+        return (self.basis[:, :, None] * self.gradient[:, None, :]).reshape(len(self.px), -1)
+
+
+def outline_distances(
+    masks: MaskStack, grid: PatchGrid, coefficients: Floats, *, reach: float, is_imaged: bool
+) -> Distances:
+    """How far the outline of the patch is from the edges of its masks, both ways; edges beyond `reach` do not count.
+
+    With `is_imaged` the patch is drawn and blurred as the masks are, and its own edge takes the place of its outline:
+    tips narrower than a pixel and notches lose the same on both sides. Worth it when the two are near each other.
+    """
+    projection = project_points(masks.px_from_world, grid.points(coefficients))
+    samples, covered = outline_samples(masks, grid, projection)
+    to_edge, hidden = _search_edges(masks, masks.blurred, samples, reach)
+    shift = np.zeros(len(to_edge))
+    if is_imaged:
+        drawn = draw_patch(masks, projection)
+        shift = _search_edges(masks, drawn, samples, MOST_SHIFT_PX)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
+    counts = np.isfinite(to_edge) & np.isfinite(shift) & ~(hidden & (to_edge < shift))
+    own, edge, toward = _nearest_samples(masks, samples, covered, reach=reach)
+    back = ((masks.edge_px[edge] - samples.px[own]) * toward).sum(1) - shift[own]
+    beyond = _is_hidden(masks, masks.edge_stack[edge], masks.edge_px[edge], masks.edge_normals[edge])
+    keep = np.isfinite(back) & ~(beyond & (back < 0))
+    own, toward, back = own[keep], toward[keep], back[keep]
+    forth = samples.select(counts)
+    reverse = samples.select(own)
+    both = _concatenate(forth, reverse)
+    normals = np.concatenate([forth.normals, toward])
+    return Distances(
+        stack=both.stack,
+        px=np.concatenate([(to_edge - shift)[counts], back]),
+        basis=both.basis,
+        gradient=_gradients(masks.px_from_world[both.stack], both, normals),
+        weight=np.concatenate([np.ones(len(forth.px)), np.full(len(reverse.px), REVERSE_WEIGHT)]),
+    )
+
+
+def _gradients(px_from_world: Floats, samples: OutlineSamples, normals: Floats) -> Floats:
+    """(N, 3) derivative of normal . px by the world position."""
+    rows = px_from_world[:, :2, :3] - samples.px[:, :, None] * px_from_world[:, 2:, :3]
+    return (normals[:, :, None] * rows).sum(1) / samples.depth[:, None]
+
+
+def _search_edges(
+    masks: MaskStack, blurred: NDArray[np.float32], samples: OutlineSamples, reach: float
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """Signed distance (K,) along the normals to the nearest edge from inside to outside, NaN for none in reach.
+
+    Also, is the leaf hidden beyond that edge?
+    """
+    steps = np.linspace(-reach, reach, 2 * int(np.ceil(reach)) + 1)
+    values = masks.interpolate(blurred, samples.stack, samples.px[:, None] + steps[:, None] * samples.normals[:, None])
+    leaves = (values[:, :-1] >= 0.5) & (values[:, 1:] < 0.5)
+    drop = np.where(leaves, values[:, :-1] - values[:, 1:], 1)
+    place = steps[:-1] + (steps[1] - steps[0]) * (values[:, :-1] - 0.5) / drop
+    place = np.where(leaves, place, np.inf)
+    nearest = np.abs(place).argmin(1) if len(place) else np.zeros(0, int)
+    distance = place[np.arange(len(place)), nearest]
+    edge = samples.px + np.where(np.isfinite(distance), distance, 0)[:, None] * samples.normals
+    return np.where(np.isfinite(distance), distance, np.nan), _is_hidden(masks, samples.stack, edge, samples.normals)
+
+
+def _is_hidden(masks: MaskStack, stack: NDArray, edge: Floats, normals: Floats) -> NDArray[np.bool_]:
+    """Does another instance, or the end of the image, begin just beyond these places of an edge?"""
+    hidden = np.zeros(len(edge), bool)
+    for step in BEYOND_PX:
+        hidden |= masks.look_up(masks.others, stack, edge + step * normals) != 0
+    return hidden
+
+
+def _nearest_samples(
+    masks: MaskStack, samples: OutlineSamples, covered: NDArray[np.uint8], *, reach: float
+) -> tuple[NDArray, NDArray, Floats]:
+    """Pairs of an outline sample and an edge sample, and the direction (M, 2) that their distance counts along.
+
+    An edge sample takes the nearest outline sample with a similar normal within twice the reach, and its own normal.
+    Where the patch stops short of a tip there is none ahead: samples outside the patch and far from its outline pull
+    the nearest sample straight towards them.
+    """
+    own, edge, toward = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 2))]
+    is_outside = masks.look_up(covered, masks.edge_stack, masks.edge_px) == 0
+    for index in range(len(masks)):
+        here, there = np.flatnonzero(samples.stack == index), np.flatnonzero(masks.edge_stack == index)
+        if not len(here) or not len(there):
+            continue
+        gap = masks.edge_px[there][:, None] - samples.px[here]
+        square = (gap**2).sum(2)
+        straight = square.argmin(1)
+        rows = np.arange(len(there))
+        pulls = is_outside[there] & (square[rows, straight] > PULL_FROM_PX**2)
+        square[masks.edge_normals[there] @ samples.normals[here].T < SIMILAR] = np.inf
+        nearest = np.where(pulls, straight, square.argmin(1))
+        found = pulls | (square[rows, nearest] < (2 * reach) ** 2)
+        ahead = gap[rows, straight] / np.maximum(np.linalg.norm(gap[rows, straight], axis=1, keepdims=True), 1e-9)
+        own.append(here[nearest[found]])
+        edge.append(there[found])
+        toward.append(np.where(pulls[:, None], ahead, masks.edge_normals[there])[found])
+    return np.concatenate(own), np.concatenate(edge), np.concatenate(toward)

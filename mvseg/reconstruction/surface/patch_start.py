@@ -1,0 +1,137 @@
+"""Where the fit of a leaf patch starts: a patch through the occupied voxels of the instance's hull."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components, dijkstra
+from scipy.spatial import cKDTree
+
+from mvseg.reconstruction.surface.leaf_patch import (
+    COUNTS,
+    CURL,
+    FOLD,
+    MIDRIB,
+    NUM_COEFFICIENTS,
+    SIDE,
+    Floats,
+    spline_basis,
+)
+
+MOST_POINTS = 1500  # of the voxels; enough for nine windows
+NUM_WINDOWS = 9
+NEIGHBOURS = 8
+ELONGATED = 2.0  # ratio of the two largest spreads from which a leaf may be bent so far that its axis is a curve
+BENT = 1.35  # or from this ratio of the way along the leaf to the straight one; graphs make detours of a tenth
+ROUND = 1.6  # ratio below which the midrib may as well run along the shorter axis
+LEAST_POINTS = 12
+
+
+def start_patches(points: Floats) -> list[Floats]:
+    """Rough patches through a cloud of points, the likeliest first.
+
+    The long axis is straight (PCA), or a geodesic one for elongated clouds, so that strongly bent blades keep their
+    two ends. Windowed centroids along it are the midrib, in-plane spreads across it the sides.
+
+    Args:
+        points: (P, 3) float64, centres of occupied voxels.
+
+    Returns:
+        (26, 3) coefficients each, fold and curl 0: along the longest axis, and for round leaves also across it. None
+        with fewer than 12 points, or without any spread.
+    """
+    points = _thin(points)
+    if len(points) < LEAST_POINTS:
+        return []
+    centred = points - points.mean(0)
+    _, spreads, axes = np.linalg.svd(centred, full_matrices=False)
+    if spreads[1] <= 1e-9 * spreads[0] or spreads[0] == 0:
+        return []
+    straight, along = centred @ axes[0], _geodesic_places(points)
+    if spreads[0] > ELONGATED * spreads[1] or along.max() > BENT * np.ptp(straight):
+        return [_patch_along(points, along, axes[1])]
+    starts = [_patch_along(points, straight, axes[1])]
+    if spreads[0] < ROUND * spreads[1]:
+        starts.append(_patch_along(points, centred @ axes[1], axes[0]))
+    return starts
+
+
+def _patch_along(points: Floats, place: Floats, side: Floats) -> Floats:
+    """A patch whose u follows `place` (P,); `side` (3,) is roughly where v points to."""
+    low, high = np.quantile(place, [0.005, 0.995])
+    t = np.clip((place - low) / max(high - low, 1e-12), 0, 1)
+    return _coefficients(*_windows(points, t, side))
+
+
+def _thin(points: Floats) -> Floats:
+    """Every so many points, in their order: deterministic, and even for the lattice order of voxels."""
+    step = max(1, int(np.ceil(len(points) / MOST_POINTS)))
+    return points[::step]
+
+
+def _geodesic_places(points: Floats) -> Floats:
+    """(P,) distance along the cloud from one of its far ends, over the nearest-neighbour graph.
+
+    Loose pieces are joined by the straight distance to the nearest point of the largest piece.
+    """
+    distance, neighbour = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
+    rows = np.repeat(np.arange(len(points)), neighbour.shape[1] - 1)
+    shape = (len(points), len(points))
+    graph = csr_matrix((np.maximum(distance[:, 1:].ravel(), 1e-12), (rows, neighbour[:, 1:].ravel())), shape)
+    _, piece = connected_components(graph, directed=False)
+    largest = np.flatnonzero(piece == np.bincount(piece).argmax())
+    start = largest[np.linalg.norm(points[largest] - points[largest].mean(0), axis=1).argmax()]
+    first = dijkstra(graph, directed=False, indices=start)
+    end = largest[first[largest].argmax()]
+    places = dijkstra(graph, directed=False, indices=end)
+    loose = ~np.isfinite(places)
+    if loose.any():
+        places[loose] = places[largest[cKDTree(points[largest]).query(points[loose])[1]]]
+    return places
+
+
+def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
+    """Centroid and half-width vector, (9, 3) each, of overlapping windows along t in [0, 1]."""
+    centres = (np.arange(NUM_WINDOWS) + 0.5) / NUM_WINDOWS
+    middles, sides = np.zeros((NUM_WINDOWS, 3)), np.zeros((NUM_WINDOWS, 3))
+    order = np.argsort(np.abs(centres - 0.5), kind="stable")
+    for index in order:
+        weight = np.clip(1 - np.abs(t - centres[index]) * NUM_WINDOWS, 0, None)
+        if (weight > 0).sum() < 4:  # a gap in the cloud: the nearest points
+            weight = np.zeros_like(t)
+            weight[np.argsort(np.abs(t - centres[index]), kind="stable")[:8]] = 1
+        middles[index] = weight @ points / weight.sum()
+    along = np.gradient(middles, axis=0)
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    directions = np.zeros((NUM_WINDOWS, 3))
+    for index in order:
+        near = np.abs(t - centres[index]) < 0.75 / NUM_WINDOWS
+        flat = points[near] - middles[index] if near.sum() >= 4 else points - middles[index]
+        flat = flat - (flat @ along[index])[:, None] * along[index]
+        direction = np.linalg.eigh(flat.T @ flat)[1][:, 2]
+        # Windows next to the middle one come first: each takes the sign of the nearest window that has a direction.
+        done = np.flatnonzero(directions.any(1))
+        before = directions[done[np.abs(done - index).argmin()]] if len(done) else side
+        directions[index] = direction * (1.0 if direction @ before >= 0 else -1.0)
+        sides[index] = np.quantile(np.abs(flat @ direction), 0.93) * directions[index]
+    return middles, sides
+
+
+def _coefficients(middles: Floats, sides: Floats) -> Floats:
+    """Splines through the windows; the ends of the midrib are pushed out by half a window to the ends of the cloud."""
+    centres = (np.arange(NUM_WINDOWS) + 0.5) / NUM_WINDOWS
+    first = middles[0] + 0.5 * (middles[0] - middles[1])
+    last = middles[-1] + 0.5 * (middles[-1] - middles[-2])
+    u = np.concatenate([[0.0], centres, [1.0]])
+    coefficients = np.zeros((NUM_COEFFICIENTS, 3))
+    coefficients[MIDRIB] = _smooth_fit(u, np.concatenate([first[None], middles, last[None]]), COUNTS[0])
+    f = np.sqrt(4 * centres * (1 - centres))[:, None]
+    coefficients[SIDE] = _smooth_fit(centres, sides / f, COUNTS[1])
+    coefficients[FOLD], coefficients[CURL] = 0, 0
+    return coefficients
+
+
+def _smooth_fit(u: Floats, values: Floats, count: int) -> Floats:
+    """(count, 3) spline coefficients near the values, with small second differences where the values leave freedom."""
+    rows = np.concatenate([spline_basis(u, count), 0.3 * np.diff(np.eye(count), 2, axis=0)])
+    return np.linalg.lstsq(rows, np.concatenate([values, np.zeros((count - 2, 3))]), rcond=None)[0]

@@ -1,0 +1,151 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy import ndimage
+
+from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_cameras
+from mvseg.errors import InputError
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras
+
+FLAT, BENT = EllipticBlade(), EllipticBlade(bend=0.9)
+CAMERAS = ring_cameras(10)
+
+
+def fit(masks: list[np.ndarray], cameras: Cameras = CAMERAS) -> LeafSurface:
+    regions, ids = as_regions(masks)
+    return fit_surfaces(regions, ids, cameras)[1]
+
+
+def errors(surface: LeafSurface, blade: EllipticBlade) -> np.ndarray:
+    """Relative errors of area, length and width."""
+    found = np.array([surface.area, surface.length, surface.width])
+    return found / [blade.area, 2 * blade.half_length, 2 * blade.half_width] - 1
+
+
+@pytest.fixture(scope="module")
+def bent() -> LeafSurface:
+    return fit(blade_masks(BENT, CAMERAS))
+
+
+def test_flat_ellipse_has_its_area_length_and_width() -> None:
+    surface = fit(blade_masks(FLAT, CAMERAS))
+    assert np.abs(errors(surface, FLAT)).max() < 0.012
+    assert abs(float(surface.normal[2])) > 0.999
+    assert surface.quality.is_good
+    assert float(surface.points()[..., 2].abs().max()) < 0.03
+
+
+def test_bent_blade_has_its_area_length_and_width(bent: LeafSurface) -> None:
+    assert np.abs(errors(bent, BENT)).max() < 0.015
+    middle = bent.midrib[len(bent.midrib) // 2]
+    drop = BENT.bend * (np.cos(1 / BENT.bend) - 1)
+    assert float(middle.norm()) < 0.04
+    assert np.abs(bent.midrib[[0, -1], 2].numpy() - drop).max() < 0.04
+    assert (np.abs(np.array(bent.deviations) / [bent.area, bent.length, bent.width]) < 0.05).all()
+
+
+def test_surface_covers_the_masks_that_it_was_fitted_to(bent: LeafSurface) -> None:
+    for seen, mask in zip(bent.project(CAMERAS), blade_masks(BENT, CAMERAS), strict=True):
+        assert (seen.numpy() & mask).sum() / (seen.numpy() | mask).sum() > 0.95
+    assert float(bent.iou.min()) > 0.95
+    assert float(bent.residual_px.max()) < 0.4
+
+
+def test_same_input_same_bits(bent: LeafSurface) -> None:
+    assert torch.equal(fit(blade_masks(BENT, CAMERAS)).coefficients, bent.coefficients)
+
+
+def test_order_of_the_views_does_not_matter(bent: LeafSurface) -> None:
+    order = [3, 7, 0, 9, 1, 8, 2, 6, 4, 5]
+    masks = blade_masks(BENT, CAMERAS)
+    other = fit([masks[view] for view in order], CAMERAS[order])
+    assert other.area == pytest.approx(bent.area, rel=2e-3)
+    assert other.length == pytest.approx(bent.length, rel=2e-3)
+
+
+def test_world_may_be_moved_turned_and_scaled(bent: LeafSurface) -> None:
+    turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
+    turn = torch.from_numpy(turn * np.sign(np.linalg.det(turn)))
+    scale, shift = 250.0, torch.tensor([4000.0, -300.0, 80.0], dtype=torch.float64)
+    R = CAMERAS.R @ turn.T
+    t = scale * CAMERAS.t - R @ shift
+    other = fit(blade_masks(BENT, CAMERAS), Cameras(K=CAMERAS.K, R=R, t=t, sizes=CAMERAS.sizes))
+    assert other.area / scale**2 == pytest.approx(bent.area, rel=5e-3)
+    assert other.length / scale == pytest.approx(bent.length, rel=5e-3)
+    assert other.width / scale == pytest.approx(bent.width, rel=5e-3)
+    middle = turn @ bent.points().mean((0, 1)) * scale + shift
+    assert float((other.points().mean((0, 1)) - middle).norm()) < 0.01 * other.length
+
+
+def test_one_wrong_mask_in_five_does_little_harm() -> None:
+    masks = blade_masks(BENT, CAMERAS)
+    for view, step in ((2, (25, 10)), (6, (-20, 30))):
+        masks[view] = np.roll(ndimage.binary_dilation(masks[view], iterations=4), step, (0, 1))
+    assert np.abs(errors(fit(masks), BENT)).max() < 0.05
+
+
+def test_masks_too_large_in_one_view_and_too_small_in_another_cancel() -> None:
+    masks = blade_masks(BENT, CAMERAS)
+    for view, mask in enumerate(masks):
+        masks[view] = ndimage.binary_dilation(mask) if view % 2 else ndimage.binary_erosion(mask)
+    assert np.abs(errors(fit(masks), BENT)).max() < 0.03
+
+
+def half_hidden(label: int) -> list[np.ndarray]:
+    """Label maps in which something hides one half of the blade in four of ten views."""
+    maps = [mask.astype(np.int64) for mask in blade_masks(BENT, CAMERAS)]
+    for view in (0, 3, 5, 8):
+        columns = np.flatnonzero(maps[view].any(0))
+        hidden = np.zeros((SIZE, SIZE), bool)
+        hidden[:, int(columns.mean()) :] = True
+        maps[view][hidden] = label
+    return maps
+
+
+def test_another_instance_may_hide_half_of_the_leaf() -> None:
+    assert np.abs(errors(fit(half_hidden(2)), BENT)).max() < 0.03
+
+
+def test_regions_matched_to_nothing_hide_leaves_too() -> None:
+    regions, ids = as_regions(half_hidden(2))
+    surface = fit_surfaces(regions, torch.where(ids == 2, -1, ids), CAMERAS)[1]
+    assert np.abs(errors(surface, BENT)).max() < 0.03
+
+
+def test_two_views_say_so() -> None:
+    masks = blade_masks(BENT, CAMERAS)
+    surface = fit([masks[0], masks[2]], CAMERAS[[0, 2]])
+    assert not surface.quality.is_good
+    assert any("two views" in reason for reason in surface.quality.reasons)
+
+
+def test_one_view_gives_no_numbers() -> None:
+    masks = blade_masks(BENT, CAMERAS)
+    surface = fit([masks[0], np.zeros_like(masks[0])], CAMERAS[[0, 2]])
+    assert surface.quality.reasons == ("seen in one view only",)
+    assert not surface.exists
+    assert np.isnan([surface.area, surface.length, surface.width, *surface.deviations]).all()
+    assert len(surface.mesh().faces) == 0
+    assert not any(mask.any() for mask in surface.project(CAMERAS))
+
+
+def test_masks_without_a_common_point_give_no_surface() -> None:
+    masks = [np.zeros((SIZE, SIZE), bool) for _ in range(2)]
+    masks[0][:20, :20], masks[1][-20:, -20:] = True, True
+    surface = fit(masks, CAMERAS[[0, 1]])
+    assert surface.quality.reasons == ("its masks agree on no point",)
+
+
+def test_no_regions_give_no_surfaces() -> None:
+    regions, ids = as_regions([np.zeros((SIZE, SIZE), bool)] * 2)
+    assert fit_surfaces(regions, ids, CAMERAS[[0, 1]]) == {}
+
+
+def test_as_many_ids_as_regions() -> None:
+    regions, ids = as_regions(blade_masks(FLAT, CAMERAS))
+    with pytest.raises(InputError, match="9 instance ids for 10 regions"):
+        fit_surfaces(regions, ids[:9], CAMERAS)

@@ -1,0 +1,142 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.interpolate import BSpline
+
+from mvseg.reconstruction.surface.leaf_patch import (
+    COUNTS,
+    MIDRIB,
+    NUM_COEFFICIENTS,
+    SIDE,
+    Floats,
+    PatchSize,
+    grid_triangles,
+    grid_vertices,
+    measure_patch,
+    patch_basis,
+    patch_grid,
+    patch_prior,
+)
+from mvseg.reconstruction.surface.leaf_surface import measure_slopes
+from mvseg.reconstruction.surface.orientation import mirror_matrix, stem_distances, turn_matrix
+from mvseg.reconstruction.surface.patch_start import start_patches
+
+
+def wavy_patch(seed: int = 0) -> Floats:
+    coefficients = np.random.default_rng(seed).normal(0, 0.05, (NUM_COEFFICIENTS, 3))
+    coefficients[MIDRIB, 0] += np.linspace(0, 4, COUNTS[0])
+    coefficients[SIDE, 1] += 1
+    return coefficients
+
+
+def evaluate_reference(coefficients: Floats, u: float, v: float) -> Floats:
+    """x(u, v) as the formula reads, a spline at a time."""
+    values = []
+    for part, count in zip(np.split(coefficients, np.cumsum(COUNTS)[:-1]), COUNTS, strict=True):
+        degree = min(3, count - 1)
+        knots = [*[0.0] * degree, *np.linspace(0, 1, count - degree + 1), *[1.0] * degree]
+        values.append(BSpline(knots, part, degree)(u))
+    m, q, r, s = values
+    return m + np.sqrt(4 * u * (1 - u)) * (v * q + abs(v) * r + v * v * s)
+
+
+def test_basis_is_the_formula() -> None:
+    coefficients = wavy_patch()
+    for u, v in ((0.0, 0.5), (0.2, -1.0), (0.37, 0.25), (0.5, 0.0), (1.0, 1.0)):
+        point = patch_basis(np.array([u]), np.array([v])) @ coefficients
+        assert point[0] == pytest.approx(evaluate_reference(coefficients, u, v), abs=1e-12)
+
+
+def test_mesh_is_one_open_disc() -> None:
+    mesh = trimesh.Trimesh(grid_vertices(patch_grid(12, 5).points(wavy_patch())), grid_triangles(12, 5), process=False)
+    assert mesh.euler_number == 1
+    assert mesh.is_winding_consistent
+    _, counts = np.unique(mesh.edges_sorted, axis=0, return_counts=True)
+    assert counts.max() == 2
+    assert (counts == 1).sum() == 2 * (12 - 1)  # the rim
+
+
+def test_size_of_a_flat_ellipse() -> None:
+    coefficients = np.zeros((NUM_COEFFICIENTS, 3))
+    coefficients[MIDRIB, 0] = np.interp(np.linspace(0, 1, COUNTS[0]), [0, 1], [0, 1])
+    coefficients[SIDE, 1] = 0.25
+    size = measure_patch(coefficients)
+    assert size.length == pytest.approx(1)
+    assert size.half_width == pytest.approx(0.25, rel=2e-3)
+
+
+def test_prior_asks_nothing_of_an_even_flat_patch() -> None:
+    """Equal spacing of the Greville points makes an even midrib; sides across it are without shear."""
+    coefficients = np.zeros((NUM_COEFFICIENTS, 3))
+    coefficients[MIDRIB, 0] = [0, 1 / 12, 1 / 4, 1 / 2, 3 / 4, 11 / 12, 1]
+    coefficients[SIDE, 1] = 0.3
+    equations, target = patch_prior(coefficients, PatchSize(length=1.0, half_width=0.3), noise=1.0)
+    surprise = equations @ coefficients.ravel() - target
+    bend = np.zeros(len(surprise), bool)
+    bend[:12] = True  # third differences of coefficients at clamped ends are not those of the curve
+    assert np.abs(surprise[~bend]).max() < 1e-9
+    assert np.abs(surprise[bend]).max() < 1.5
+
+
+def test_prior_does_not_depend_on_the_turn_of_the_world() -> None:
+    coefficients = wavy_patch()
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    costs = []
+    for patch in (coefficients, coefficients @ turn.T):
+        equations, target = patch_prior(patch, measure_patch(patch), noise=1.0)
+        costs.append(((equations @ patch.ravel() - target) ** 2).sum())
+    assert costs[0] == pytest.approx(costs[1], rel=1e-9)
+
+
+def test_slopes_of_the_measures_are_their_differences() -> None:
+    coefficients, step = wavy_patch(), 1e-6
+    slopes = measure_slopes(coefficients)
+    rng = np.random.default_rng(2)
+    triangles = grid_triangles(64, 17)
+    for _ in range(3):
+        direction = rng.normal(size=coefficients.shape)
+        areas, lengths = [], []
+        for sign in (1, -1):
+            points = patch_grid(64, 17).points(coefficients + sign * step * direction)
+            areas.append(trimesh.Trimesh(grid_vertices(points), triangles, process=False).area)
+            lengths.append(np.linalg.norm(np.diff(points[:, 8], axis=0), axis=1).sum())
+        assert slopes[0] @ direction.ravel() == pytest.approx((areas[0] - areas[1]) / (2 * step), rel=1e-5)
+        assert slopes[1] @ direction.ravel() == pytest.approx((lengths[0] - lengths[1]) / (2 * step), rel=1e-5)
+
+
+def test_turned_and_mirrored_patches_are_the_same_surface() -> None:
+    coefficients, grid = wavy_patch(), patch_grid(12, 5)
+    points = grid.points(coefficients)
+    assert grid.points(turn_matrix() @ coefficients) == pytest.approx(points[::-1, ::-1], abs=1e-12)
+    assert grid.points(mirror_matrix() @ coefficients) == pytest.approx(points[:, ::-1], abs=1e-12)
+
+
+def test_stem_is_where_the_bases_line_up() -> None:
+    rng = np.random.default_rng(0)
+    heights, azimuths = np.linspace(0, 100, 9), rng.uniform(0, 2 * np.pi, 9)
+    stem = np.stack([np.zeros(9), np.zeros(9), heights], 1)
+    out = np.stack([np.cos(azimuths), np.sin(azimuths), rng.uniform(-0.5, 0.5, 9)], 1)
+    ends = np.stack([stem + 10 * out, stem + 70 * out], 1)
+    swapped = rng.random(9) < 0.5
+    ends[swapped] = ends[swapped, ::-1]
+    assert (stem_distances(ends).argmin(1) == swapped).all()
+
+
+@pytest.mark.parametrize("bend", [1e3, 0.45])
+def test_start_follows_a_strip_from_end_to_end(bend: float) -> None:
+    s, y = (a.ravel() for a in np.meshgrid(np.linspace(-1, 1, 80), np.linspace(-0.1, 0.1, 9)))
+    cloud = np.stack([bend * np.sin(s / bend), y, bend * (np.cos(s / bend) - 1)], 1)
+    (start,) = start_patches(cloud)
+    size = measure_patch(start)
+    assert size.length == pytest.approx(2, rel=0.08)
+    assert size.half_width == pytest.approx(0.1, rel=0.35)
+
+
+def test_round_clouds_have_two_starts_and_tiny_ones_none() -> None:
+    angle, radius = (a.ravel() for a in np.meshgrid(np.linspace(0, 6.2, 40), np.linspace(0.1, 1, 9)))
+    disc = np.stack([radius * np.cos(angle), 0.9 * radius * np.sin(angle), 0 * angle], 1)
+    assert len(start_patches(disc)) == 2
+    assert start_patches(disc[:11]) == []
+    assert start_patches(np.ones((40, 3))) == []

@@ -1,0 +1,159 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
+from mvseg.reconstruction.surface.leaf_patch import COUNTS, MIDRIB, NUM_COEFFICIENTS, SIDE, Floats, patch_grid
+from mvseg.reconstruction.surface.mask_stack import FRAME, MaskStack, stack_masks
+from mvseg.reconstruction.surface.outline import outline_distances, outline_samples
+from mvseg.reconstruction.surface.patch_image import (
+    DRAWN_TOO_FAR,
+    SUPERSAMPLED,
+    draw_polygons,
+    pixels_behind,
+    project_points,
+    view_ious,
+)
+
+CAMERAS = ring_cameras(4)
+GRID = patch_grid(36, 9)
+NOTHING = np.zeros((SIZE, SIZE), np.int32)
+
+
+def matrices() -> Floats:
+    pose = np.concatenate([CAMERAS.R.numpy(), CAMERAS.t.numpy()[:, :, None]], 2)
+    return CAMERAS.K.numpy() @ pose
+
+
+def ellipse(half_length: float = 1.0, half_width: float = 0.45, height: float = 0.0) -> Floats:
+    """A patch whose midrib is even in the cosine of the ellipse: exactly (cos, sin) at the rim."""
+    coefficients = np.zeros((NUM_COEFFICIENTS, 3))
+    coefficients[MIDRIB, 0] = half_length * np.array([-1, -5 / 6, -1 / 2, 0, 1 / 2, 5 / 6, 1])
+    coefficients[MIDRIB, 2] = height
+    coefficients[SIDE, 1] = half_width
+    assert COUNTS[0] == 7
+    return coefficients
+
+
+def stack(others: list[np.ndarray] | None = None) -> MaskStack:
+    masks = blade_masks(EllipticBlade(), CAMERAS)
+    hiding = others or [NOTHING] * len(masks)
+    masks = [mask & (other == 0) for mask, other in zip(masks, hiding, strict=True)]
+    return stack_masks(masks, hiding, range(len(masks)), px_from_world=matrices())
+
+
+@pytest.mark.parametrize("is_imaged", [False, True])
+def test_a_patch_in_its_place_has_no_distance(is_imaged: bool) -> None:
+    distances = outline_distances(stack(), GRID, ellipse(), reach=6.0, is_imaged=is_imaged)
+    assert len(distances.px) > 4 * 60
+    assert np.abs(np.median(distances.px)) < 0.06
+    assert np.quantile(np.abs(distances.px), 0.9) < 0.5
+
+
+def test_a_patch_that_is_too_small_has_to_grow_by_the_difference() -> None:
+    """Slow twin: distance from each projected rim point to the densely sampled true rim."""
+    masks, small = stack(), ellipse(0.9, 0.36)
+    distances = outline_distances(masks, GRID, small, reach=14.0, is_imaged=False)
+    forth = distances.weight == 1
+    angle = np.linspace(0, 2 * np.pi, 4000)
+    rim = np.stack([np.cos(angle), 0.45 * np.sin(angle), 0 * angle], 1)
+    points = distances.basis[forth] @ small
+    for view in range(len(masks)):
+        here = distances.stack[forth] == view
+        true, seen = (
+            project_points(masks.px_from_world[[view]], x[None]).px[0, 0] for x in (rim, points[here])
+        )
+        nearest = np.sqrt(((seen[:, None] - true) ** 2).sum(2)).min(1)
+        off = distances.px[forth][here] - nearest
+        assert np.abs(np.median(off)) < 0.15
+        assert (distances.px[forth][here] > 0).all()
+
+
+def test_gradients_are_what_moving_the_patch_does() -> None:
+    """Slow twin: each gradient is a unit normal times the change of the pixel position, by differences."""
+    masks, patch, step = stack(), ellipse(0.97, 0.42), 1e-6
+    distances = outline_distances(masks, GRID, patch, reach=6.0, is_imaged=False)
+    for sample in range(0, len(distances.px), 9):
+        camera = masks.px_from_world[[distances.stack[sample]]]
+        point = distances.basis[sample] @ patch
+        corners = np.stack([point + step * axis for axis in (*np.eye(3), *-np.eye(3))])
+        px = project_points(camera, corners[None]).px[0, 0]
+        change = (px[:3] - px[3:]).T / (2 * step)
+        normal = np.linalg.lstsq(change.T, distances.gradient[sample], rcond=None)[0]
+        assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-5)
+        assert normal @ change == pytest.approx(distances.gradient[sample], abs=1e-4)
+    row = distances.basis[5][:, None] * distances.gradient[5]
+    assert (distances.jacobian[5] == row.ravel()).all()
+
+
+def test_where_another_instance_hides_the_leaf_it_need_not_shrink() -> None:
+    other = NOTHING.copy()
+    other[:, SIZE // 2 :] = 7
+    hidden, bare = stack(others=[other] * 4), stack(others=[other] * 4)
+    bare = bare.with_background(np.ones(len(bare.others), bool))
+    with_rule = outline_distances(hidden, GRID, ellipse(), reach=14.0, is_imaged=False)
+    without = outline_distances(bare, GRID, ellipse(), reach=14.0, is_imaged=False)
+    assert (without.px < -5).sum() > 10
+    assert (with_rule.px < -5).sum() == 0
+    assert np.abs(np.median(with_rule.px)) < 0.1
+
+
+def test_beyond_the_frame_is_hidden() -> None:
+    mask = np.zeros((SIZE, SIZE), bool)
+    mask[:30, 50:90] = True
+    frame = stack_masks([mask], [NOTHING], [0], px_from_world=matrices()[:1])
+    values = frame.look_up(frame.others, np.zeros(2, int), np.array([[70.0, -1.0], [70.0, 40.0]]))
+    assert values.tolist() == [FRAME, 0]
+
+
+def test_samples_of_an_edge_lie_on_it_and_point_outwards() -> None:
+    masks = stack()
+    ahead = masks.interpolate(masks.blurred, masks.edge_stack, (masks.edge_px + 1.5 * masks.edge_normals)[:, None])
+    behind = masks.interpolate(masks.blurred, masks.edge_stack, (masks.edge_px - 1.5 * masks.edge_normals)[:, None])
+    on = masks.interpolate(masks.blurred, masks.edge_stack, masks.edge_px[:, None])
+    assert np.abs(on - 0.5).max() < 0.05
+    assert (ahead < 0.35).all()
+    assert (behind > 0.65).all()
+    assert np.linalg.norm(masks.edge_normals, axis=1) == pytest.approx(1)
+
+
+def test_outline_has_no_samples_inside_the_patch() -> None:
+    """A blade folded in two: the crease is an outline from the side, and its hidden rim is none."""
+    folded = ellipse()
+    folded[SIDE.stop : SIDE.stop + COUNTS[2], 2] = 0.4
+    masks = stack()
+    projection = project_points(masks.px_from_world, GRID.points(folded))
+    samples, covered = outline_samples(masks, GRID, projection)
+    outside = masks.look_up(covered, samples.stack, samples.px + 1.6 * samples.normals)
+    assert (outside == 0).all()
+    assert (np.abs(np.linalg.norm(samples.normals, axis=1) - 1) < 1e-9).all()
+
+
+def test_polygons_are_too_wide_by_a_known_part_of_a_pixel() -> None:
+    rng, extra = np.random.default_rng(0), []
+    for _ in range(100):
+        angle, (width, height) = rng.uniform(0, 2 * np.pi), rng.uniform(5, 30, 2)
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        corners = np.array([[-width, -height], [width, -height], [width, height], [-width, height]]) / 2
+        share = draw_polygons((corners @ turn.T + rng.uniform(28, 32, 2))[None], (60, 60), np.zeros(2))
+        extra.append((share.sum() - width * height) / (2 * (width + height)))
+    assert np.mean(extra) == pytest.approx(DRAWN_TOO_FAR / SUPERSAMPLED, abs=0.02)
+
+
+def test_iou_of_a_patch_in_its_place() -> None:
+    masks = stack()
+    assert view_ious(masks, GRID.points(ellipse())).min() > 0.96
+    assert view_ious(masks, GRID.points(ellipse(0.5, 0.45))).max() < 0.65
+
+
+def test_neighbour_behind_the_leaf_hides_nothing() -> None:
+    other = NOTHING.copy()
+    other[:, SIZE // 2 :] = 7
+    masks = stack(others=[other] * 4)
+    below, above = GRID.points(ellipse(1.2, 0.6, -0.3)), GRID.points(ellipse(1.2, 0.6, 0.3))
+    own = GRID.points(ellipse())
+    near = masks.others == 7
+    assert pixels_behind(masks, own, {7: below}, margin=0.05)[near].any()
+    assert not pixels_behind(masks, own, {7: above}, margin=0.05).any()
+    assert not pixels_behind(masks, own, {8: below}, margin=0.05).any()
