@@ -39,6 +39,8 @@ if TYPE_CHECKING:
     from mvseg.multiview.nms import cluster_aware_nms as cluster_aware_nms
     from mvseg.pipeline import run_scene as run_scene
     from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig
+    from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces as fit_surfaces
+    from mvseg.reconstruction.surface.leaf_surface import LeafSurface as LeafSurface
     from mvseg.reconstruction.voxels import reconstruct_instances as reconstruct_instances
     from mvseg.regions import Regions as Regions
     from mvseg.regions import regions_from_label_maps as regions_from_label_maps
@@ -63,6 +65,8 @@ _HOME = {
     "matching.split_merged": ("split_merged",),
     "reconstruction.config": ("ReconstructConfig",),
     "reconstruction.voxels": ("reconstruct_instances",),
+    "reconstruction.surface.leaf_surface": ("LeafSurface",),
+    "reconstruction.surface.fit_surfaces": ("fit_surfaces",),
     "multiview.config": ("DetectConfig",),
     "multiview.assignment": ("EpipolarAssignment",),
     "multiview.nms": ("cluster_aware_nms",),

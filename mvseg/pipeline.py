@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -21,7 +21,11 @@ from mvseg.matching.result import Matching
 from mvseg.matching.split_merged import split_merged
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
-from mvseg.reconstruction.voxels import reconstruct_instances
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid, reconstruct_instances
+from mvseg.regions import Regions
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 
@@ -61,12 +65,10 @@ def run_scene(
     if config.split_merged:
         regions, matching, source = split_merged(regions, matching)
         scores = None if scores is None else scores[source]
-    shapes = None
+    shapes: Mapping[int, VoxelGrid | LeafSurface] | None = None
     if config.reconstruct is not None:
         with _timed(seconds, "reconstruct"):
-            shapes = reconstruct_instances(
-                regions, matching.instance_ids, scene.cameras, config=config.reconstruct, progress=progress
-            )
+            shapes = reconstruct(regions, matching, scene, config=config.reconstruct, progress=progress)
     return Result(
         scene=scene, regions=regions, matching=matching, shapes=shapes, seconds=seconds, detection_scores=scores
     )
@@ -93,6 +95,15 @@ def detect_regions(
         message = f"the detector finds nothing that scores {detect.min_score:g} or more"
         warnings.warn(message, InputWarning, stacklevel=3)
     return detections, matching
+
+
+def reconstruct(
+    regions: Regions, matching: Matching, scene: Scene, *, config: ReconstructConfig, progress: bool = False
+) -> Mapping[int, VoxelGrid | LeafSurface]:
+    """{instance id: shape}, as `config.shape` says."""
+    if config.shape == "surface":
+        return fit_surfaces(regions, matching.instance_ids, scene.cameras, progress=progress)
+    return reconstruct_instances(regions, matching.instance_ids, scene.cameras, config=config, progress=progress)
 
 
 @contextmanager

@@ -160,7 +160,13 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         },
         "split_merged": False,
         "coco_crowd": "mask",
-        "reconstruct": {"threshold": 0.4, "seen_share": 0.8, "voxel_size": 1.5, "voxel_budget": 250_000},
+        "reconstruct": {
+            "shape": "voxels",
+            "threshold": 0.4,
+            "seen_share": 0.8,
+            "voxel_size": 1.5,
+            "voxel_budget": 250_000,
+        },
     }
     assert run["mvseg"] == mvseg.__version__
     assert run["inputs"].keys() == {str(plant / "cameras.json"), str(plant / "masks")}
@@ -659,6 +665,28 @@ def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytes
     monkeypatch.setattr("mvseg.cli._run", stop)
     assert main(["infer", str(plant)]) == 130
     assert capsys.readouterr().err == "mvseg: interrupted\n"
+
+
+def test_surfaces_of_the_shipped_plant_have_its_traits(tmp_path: Path) -> None:
+    """Area, length and width of every leaf against the simulator's; width there counts the teeth of the edge, too."""
+    arguments = ["infer", str(demo_scene()), "--masks", str(demo_scene() / "masks"), "--quiet", "--out", str(tmp_path)]
+    assert main([*arguments, "--reconstruct.shape", "surface"]) == 0
+    labels = [read_label_png(path / "001.png", 640, 480) for path in (tmp_path / "labels", demo_scene() / "truth")]
+    rows = {int(row["id"]): row for row in csv.DictReader((tmp_path / "traits.csv").read_text().splitlines())}
+    lines = (demo_scene() / "truth" / "traits.csv").read_text().splitlines()
+    truth = {int(row["leaf_id"]): row for row in csv.DictReader(lines)}
+    assert len(rows) == len(list((tmp_path / "leaves").iterdir())) == 12
+    errors = []
+    for leaf in np.unique(labels[1][labels[1] > 0]).tolist():
+        row = rows[int(np.bincount(labels[0][labels[1] == leaf]).argmax())]
+        assert row["quality"] == "good"
+        errors.append([float(row[name]) / float(truth[leaf][name]) - 1 for name in ("area", "length", "width")])
+        assert 0 < float(row["area_sd"]) < 0.06 * float(row["area"])
+    assert (np.median(np.abs(errors), 0) < (0.015, 0.01, 0.045)).all()
+    assert np.abs(errors).max() < 0.08
+    mesh = trimesh.load_mesh(tmp_path / "leaves" / "leaf_001.ply")
+    assert not mesh.is_watertight
+    assert mesh.area == pytest.approx(float(rows[1]["area"]), rel=1e-3)
 
 
 def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,10 +14,18 @@ def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int]) ->
 
 
 def write_glb(path: Path, meshes: Mapping[str, trimesh.Trimesh], colors: Mapping[str, tuple[int, int, int]]) -> None:
-    """Write meshes as one binary glTF, a node per name, in world coordinates (axes and unit stay the scene's)."""
+    """Write meshes as one binary glTF, in world coordinates (axes and unit stay the scene's).
+
+    Each name gets a node and a material of its own, which is seen from both sides: a leaf may be an open surface.
+    """
     scene = trimesh.Scene()
     for name, mesh in meshes.items():
-        scene.add_geometry(_colored(mesh, colors[name]), node_name=name, geom_name=name)
+        material = trimesh.visual.material.PBRMaterial(
+            name=name, baseColorFactor=[*colors[name], 255], metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
+        )
+        visual = trimesh.visual.TextureVisuals(material=material)
+        painted = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False)
+        scene.add_geometry(painted, node_name=name, geom_name=name)
     path.write_bytes(trimesh.exchange.gltf.export_glb(scene))
 
 

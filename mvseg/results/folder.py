@@ -22,6 +22,7 @@ from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.mesh import write_glb, write_ply
 from mvseg.formats.photos import read_photo
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, instance_color
@@ -115,31 +116,52 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
     }
 
 
+VOXEL_COLUMNS = ("volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max")
+SURFACE_COLUMNS = ("area", "area_sd", "length", "length_sd", "width", "width_sd", "quality")
+
+
 def _write_shapes(result: Result, folder: Path) -> None:
     """leaves/*.ply, scene.glb and traits.csv."""
     (folder / "leaves").mkdir()
+    shapes = result.shapes or {}
     meshes, colors, rows = {}, {}, []
     ids, views = result.matching.instance_ids, result.regions.view_index
     for instance in range(1, result.matching.num_instances + 1):
         row: dict[str, Any] = {"id": instance, "views": len(views[ids == instance].unique())}
         if result.matching.support is not None:
             row["sure_views"] = int(result.matching.support[instance - 1])
-        grid = (result.shapes or {}).get(instance)
-        if grid is not None and grid.volume > 0:
-            name = f"leaf_{instance:03d}"
-            meshes[name], colors[name] = grid.mesh(), instance_color(instance)
-            write_ply(folder / "leaves" / f"{name}.ply", meshes[name], colors[name])
-            row |= _shape_traits(grid)
+        shape = shapes.get(instance)
+        if shape is not None:
+            row |= _surface_traits(shape) if isinstance(shape, LeafSurface) else _voxel_traits(shape)
+            mesh = shape.mesh()
+            if len(mesh.faces):
+                name = f"leaf_{instance:03d}"
+                meshes[name], colors[name] = mesh, instance_color(instance)
+                write_ply(folder / "leaves" / f"{name}.ply", mesh, colors[name])
         rows.append(row)
     write_glb(folder / "scene.glb", meshes, colors)
-    columns = ["id", "views", "sure_views", "volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "unit"]
+    has_surfaces = any(isinstance(shape, LeafSurface) for shape in shapes.values())
+    columns = ["id", "views", "sure_views", *(SURFACE_COLUMNS if has_surfaces else VOXEL_COLUMNS), "unit"]
     with (folder / "traits.csv").open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(row | {"unit": result.scene.unit} for row in rows)
 
 
-def _shape_traits(grid: VoxelGrid) -> dict[str, str]:
+def _surface_traits(surface: LeafSurface) -> dict[str, str]:
+    """Area, length and width in the scene's unit, each with its standard deviation, and the reasons to doubt them."""
+    quality = {"quality": "; ".join(surface.quality.reasons) or "good"}
+    if not surface.exists:
+        return quality
+    values = (surface.area, surface.length, surface.width)
+    names = ("area", "length", "width")
+    traits = dict(zip(names, values, strict=True)) | {
+        f"{name}_sd": deviation for name, deviation in zip(names, surface.deviations, strict=True)
+    }
+    return {name: f"{value:.6g}" for name, value in traits.items()} | quality
+
+
+def _voxel_traits(grid: VoxelGrid) -> dict[str, str]:
     """Volume in cubed world units, and the corners of the bounding box in world units."""
     points, half = grid.points, grid.voxel_size / 2
     low, high = points.amin(0) - half, points.amax(0) + half

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from torch import Tensor
 
 from mvseg.matching.result import Matching
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.regions import Regions
 from mvseg.scene import Scene
@@ -20,7 +22,7 @@ class Result:
         scene: the scene.
         regions: D masks, undistorted.
         matching: their ids.
-        shapes: {instance id: voxels}; None when only ids were asked for.
+        shapes: {instance id: voxels or surface}; None when only ids were asked for.
         seconds: {stage: wall time}.
         detection_scores: (D,) float32, the detector's score of each mask; None when the masks were given.
     """
@@ -28,6 +30,6 @@ class Result:
     scene: Scene
     regions: Regions
     matching: Matching
-    shapes: dict[int, VoxelGrid] | None = None
+    shapes: Mapping[int, VoxelGrid | LeafSurface] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     detection_scores: Tensor | None = None

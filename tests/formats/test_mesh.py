@@ -48,7 +48,9 @@ def test_glb_has_a_node_per_mesh(ball: trimesh.Trimesh, tmp_path: Path) -> None:
         np.testing.assert_array_equal(pose, np.eye(4))
         np.testing.assert_allclose(back.bounds, meshes[name].bounds, rtol=1e-6)
         assert back.is_watertight
-        assert (back.visual.vertex_colors == [*color, 255]).all()
+        material = back.visual.material
+        assert material.baseColorFactor.tolist() == [*color, 255]
+        assert (material.doubleSided, material.metallicFactor) == (True, 0)
 
 
 def test_the_mesh_itself_stays_uncoloured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
