@@ -72,8 +72,8 @@ def fit_surfaces(
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
-        stacks[instance] = _stack(members, instance, frames, cameras)
-        fit = _fit_from_hull(stacks[instance], members, cameras, free)
+        stacks[instance] = _stack(members, cameras, frames, instance=instance)
+        fit = _fit_from_hull(stacks[instance], members, cameras, free=free)
         if fit is None:
             surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
@@ -97,7 +97,9 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
     return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
 
 
-def _fit_from_hull(masks: MaskStack, members: Regions, cameras: Cameras, free: list[Tensor]) -> PatchFit | None:
+def _fit_from_hull(
+    masks: MaskStack, members: Regions, cameras: Cameras, *, free: list[Tensor]
+) -> PatchFit | None:
     """The best of the fits from several starts, which are tried until one explains the masks.
 
     The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
@@ -115,7 +117,7 @@ def _fit_from_hull(masks: MaskStack, members: Regions, cameras: Cameras, free: l
     return best
 
 
-def _stack(members: Regions, instance: int, frames: list[np.ndarray], cameras: Cameras) -> MaskStack:
+def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
     """The outlines of one instance; its masks of one view are united."""
     views = members.view_index.unique().tolist()
     masks = []
@@ -158,7 +160,7 @@ def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
 
 
 def _judge(surface: LeafSurface, fit: PatchFit) -> Quality:
-    """What speaks against a fit."""
+    """The reasons to doubt a fit."""
     reasons = []
     if len(surface.views) == 2:
         reasons.append("seen in two views only")

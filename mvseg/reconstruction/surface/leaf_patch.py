@@ -142,7 +142,7 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
     equations: list[NDArray] = []
     targets: list[NDArray] = []
 
-    def expect(rows: Floats, directions: Floats | None, sd: float, target: Floats | float = 0.0) -> None:
+    def expect(rows: Floats, directions: Floats | None, sd: float, *, target: float = 0.0) -> None:
         """Rows (E, 26) along directions (E, 3), or along all three axes."""
         if directions is None:
             equations.append(np.kron(rows, np.eye(3)) / sd)
@@ -162,7 +162,7 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
         expect(_rows(place), normal, sd * half / noise)
     expect(_differences(FOLD, 1), None, FOLD_STEP_SD * half / noise)
     speed, tangents = _speed(coefficients)
-    expect(speed, tangents, SPEED_SD * length, length)
+    expect(speed, tangents, SPEED_SD * length, target=length)
     return np.concatenate(equations), np.concatenate(targets)
 
 

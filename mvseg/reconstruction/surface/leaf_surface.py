@@ -31,14 +31,14 @@ class Quality:
     """Is the surface to be trusted?
 
     Attributes:
-        is_good: no reason speaks against it.
-        reasons: what does, in words, the gravest first; empty for a good one.
+        reasons: to doubt it, in words, the gravest first; empty for a good one.
     """
 
     reasons: tuple[str, ...] = ()
 
     @property
     def is_good(self) -> bool:
+        """Whether there is no reason to doubt it."""
         return not self.reasons
 
 
@@ -54,7 +54,7 @@ class LeafSurface:
         iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it; NaN where the
             fit did not get that far.
         is_oriented: u runs from the stem to the tip; False where the stem's side cannot be told.
-        quality: good, or what speaks against it.
+        quality: good, or the reasons to doubt it.
     """
 
     coefficients: Tensor

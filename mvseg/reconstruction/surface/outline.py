@@ -176,15 +176,15 @@ def outline_distances(
     """
     projection = project_points(masks.px_from_world, grid.points(coefficients))
     samples, covered = outline_samples(masks, grid, projection)
-    to_edge, hidden = _search_edges(masks, masks.blurred, samples, reach)
+    to_edge, hidden = _search_edges(masks, samples, masks.blurred, reach=reach)
     shift = np.zeros(len(to_edge))
     if is_imaged:
         drawn = draw_patch(masks, projection)
-        shift = _search_edges(masks, drawn, samples, MOST_SHIFT_PX)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
+        shift = _search_edges(masks, samples, drawn, reach=MOST_SHIFT_PX)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
     counts = np.isfinite(to_edge) & np.isfinite(shift) & ~(hidden & (to_edge < shift))
     own, edge, toward = _nearest_samples(masks, samples, covered, reach=reach)
     back = ((masks.edge_px[edge] - samples.px[own]) * toward).sum(1) - shift[own]
-    beyond = _is_hidden(masks, masks.edge_stack[edge], masks.edge_px[edge], masks.edge_normals[edge])
+    beyond = _is_hidden(masks, masks.edge_stack[edge], masks.edge_px[edge], normals=masks.edge_normals[edge])
     keep = np.isfinite(back) & ~(beyond & (back < 0))
     own, toward, back = own[keep], toward[keep], back[keep]
     forth = samples.select(counts)
@@ -207,7 +207,7 @@ def _gradients(px_from_world: Floats, samples: OutlineSamples, normals: Floats) 
 
 
 def _search_edges(
-    masks: MaskStack, blurred: NDArray[np.float32], samples: OutlineSamples, reach: float
+    masks: MaskStack, samples: OutlineSamples, blurred: NDArray[np.float32], *, reach: float
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Signed distance (K,) along the normals to the nearest edge from inside to outside, NaN for none in reach.
 
@@ -222,10 +222,10 @@ def _search_edges(
     nearest = np.abs(place).argmin(1) if len(place) else np.zeros(0, int)
     distance = place[np.arange(len(place)), nearest]
     edge = samples.px + np.where(np.isfinite(distance), distance, 0)[:, None] * samples.normals
-    return np.where(np.isfinite(distance), distance, np.nan), _is_hidden(masks, samples.stack, edge, samples.normals)
+    return np.where(np.isfinite(distance), distance, np.nan), _is_hidden(masks, samples.stack, edge, normals=samples.normals)
 
 
-def _is_hidden(masks: MaskStack, stack: NDArray, edge: Floats, normals: Floats) -> NDArray[np.bool_]:
+def _is_hidden(masks: MaskStack, stack: NDArray, edge: Floats, *, normals: Floats) -> NDArray[np.bool_]:
     """Does another instance, or the end of the image, begin just beyond these places of an edge?"""
     hidden = np.zeros(len(edge), bool)
     for step in BEYOND_PX:
