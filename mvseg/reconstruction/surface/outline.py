@@ -222,7 +222,8 @@ def _search_edges(
     nearest = np.abs(place).argmin(1) if len(place) else np.zeros(0, int)
     distance = place[np.arange(len(place)), nearest]
     edge = samples.px + np.where(np.isfinite(distance), distance, 0)[:, None] * samples.normals
-    return np.where(np.isfinite(distance), distance, np.nan), _is_hidden(masks, samples.stack, edge, normals=samples.normals)
+    hidden = _is_hidden(masks, samples.stack, edge, normals=samples.normals)
+    return np.where(np.isfinite(distance), distance, np.nan), hidden
 
 
 def _is_hidden(masks: MaskStack, stack: NDArray, edge: Floats, *, normals: Floats) -> NDArray[np.bool_]:
