@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.optimize import linear_sum_assignment
-from scipy.spatial.distance import squareform
 from torch import Tensor
 
 from mvseg.matching.affinity import Affinity
@@ -22,6 +21,7 @@ from mvseg.partition import drop_singletons, number_instances, renumber
 STOP = 0.2  # mean weight below which two clusters are not joined
 ALONE = 0.1  # gain of a region that stays alone, comparable to its mean weight to the V - 1 other views
 MAX_SWEEPS = 20
+TIE = 1e-9  # what equal weights differ by: less than two float32 weights do that differ at all
 FORBIDDEN = 1e9  # distance between two regions of one view: a mean that includes it is never small enough
 
 Floats = NDArray[np.floating]
@@ -70,6 +70,8 @@ def one_per_view_clusters(affinity: Affinity, view_index: Tensor, num_views: int
 def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
     """Average linkage in which clusters that share a view are never joined.
 
+    Of equal weights, that of the regions that come first counts as larger, so that SciPy's order of ties does not show.
+
     Args:
         graph: of D regions.
         stop: two clusters with a smaller mean weight, or with mean weight 0, are not joined.
@@ -79,13 +81,12 @@ def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
     """
     if len(graph.weights) < 2:
         return np.arange(len(graph.weights))
-    is_same_view = graph.view_index[:, None] == graph.view_index
+    first, second = np.triu_indices(len(graph.weights), 1)
     farthest = graph.weights.max(initial=1.0)  # the distance between two regions without an edge
-    distance = np.where(is_same_view, FORBIDDEN, farthest - graph.weights)
-    np.fill_diagonal(distance, 0)
-    tree = linkage(squareform(distance, checks=False), "average")
-    cut = min(farthest - stop, np.nextafter(farthest, 0))
-    return renumber(fcluster(tree, cut, "distance").astype(np.int64))
+    distance = farthest - graph.weights[first, second] + TIE * np.linspace(0, 1, len(first))
+    distance[graph.view_index[first] == graph.view_index[second]] = FORBIDDEN
+    cut = min(farthest - stop + TIE, np.nextafter(farthest, 0))
+    return renumber(fcluster(linkage(distance, "average"), cut, "distance").astype(np.int64))
 
 
 def power_iteration(graph: ViewGraph, clusters: Ints) -> Ints:

@@ -79,6 +79,14 @@ def test_average_linkage_agrees_with_its_definition(seed: int, stop: float) -> N
     np.testing.assert_array_equal(linked, renumber(mean_weights_reference(W, views, stop)))
 
 
+def test_of_equal_weights_the_first_regions_win() -> None:
+    W = np.zeros((4, 4))
+    W[0, 2] = W[0, 3] = W[1, 2] = W[1, 3] = 0.5
+    views = np.array([0, 0, 1, 1])
+    assert link_average(ViewGraph(W + W.T, views, 2)).tolist() == [0, 1, 0, 1]
+    assert link_average(ViewGraph(W + W.T, views, 2), stop=0.5).tolist() == [0, 1, 0, 1]  # as large as asked for
+
+
 def test_assignment_agrees_with_trying_everything() -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
