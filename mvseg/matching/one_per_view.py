@@ -128,7 +128,7 @@ def join_alone(graph: ViewGraph, clusters: Ints, *, stop: float) -> Ints:
     clusters = clusters.copy()
     alone = np.flatnonzero(np.bincount(clusters, minlength=1)[clusters] == 1)
     clusters[alone] = clusters.max(initial=0) + 1 + link_average(graph.select(alone), stop)
-    best_weight = graph.weights[np.ix_(alone, alone)].max(1, initial=0)
+    best_weight = graph.weights[alone].max(1, initial=0)
     for region in alone[np.argsort(-best_weight, kind="stable")].tolist():
         clusters = renumber(clusters)
         sizes = np.bincount(clusters)

@@ -119,6 +119,14 @@ def test_second_chance_for_those_alone() -> None:
     assert joined.tolist() == [0, 0, 0, 1, 2, 2, 3]
 
 
+def test_of_two_alone_in_one_view_the_one_with_the_largest_weight_to_anybody_comes_first() -> None:
+    """Cluster 0 holds views 0 and 1; regions 2 and 3, of one view, both fit it, and only one can join."""
+    views, W = np.array([0, 1, 2, 2]), np.zeros((4, 4))
+    W[0, 1], W[0, 2], W[1, 2], W[0, 3], W[1, 3] = 0.9, 0.6, 0.6, 0.9, 0.5
+    joined = join_alone(ViewGraph(W + W.T, views, 3), np.array([0, 0, 1, 2]), stop=0.4)
+    assert joined.tolist() == [0, 0, 1, 0]
+
+
 def test_sweeps_settle() -> None:
     views = np.random.default_rng(1).integers(0, 4, 30)
     W = random_weights(views, 1)
