@@ -28,10 +28,10 @@ if TYPE_CHECKING:
     from mvseg.matching.affinity import region_affinity as region_affinity
     from mvseg.matching.config import MatchConfig as MatchConfig
     from mvseg.matching.epipolar import epipolar_map as epipolar_map
-    from mvseg.matching.match_regions import match_regions as match_regions
+    from mvseg.matching.match import match_regions as match_regions
     from mvseg.matching.result import Matching as Matching
     from mvseg.matching.result import MergedMask as MergedMask
-    from mvseg.matching.split_merged import split_merged as split_merged
+    from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
     from mvseg.multiview.assignment import EpipolarAssignment as EpipolarAssignment
     from mvseg.multiview.config import DetectConfig as DetectConfig
@@ -60,9 +60,9 @@ _HOME = {
     "matching.epipolar": ("epipolar_map",),
     "matching.affinity": ("Affinity", "region_affinity"),
     "matching.symnmf": ("cluster_affinity",),
-    "matching.match_regions": ("match_regions",),
+    "matching.match": ("match_regions",),
     "matching.result": ("Matching", "MergedMask"),
-    "matching.split_merged": ("split_merged",),
+    "matching.split": ("split_merged",),
     "reconstruction.config": ("ReconstructConfig",),
     "reconstruction.voxels": ("reconstruct_instances",),
     "reconstruction.surface.leaf_surface": ("LeafSurface",),

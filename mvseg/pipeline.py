@@ -16,9 +16,9 @@ from mvseg.detectors.zoo import load_detector
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import check_photos, read_photo
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.matching.match_regions import match_regions
+from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
-from mvseg.matching.split_merged import split_merged
+from mvseg.matching.split import split_merged
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
 from mvseg.reconstruction.config import ReconstructConfig

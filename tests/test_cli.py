@@ -26,7 +26,7 @@ from mvseg.cli import main
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.formats.label_png import read_label_png, write_label_png
-from mvseg.matching.match_regions import match_regions
+from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
 from mvseg.multiview.config import DetectConfig
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene

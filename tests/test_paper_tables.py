@@ -26,7 +26,7 @@ from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.shape_distance import shape_distance
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match_regions import match_regions
+from mvseg.matching.match import match_regions
 from mvseg.multiview.config import DetectConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.simulation.dataset import list_scenes, start_worker

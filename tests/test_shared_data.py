@@ -16,7 +16,7 @@ from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match_regions import match_regions
+from mvseg.matching.match import match_regions
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import back_project
 

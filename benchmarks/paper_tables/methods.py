@@ -18,7 +18,7 @@ from mvseg.baselines.sparse import match_sparse
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match_regions import match_regions
+from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 

@@ -25,7 +25,7 @@ from benchmarks.paper_tables.shape_error import (
 from mvseg.baselines.semantic import reconstruct_semantic
 from mvseg.errors import InputError, InputWarning
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match_regions import match_regions
+from mvseg.matching.match import match_regions
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import VoxelGrid, back_project, reconstruct_instances
 

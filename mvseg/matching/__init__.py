@@ -15,10 +15,10 @@ if TYPE_CHECKING:
     from mvseg.matching.affinity import region_affinity as region_affinity
     from mvseg.matching.config import MatchConfig as MatchConfig
     from mvseg.matching.epipolar import epipolar_map as epipolar_map
-    from mvseg.matching.match_regions import match_regions as match_regions
+    from mvseg.matching.match import match_regions as match_regions
     from mvseg.matching.result import Matching as Matching
     from mvseg.matching.result import MergedMask as MergedMask
-    from mvseg.matching.split_merged import split_merged as split_merged
+    from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
 
 _HOME = {
@@ -26,9 +26,9 @@ _HOME = {
     "epipolar": ("epipolar_map",),
     "affinity": ("Affinity", "region_affinity"),
     "symnmf": ("cluster_affinity",),
-    "match_regions": ("match_regions",),
+    "match": ("match_regions",),
     "result": ("Matching", "MergedMask"),
-    "split_merged": ("split_merged",),
+    "split": ("split_merged",),
 }
 __all__ = [name for names in _HOME.values() for name in names]
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match_regions import match_regions
+from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
 from mvseg.multiview.assignment import EpipolarAssignment
 from mvseg.multiview.nms import cluster_aware_nms, confirmed

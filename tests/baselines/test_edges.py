@@ -5,7 +5,7 @@ import torch
 
 from mvseg.baselines.edges import edge_graph
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match_regions import match_graph
+from mvseg.matching.match import match_graph
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions, regions_from_label_maps
 

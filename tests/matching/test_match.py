@@ -10,8 +10,8 @@ from sklearn.metrics import adjusted_rand_score
 from mvseg.errors import InputError, InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match_regions import match_regions
-from mvseg.matching.split_merged import split_merged
+from mvseg.matching.match import match_regions
+from mvseg.matching.split import split_merged
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
 from synthetic import ball_scene, cameras_at, merged_balls, permute_views, render_balls
