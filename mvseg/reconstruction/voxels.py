@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
@@ -204,6 +205,11 @@ class _ViewMask:
             ray=ray,
         )
 
+    @cached_property
+    def integral(self) -> Tensor:
+        """((h + 1) * (w + 1),) int: pixels of the mask above and to the left of each pixel corner, row by row."""
+        return torch.nn.functional.pad(self.mask.int().cumsum(0).cumsum(1), (1, 0, 1, 0)).flatten()
+
     def contains(self, axes: list[Tensor]) -> Tensor:
         """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask?"""
         return self.look_up(axes, self.mask, self.corner)
@@ -240,7 +246,7 @@ class _ViewMask:
         # |u' - u| <= f reach sqrt(1 + (X/Z)^2) / (Z - reach), and distance / depth bounds the root.
         margin = reach * self.focal / (depth - reach).clamp(min=1e-12) * distance * scale
         height, width = self.mask.shape
-        integral = torch.nn.functional.pad(self.mask.int().cumsum(0).cumsum(1), (1, 0, 1, 0)).flatten()
+        integral = self.integral
         x1, y1 = ((c - margin).floor().clamp(0, side).long() for c, side in ((u, width), (v, height)))
         x2, y2 = (((c + margin).floor() + 1).clamp(0, side).long() for c, side in ((u, width), (v, height)))
         top, bottom = y1 * (width + 1), y2 * (width + 1)

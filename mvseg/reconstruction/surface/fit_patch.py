@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid, patch_prior
+from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
@@ -31,11 +32,13 @@ class PatchFit:
         coefficients: (26, 3).
         covariance: (78, 78).
         residual_px: (S,) root mean square distance per view, robustly weighted.
+        offsets_px: (S,) by how much the mask of each view is too large; NaN where none of its edges was met.
     """
 
     coefficients: Floats
     covariance: Floats
     residual_px: Floats
+    offsets_px: Floats
 
     @property
     def rms_px(self) -> float:
@@ -43,10 +46,18 @@ class PatchFit:
         return float(np.nanmedian(self.residual_px)) if np.isfinite(self.residual_px).any() else float("nan")
 
 
-def fit_patch(masks: MaskStack, start: Floats, *, num_steps: int) -> PatchFit:
+def fit_patch(
+    masks: MaskStack, start: Floats, *, num_steps: int, errors: MaskErrors | None = None
+) -> PatchFit:
     """Move a patch until its outlines are those of the masks: reweighted Gauss-Newton.
 
     Works in a world moved and scaled to the start, so nothing depends on the scene's origin and unit.
+
+    Args:
+        masks: of the leaf.
+        start: (26, 3) coefficients.
+        num_steps: up to NUM_WARM_STEPS: from a start that is nearly right.
+        errors: how the masks of this segmenter err; None: they are right on average over the views.
     """
     centre, scale = start[MIDRIB].mean(0), measure_patch(start).length
     moved = masks.move_world(centre, scale)
@@ -55,18 +66,24 @@ def fit_patch(masks: MaskStack, start: Floats, *, num_steps: int) -> PatchFit:
     coefficients /= scale
     grid = patch_grid(*FIT_GRID)
     is_warm = num_steps <= NUM_WARM_STEPS
+    offsets = np.zeros(len(masks))
     for step in range(num_steps):
         progress = 1.0 if is_warm else min(1.0, step / REACH_STEPS)
         reach = masks.enlargement * (FAR_REACH + (NEAR_REACH - FAR_REACH) * progress)
         is_near = is_warm or step >= NUM_STEPS - NUM_IMAGED
-        distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=is_near)
-        has_offsets = is_warm or step >= OFFSET_FROM
+        drawn = offsets if is_near and errors else np.zeros(len(masks))
+        distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=is_near, offsets=drawn)
+        if is_warm or step >= OFFSET_FROM:
+            offsets = _believe(drawn + _per_view(distances.px, distances.stack, len(masks)), errors)
         scale_px = FAR_SCALE_PX + (LEAST_SCALE_PX - FAR_SCALE_PX) * progress
-        equations = _weigh(distances, len(masks), has_offsets=has_offsets, scale_px=scale_px)
+        equations = _weigh(distances, offsets - drawn, scale_px=scale_px)
         is_late = is_warm or step >= NUM_STEPS // 2
         coefficients = _step(coefficients, equations, damping=0.005 if is_late else 0.05, cap=0.12 if is_late else 0.25)
-    distances = outline_distances(moved, grid, coefficients, reach=NEAR_REACH * masks.enlargement, is_imaged=True)
-    equations = _weigh(distances, len(masks), has_offsets=True, scale_px=LEAST_SCALE_PX)
+    drawn = offsets if errors else np.zeros(len(masks))
+    reach = NEAR_REACH * masks.enlargement
+    distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=True, offsets=drawn)
+    measured = drawn + _per_view(distances.px, distances.stack, len(masks))
+    equations = _weigh(distances, _believe(measured, errors) - drawn, scale_px=LEAST_SCALE_PX)
     covariance = np.linalg.inv(_normal_matrix(coefficients, equations)[0])
     coefficients = coefficients * scale
     coefficients[MIDRIB] += centre
@@ -74,6 +91,7 @@ def fit_patch(masks: MaskStack, start: Floats, *, num_steps: int) -> PatchFit:
         coefficients=coefficients,
         covariance=np.asarray(covariance * scale**2, dtype=float),
         residual_px=_rms_per_view(distances, equations, len(masks)),
+        offsets_px=measured - _centre(measured, errors),
     )
 
 
@@ -90,38 +108,42 @@ class _Equations:
     noise: float
 
 
-def _weigh(distances: Distances, num_views: int, *, has_offsets: bool, scale_px: float) -> _Equations:
-    """Robust weights, after what the masks of a view are all too large or too small by is taken off."""
-    px = distances.px
-    if has_offsets and len(px):
-        px = px - OFFSET_SHARE * _view_offsets(distances, num_views)[distances.stack]
+def _weigh(distances: Distances, offsets: Floats, *, scale_px: float) -> _Equations:
+    """Robust weights, after what the masks of each view (S,) are all too large or too small by is taken off."""
+    px = distances.px - offsets[distances.stack]
     spread = float(np.median(np.abs(px))) if len(px) else 0.0
     scale = max(scale_px, SCALE_FACTOR * spread)
     weight = SAMPLE_WEIGHT * distances.weight / (1 + (px / scale) ** 2)
-    weight = weight * _view_weights(px, distances.stack, num_views)[distances.stack]
+    weight = weight * _view_weights(px, distances.stack, len(offsets))[distances.stack]
     noise = max(1.0, 1.48 * spread / CLEAN_PX)
     return _Equations(jacobian=distances.jacobian, px=px, weight=weight, noise=noise)
 
 
-def _view_offsets(distances: Distances, num_views: int) -> Floats:
-    """(S,) median distance of each view beyond the winsorised mean of all views."""
-    medians = _per_view(distances.px, distances.stack, num_views)
-    ordered = np.sort(medians)
-    cut = num_views // 5
-    return medians - np.clip(medians, ordered[cut], ordered[-1 - cut]).mean()
+def _believe(measured: Floats, errors: MaskErrors | None) -> Floats:
+    """(S,) the offset of each view's mask, from the measured ones, NaN for views that show none."""
+    share = errors.share if errors else OFFSET_SHARE
+    return np.nan_to_num(share * (measured - _centre(measured, errors)))
+
+
+def _centre(measured: Floats, errors: MaskErrors | None) -> float:
+    """Which of the measured offsets is no offset."""
+    known = measured[np.isfinite(measured)]
+    if not len(known):
+        return 0.0
+    return errors.centre(known)[0] if errors else winsorised_mean(known)
 
 
 def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
     """(S,) 1, or less for views whose distances spread more than is usual in the others."""
-    spreads = _per_view(np.abs(px), stack, num_views)
+    spreads = np.nan_to_num(_per_view(np.abs(px), stack, num_views))
     usual = NOISY_VIEW * max(float(np.median(spreads)), 0.3)
     return np.minimum(1.0, (usual / np.maximum(spreads, 1e-9)) ** 2)
 
 
 def _per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
-    """(S,) medians; 0 for a view without samples."""
+    """(S,) medians; NaN for a view without samples."""
     picks = [values[stack == index] for index in range(num_views)]
-    return np.array([np.median(pick) if len(pick) else 0.0 for pick in picks])
+    return np.array([np.median(pick) if len(pick) else np.nan for pick in picks])
 
 
 def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats, Floats]:

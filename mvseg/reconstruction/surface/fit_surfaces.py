@@ -20,9 +20,10 @@ from mvseg.reconstruction.surface.fit_patch import (
 )
 from mvseg.reconstruction.surface.leaf_patch import measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.mask_errors import learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
-from mvseg.reconstruction.surface.patch_image import pixels_behind, view_ious
+from mvseg.reconstruction.surface.patch_image import hiding_pixels, view_ious
 from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions
@@ -132,15 +133,18 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
 def _fit_again(
     stacks: dict[int, MaskStack], fits: dict[int, PatchFit]
 ) -> tuple[dict[int, MaskStack], dict[int, PatchFit]]:
-    """Leaves whose neighbours turn out to lie behind them, fitted to what is then a rim."""
+    """Leaves fitted to what is their rim now that all leaves are known, and the errors of the masks."""
     points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
+    offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
+    errors = learn_mask_errors([each for each in offsets if len(each) > 1])
     again: dict[int, PatchFit] = {}
     for instance, fit in fits.items():
         margin = BEHIND * measure_patch(fit.coefficients).length
-        behind = pixels_behind(stacks[instance], points[instance], points, margin=margin)
-        if behind.any():
-            stacks[instance] = stacks[instance].with_background(behind)
-            fit = fit_patch(stacks[instance], fit.coefficients, num_steps=NUM_WARM_STEPS)
+        others = {other: grid for other, grid in points.items() if other != instance}
+        hiding = hiding_pixels(stacks[instance], points[instance], others, margin=margin)
+        if errors or (hiding != stacks[instance].others).any():
+            stacks[instance] = stacks[instance].with_others(hiding)
+            fit = fit_patch(stacks[instance], fit.coefficients, num_steps=NUM_WARM_STEPS, errors=errors)
         again[instance] = fit
     return stacks, again
 

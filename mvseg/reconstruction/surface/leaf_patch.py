@@ -176,24 +176,34 @@ def _differences(part: slice, order: int) -> Floats:
 
 def _speed(coefficients: Floats) -> tuple[Floats, Floats]:
     """(10, 26) rows that give dm/du on ten pieces of the midrib, and the present directions (10, 3) of these."""
+    rows = _speed_rows()
+    return rows, _unit(rows @ coefficients)
+
+
+@cache
+def _speed_rows() -> Floats:
     u = np.linspace(0, 1, 11)
-    rows = np.diff(patch_basis(u, np.zeros_like(u)), axis=0) / 0.1
-    tangents = rows @ coefficients
-    return rows, _unit(tangents)
+    return np.diff(patch_basis(u, np.zeros_like(u)), axis=0) / 0.1
 
 
 def _frames(coefficients: Floats, count: int) -> tuple[Floats, Floats, Floats]:
     """Directions along, across and normal to the blade, (count, 3) each, at the places of `count` coefficients."""
-    u = np.linspace(0, 1, count)
-    middle = np.clip(u, 0.02, 0.98)
-    zeros = np.zeros_like(u)
-    ahead = patch_basis(middle + 0.02, zeros) - patch_basis(middle - 0.02, zeros)
+    ahead, sideways = _frame_rows(count)
     along = _unit(ahead @ coefficients)
-    side = spline_basis(middle, COUNTS[1]) @ coefficients[SIDE]
+    side = sideways @ coefficients[SIDE]
     # Where the side vector vanishes (pointed ends) the mean one stands in.
     side = side + 1e-3 * coefficients[SIDE].mean(0)
     across = _unit(side - (side * along).sum(1, keepdims=True) * along)
     return along, across, np.cross(along, across)
+
+
+@cache
+def _frame_rows(count: int) -> tuple[Floats, Floats]:
+    """(count, 26) rows of directions along the midrib, and (count, 12) of the side vectors."""
+    middle = np.clip(np.linspace(0, 1, count), 0.02, 0.98)
+    zeros = np.zeros_like(middle)
+    ahead = patch_basis(middle + 0.02, zeros) - patch_basis(middle - 0.02, zeros)
+    return ahead, spline_basis(middle, COUNTS[1])
 
 
 def _unit(vectors: Floats) -> Floats:

@@ -84,9 +84,9 @@ class MaskStack:
         bottom = values[below] * (1 - x) + values[below + 1] * x
         return top * (1 - y) + bottom * y
 
-    def with_background(self, is_behind: NDArray[np.bool_]) -> MaskStack:
-        """The same masks, where the pixels (of the flat arrays) that are known to lie behind the leaf hide nothing."""
-        return replace(self, others=np.where(is_behind, 0, self.others))
+    def with_others(self, others: Labels) -> MaskStack:
+        """The same masks, with what hides the leaf as (pixels,) int32."""
+        return replace(self, others=others)
 
     def move_world(self, centre: Floats, scale: float) -> MaskStack:
         """The same masks for world coordinates (x - centre) / scale."""

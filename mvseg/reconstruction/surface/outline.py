@@ -167,24 +167,34 @@ class Distances:
 
 
 def outline_distances(
-    masks: MaskStack, grid: PatchGrid, coefficients: Floats, *, reach: float, is_imaged: bool
+    masks: MaskStack,
+    grid: PatchGrid,
+    coefficients: Floats,
+    *,
+    reach: float,
+    is_imaged: bool,
+    offsets: Floats | None = None,
 ) -> Distances:
     """How far the outline of the patch is from the edges of its masks, both ways; edges beyond `reach` do not count.
 
     With `is_imaged` the patch is drawn and blurred as the masks are, and its own edge takes the place of its outline:
     tips narrower than a pixel and notches lose the same on both sides. Worth it when the two are near each other.
+    With `offsets` (S,), pixels, it is drawn as much too large or small as the masks of each view are.
     """
     projection = project_points(masks.px_from_world, grid.points(coefficients))
     samples, covered = outline_samples(masks, grid, projection)
-    to_edge, hidden = _search_edges(masks, samples, masks.blurred, reach=reach)
+    offsets = np.zeros(len(masks)) if offsets is None else offsets
+    to_edge, hidden = _search_edges(masks, samples, masks.blurred, reach=reach, offsets=offsets)
     shift = np.zeros(len(to_edge))
     if is_imaged:
-        drawn = draw_patch(masks, projection)
-        shift = _search_edges(masks, samples, drawn, reach=MOST_SHIFT_PX)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
+        drawn = draw_patch(masks, projection, offsets=offsets)
+        most = MOST_SHIFT_PX + float(np.abs(offsets).max(initial=0))
+        shift = _search_edges(masks, samples, drawn, reach=most, offsets=offsets)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
     counts = np.isfinite(to_edge) & np.isfinite(shift) & ~(hidden & (to_edge < shift))
     own, edge, toward = _nearest_samples(masks, samples, covered, reach=reach)
     back = ((masks.edge_px[edge] - samples.px[own]) * toward).sum(1) - shift[own]
-    beyond = _is_hidden(masks, masks.edge_stack[edge], masks.edge_px[edge], normals=masks.edge_normals[edge])
+    stack = masks.edge_stack[edge]
+    beyond = _is_hidden(masks, stack, masks.edge_px[edge], normals=masks.edge_normals[edge], offsets=offsets)
     keep = np.isfinite(back) & ~(beyond & (back < 0))
     own, toward, back = own[keep], toward[keep], back[keep]
     forth = samples.select(counts)
@@ -207,7 +217,7 @@ def _gradients(px_from_world: Floats, samples: OutlineSamples, normals: Floats) 
 
 
 def _search_edges(
-    masks: MaskStack, samples: OutlineSamples, blurred: NDArray[np.float32], *, reach: float
+    masks: MaskStack, samples: OutlineSamples, blurred: NDArray[np.float32], *, reach: float, offsets: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Signed distance (K,) along the normals to the nearest edge from inside to outside, NaN for none in reach.
 
@@ -222,15 +232,21 @@ def _search_edges(
     nearest = np.abs(place).argmin(1) if len(place) else np.zeros(0, int)
     distance = place[np.arange(len(place)), nearest]
     edge = samples.px + np.where(np.isfinite(distance), distance, 0)[:, None] * samples.normals
-    hidden = _is_hidden(masks, samples.stack, edge, normals=samples.normals)
+    hidden = _is_hidden(masks, samples.stack, edge, normals=samples.normals, offsets=offsets)
     return np.where(np.isfinite(distance), distance, np.nan), hidden
 
 
-def _is_hidden(masks: MaskStack, stack: NDArray, edge: Floats, *, normals: Floats) -> NDArray[np.bool_]:
-    """Does another instance, or the end of the image, begin just beyond these places of an edge?"""
+def _is_hidden(
+    masks: MaskStack, stack: NDArray, edge: Floats, *, normals: Floats, offsets: Floats
+) -> NDArray[np.bool_]:
+    """Does another instance, or the end of the image, begin just beyond these places of an edge?
+
+    Masks that are too small end before they reach what hides the leaf.
+    """
     hidden = np.zeros(len(edge), bool)
+    gap = np.maximum(0, -offsets)[stack]
     for step in BEYOND_PX:
-        hidden |= masks.look_up(masks.others, stack, edge + step * normals) != 0
+        hidden |= masks.look_up(masks.others, stack, edge + (step + gap)[:, None] * normals) != 0
     return hidden
 
 

@@ -15,6 +15,7 @@ from mvseg.reconstruction.surface.mask_stack import BLUR_PX, MaskStack
 SUPERSAMPLED = 3  # side of the small pixels that patches are drawn in
 DRAWN_TOO_FAR = 0.48  # small pixels, measured
 SUB_PIXEL_BITS = 4  # of OpenCV's polygons
+LEAST_GROWTH_PX = 0.15  # offsets that are worth the time
 NEAR_PX = 4  # around a mask, where it matters what lies in front
 
 
@@ -49,9 +50,12 @@ def cover_crop(masks: MaskStack, projection: Projection, index: int) -> NDArray[
     return canvas
 
 
-def view_ious(masks: MaskStack, points: Floats) -> Floats:
-    """(S,) IoU of grid points (rows, columns, 3) of a patch and the mask in each view, where nothing else hides it."""
-    shares = draw_patch(masks, project_points(masks.px_from_world, points), blur_px=0.0)
+def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats | None = None) -> Floats:
+    """(S,) IoU of grid points (rows, columns, 3) of a patch and the mask in each view, where nothing else hides it.
+
+    With `offsets` (S,), pixels, the patch is drawn as much too large or small as the mask of each view is.
+    """
+    shares = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, blur_px=0.0)
     is_covered = (shares >= 0.5) & (masks.others == 0)
     ious = []
     for index in range(len(masks)):
@@ -60,14 +64,31 @@ def view_ious(masks: MaskStack, points: Floats) -> Floats:
     return np.array(ious)
 
 
-def draw_patch(masks: MaskStack, projection: Projection, *, blur_px: float = BLUR_PX) -> NDArray[np.float32]:
-    """(pixels,) the projected grid as a blurred mask, like `MaskStack.blurred`; sharp with a blur of 0."""
+def draw_patch(
+    masks: MaskStack, projection: Projection, *, offsets: Floats | None = None, blur_px: float = BLUR_PX
+) -> NDArray[np.float32]:
+    """(pixels,) the projected grid as a blurred mask, like `MaskStack.blurred`; sharp with a blur of 0.
+
+    With `offsets` (S,), pixels, it is grown or shrunk as the mask of each view seems to be.
+    """
     drawn = []
     for index in range(len(masks)):
         height, width = masks.shapes[index].tolist()
-        share = draw_polygons(grid_quads(projection.px[index]), (width, height), masks.corners[index])
+        canvas = _draw_small(grid_quads(projection.px[index]), (width, height), masks.corners[index])
+        if offsets is not None and abs(offsets[index]) > LEAST_GROWTH_PX:
+            canvas = grow(canvas, SUPERSAMPLED * float(offsets[index]))
+        share = _shares(canvas, (width, height))
         drawn.append((cv2.GaussianBlur(share, (0, 0), blur_px) if blur_px else share).ravel())
     return np.concatenate(drawn)
+
+
+def grow(canvas: NDArray[np.uint8], px: float) -> NDArray[np.uint8]:
+    """Pixels (rows, columns) of 0 or 255, grown by `px` pixels, or shrunk where that is negative."""
+    is_away = canvas == 0 if px > 0 else canvas > 0
+    # Distances are to pixel centres: the border is half a pixel nearer.
+    is_near = cv2.distanceTransform(is_away.astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5) < abs(px) + 0.5
+    grown: NDArray[np.uint8] = np.where(is_near if px > 0 else is_away & ~is_near, np.uint8(255), np.uint8(0))
+    return grown
 
 
 def grid_quads(grid: Floats) -> Floats:
@@ -82,6 +103,10 @@ def draw_polygons(polygons: Floats, size: tuple[int, int], corner: Floats) -> ND
     Drawn several times as large. OpenCV's polygons include their border: they are DRAWN_TOO_FAR small pixels too wide
     on every side.
     """
+    return _shares(_draw_small(polygons, size, corner), size)
+
+
+def _draw_small(polygons: Floats, size: tuple[int, int], corner: Floats) -> NDArray[np.uint8]:
     width, height = size
     scale = SUPERSAMPLED
     local = ((polygons - corner) * scale - 0.5) * (1 << SUB_PIXEL_BITS)
@@ -89,35 +114,49 @@ def draw_polygons(polygons: Floats, size: tuple[int, int], corner: Floats) -> ND
     canvas = np.zeros((height * scale, width * scale), np.uint8)
     for polygon in local:
         cv2.fillConvexPoly(canvas, polygon, 255, shift=SUB_PIXEL_BITS)
-    share: NDArray[np.float32] = cv2.resize(canvas, (width, height), interpolation=cv2.INTER_AREA).astype(np.float32)
+    return canvas
+
+
+def _shares(canvas: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
+    share: NDArray[np.float32] = cv2.resize(canvas, size, interpolation=cv2.INTER_AREA).astype(np.float32)
     return share / np.float32(255)
 
 
-def pixels_behind(
+def hiding_pixels(
     masks: MaskStack, points: Floats, others: dict[int, Floats], *, margin: float
-) -> NDArray[np.bool_]:
-    """(pixels,) bool: pixels of other instances next to the mask that are known to lie behind the leaf.
+) -> NDArray[np.int32]:
+    """(pixels,) int32: which instance hides the leaf there, 0 for none, as the surfaces have it.
+
+    A pixel that shows another instance hides nothing where that one's surface lies behind the leaf. And a surface in
+    front of the leaf hides it, whether that instance has a mask there or not.
 
     Args:
         masks: of the leaf.
         points: (rows, columns, 3) grid points of its present patch.
         others: instance id -> grid points of its patch. Instances without a patch may hide anything.
-        margin: world units by which the other one must be farther away.
+        margin: world units by which another one must be farther away to lie behind, or nearer to lie in front.
     """
-    behind = np.zeros(len(masks.others), bool)
+    hiding = masks.others.copy()
     projection = project_points(masks.px_from_world, points)
+    seen = {other: project_points(masks.px_from_world, grid) for other, grid in others.items()}
     for index in range(len(masks)):
-        hiding = masks.crop(masks.others, index)
+        crop = masks.crop(hiding, index)
         inside = masks.crop(masks.inside, index).astype(np.uint8)
         near = cv2.dilate(inside, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
-        marks = masks.crop(behind, index)
         own = cKDTree(projection.px[index].reshape(-1, 2))
-        for other in np.unique(hiding[near & (hiding > 0)]).tolist():
-            if other not in others:
+        own_depth = projection.depth[index].ravel()
+        corner, (rows, columns) = masks.corners[index], crop.shape
+        for other, image in seen.items():
+            px, depth = image.px[index].reshape(-1, 2), image.depth[index].ravel()
+            if (px.max(0) < corner).any() or (px.min(0) > corner + (columns, rows)).any():
                 continue
-            row, column = np.nonzero(near & (hiding == other))
-            px = np.stack([column, row], 1) + 0.5 + masks.corners[index]
-            seen = project_points(masks.px_from_world[index : index + 1], others[other])
-            far = seen.depth.ravel()[cKDTree(seen.px.reshape(-1, 2)).query(px)[1]]
-            marks[row, column] = far > projection.depth[index].ravel()[own.query(px)[1]] + margin
-    return behind
+            drawn = draw_polygons(grid_quads(image.px[index]), (columns, rows), corner) >= 0.5
+            shows = crop == other
+            row, column = np.nonzero(near & shows | drawn & (shows | (crop == 0)) & (inside == 0))
+            if not len(row):
+                continue
+            place = np.stack([column, row], 1) + 0.5 + corner
+            gap = depth[cKDTree(px).query(place)[1]] - own_depth[own.query(place)[1]]
+            is_front = drawn[row, column] & (gap < -margin)
+            crop[row, column] = np.where(gap > margin, 0, np.where(is_front, other, crop[row, column]))
+    return hiding

@@ -1,0 +1,100 @@
+"""How the masks of one segmenter err: each is a little too large or too small as a whole.
+
+Of one leaf alone only the differences between its masks can be seen; what they share stays unknown, and the best guess
+is that they are right on average. But the masks of all leaves come from the same segmenter. The differences of all of
+them together show how its errors are spread, and with that each leaf's share is found better: errors that end sharply
+at 3 px tell by their extremes, errors with long tails by their middle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from mvseg.reconstruction.surface.leaf_patch import Floats
+
+ROUNDS = 4
+LEAST_MASKS = 20  # to learn the spread from
+LEAST_SPREAD_PX = 0.3  # masks whose sizes differ by less are clean
+MEASURED_PX = 0.2  # deviation of the measured offset of one mask
+STEP_PX = 0.05
+FLOOR = 1e-3  # least density, per pixel: any mask may be wrong in another way
+
+
+@dataclass(frozen=True, eq=False)
+class MaskErrors:
+    """The spread of the offsets of a segmenter's masks: a symmetric density.
+
+    Attributes:
+        spread: standard deviation, pixels.
+        density: (2 G + 1,) per pixel, at -G ... G steps of STEP_PX.
+    """
+
+    spread: float
+    density: Floats
+
+    @property
+    def share(self) -> float:
+        """How much of a measured offset is to be believed: all of it where masks differ by more than is measured."""
+        return self.spread**2 / (self.spread**2 + MEASURED_PX**2)
+
+    def centre(self, offsets: Floats) -> tuple[float, float]:
+        """Where offset 0 lies among the offsets (S,) of one leaf, in pixels, and its standard deviation.
+
+        Mean and deviation of the posterior over all places between the smallest and the largest offset.
+        """
+        places = np.arange(offsets.min(), offsets.max() + STEP_PX, STEP_PX)
+        middle = len(self.density) // 2
+        cells = np.round((offsets - places[:, None]) / STEP_PX).astype(int) + middle
+        density = self.density[np.clip(cells, 0, 2 * middle)]
+        evidence = np.log(density + FLOOR).sum(1)
+        weight = np.exp(evidence - evidence.max())
+        weight /= weight.sum()
+        mean = float(weight @ places)
+        return mean, float(np.sqrt(weight @ (places - mean) ** 2 + STEP_PX**2))
+
+
+def learn_mask_errors(offsets: Sequence[Floats]) -> MaskErrors | None:
+    """The spread of the offsets of all masks of a scene.
+
+    Args:
+        offsets: of each leaf (S,) pixels by which its masks are too large, up to a number that they share.
+
+    Returns:
+        None where there are too few masks, or where they differ so little that they are clean.
+    """
+    if sum(map(len, offsets)) < LEAST_MASKS:
+        return None
+    centres = [winsorised_mean(each) for each in offsets]
+    errors = _spread(offsets, centres)
+    if errors.spread < LEAST_SPREAD_PX:
+        return None
+    for _ in range(ROUNDS):
+        centres = [errors.centre(each)[0] for each in offsets]
+        errors = _spread(offsets, centres)
+    return errors
+
+
+def winsorised_mean(values: Floats) -> float:
+    """Mean of (S,) values of which the largest and smallest fifth are pulled in to the next one."""
+    ordered = np.sort(values)
+    cut = len(values) // 5
+    return float(np.clip(values, ordered[cut], ordered[-1 - cut]).mean())
+
+
+def _spread(offsets: Sequence[Floats], centres: Sequence[float]) -> MaskErrors:
+    """Kernel density of the offsets and their negatives, with half of Scott's bandwidth: it may have edges."""
+    # Differences to a centre of S values are too small by this factor.
+    widen = [np.sqrt(len(each) / max(len(each) - 1, 1)) for each in offsets]
+    away = [(each - centre) * by for each, centre, by in zip(offsets, centres, widen, strict=True)]
+    sample = np.abs(np.concatenate(away))
+    spread = float(np.sqrt((sample**2).mean()))
+    bandwidth = max(0.5 * spread * (2 * len(sample)) ** -0.2, MEASURED_PX / 2)
+    half = int(np.ceil((sample.max() + 4 * bandwidth) / STEP_PX))
+    counts = np.bincount(np.round(sample / STEP_PX).astype(int), minlength=half + 1) / (2 * len(sample) * STEP_PX)
+    both = np.concatenate([counts[:0:-1], counts])
+    both[half] *= 2
+    return MaskErrors(spread=spread, density=gaussian_filter1d(both, bandwidth / STEP_PX, mode="constant"))

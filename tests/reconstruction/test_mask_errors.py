@@ -1,0 +1,63 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mvseg.reconstruction.surface.mask_errors import LEAST_MASKS, learn_mask_errors, winsorised_mean
+
+RNG = np.random.default_rng(5)
+FLAT = [RNG.choice([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0], 10) + RNG.normal(0, 0.1, 10) for _ in range(30)]
+NORMAL = [RNG.normal(0, 2, 10) for _ in range(30)]
+
+
+def deviation(offsets: list[np.ndarray]) -> tuple[float, float]:
+    """Of the centres that the errors give, and of the winsorised means; the true centre is 0."""
+    errors = learn_mask_errors(offsets)
+    assert errors is not None
+    return float(np.std([errors.centre(each)[0] for each in offsets])), float(np.std([*map(winsorised_mean, offsets)]))
+
+
+def test_errors_that_end_sharply_are_centred_by_their_extremes() -> None:
+    learned, plain = deviation(FLAT)
+    assert learned < 0.5 * plain
+
+
+def test_normal_errors_are_centred_nearly_as_well_as_by_their_mean() -> None:
+    learned, plain = deviation(NORMAL)
+    assert learned < 1.2 * plain
+
+
+@pytest.mark.parametrize("offsets", [FLAT, NORMAL])
+def test_centre_lies_within_its_deviations(offsets: list[np.ndarray]) -> None:
+    errors = learn_mask_errors(offsets)
+    assert errors is not None
+    inside = [abs(centre) < 2 * deviation for centre, deviation in map(errors.centre, offsets)]
+    assert np.mean(inside) > 0.75
+
+
+def test_centre_moves_with_the_offsets_and_turns_with_their_sign() -> None:
+    errors = learn_mask_errors(FLAT)
+    assert errors is not None
+    centre, deviation = errors.centre(FLAT[0])
+    assert errors.centre(FLAT[0] + 7) == pytest.approx((centre + 7, deviation), abs=0.03)
+    assert errors.centre(-FLAT[0])[0] == pytest.approx(-centre, abs=0.06)
+    assert errors.centre(FLAT[0][::-1])[0] == pytest.approx(centre)
+
+
+def test_density_is_symmetric_and_sums_to_one() -> None:
+    errors = learn_mask_errors(NORMAL)
+    assert errors is not None
+    assert errors.density == pytest.approx(errors.density[::-1])
+    assert errors.density.sum() * 0.05 == pytest.approx(1, abs=1e-3)
+    assert errors.spread == pytest.approx(2, abs=0.3)
+
+
+def test_clean_masks_and_few_masks_teach_nothing() -> None:
+    assert learn_mask_errors([0.02 * each for each in NORMAL]) is None
+    assert learn_mask_errors([np.arange(LEAST_MASKS - 1.0)]) is None
+    assert learn_mask_errors([]) is None
+
+
+def test_winsorised_mean() -> None:
+    assert winsorised_mean(np.array([0.0, 1, 2, 3, 100])) == pytest.approx(2)
+    assert winsorised_mean(np.array([4.0])) == 4
