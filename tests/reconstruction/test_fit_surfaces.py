@@ -88,6 +88,16 @@ def test_one_wrong_mask_in_five_does_little_harm() -> None:
     assert np.abs(errors(fit(masks), BENT)).max() < 0.05
 
 
+def test_masks_of_another_leaf_are_left_out() -> None:
+    masks = blade_masks(BENT, CAMERAS)
+    for view in (2, 6):
+        masks[view] = np.zeros_like(masks[view])
+        masks[view][150:185, 20:60] = True
+    surface = fit(masks)
+    assert np.abs(errors(surface, BENT)).max() < 0.02
+    assert surface.views.tolist() == [0, 1, 3, 4, 5, 7, 8, 9]
+
+
 def test_masks_too_large_in_one_view_and_too_small_in_another_cancel() -> None:
     masks = blade_masks(BENT, CAMERAS)
     for view, mask in enumerate(masks):

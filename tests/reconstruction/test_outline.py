@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import fields
+
 import cv2
 import numpy as np
 import pytest
@@ -215,3 +217,13 @@ def test_drawing_without_offsets_is_drawing_with_offsets_of_zero() -> None:
     masks = stack()
     projection = project_points(masks.px_from_world, GRID.points(ellipse()))
     assert (draw_patch(masks, projection) == draw_patch(masks, projection, offsets=np.zeros(4))).all()
+
+
+def test_selected_views_are_those_of_a_stack_of_their_own() -> None:
+    mask = blade_masks(EllipticBlade(), CAMERAS)[0]
+    moved = [np.roll(mask, 5 * view, axis=1) for view in range(4)]  # of one size: the margins are the same
+    every = stack_masks(moved, [NOTHING] * 4, range(4), px_from_world=matrices())
+    few = stack_masks(moved[1::2], [NOTHING] * 2, [1, 3], px_from_world=matrices()[1::2])
+    selected = every.select(np.array([False, True, False, True]))
+    for field in fields(MaskStack):
+        assert np.array_equal(getattr(selected, field.name), getattr(few, field.name)), field.name

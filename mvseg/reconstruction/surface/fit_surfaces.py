@@ -34,6 +34,8 @@ HULL_BY_VOTE = ReconstructConfig(voxel_budget=25_000, seen_share=0.0)  # where f
 GOOD_IOU, IOU_PER_PX = 0.92, 0.2  # of a fit after which no other start is tried; less where the masks are noisy
 CLEAN_RMS_PX = 0.5  # up to which masks are not noisy
 LEAST_GAIN = 0.03  # in IoU, for another start to be better
+WRONG_SHARE = 0.25  # of the median IoU: a mask that a leaf explains worse is another's
+MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
 
 # What a surface must reach not to be doubted.
@@ -78,7 +80,7 @@ def fit_surfaces(
         if fit is None:
             surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
-            fits[instance] = fit
+            stacks[instance], fits[instance] = _leave_out_wrong_masks(stacks[instance], fit)
     if has_second_pass:
         stacks, fits = _fit_again(stacks, fits)
     for instance, fit in fits.items():
@@ -116,6 +118,20 @@ def _fit_from_hull(
             if best is not None and best_iou > GOOD_IOU - IOU_PER_PX * max(0.0, best.rms_px - CLEAN_RMS_PX):
                 return best
     return best
+
+
+def _leave_out_wrong_masks(masks: MaskStack, fit: PatchFit) -> tuple[MaskStack, PatchFit]:
+    """Without the masks that the fit to all of them hardly touches: those of another leaf, or of two leaves.
+
+    At most MOST_WRONG of them, and never so many that fewer than three are left.
+    """
+    points = patch_grid(*FIT_GRID).points(fit.coefficients)
+    ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
+    is_wrong = ious < WRONG_SHARE * np.median(ious)
+    if not is_wrong.any() or is_wrong.sum() > MOST_WRONG * len(masks) or (~is_wrong).sum() < 3:
+        return masks, fit
+    kept = masks.select(~is_wrong)
+    return kept, fit_patch(kept, fit.coefficients, num_steps=NUM_STEPS)
 
 
 def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:

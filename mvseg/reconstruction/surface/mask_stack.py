@@ -84,6 +84,27 @@ class MaskStack:
         bottom = values[below] * (1 - x) + values[below + 1] * x
         return top * (1 - y) + bottom * y
 
+    def select(self, keep: NDArray[np.bool_]) -> MaskStack:
+        """Only the views (S,) that are to be kept."""
+        pick = np.flatnonzero(keep)
+        sizes = self.shapes.prod(1)
+        pixels = np.repeat(keep, sizes)
+        edges = keep[self.edge_stack]
+        place = np.cumsum(keep) - 1
+        return MaskStack(
+            views=self.views[pick],
+            px_from_world=self.px_from_world[pick],
+            corners=self.corners[pick],
+            shapes=self.shapes[pick],
+            starts=np.cumsum(sizes[pick]) - sizes[pick],
+            blurred=self.blurred[pixels],
+            inside=self.inside[pixels],
+            others=self.others[pixels],
+            edge_px=self.edge_px[edges],
+            edge_normals=self.edge_normals[edges],
+            edge_stack=place[self.edge_stack[edges]],
+        )
+
     def with_others(self, others: Labels) -> MaskStack:
         """The same masks, with what hides the leaf as (pixels,) int32."""
         return replace(self, others=others)
