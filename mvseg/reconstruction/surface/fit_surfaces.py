@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
@@ -18,12 +19,12 @@ from mvseg.reconstruction.surface.fit_patch import (
     PatchFit,
     fit_patch,
 )
-from mvseg.reconstruction.surface.leaf_patch import measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_patch import Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.reconstruction.surface.mask_errors import learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
-from mvseg.reconstruction.surface.patch_image import hiding_pixels, view_ious
+from mvseg.reconstruction.surface.patch_image import hiding_pixels, project_points, view_ious
 from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions
@@ -34,7 +35,7 @@ HULL_BY_VOTE = ReconstructConfig(voxel_budget=25_000, seen_share=0.0)  # where f
 GOOD_IOU, IOU_PER_PX = 0.92, 0.2  # of a fit after which no other start is tried; less where the masks are noisy
 CLEAN_RMS_PX = 0.5  # up to which masks are not noisy
 LEAST_GAIN = 0.03  # in IoU, for another start to be better
-WRONG_SHARE = 0.25  # of the median IoU: a mask that a leaf explains worse is another's
+WRONG_SHARE = 0.25  # of the median share of voxels in a mask: with less of them it is another leaf's
 MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
 
@@ -76,11 +77,11 @@ def fit_surfaces(
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
         stacks[instance] = _stack(members, cameras, frames, instance=instance)
-        fit = _fit_from_hull(stacks[instance], members, cameras, free=free)
+        stacks[instance], fit = _fit_from_hull(stacks[instance], members, cameras, free=free)
         if fit is None:
             surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
-            stacks[instance], fits[instance] = _leave_out_wrong_masks(stacks[instance], fit)
+            fits[instance] = fit
     if has_second_pass:
         stacks, fits = _fit_again(stacks, fits)
     for instance, fit in fits.items():
@@ -102,36 +103,45 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
 
 def _fit_from_hull(
     masks: MaskStack, members: Regions, cameras: Cameras, *, free: list[Tensor]
-) -> PatchFit | None:
-    """The best of the fits from several starts, which are tried until one explains the masks.
+) -> tuple[MaskStack, PatchFit | None]:
+    """The best of the fits from several starts, which are tried until one explains the masks; and the masks it is to.
 
     The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
     """
-    best, best_iou = None, -1.0
+    best, best_iou, is_checked = None, -1.0, False
     for config in (HULL, HULL_BY_VOTE):
         hull = back_project(members, cameras, config=config, free=free)
-        for start in [] if hull is None else start_patches(hull.points.numpy()):
+        if hull is None or not hull.occupied.any():
+            continue
+        if not is_checked:
+            is_checked, is_right = True, ~find_wrong_masks(masks, hull.points.numpy())
+            if not is_right.all():
+                masks = masks.select(is_right)
+                members = members.select(torch.isin(members.view_index, torch.from_numpy(masks.views)))
+                hull = back_project(members, cameras, config=HULL, free=free) or hull
+        for start in start_patches(hull.points.numpy()):
             fit = fit_patch(masks, start, num_steps=NUM_STEPS)
             iou = float(np.median(view_ious(masks, patch_grid(*FIT_GRID).points(fit.coefficients))))
             if iou > best_iou + LEAST_GAIN:
                 best, best_iou = fit, iou
             if best is not None and best_iou > GOOD_IOU - IOU_PER_PX * max(0.0, best.rms_px - CLEAN_RMS_PX):
-                return best
-    return best
+                return masks, best
+    return masks, best
 
 
-def _leave_out_wrong_masks(masks: MaskStack, fit: PatchFit) -> tuple[MaskStack, PatchFit]:
-    """Without the masks that the fit to all of them hardly touches: those of another leaf, or of two leaves.
+def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
+    """(S,) bool: masks that hardly any voxel (P, 3) falls into although nothing hides it there: another leaf's.
 
-    At most MOST_WRONG of them, and never so many that fewer than three are left.
+    None where they are more than MOST_WRONG of all, or where fewer than three would be left.
     """
-    points = patch_grid(*FIT_GRID).points(fit.coefficients)
-    ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
-    is_wrong = ious < WRONG_SHARE * np.median(ious)
-    if not is_wrong.any() or is_wrong.sum() > MOST_WRONG * len(masks) or (~is_wrong).sum() < 3:
-        return masks, fit
-    kept = masks.select(~is_wrong)
-    return kept, fit_patch(kept, fit.coefficients, num_steps=NUM_STEPS)
+    seen = project_points(masks.px_from_world, points[None]).px.reshape(-1, 2)
+    stack = np.repeat(np.arange(len(masks)), len(points))
+    inside = masks.look_up(masks.inside, stack, seen).reshape(len(masks), -1)
+    hidden = masks.look_up(masks.others, stack, seen).reshape(len(masks), -1) != 0
+    shares = inside.sum(1) / np.maximum((inside | ~hidden).sum(1), 1)
+    is_wrong = shares < WRONG_SHARE * np.median(shares)
+    is_much = is_wrong.sum() > MOST_WRONG * len(masks) or (~is_wrong).sum() < 3
+    return np.zeros(len(masks), bool) if is_much else is_wrong
 
 
 def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
