@@ -46,6 +46,9 @@ if TYPE_CHECKING:
     from mvseg.regions import regions_from_label_maps as regions_from_label_maps
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
+    from mvseg.traits.config import TraitsConfig as TraitsConfig
+    from mvseg.traits.measure import Traits as Traits
+    from mvseg.traits.measure import measure_plant as measure_plant
 
 # The public names, by room.
 _HOME = {
@@ -68,6 +71,8 @@ _HOME = {
     "reconstruction.surface.leaf_surface": ("LeafSurface",),
     "reconstruction.surface.fit_surfaces": ("fit_surfaces",),
     "multiview.config": ("DetectConfig",),
+    "traits.config": ("TraitsConfig",),
+    "traits.measure": ("Traits", "measure_plant"),
     "multiview.assignment": ("EpipolarAssignment",),
     "multiview.nms": ("cluster_aware_nms",),
     "multiview.mask_rcnn": ("MultiViewMaskRCNN",),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import logging
 import os
@@ -23,6 +24,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.multiview.config import DetectConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.training.config import TrainConfig
+from mvseg.traits.config import TraitsConfig, Up
 
 DEFAULT_OUT = Path("results")
 BAD_INPUT, INTERRUPTED = 2, 130
@@ -47,7 +49,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
-            args = build_parser().parse_args(list(sys.argv[1:] if argv is None else argv))
+            args = build_parser().parse_args(_join_up(sys.argv[1:] if argv is None else argv))
             return verbs[args.verb](args[args.verb])
     except (InputError, argparse.ArgumentError) as error:
         return _complain(error)
@@ -66,17 +68,24 @@ def build_parser() -> ArgumentParser:
     parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__)
     verbs = parser.add_subcommands(dest="verb")
 
-    infer = ArgumentParser(exit_on_error=False, description="Ids in every view and shapes in 3D, of one scene.")
+    infer = ArgumentParser(exit_on_error=False, description="Ids in every view, shapes in 3D and traits, of one scene.")
     help_scene = "scene folder; without it, the plant that ships with mvseg"
     infer.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     _add_options(infer, masks=None)
     infer.add_class_arguments(DetectConfig, "detect")
     infer.add_class_arguments(ReconstructConfig, "reconstruct")
+    infer.add_class_arguments(TraitsConfig, "traits")
+    infer.add_argument("--scale", type=float | None, help="multiplies the world's lengths, for cameras without a scale")
+    infer.add_argument("--unit", type=str | None, help="name of the world's unit, after --scale (default: the scene's)")
+    help_up = "which way is up: X Y Z, or 'rig' to find it from level cameras (default: what the scene says, if at all)"
+    infer.add_argument("--up", type=str | list[float] | None, help=help_up)
     verbs.add_subcommand("infer", infer, help="ids and 3D shapes of one scene")
 
     match = ArgumentParser(exit_on_error=False, description="Ids only, of any number of scenes.")
     match.add_argument("scenes", nargs="+", type=Path, help="scene folders")
     _add_options(match, masks=Path("masks"))
+    help_reconstruct = "has no effect; it lets infer and match share their YAML files"
+    match.add_argument("--reconstruct", type=ReconstructConfig | None, help=help_reconstruct)
     verbs.add_subcommand("match", match, help="ids only, of any number of scenes")
 
     evaluate = ArgumentParser(exit_on_error=False, description="Compare the ids of a result with true labels.")
@@ -133,11 +142,44 @@ def _infer(args: Namespace) -> int:
         detect=DetectConfig(**vars(args.detect)),
         match=MatchConfig(**vars(args.match)),
         reconstruct=ReconstructConfig(**vars(args.reconstruct)),
+        traits=TraitsConfig(**vars(args.traits)),
+        scale=args.scale,
+        unit=args.unit,
+        up=_read_up(args.up),
         split_merged=args.split_merged,
         coco_crowd=args.coco_crowd,
     )
     _run(scene, args.masks, out, config=config, quiet=args.quiet)
     return 0
+
+
+def _join_up(argv: Sequence[str]) -> list[str]:
+    """The three numbers after --up as one argument: a list would swallow the scene folder that may follow."""
+    if "--up" not in argv:
+        return list(argv)
+    start = argv.index("--up") + 1
+    numbers = list(itertools.takewhile(_is_number, argv[start : start + 3]))
+    return [*argv[:start], " ".join(numbers), *argv[start + len(numbers) :]] if numbers else list(argv)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _read_up(up: str | list[float] | None) -> Up | None:
+    if up is None:
+        return None
+    if up == "rig":
+        return "rig"
+    words = up.replace(",", " ").split() if isinstance(up, str) else [str(number) for number in up]
+    if len(words) != 3 or not all(_is_number(word) for word in words):
+        raise InputError(f"up is '{' '.join(words)}', expected three numbers, as in 0 0 1, or rig")
+    x, y, z = (float(word) for word in words)
+    return x, y, z
 
 
 def _match(args: Namespace) -> int:

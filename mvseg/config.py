@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 from mvseg.multiview.config import DetectConfig
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.traits.config import TraitsConfig, Up
 
 
 @dataclass(frozen=True)
@@ -18,6 +21,11 @@ class RunConfig:
         detect: how instances are found in photos; has no effect when masks are given.
         match: how regions are matched across views.
         reconstruct: how instances become shapes; None for ids only.
+        traits: which instances count as leaves in the tables of traits.
+        scale: the world's lengths are multiplied by this; None leaves them.
+        unit: name of the world's unit after that; None for that of the scene.
+        up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
+            level; None for that of the scene.
         split_merged: cut a mask that seems to cover two instances in two.
         coco_crowd: what annotations with `iscrowd` are in a COCO file of masks: "mask", one like all others, or
             "ignore", left out.
@@ -26,5 +34,15 @@ class RunConfig:
     detect: DetectConfig = DetectConfig()
     match: MatchConfig = MatchConfig()
     reconstruct: ReconstructConfig | None = ReconstructConfig()
+    traits: TraitsConfig = TraitsConfig()
+    scale: float | None = None
+    unit: str | None = None
+    up: Up | None = None
     split_merged: bool = False
     coco_crowd: Literal["mask", "ignore"] = "mask"
+
+    def __post_init__(self) -> None:
+        if self.scale is not None and not 0 < self.scale < math.inf:
+            raise InputError(f"scale is {self.scale:g}, expected a positive number")
+        if self.up is not None and self.up != "rig" and not 0 < math.hypot(*self.up) < math.inf:
+            raise InputError(f"up is {self.up}, expected a direction: three finite numbers, not all 0")

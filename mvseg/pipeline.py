@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -21,19 +22,17 @@ from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
-from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.voxels import VoxelGrid, reconstruct_instances
-from mvseg.regions import Regions
+from mvseg.reconstruction.shapes import reconstruct_shapes
 from mvseg.results.result import Result
 from mvseg.scene import Scene
+from mvseg.traits.measure import measure_plant
+from mvseg.traits.up import find_up
 
 
 def run_scene(
     folder: Path, masks: Path | None = None, config: RunConfig = RunConfig(), *, progress: bool = False
 ) -> Result:
-    """From a scene folder, with or without masks, to instances with ids in every view and, if asked for, shapes in 3D.
+    """From a scene folder, with or without masks, to ids in every view and, if asked for, shapes in 3D and traits.
 
     Args:
         folder: the scene, see `load_scene`.
@@ -50,7 +49,7 @@ def run_scene(
     seconds: dict[str, float] = {}
     scores = None
     with _timed(seconds, "load"):
-        scene = load_scene(folder)
+        scene = place_scene(load_scene(folder), config)
         check_photos(scene)
         regions = load_masks(scene, masks, crowd=config.coco_crowd) if masks is not None else None
     if masks is None and not scene.views[0].path.is_file():
@@ -65,13 +64,42 @@ def run_scene(
     if config.split_merged:
         regions, matching, source = split_merged(regions, matching)
         scores = None if scores is None else scores[source]
-    shapes: Mapping[int, VoxelGrid | LeafSurface] | None = None
-    if config.reconstruct is not None:
-        with _timed(seconds, "reconstruct"):
-            shapes = reconstruct(regions, matching, scene, config=config.reconstruct, progress=progress)
+    if config.reconstruct is None:
+        return Result(scene=scene, regions=regions, matching=matching, seconds=seconds, detection_scores=scores)
+    with _timed(seconds, "reconstruct"):
+        surfaces, voxels = reconstruct_shapes(
+            regions, matching.instance_ids, scene.cameras, config=config.reconstruct, progress=progress
+        )
+    with _timed(seconds, "measure"):
+        traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels, config=config.traits)
     return Result(
-        scene=scene, regions=regions, matching=matching, shapes=shapes, seconds=seconds, detection_scores=scores
+        scene=scene,
+        regions=regions,
+        matching=matching,
+        surfaces=surfaces,
+        voxels=voxels,
+        traits=traits,
+        seconds=seconds,
+        detection_scores=scores,
     )
+
+
+def place_scene(scene: Scene, config: RunConfig) -> Scene:
+    """The scene in the world that the user asks for: scale, unit and direction of up.
+
+    Warns (InputWarning) of a unit that contradicts the scene's and comes without a scale.
+
+    Raises:
+        InputError: up cannot be found, see `find_up`.
+    """
+    if config.scale is not None:
+        scene = replace(scene, cameras=scene.cameras.scale(config.scale))
+    if config.unit is not None:
+        if scene.unit not in ("", config.unit) and config.scale is None:
+            message = f"the cameras are in {scene.unit}: unit {config.unit} without a scale only renames it"
+            warnings.warn(message, InputWarning, stacklevel=3)
+        scene = replace(scene, unit=config.unit)
+    return find_up(scene, config.up)
 
 
 def detect_regions(
@@ -95,15 +123,6 @@ def detect_regions(
         message = f"the detector finds nothing that scores {detect.min_score:g} or more"
         warnings.warn(message, InputWarning, stacklevel=3)
     return detections, matching
-
-
-def reconstruct(
-    regions: Regions, matching: Matching, scene: Scene, *, config: ReconstructConfig, progress: bool = False
-) -> Mapping[int, VoxelGrid | LeafSurface]:
-    """{instance id: shape}, as `config.shape` says."""
-    if config.shape == "surface":
-        return fit_surfaces(regions, matching.instance_ids, scene.cameras, progress=progress)
-    return reconstruct_instances(regions, matching.instance_ids, scene.cameras, config=config, progress=progress)
 
 
 @contextmanager

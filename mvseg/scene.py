@@ -12,6 +12,7 @@ Lenses     distortion is removed once, on load: `Cameras` are pinholes. `View.le
 Axes       V views, D all regions of a scene, N and M regions of two views, K clusters, P points or pixels, B bins of
            plane angle, H W image.
 Units      world units are the scene's (`Scene.unit`); thresholds are in pixels or fractions, never in world units.
+           Which way is up is not known, unless the cameras' file or the user says so (`Scene.up`).
 Ids        instances are 1, 2, ... in Python as in files; -1 is a region matched to nothing, 0 the background of a label
            image. Cluster numbers (0, 1, ...) are array indices inside `matching/` and do not leave it.
 Types      cameras and plane angles in float64 on entry, image-sized work in float32; indices int64. Tensors, on the
@@ -22,7 +23,8 @@ Ragged     one flat tensor and an index vector, never padded, never lists of lis
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -98,6 +100,10 @@ class Cameras:
         """(V, 3, 3): `world_from_px @ (u, v, 1)` is the viewing ray of a pixel in world axes, with depth 1 along +z."""
         return self.R.mT @ torch.linalg.inv(self.K)
 
+    def scale(self, factor: float) -> Cameras:
+        """The same cameras in a world whose lengths are multiplied by `factor` > 0; every point keeps its pixel."""
+        return replace(self, t=factor * self.t)
+
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Project world points into every view.
 
@@ -158,6 +164,10 @@ class Scene:
         cameras: the undistorted `Cameras`, in the order of the views.
         unit: name of the world unit ("mm", "m", ...); "" when the cameras do not say.
         source: the file or folder that the cameras were read from.
+        up: unit vector (x, y, z) of the world that points up; None when the cameras do not say.
+
+    Raises:
+        InputError: as many cameras as views are expected, with different names; an `up` without a direction.
     """
 
     name: str
@@ -165,8 +175,15 @@ class Scene:
     cameras: Cameras
     unit: str = ""
     source: Path | None = None
+    up: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
+        if self.up is not None:
+            length = math.hypot(*self.up)
+            if not 0 < length < math.inf:
+                raise InputError(f"up is {self.up}, expected a direction: three finite numbers, not all 0")
+            x, y, z = self.up
+            object.__setattr__(self, "up", (x / length, y / length, z / length))
         if len(self.views) != len(self.cameras):
             raise InputError(f"{len(self.views)} views with {len(self.cameras)} cameras, expected one per view")
         first_with: dict[str, int] = {}

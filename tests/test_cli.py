@@ -33,7 +33,7 @@ from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_co
 
 ROOT = Path(__file__).parent.parent
 NAN, INF = float("nan"), float("inf")
-COARSE = ["--reconstruct.voxel_budget", "500"]  # for tests that look at no shape
+COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]  # for tests that look at no shape
 Break = Callable[[Path], None]
 
 
@@ -75,7 +75,7 @@ def test_demo_finds_every_leaf(demo: Path) -> None:
         *(f"labels/{name}" for name in views),
         *(f"overlay/{name}" for name in views),
         *(f"leaves/leaf_{leaf:03d}.ply" for leaf in range(1, 13)),
-        *("contact.png", "instances.json", "run.json", "scene.glb", "traits.csv"),
+        *("contact.png", "instances.json", "run.json", "scene.glb", "traits.csv", "traits_wide.csv"),
     }
     leaf_of_label: dict[int, set[int]] = {}
     for name in views:
@@ -98,6 +98,33 @@ def test_demo_shapes_hold_the_true_leaves(demo: Path) -> None:
         assert np.abs(shape.bounds.mean(0) - true.bounds.mean(0)).max() < 0.2 * size
     scene = trimesh.load_scene(demo / "scene.glb")
     assert set(scene.graph.nodes_geometry) == {f"leaf_{leaf:03d}" for leaf in range(1, 13)}
+
+
+def test_demo_has_its_traits(demo: Path) -> None:
+    """Area, length and width of every leaf against the simulator's; width there counts the teeth of the edge, too."""
+    labels = [read_label_png(path / "001.png", 640, 480) for path in (demo / "labels", demo_scene() / "truth")]
+    rows = {int(row["leaf"]): row for row in csv.DictReader((demo / "traits_wide.csv").read_text().splitlines())}
+    lines = (demo_scene() / "truth" / "traits.csv").read_text().splitlines()
+    truth = {int(row["leaf_id"]): row for row in csv.DictReader(lines)}
+    errors = []
+    for leaf in np.unique(labels[1][labels[1] > 0]).tolist():
+        row = rows[int(np.bincount(labels[0][labels[1] == leaf]).argmax())]
+        assert (row["method"], row["quality"], row["unit"]) == ("surface", "good", "mm")
+        errors.append([float(row[name]) / float(truth[leaf][name]) - 1 for name in ("area", "length", "width")])
+        assert 0 < float(row["area_sd"]) < 0.06 * float(row["area"])
+        mesh = trimesh.load_mesh(demo_scene() / "truth" / "leaves" / f"leaf_{leaf:03d}.ply")
+        upright = np.abs((mesh.area_faces @ mesh.face_normals)[2]) / np.linalg.norm(mesh.area_faces @ mesh.face_normals)
+        assert float(row["inclination"]) == pytest.approx(np.degrees(np.arccos(upright)), abs=1.5)
+    assert (np.median(np.abs(errors), 0) < (0.015, 0.01, 0.045)).all()
+    assert np.abs(errors).max() < 0.08
+    mesh = trimesh.load_mesh(demo / "leaves" / "leaf_001.ply")
+    assert not mesh.is_watertight
+    assert mesh.area == pytest.approx(float(rows[1]["area"]), rel=1e-3)
+    long = list(csv.DictReader((demo / "traits.csv").read_text().splitlines()))
+    whole = {row["trait"]: float(row["value"]) for row in long if not row["leaf"]}
+    assert whole["number_of_leaves"] == 12
+    assert whole["total_leaf_area"] == pytest.approx(sum(float(row["area"]) for row in truth.values()), rel=0.02)
+    assert json.loads((demo / "run.json").read_text())["traits"] == {"unit": "mm", "up": [0, 0, 1], "rejected": {}}
 
 
 def test_demo_evaluates_to_one(demo: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -138,7 +165,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
     config = tmp_path / "run.yaml"
     config.write_text(
         "masks: masks\nquiet: true\nmatch:\n  num_instances: 3\n  seed: 4\n"
-        "reconstruct: {voxel_size: 1.5, threshold: 0.4}\n"
+        "reconstruct: {shape: voxels, voxel_size: 1.5, threshold: 0.4}\n"
     )
     arguments = ["infer", str(plant), "--config", str(config), "--match.seed", "9", "--out", str(tmp_path / "out")]
     assert main(arguments) == 0
@@ -167,10 +194,49 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "voxel_size": 1.5,
             "voxel_budget": 250_000,
         },
+        "traits": {"min_sure_views": 2, "min_quality": 0.5, "min_visible_share": 0.05, "leaves_only": True},
+        "scale": None,
+        "unit": None,
+        "up": None,
     }
     assert run["mvseg"] == mvseg.__version__
     assert run["inputs"].keys() == {str(plant / "cameras.json"), str(plant / "masks")}
     assert run["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("words", "up"),
+    [
+        (["--up", "0", "0", "2"], [0, 0, 1]),
+        (["--up", "-1", "0", "0", "--unit", "cm", "--scale", "0.1"], [-1, 0, 0]),
+        (["--up", "0 -1 0"], [0, -1, 0]),
+        (["--config", "{up: [0, 1, 0]}"], [0, 1, 0]),
+        ([], None),
+    ],
+)
+def test_which_way_is_up(words: list[str], up: list[float] | None, plant: Path, tmp_path: Path) -> None:
+    out = ["--out", str(tmp_path / "out"), "--quiet", *COARSE]
+    assert main(["infer", *words, *out, "--masks", "masks", str(plant)]) == 0
+    said = json.loads((tmp_path / "out" / "run.json").read_text())["traits"]
+    assert said["up"] == up
+    assert said["unit"] == ("cm" if "cm" in words else "mm")
+
+
+@pytest.mark.parametrize("words", [["up"], ["0", "1"], ["0 0 0"], ["0 0 x"], ["nan", "0", "1"]])
+def test_up_that_is_no_direction(
+    words: list[str], plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["infer", str(plant), "--masks", "masks", "--up", *words, "--out", str(tmp_path / "out")]) == 2
+    assert complaint(capsys).startswith("up is ")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_papers_config_serves_both_verbs(plant: Path, tmp_path: Path) -> None:
+    for verb in ("infer", "match"):
+        out = ["--out", str(tmp_path / verb), "--quiet", "--config", str(ROOT / "configs" / "paper.yaml")]
+        assert main([verb, str(plant), "--masks", "masks", "--match.num_instances", "3", *out]) == 0
+    assert trimesh.load_mesh(tmp_path / "infer" / "leaves" / "leaf_001.ply").is_watertight
+    assert "reconstruct" not in json.loads((tmp_path / "match" / "plant" / "run.json").read_text())["config"]
 
 
 def test_progress_bars_unless_quiet(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -329,8 +395,10 @@ def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: py
     assert not read_label_png(out / "labels" / "002.png", WIDTH, HEIGHT).any()
     assert json.loads((out / "run.json").read_text())["counts"] == {"regions": 0, "instances": 0}
     if verb == "infer":
-        assert list(csv.DictReader((out / "traits.csv").read_text().splitlines())) == []
-        assert (out / "traits.csv").read_text().startswith("id,views,sure_views,volume,")
+        assert list(csv.DictReader((out / "traits_wide.csv").read_text().splitlines())) == []
+        rows = list(csv.DictReader((out / "traits.csv").read_text().splitlines()))
+        assert {row["leaf"] for row in rows} == {""}
+        assert [row["value"] for row in rows if row["trait"] == "number_of_leaves"] == ["0"]
         assert not trimesh.load_scene(out / "scene.glb").geometry
         assert list((out / "leaves").iterdir()) == []
     assert main(["eval", str(out), "--truth", str(plant / "masks")]) == 0
@@ -665,28 +733,6 @@ def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytes
     monkeypatch.setattr("mvseg.cli._run", stop)
     assert main(["infer", str(plant)]) == 130
     assert capsys.readouterr().err == "mvseg: interrupted\n"
-
-
-def test_surfaces_of_the_shipped_plant_have_its_traits(tmp_path: Path) -> None:
-    """Area, length and width of every leaf against the simulator's; width there counts the teeth of the edge, too."""
-    arguments = ["infer", str(demo_scene()), "--masks", str(demo_scene() / "masks"), "--quiet", "--out", str(tmp_path)]
-    assert main([*arguments, "--reconstruct.shape", "surface"]) == 0
-    labels = [read_label_png(path / "001.png", 640, 480) for path in (tmp_path / "labels", demo_scene() / "truth")]
-    rows = {int(row["id"]): row for row in csv.DictReader((tmp_path / "traits.csv").read_text().splitlines())}
-    lines = (demo_scene() / "truth" / "traits.csv").read_text().splitlines()
-    truth = {int(row["leaf_id"]): row for row in csv.DictReader(lines)}
-    assert len(rows) == len(list((tmp_path / "leaves").iterdir())) == 12
-    errors = []
-    for leaf in np.unique(labels[1][labels[1] > 0]).tolist():
-        row = rows[int(np.bincount(labels[0][labels[1] == leaf]).argmax())]
-        assert row["quality"] == "good"
-        errors.append([float(row[name]) / float(truth[leaf][name]) - 1 for name in ("area", "length", "width")])
-        assert 0 < float(row["area_sd"]) < 0.06 * float(row["area"])
-    assert (np.median(np.abs(errors), 0) < (0.015, 0.01, 0.045)).all()
-    assert np.abs(errors).max() < 0.08
-    mesh = trimesh.load_mesh(tmp_path / "leaves" / "leaf_001.ply")
-    assert not mesh.is_watertight
-    assert mesh.area == pytest.approx(float(rows[1]["area"]), rel=1e-3)
 
 
 def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -227,6 +227,7 @@ def test_published_configs_are_understood(config: Path) -> None:
     if verb == "train":
         TrainConfig(**{field.name: args[field.name] for field in fields(TrainConfig)})
         return
-    kinds = {"match": mvseg.MatchConfig, "detect": mvseg.DetectConfig, "reconstruct": mvseg.ReconstructConfig}
+    kinds = {"match": mvseg.MatchConfig, "detect": mvseg.DetectConfig, "reconstruct": mvseg.ReconstructConfig,
+             "traits": mvseg.TraitsConfig}  # fmt: skip
     for name, settings in yaml.safe_load(config.read_text(encoding="utf-8")).items():
         assert kinds[name](**vars(args[name])) == kinds[name](**settings) != kinds[name]()

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -12,6 +15,7 @@ import torch
 import mvseg
 from mvseg import (
     InputError,
+    InputWarning,
     MatchConfig,
     ReconstructConfig,
     RunConfig,
@@ -25,7 +29,7 @@ from mvseg.results.provenance import describe_run
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)
-COARSE = RunConfig(reconstruct=ReconstructConfig(voxel_budget=500))
+COARSE = RunConfig(reconstruct=ReconstructConfig(shape="voxels", voxel_budget=500))
 
 
 @pytest.fixture(scope="module")
@@ -34,7 +38,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_it_is_the_stages_one_after_another(plant: Path) -> None:
-    match, reconstruct = MatchConfig(num_instances=3, seed=7), ReconstructConfig(voxel_size=1.0)
+    match, reconstruct = MatchConfig(num_instances=3, seed=7), ReconstructConfig(shape="voxels", voxel_size=1.0)
     result = run_scene(plant, plant / "masks", RunConfig(match=match, reconstruct=reconstruct))
     scene = load_scene(plant)
     regions = load_masks(scene, plant / "masks")
@@ -42,10 +46,11 @@ def test_it_is_the_stages_one_after_another(plant: Path) -> None:
     shapes = reconstruct_instances(regions, matching.instance_ids, scene.cameras, config=reconstruct)
     assert torch.equal(result.regions.crops, regions.crops)
     assert torch.equal(result.matching.instance_ids, matching.instance_ids)
-    assert result.shapes is not None
-    assert result.shapes.keys() == shapes.keys() == {1, 2, 3}
-    assert all(torch.equal(result.shapes[instance].votes, shapes[instance].votes) for instance in shapes)
-    assert [*result.seconds] == ["load", "match", "reconstruct"]
+    assert result.surfaces is None
+    assert result.voxels is not None
+    assert result.voxels.keys() == shapes.keys() == {1, 2, 3}
+    assert all(torch.equal(result.voxels[instance].votes, shapes[instance].votes) for instance in shapes)
+    assert [*result.seconds] == ["load", "match", "reconstruct", "measure"]
 
 
 def test_ids_are_those_of_the_balls(plant: Path) -> None:
@@ -58,14 +63,14 @@ def test_ids_are_those_of_the_balls(plant: Path) -> None:
 
 def test_ids_only(plant: Path) -> None:
     result = run_scene(plant, plant / "masks", IDS_ONLY)
-    assert result.shapes is None
+    assert (result.surfaces, result.voxels, result.traits) == (None, None, None)
     assert [*result.seconds] == ["load", "match"]
 
 
 def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
     plant = write_scene(tmp_path / "plant", images=False)
     before = sorted(tmp_path.rglob("*"))
-    assert run_scene(plant, plant / "masks", COARSE).shapes
+    assert run_scene(plant, plant / "masks", COARSE).voxels
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -85,6 +90,31 @@ def test_wrong_input_is_an_input_error(plant: Path, tmp_path: Path) -> None:
         run_scene(plant, plant / "absent")
     with pytest.raises(ValueError, match="voxel_size"):  # an InputError is a ValueError
         RunConfig(reconstruct=ReconstructConfig(voxel_size=-1.0))
+
+
+def test_the_users_word_on_the_world(plant: Path) -> None:
+    """Lengths in centimetres: the same plant, ten times smaller, and up where the user says."""
+    first = run_scene(plant, plant / "masks", COARSE)
+    config = replace(COARSE, scale=0.1, unit="cm", up=(0.0, -2.0, 0.0))
+    second = run_scene(plant, plant / "masks", config)
+    assert (first.scene.unit, first.scene.up) == ("mm", None)
+    assert (second.scene.unit, second.scene.up) == ("cm", (0, -1, 0))
+    assert first.traits is not None
+    assert second.traits is not None
+    for leaf, other in zip(first.traits.leaves, second.traits.leaves, strict=True):
+        assert other.numbers["volume"].value == pytest.approx(leaf.numbers["volume"].value / 1000, rel=1e-6)
+        assert other.numbers["x_min"].value == pytest.approx(leaf.numbers["x_min"].value / 10, abs=1e-9)
+
+
+def test_another_unit_without_a_scale_is_warned_of(plant: Path) -> None:
+    with pytest.warns(InputWarning, match="the cameras are in mm: unit cm without a scale only renames it"):
+        assert run_scene(plant, plant / "masks", replace(IDS_ONLY, unit="cm")).scene.unit == "cm"
+
+
+@pytest.mark.parametrize("wrong", [{"scale": 0.0}, {"scale": math.inf}, {"up": (0.0, 0.0, 0.0)}])
+def test_worlds_that_cannot_be(wrong: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=f"{next(iter(wrong))} is "):
+        RunConfig(**wrong)
 
 
 class TestDescribeRun:

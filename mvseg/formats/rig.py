@@ -1,16 +1,18 @@
 """The rig file `cameras.json`: OpenCV's K, R, t and distortion, one entry per view.
 
-    {"format": "mvseg-rig/1", "unit": "mm", "views": [
+    {"format": "mvseg-rig/1", "unit": "mm", "up": [0, 0, 1], "views": [
         {"file": "images/000.jpg", "width": W, "height": H, "K": 3x3, "R": 3x3, "t": 3,
          "distortion": [k1, k2, p1, p2, k3]}]}
 
-R and t are cam_from_world; the centre of the top-left pixel is (0.5, 0.5). `distortion` may be left out.
+R and t are cam_from_world; the centre of the top-left pixel is (0.5, 0.5). `distortion` may be left out, `unit` and
+`up`, the direction that points up in the world, as well where they are not known.
 """
 
 from __future__ import annotations
 
 import json
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -41,6 +43,7 @@ class _Rig(BaseModel):
     model_config = ConfigDict(extra="allow")
     format: Literal["mvseg-rig/1"]
     unit: str = ""
+    up: Vector3 | None = None
     views: list[_RigView]
 
 
@@ -56,7 +59,11 @@ def read_rig(path: Path) -> Scene:
         for key in entry.model_extra or {}:
             warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
     photos = [_photo(path, index, view) for index, view in enumerate(rig.views)]
-    return build_scene(path.parent, photos, unit=rig.unit, source=path)
+    scene = build_scene(path.parent, photos, unit=rig.unit, source=path)
+    try:
+        return replace(scene, up=rig.up)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
 
 
 def _photo(path: Path, index: int, view: _RigView) -> Photo:
@@ -88,7 +95,7 @@ def write_rig(
 
     Args:
         path: where; its folder must exist.
-        scene: gives the cameras and the unit.
+        scene: gives the cameras, the unit and the direction that points up.
         files: V photo paths relative to the folder of `path`.
         distortion: V lists of OpenCV coefficients, or None for pinholes.
     """
@@ -100,4 +107,5 @@ def write_rig(
         if distortion and distortion[index]:
             view["distortion"] = distortion[index]
         views.append(view)
-    path.write_text(json.dumps({"format": RIG_FORMAT, "unit": scene.unit, "views": views}, indent=1) + "\n")
+    world = {"unit": scene.unit} | ({} if scene.up is None else {"up": scene.up})
+    path.write_text(json.dumps({"format": RIG_FORMAT, **world, "views": views}, indent=1) + "\n")

@@ -13,8 +13,9 @@ class ReconstructConfig:
     """How instances become shapes.
 
     Attributes:
-        shape: voxels (Eq. 6, a closed shape with a volume), or surface (a spline surface fitted to the outlines of the
-            masks, with area, length and width; new, see docs/surfaces.md). The other options are about voxels.
+        shape: surface (a spline surface fitted to the outlines of the masks, with area, length, width and angles, see
+            docs/surfaces.md; an instance without a credible one gets voxels), voxels (Eq. 6, a closed shape with a
+            volume) or both. The other options are about voxels.
         threshold: a voxel belongs to an instance when more than this share of the instance's masks contains it (the
             paper: 0.5); in [0, 1).
         seen_share: keeps thin instances thin: of the instance's views with a clear line of sight to a voxel (its pixel
@@ -25,7 +26,7 @@ class ReconstructConfig:
         voxel_budget: number of voxels in an instance's bounding box when no size is given.
     """
 
-    shape: Literal["voxels", "surface"] = "voxels"
+    shape: Literal["surface", "voxels", "both"] = "surface"
     threshold: float = 0.5
     seen_share: float = 0.8
     voxel_size: float | None = None

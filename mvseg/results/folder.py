@@ -1,12 +1,11 @@
 """The result folder of one scene: written whole or not at all.
 
-Numbers in files are instance ids: label 3, `leaf_003.ply`, row 3 of `traits.csv` and `"instance_id": 3` in
+Numbers in files are instance ids: label 3, `leaf_003.ply`, leaf 3 in `traits.csv` and `"instance_id": 3` in
 `instances.json` are one leaf. A region that is matched to nothing has -1 there, and 0 in the label images.
 """
 
 from __future__ import annotations
 
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -22,11 +21,13 @@ from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.mesh import write_glb, write_ply
 from mvseg.formats.photos import read_photo
+from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, instance_color
 from mvseg.results.result import Result
+from mvseg.traits.measure import Traits
+from mvseg.traits.table import write_long, write_wide
 
 
 def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False) -> None:
@@ -50,13 +51,17 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         with folder_whole(out) as folder:
             _write_images(result, folder, progress)
             _write_instances(result, folder)
-            if result.shapes is not None:
+            if result.surfaces is not None or result.voxels is not None:
                 _write_shapes(result, folder)
+            if result.traits is not None:
+                write_long(folder / "traits.csv", result.traits)
+                write_wide(folder / "traits_wide.csv", result.traits)
             counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
             seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
             matched = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
             written = {"counts": counts, "seconds": seconds, "files": list_files(folder)}
-            text = json.dumps(run | matched | written, indent=1, default=str)
+            measured = {} if result.traits is None else {"traits": _describe_traits(result.traits)}
+            text = json.dumps(run | matched | measured | written, indent=1, default=str)
             (folder / RUN_FILE).write_text(text + "\n", encoding="utf-8")
             keep_user_files(out, folder)
     except OSError as error:
@@ -116,55 +121,22 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
     }
 
 
-VOXEL_COLUMNS = ("volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max")
-SURFACE_COLUMNS = ("area", "area_sd", "length", "length_sd", "width", "width_sd", "quality")
-
-
 def _write_shapes(result: Result, folder: Path) -> None:
-    """leaves/*.ply, scene.glb and traits.csv."""
+    """leaves/*.ply and scene.glb: credible surfaces, for other instances voxels. The voxels of a leaf that has both get
+    a file of their own."""
     (folder / "leaves").mkdir()
-    shapes = result.shapes or {}
-    meshes, colors, rows = {}, {}, []
-    ids, views = result.matching.instance_ids, result.regions.view_index
+    meshes, colors = {}, {}
     for instance in range(1, result.matching.num_instances + 1):
-        row: dict[str, Any] = {"id": instance, "views": len(views[ids == instance].unique())}
-        if result.matching.support is not None:
-            row["sure_views"] = int(result.matching.support[instance - 1])
-        shape = shapes.get(instance)
-        if shape is not None:
-            row |= _surface_traits(shape) if isinstance(shape, LeafSurface) else _voxel_traits(shape)
-            mesh = shape.mesh()
-            if len(mesh.faces):
-                name = f"leaf_{instance:03d}"
-                meshes[name], colors[name] = mesh, instance_color(instance)
-                write_ply(folder / "leaves" / f"{name}.ply", mesh, colors[name])
-        rows.append(row)
+        shape = best_shape(instance, result.surfaces, result.voxels)
+        name, color = f"leaf_{instance:03d}", instance_color(instance)
+        if shape is not None and len((mesh := shape.mesh()).faces):
+            meshes[name], colors[name] = mesh, color
+            write_ply(folder / "leaves" / f"{name}.ply", mesh, color)
+        if isinstance(shape, LeafSurface) and result.voxels and instance in result.voxels:
+            write_ply(folder / "leaves" / f"{name}_voxels.ply", result.voxels[instance].mesh(), color)
     write_glb(folder / "scene.glb", meshes, colors)
-    has_surfaces = any(isinstance(shape, LeafSurface) for shape in shapes.values())
-    columns = ["id", "views", "sure_views", *(SURFACE_COLUMNS if has_surfaces else VOXEL_COLUMNS), "unit"]
-    with (folder / "traits.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(row | {"unit": result.scene.unit} for row in rows)
 
 
-def _surface_traits(surface: LeafSurface) -> dict[str, str]:
-    """Area, length and width in the scene's unit, each with its standard deviation, and the reasons to doubt them."""
-    quality = {"quality": "; ".join(surface.quality.reasons) or "good"}
-    if not surface.exists:
-        return quality
-    values = (surface.area, surface.length, surface.width)
-    names = ("area", "length", "width")
-    traits = dict(zip(names, values, strict=True)) | {
-        f"{name}_sd": deviation for name, deviation in zip(names, surface.deviations, strict=True)
-    }
-    return {name: f"{value:.6g}" for name, value in traits.items()} | quality
-
-
-def _voxel_traits(grid: VoxelGrid) -> dict[str, str]:
-    """Volume in cubed world units, and the corners of the bounding box in world units."""
-    points, half = grid.points, grid.voxel_size / 2
-    low, high = points.amin(0) - half, points.amax(0) + half
-    corners = [*zip(("x_min", "y_min", "z_min"), low.tolist(), strict=True)]
-    corners += [*zip(("x_max", "y_max", "z_max"), high.tolist(), strict=True)]
-    return {"volume": f"{grid.volume:.6g}"} | {name: f"{value:.6g}" for name, value in corners}
+def _describe_traits(traits: Traits) -> dict[str, Any]:
+    """What run.json says of the traits: the world they are measured in, and how many instances are no leaves."""
+    return {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}

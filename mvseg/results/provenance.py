@@ -32,7 +32,8 @@ def describe_run(
     if masks is not None:
         del options["detect"]
     if config.reconstruct is None:
-        del options["reconstruct"]
+        for name in ("reconstruct", "traits", "scale", "unit", "up"):
+            del options[name]
     source = masks or find_weights(config.detect.weights) or Path(config.detect.weights)
     return {
         "mvseg": __version__,

@@ -12,6 +12,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.regions import Regions
 from mvseg.scene import Scene
+from mvseg.traits.measure import Traits
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +23,11 @@ class Result:
         scene: the scene.
         regions: D masks, undistorted.
         matching: their ids.
-        shapes: {instance id: voxels or surface}; None when only ids were asked for.
+        surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None when no surfaces were
+            asked for.
+        voxels: {instance id: voxels}: of all instances where voxels were asked for, otherwise of those without a
+            credible surface; None when only ids were asked for.
+        traits: of the plant and its leaves; None when only ids were asked for.
         seconds: {stage: wall time}.
         detection_scores: (D,) float32, the detector's score of each mask; None when the masks were given.
     """
@@ -30,6 +35,8 @@ class Result:
     scene: Scene
     regions: Regions
     matching: Matching
-    shapes: Mapping[int, VoxelGrid | LeafSurface] | None = None
+    surfaces: Mapping[int, LeafSurface] | None = None
+    voxels: Mapping[int, VoxelGrid] | None = None
+    traits: Traits | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     detection_scores: Tensor | None = None

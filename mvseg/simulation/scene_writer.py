@@ -69,7 +69,7 @@ def write_views(folder: Path, plant: Plant, cameras: Cameras, *, seed: int, min_
         write_label_png(folder / "masks" / f"{name}.png", shuffle_labels(truth, np.random.default_rng([seed, view])))
     files = [f"images/{name}.jpg" for name in names]
     views = tuple(View(name, folder / file) for name, file in zip(names, files, strict=True))
-    scene = Scene(name=folder.name, views=views, cameras=cameras, unit=plant.unit)
+    scene = Scene(name=folder.name, views=views, cameras=cameras, unit=plant.unit, up=(0.0, 0.0, 1.0))
     write_rig(folder / "cameras.json", scene, files)
 
 

@@ -15,6 +15,7 @@ import trimesh
 
 import mvseg.results.earlier
 import mvseg.results.folder
+from known_leaves import bent_blade
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
@@ -24,11 +25,13 @@ from mvseg.formats.scene_folder import load_masks
 from mvseg.matching.result import MergedMask
 from mvseg.pipeline import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import check_out
 from mvseg.results.folder import save_result
 from mvseg.results.overlay import instance_color
 from mvseg.results.read import read_instances
 from mvseg.results.result import Result
+from mvseg.traits.measure import measure_plant
 from scene_folders import (
     BALLS,
     HEIGHT,
@@ -46,6 +49,7 @@ from scene_folders import (
 
 DISTORTION = [-0.8, 0.3, 0.01, -0.01, 0.0]
 DISTORTED = 2  # the view
+VOXELS = ReconstructConfig(shape="voxels", voxel_budget=8000)
 IDS_FILES = {
     *(f"labels/{view:03d}.png" for view in range(4)),
     *(f"overlay/{view:03d}.png" for view in range(4)),
@@ -53,7 +57,9 @@ IDS_FILES = {
     "instances.json",
     "run.json",
 }
-SHAPE_FILES = {*(f"leaves/leaf_{leaf:03d}.ply" for leaf in (1, 2, 3)), "scene.glb", "traits.csv"}
+SHAPE_FILES = {
+    *(f"leaves/leaf_{leaf:03d}.ply" for leaf in (1, 2, 3)), "scene.glb", "traits.csv", "traits_wide.csv"
+}  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +76,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def result(plant: Path) -> Result:
-    return run_scene(plant, plant / "masks", RunConfig(reconstruct=ReconstructConfig(voxel_budget=8000)))
+    return run_scene(plant, plant / "masks", RunConfig(reconstruct=VOXELS))
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +87,7 @@ def saved(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def ids_only(result: Result) -> Result:
-    return replace(result, shapes=None)
+    return replace(result, surfaces=None, voxels=None, traits=None)
 
 
 def files_below(folder: Path) -> set[str]:
@@ -89,7 +95,7 @@ def files_below(folder: Path) -> set[str]:
 
 
 def read_rows(folder: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader((folder / "traits.csv").read_text().splitlines()))
+    return list(csv.DictReader((folder / "traits_wide.csv").read_text().splitlines()))
 
 
 def label_of_balls(folder: Path, plant: Path) -> list[list[int]]:
@@ -111,7 +117,8 @@ class TestContent:
         part = torch.zeros_like(result.regions.crop(3))
         merged = (MergedMask(region=3, own=1, other=3, part=part),)
         matching = replace(result.matching, merged=merged, support=torch.tensor([4, 3, 2]), residual_px=2)
-        save_result(replace(result, matching=matching), tmp_path / "out", {})
+        traits = measure_plant(result.scene, result.regions, matching, surfaces=None, voxels=result.voxels or {})
+        save_result(replace(result, matching=matching, traits=traits), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         others = {n: entry["other_instance_id"] for n, entry in enumerate(annotations) if "other_instance_id" in entry}
         assert others == {3: 3}
@@ -162,7 +169,7 @@ class TestContent:
         scene = trimesh.load_scene(saved / "scene.glb")
         assert set(scene.graph.nodes_geometry) == {"leaf_001", "leaf_002", "leaf_003"}
         for leaf, row in enumerate(rows, start=1):
-            assert (row["id"], row["views"], row["unit"]) == (str(leaf), "4", "mm")
+            assert (row["leaf"], row["num_views"], row["unit"]) == (str(leaf), "4", "mm")
             mesh = trimesh.load_mesh(saved / "leaves" / f"leaf_{leaf:03d}.ply")
             assert mesh.is_watertight
             assert float(row["volume"]) == pytest.approx(mesh.volume, rel=0.1)
@@ -187,7 +194,7 @@ class TestContent:
         run = json.loads((saved / "run.json").read_text())
         assert (run["mvseg"], run["config"]) == ("1.2.3", {"seed": 5})
         assert run["counts"] == {"regions": 12, "instances": 3}
-        assert set(run["seconds"]) == {"load", "match", "reconstruct"}
+        assert set(run["seconds"]) == {"load", "match", "reconstruct", "measure"}
 
     def test_eval_reads_it(self, saved: Path, plant: Path) -> None:
         ids, true = read_instances(saved, plant / "truth")
@@ -205,7 +212,7 @@ class TestVariants:
         ids = result.matching.instance_ids.clone()
         ids[ids == 2] = -1
         matching = replace(result.matching, instance_ids=ids)
-        save_result(replace(result, matching=matching, shapes=None), tmp_path / "out", {})
+        save_result(replace(ids_only(result), matching=matching), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         assert [entry["instance_id"] for entry in annotations].count(-1) == 4
         assert {entry["instance_id"] for entry in annotations} == {-1, 1, 3}
@@ -214,13 +221,31 @@ class TestVariants:
         assert [numbers.tolist() for numbers in numbers_per_view] == [[0, 1, 3]] * 4
 
     def test_an_instance_without_shape_has_a_row_but_no_mesh(self, result: Result, tmp_path: Path) -> None:
-        assert result.shapes is not None
-        shapes = {instance: grid for instance, grid in result.shapes.items() if instance != 2}
-        save_result(replace(result, shapes=shapes), tmp_path / "out", {})
+        assert result.voxels is not None
+        voxels = {instance: grid for instance, grid in result.voxels.items() if instance != 2}
+        traits = measure_plant(result.scene, result.regions, result.matching, surfaces=None, voxels=voxels)
+        save_result(replace(result, voxels=voxels, traits=traits), tmp_path / "out", {})
         rows = read_rows(tmp_path / "out")
-        assert [row["id"] for row in rows] == ["1", "2", "3"]
+        assert [row["leaf"] for row in rows] == ["1", "2", "3"]
+        assert [row["quality"] == "good" for row in rows] == [True, False, True]
         assert [row["volume"] == "" for row in rows] == [False, True, False]
         assert files_below(tmp_path / "out" / "leaves") == {"leaf_001.ply", "leaf_003.ply"}
+
+    def test_surfaces_and_voxels_side_by_side(self, result: Result, tmp_path: Path) -> None:
+        """Leaf 1 has both, leaf 2 a surface only, leaf 3 a surface that is none, and voxels."""
+        assert result.voxels is not None
+        blade = bent_blade()
+        none = LeafSurface.none(torch.tensor([0]), "seen in one view only")
+        surfaces, voxels = {1: blade, 2: blade, 3: none}, {1: result.voxels[1], 3: result.voxels[3]}
+        save_result(replace(result, surfaces=surfaces, voxels=voxels), tmp_path / "out", {})
+        folder = tmp_path / "out" / "leaves"
+        assert files_below(folder) == {*(f"leaf_00{leaf}.ply" for leaf in (1, 2, 3)), "leaf_001_voxels.ply"}
+        closed = [trimesh.load_mesh(folder / f"leaf_00{leaf}.ply").is_watertight for leaf in (1, 2, 3)]
+        assert closed == [False, False, True]
+        assert trimesh.load_mesh(folder / "leaf_001_voxels.ply").is_watertight
+        scene = trimesh.load_scene(tmp_path / "out" / "scene.glb")
+        sizes = {name: len(mesh.faces) for name, mesh in scene.geometry.items()}
+        assert sizes["leaf_001"] == sizes["leaf_002"] == len(blade.mesh().faces) != sizes["leaf_003"]
 
     def test_without_photos_overlays_are_drawn_on_grey(self, tmp_path: Path) -> None:
         plant = write_scene(tmp_path / "plant", images=False)
@@ -264,7 +289,10 @@ class TestBrokenPhotos:
         assert [path.name for path in tmp_path.iterdir()] == ["plant"]
 
 
-WRITERS = ["write_label_png", "draw_overlay", "write_png", "draw_contact_sheet", "write_coco", "write_ply", "write_glb"]
+WRITERS = [
+    "write_label_png", "draw_overlay", "write_png", "draw_contact_sheet", "write_coco", "write_ply", "write_glb",
+    "write_long", "write_wide",
+]  # fmt: skip
 
 
 class TestWholeOrNotAtAll:
@@ -279,7 +307,7 @@ class TestWholeOrNotAtAll:
 
         def fail_at_the_second_call(*args: object, **named: object) -> object:
             calls.append(args)
-            if len(calls) == 2 or writer in ("draw_contact_sheet", "write_coco", "write_glb"):
+            if len(calls) == 2 or writer not in ("write_label_png", "draw_overlay", "write_png", "write_ply"):
                 raise error
             return original(*args, **named)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -24,6 +25,8 @@ from mvseg.scene import Cameras
 MESH_SHAPE = (64, 17)
 # The covariance of the fit knows nothing of the model's own errors: factors that give its deviations 68 % coverage.
 AREA_FACTOR, LENGTH_FACTOR, WIDTH_FACTOR = 3.0, 2.3, 1.7
+MEASURE_FACTOR = 3.0  # for measures without a factor of their own: the largest of these
+STEP = 1e-4  # of the coefficients' spread, for differences
 
 
 @dataclass(frozen=True)
@@ -84,6 +87,11 @@ class LeafSurface:
         """Is there a surface at all?"""
         return bool(self.coefficients.isfinite().all())
 
+    @property
+    def is_credible(self) -> bool:
+        """May measures of the surface be given at all? False: the instance is better shown as voxels."""
+        return self.exists
+
     def points(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> Tensor:
         """(rows, columns, 3) float64 grid from base to tip and from edge to edge; odd columns have the midrib."""
         return torch.from_numpy(patch_grid(num_rows, num_columns).points(self.coefficients.numpy()))
@@ -112,6 +120,31 @@ class LeafSurface:
         variance = np.einsum("ij,jk,ik->i", slopes, self.covariance.numpy(), slopes)
         area, length, width = np.sqrt(np.maximum(variance, 0)) * (AREA_FACTOR, LENGTH_FACTOR, WIDTH_FACTOR)
         return float(area), float(length), float(width)
+
+    def deviation(self, measure: Callable[[Floats], Floats]) -> Floats:
+        """Standard deviations of what is measured on the surface: the fit's, propagated linearly, times a factor.
+
+        Args:
+            measure: from coefficients (26, 3) float64 to T numbers, (T,) float64. It is called 157 times and must be
+                smooth at `coefficients`: an angle must not jump by 360 degrees, nor be folded back where it meets 0.
+
+        Returns:
+            (T,) float64; NaN without a surface, and for numbers that are NaN.
+        """
+        center = self.coefficients.numpy()
+        with np.errstate(all="ignore"):
+            numbers = np.asarray(measure(center), dtype=np.float64)
+            if not self.exists:
+                return np.full_like(numbers, np.nan)
+            step = STEP * float(np.linalg.norm(center.std(axis=0)))
+            slopes = np.empty((len(numbers), center.size))
+            for index in range(center.size):
+                moved = np.zeros(center.size)
+                moved[index] = step
+                ahead, behind = (measure(center + sign * moved.reshape(center.shape)) for sign in (1, -1))
+                slopes[:, index] = (ahead - behind) / (2 * step)
+            variance = np.einsum("ij,jk,ik->i", slopes, self.covariance.numpy(), slopes)
+            return np.where(np.isfinite(numbers), MEASURE_FACTOR * np.sqrt(np.maximum(variance, 0)), np.nan)
 
     @property
     def midrib(self) -> Tensor:

@@ -1,0 +1,54 @@
+"""Which shape an instance gets: a surface where there is a credible one, or else voxels."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid, reconstruct_instances
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+Surfaces = Mapping[int, LeafSurface]
+Voxels = Mapping[int, VoxelGrid]
+
+
+def reconstruct_shapes(
+    regions: Regions, instance_ids: Tensor, cameras: Cameras, *, config: ReconstructConfig, progress: bool = False
+) -> tuple[Surfaces | None, Voxels]:
+    """The shapes of all instances, as `config.shape` says.
+
+    Args:
+        regions: D regions.
+        instance_ids: (D,) int64, from 1 on; -1 = no instance.
+        cameras: V cameras.
+        config: what to make, and how.
+        progress: show progress bars over the instances.
+
+    Returns:
+        {instance id: surface}, None with "voxels"; and {instance id: voxels}: of all instances with "voxels" or "both",
+        of those without a credible surface with "surface".
+
+    Raises:
+        InputError: see `fit_surfaces` and `reconstruct_instances`.
+    """
+    surfaces = None
+    if config.shape != "voxels":
+        surfaces = fit_surfaces(regions, instance_ids, cameras, progress=progress)
+        if config.shape == "surface":
+            credible = [instance for instance, surface in surfaces.items() if surface.is_credible]
+            instance_ids = instance_ids.where(~torch.isin(instance_ids, torch.tensor(credible).to(instance_ids)), -1)
+            if not bool((instance_ids > 0).any()):
+                return surfaces, {}
+    return surfaces, reconstruct_instances(regions, instance_ids, cameras, config=config, progress=progress)
+
+
+def best_shape(instance: int, surfaces: Surfaces | None, voxels: Voxels | None) -> LeafSurface | VoxelGrid | None:
+    """The surface of an instance if it has a credible one, or else its voxels, or else None."""
+    surface = (surfaces or {}).get(instance)
+    return surface if surface is not None and surface.is_credible else (voxels or {}).get(instance)

@@ -1,0 +1,110 @@
+"""How much of each leaf the photos show, and in which colour."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mvseg.formats.photos import read_photo
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
+from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
+from mvseg.regions import Regions
+from mvseg.scene import Cameras, Scene
+from mvseg.traits.leaf import Measurement, missing
+
+Floats = NDArray[np.float64]
+
+BORDER_PX = 2  # pixels this near to the edge of a mask may show something else
+COLORS = ("mean_red", "mean_green", "mean_blue", "greenness_index")
+OUTSIDE = missing("not measured: no photo can show it")
+NO_PIXELS = missing("not measured: no pixel is surely of this leaf")
+NO_PHOTOS = missing("not measured: there are no photos")
+
+
+def measure_appearance(
+    surfaces: Mapping[int, LeafSurface], regions: Regions, instance_ids: Tensor, *, scene: Scene
+) -> dict[int, dict[str, Measurement]]:
+    """Visible share, mean colour and greenness of leaves.
+
+    Args:
+        surfaces: {instance id: surface that exists}.
+        regions: D regions of the scene.
+        instance_ids: (D,) int64.
+        scene: its photos are read, if there are any.
+
+    Returns:
+        {instance id: {trait: number}}. The standard deviation of a colour is the standard error over the views, so
+        there is none with one view.
+
+    Raises:
+        InputError: a photo is broken, or missing while others exist.
+    """
+    has_photos = bool(surfaces) and any(view.path.exists() for view in scene.views)
+    pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
+    colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # sure pixels, their mean
+    for view in range(len(scene.views)):
+        photo = read_photo(scene, view) if has_photos else None
+        labels = regions.label_map(view, instance_ids, scene.cameras.sizes[view].tolist()).cpu().numpy()
+        for instance, surface in surfaces.items():
+            covered, (x, y) = project_crop(surface, scene.cameras, view)
+            if not covered.any():
+                continue
+            window = np.s_[y : y + covered.shape[0], x : x + covered.shape[1]]
+            own = labels[window] == instance
+            pixels[instance] += (covered.sum(), (covered & own).sum())
+            if photo is not None:
+                sure = covered & shrink(own)
+                if sure.any():
+                    colors[instance].append((int(sure.sum()), photo[window][sure].mean(0) / 255))
+    found = {}
+    for instance in surfaces:
+        projected, visible = pixels[instance].tolist()
+        share = Measurement(visible / projected, float("nan"), "masks") if projected else OUTSIDE
+        of_photos = mean_colors(colors[instance]) if has_photos else dict.fromkeys(COLORS, NO_PHOTOS)
+        found[instance] = {"visible_share": share, **of_photos}
+    return found
+
+
+def project_crop(surface: LeafSurface, cameras: Cameras, view: int) -> tuple[NDArray[np.bool_], tuple[int, int]]:
+    """What `surface.project` gives for one view, as a crop with a margin: (h, w) bool and the crop's corner x, y."""
+    width, height = cameras.sizes[view].tolist()
+    points, depths = cameras[[view]].project(surface.points().reshape(-1, 3))
+    is_ahead = (grid_quads(depths.reshape(*MESH_SHAPE, 1).cpu().numpy()) > 0).all((1, 2))
+    quads = grid_quads(points.reshape(*MESH_SHAPE, 2).cpu().numpy())[is_ahead]
+    if not len(quads):
+        return np.zeros((0, 0), bool), (0, 0)
+    margin = BORDER_PX + 1
+    low, high = quads.min((0, 1)) - margin, quads.max((0, 1)) + margin
+    x1, y1 = np.floor(np.clip(low, 0, (width, height))).astype(int).tolist()
+    x2, y2 = np.ceil(np.clip(high, 0, (width, height))).astype(int).tolist()
+    if x1 == x2 or y1 == y2:
+        return np.zeros((0, 0), bool), (0, 0)
+    return draw_polygons(quads, (x2 - x1, y2 - y1), np.array([x1, y1])) >= 0.5, (x1, y1)
+
+
+def shrink(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """A mask (h, w) without the pixels within BORDER_PX of others; what lies outside the picture is no other."""
+    side = 2 * BORDER_PX + 1
+    eroded = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderType=cv2.BORDER_REPLICATE)
+    return np.asarray(eroded, bool)
+
+
+def mean_colors(views: list[tuple[int, Floats]]) -> dict[str, Measurement]:
+    """The traits in COLORS from the number of pixels and the mean colour (3,), 0 to 1, of each view."""
+    if not views:
+        return dict.fromkeys(COLORS, NO_PIXELS)
+    weights = np.array([count for count, _ in views], dtype=np.float64)
+    colors = np.stack([color for _, color in views])
+    red, green, blue = colors.T
+    greenness = (2 * green - red - blue) / np.maximum(2 * green + red + blue, 1e-9)
+    table = np.column_stack([colors, greenness])
+    means = weights @ table / weights.sum()
+    errors = table.std(0, ddof=1) / np.sqrt(len(views)) if len(views) > 1 else np.full(4, np.nan)
+    return {
+        name: Measurement(float(mean), float(error), "photographs")
+        for name, mean, error in zip(COLORS, means, errors, strict=True)
+    }

@@ -1,0 +1,39 @@
+"""Which instances count as leaves. The fields are keys in YAML files and options on the command line."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from mvseg.errors import InputError
+
+Up = tuple[float, float, float] | Literal["rig"]  # the direction that points up, or to find it from the cameras
+
+
+@dataclass(frozen=True)
+class TraitsConfig:
+    """Which instances count as leaves; of the others the table says why they do not, and their shapes and ids stay.
+
+    Attributes:
+        min_sure_views: views with a sure match (match score of 0.5 or more) that a leaf needs; it has no effect where
+            the matcher gives no probabilities.
+        min_quality: least median IoU of a leaf's surface with its masks; in [0, 1]. Leaves that have voxels only are
+            not judged by it.
+        min_visible_share: of the pixels that a leaf's surface covers in the photos, its masks must cover this share; in
+            [0, 1]. A surface that hardly any photo shows is not where the leaf is.
+        leaves_only: leave out what looks like a stem (long and steep, and a surface explains its masks badly), the
+            floor (below everything else, and far larger) or something beside the plant (more than two leaf lengths
+            away from it). Stems and the floor are told only where it is known which way is up.
+    """
+
+    min_sure_views: int = 2
+    min_quality: float = 0.5
+    min_visible_share: float = 0.05
+    leaves_only: bool = True
+
+    def __post_init__(self) -> None:
+        if self.min_sure_views < 0:
+            raise InputError(f"traits.min_sure_views is {self.min_sure_views}, expected 0 or more")
+        for name, share in (("min_quality", self.min_quality), ("min_visible_share", self.min_visible_share)):
+            if not 0 <= share <= 1:
+                raise InputError(f"traits.{name} is {share:g}, expected a number in [0, 1]")

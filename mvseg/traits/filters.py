@@ -1,0 +1,180 @@
+"""Which instances are no leaves to be measured, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid
+from mvseg.traits.config import TraitsConfig
+
+Floats = NDArray[np.float64]
+Kind = Literal["few_sure_views", "low_quality", "hardly_visible", "stem", "floor", "beside_the_plant"]
+
+# Found on simulated plants with masks of stems and of a tape on the floor, and on a real basil; see docs/traits.md.
+LONG, STEEP_DEG, TUBE_IOU = 8.0, 70.0, 0.9  # of stems: longer than wide by this, steeper and explained worse than this
+FLOOR_AREA = 1.8  # times that of the largest other instance
+FAR = 2.0  # lengths of the longest instance but one, from instance to instance
+FEWEST = 3  # instances, for floor and distance to be told
+NUM_POINTS = 400  # of a shape, for distances
+
+
+@dataclass(frozen=True)
+class Rejection:
+    """Why an instance is not measured: the kind, which is counted, and a sentence."""
+
+    kind: Kind
+    reason: str
+
+
+@dataclass(frozen=True)
+class Support:
+    """What speaks for instances.
+
+    Attributes:
+        sure_views: {instance id: views with a sure match}; empty where the matcher gives no probabilities.
+        visible_shares: {instance id: share of its surface, over all photos, that its masks cover}, of those with a
+            surface.
+    """
+
+    sure_views: Mapping[int, int] = field(default_factory=dict)
+    visible_shares: Mapping[int, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, eq=False)
+class _Body:
+    """Where an instance is, and how large.
+
+    Attributes:
+        points: (P, 3) on it.
+        deviations: (3,) standard deviations along its principal axes, the largest first.
+        axis: (3,) the first of these.
+        area: one-sided.
+    """
+
+    points: Floats
+    deviations: Floats
+    axis: Floats
+    area: float
+
+    @staticmethod
+    def of(shape: LeafSurface | VoxelGrid) -> _Body:
+        every = shape.points().reshape(-1, 3) if isinstance(shape, LeafSurface) else shape.points
+        points = every.cpu().numpy()
+        variances, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+        deviations = np.sqrt(np.maximum(variances[::-1], 0))
+        area = shape.area if isinstance(shape, LeafSurface) else 12 * float(deviations[0] * deviations[1])
+        few = points[:: max(1, len(points) // NUM_POINTS)]
+        return _Body(points=few, deviations=deviations, axis=axes[:, -1], area=area)
+
+    @property
+    def length(self) -> float:
+        """Roughly from end to end."""
+        return float(np.sqrt(12) * self.deviations[0])
+
+
+def find_rejected(
+    shapes: Mapping[int, LeafSurface | VoxelGrid], support: Support, up: Floats | None, *, config: TraitsConfig
+) -> dict[int, Rejection]:
+    """The instances that are not measured as leaves.
+
+    Args:
+        shapes: {instance id: its shape}, instances without one left out.
+        support: what speaks for them.
+        up: (3,) unit vector; None: not known, so that stems and the floor are not told.
+        config: what is asked of a leaf.
+
+    Returns:
+        {instance id: why}. One that several rules reject has the first of their reasons.
+    """
+    found: dict[int, Rejection] = {}
+    for instance, num_views in support.sure_views.items():
+        if num_views < config.min_sure_views:
+            reason = f"{num_views} sure views, asked for are {config.min_sure_views}"
+            found[instance] = Rejection("few_sure_views", reason)
+    for instance, shape in shapes.items():
+        if isinstance(shape, LeafSurface) and (iou := median_iou(shape)) < config.min_quality:
+            reason = f"median IoU {iou:.2f} with its masks, asked for is {config.min_quality:g}"
+            found.setdefault(instance, Rejection("low_quality", reason))
+    for instance, share in support.visible_shares.items():
+        if share < config.min_visible_share:
+            reason = f"its masks cover a share of {share:.2f} of its surface, asked for is {config.min_visible_share:g}"
+            found.setdefault(instance, Rejection("hardly_visible", reason))
+    if not config.leaves_only:
+        return found
+    bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in found}
+    if up is not None:
+        found |= find_stems(bodies, shapes, up)
+        found |= find_floor(_without(bodies, found), up)
+    found |= find_distant(_without(bodies, found))
+    return dict(sorted(found.items()))
+
+
+def _without(bodies: Mapping[int, _Body], found: Mapping[int, Rejection]) -> dict[int, _Body]:
+    return {instance: body for instance, body in bodies.items() if instance not in found}
+
+
+def median_iou(surface: LeafSurface) -> float:
+    """Of a surface with its masks; 0 where that is not known."""
+    iou = surface.iou[surface.iou.isfinite()]
+    return float(iou.median()) if len(iou) else 0.0
+
+
+def find_stems(
+    bodies: Mapping[int, _Body], shapes: Mapping[int, LeafSurface | VoxelGrid], up: Floats
+) -> dict[int, Rejection]:
+    """Long and steep ones; a blade that stands upright is told from them by a surface that explains its masks."""
+    found = {}
+    for instance, body in bodies.items():
+        shape = shapes[instance]
+        elongation = body.deviations[0] / max(body.deviations[1], 1e-12)
+        steepness = np.degrees(np.arcsin(min(1.0, abs(float(body.axis @ up)))))
+        is_blade = isinstance(shape, LeafSurface) and median_iou(shape) >= TUBE_IOU
+        if elongation > LONG and steepness > STEEP_DEG and not is_blade:
+            reason = f"looks like a stem: {elongation:.0f} times longer than wide, {steepness:.0f} degrees steep"
+            found[instance] = Rejection("stem", reason)
+    return found
+
+
+def find_floor(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
+    """What lies below everything else, and is far larger than anything else."""
+    if len(bodies) < FEWEST:
+        return {}
+    tops = {instance: float((body.points @ up).max()) for instance, body in bodies.items()}
+    lowest = min(tops, key=lambda instance: tops[instance])
+    others = [body for instance, body in bodies.items() if instance != lowest]
+    if tops[lowest] >= min(float((body.points @ up).min()) for body in others):
+        return {}
+    ratio = bodies[lowest].area / max(max(body.area for body in others), 1e-300)
+    if ratio <= FLOOR_AREA:
+        return {}
+    reason = f"looks like the floor: below everything else, and {ratio:.1f} times the largest leaf"
+    return {lowest: Rejection("floor", reason)}
+
+
+def find_distant(bodies: Mapping[int, _Body]) -> dict[int, Rejection]:
+    """Those that no chain of short steps, from instance to instance, joins with most of the others."""
+    if len(bodies) < FEWEST:
+        return {}
+    length = sorted(body.length for body in bodies.values())[-2]  # the longest one may be what lies beside the plant
+    trees = [cKDTree(body.points) for body in bodies.values()]
+    gaps = np.array([[tree.query(body.points)[0].min() for tree in trees] for body in bodies.values()])
+    _, group = connected_components(gaps <= FAR * length, directed=False)
+    sizes = np.bincount(group)
+    if sizes.max() <= len(bodies) / 2:
+        return {}
+    plant = group == sizes.argmax()
+    found = {}
+    for index, instance in enumerate(bodies):
+        if not plant[index]:
+            steps = gaps[index, plant].min() / length
+            reason = f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
+            found[instance] = Rejection("beside_the_plant", reason)
+    return found

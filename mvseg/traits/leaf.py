@@ -1,0 +1,185 @@
+"""Sizes and angles of one leaf, each with its standard deviation; see docs/traits.md for the definitions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.reconstruction.surface.leaf_patch import patch_basis, patch_grid
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid
+
+Floats = NDArray[np.float64]
+
+COARSE = (24, 9)  # grid for standard deviations
+END = 0.25  # share of the midrib whose direction counts as that of its base or tip; less is noise
+MIDDLE = np.linspace(0.4, 0.6, 5)  # where the fold is measured
+VAGUE_DEG = 60.0  # standard deviation from which an azimuth says nothing
+PARALLEL = 1e-9  # sine of the angle between directions that span no plane
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """A number, or why there is none.
+
+    Attributes:
+        value: NaN where there is none.
+        sd: standard deviation; NaN where there is none.
+        method: what it was measured on ("surface", "voxels", "masks", "photographs"); the reason where there is none.
+    """
+
+    value: float
+    sd: float
+    method: str
+
+    @property
+    def exists(self) -> bool:
+        return bool(np.isfinite(self.value))
+
+
+def missing(reason: str) -> Measurement:
+    """No number, and why."""
+    return Measurement(float("nan"), float("nan"), reason)
+
+
+UP_UNKNOWN = missing("not measured: the direction of up is not known (--up)")
+STEEP = missing("not measured: the leaf points nearly straight up or down")
+BASE_UNKNOWN = missing("not measured: base and tip cannot be told apart")
+NEED_BASE = ("base_inclination", "tip_inclination", "azimuth", "insertion_height", "insertion_angle")
+NEED_UP = ("inclination", *NEED_BASE)
+
+
+def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 0.0) -> dict[str, Measurement]:
+    """All of `SURFACE_TRAITS` of one leaf.
+
+    Args:
+        surface: credible.
+        frame: (3, 3) rows east, north, up (`level_frame`); None: up is not known.
+        ground: height that insertion heights start from, along up, world units.
+
+    Returns:
+        {trait: number}; those that need up, or base and tip, say so where these are not known. Angles in degrees.
+    """
+    coefficients = surface.coefficients.numpy()
+    normals = cell_normals(patch_grid(*COARSE).points(coefficients))
+    directions = _directions(coefficients, frame, normal=normals.sum((0, 1)))
+    angles = {name: _Angle.of(*pair, across=_north(name, frame)) for name, pair in directions.items()}
+
+    def measure(moved: Floats) -> Floats:
+        points = patch_grid(*COARSE).points(moved)
+        normals = cell_normals(points)
+        area = np.linalg.norm(normals, axis=-1).sum()
+        length = np.linalg.norm(np.diff(points[:, COARSE[1] // 2], axis=0), axis=1).sum()
+        width = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(1).max()
+        pairs = _directions(moved, frame, normal=normals.sum((0, 1)))
+        turned = [angle.between(*pairs[name]) for name, angle in angles.items()]
+        return np.array([area, length, width, length / width, _base_height(moved, frame), *turned])
+
+    values = {
+        "area": surface.area,
+        "length": surface.length,
+        "width": surface.width,
+        "length_width_ratio": surface.length / surface.width,
+        "insertion_height": _base_height(coefficients, frame) - ground,
+    }
+    values |= {name: angle.degrees for name, angle in angles.items()}
+    sds = dict(zip(values, surface.deviation(measure).tolist(), strict=True))
+    if frame is not None:
+        values["inclination"] = min(values["inclination"], 180 - values["inclination"])
+        values["azimuth"] %= 360
+        values |= {"base_inclination": 90 - values["insertion_angle"], "tip_inclination": 90 - values.pop("tip_angle")}
+        sds |= {"base_inclination": sds["insertion_angle"], "tip_inclination": sds.pop("tip_angle")}
+    numbers = {name: Measurement(float(value), sds[name], "surface") for name, value in values.items()}
+    if frame is not None and not numbers["azimuth"].sd <= VAGUE_DEG:
+        numbers["azimuth"] = STEEP
+    if not surface.is_oriented:
+        numbers |= dict.fromkeys(NEED_BASE, BASE_UNKNOWN)
+    if frame is None:
+        numbers |= dict.fromkeys(NEED_UP, UP_UNKNOWN)
+    return numbers
+
+
+def cell_normals(points: Floats) -> Floats:
+    """(rows - 1, columns - 1, 3) normals of the cells of a grid (rows, columns, 3), as long as their areas."""
+    ax, ay, az = np.moveaxis(points[1:, 1:] - points[:-1, :-1], -1, 0)
+    bx, by, bz = np.moveaxis(points[1:, :-1] - points[:-1, 1:], -1, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1) / 2  # np.cross is slow on few
+
+
+def measure_voxels(grid: VoxelGrid) -> dict[str, Measurement]:
+    """All of `VOXEL_TRAITS`: volume, and the corners of the box along the world's axes."""
+    points, half = grid.points, grid.voxel_size / 2
+    values = {"volume": grid.volume}
+    for end, corner in (("min", points.amin(0) - half), ("max", points.amax(0) + half)):
+        values |= {f"{axis}_{end}": float(value) for axis, value in zip("xyz", corner, strict=True)}
+    return {name: Measurement(value, float("nan"), "voxels") for name, value in values.items()}
+
+
+# The midrib at the base, where that ends, where the tip begins, and at the tip: (4, 26).
+_ENDS = patch_basis(np.array([0.0, END, 1 - END, 1.0]), np.zeros(4))
+# One edge, the midrib and the other edge at mid length: (3, 26).
+_HALVES = np.stack([patch_basis(MIDDLE, np.full(len(MIDDLE), v)).mean(0) for v in (-1.0, 0.0, 1.0)])
+
+
+def _base_height(coefficients: Floats, frame: Floats | None) -> float:
+    return float("nan") if frame is None else float((_ENDS[0] @ coefficients) @ frame[2])
+
+
+def _directions(
+    coefficients: Floats, frame: Floats | None, *, normal: Floats
+) -> dict[str, tuple[Floats, Floats]]:
+    """{angle: the two directions, (3,) of any length, that it lies between}; `normal` (3,) is the mean one."""
+    ends, (left, middle, right) = _ENDS @ coefficients, _HALVES @ coefficients
+    base, ahead, tip = ends[1] - ends[0], ends[2] - ends[1], ends[3] - ends[2]
+    pairs = {"curvature": (base, tip), "fold_angle": (left - middle, right - middle)}
+    if frame is None:
+        return pairs
+    east, _, up = frame
+    level = ahead - (ahead @ up) * up
+    return pairs | {
+        "inclination": (up, normal), "insertion_angle": (up, base), "tip_angle": (up, tip), "azimuth": (east, level)
+    }  # fmt: skip
+
+
+def _north(name: str, frame: Floats | None) -> Floats | None:
+    """Azimuths have a plane and a sense of their own."""
+    return frame[1] if frame is not None and name == "azimuth" else None
+
+
+@dataclass(frozen=True, eq=False)
+class _Angle:
+    """An angle between two directions, signed within the plane that they span on the leaf as fitted.
+
+    When the leaf moves, it passes smoothly through 0 and 180 degrees, where the angle between two directions itself
+    has a kink: standard deviations need that.
+
+    Attributes:
+        ahead, across: (3,) orthonormal; the plane.
+        degrees: the angle on the leaf as fitted; NaN where a direction has no length.
+    """
+
+    ahead: Floats
+    across: Floats
+    degrees: float
+
+    @staticmethod
+    def of(start: Floats, end: Floats, *, across: Floats | None = None) -> _Angle:
+        ahead, size = start / np.linalg.norm(start), float(np.linalg.norm(end))
+        if across is not None:
+            sine = float(end @ across)
+        else:
+            across = end - (end @ ahead) * ahead
+            sine = float(np.linalg.norm(across))
+            if sine <= PARALLEL * size:
+                across = np.cross(ahead, np.eye(3)[np.abs(ahead).argmin()])
+            across = across / np.linalg.norm(across)
+        angle = np.degrees(np.arctan2(sine, end @ ahead)) if size > 0 else np.nan
+        return _Angle(ahead, across, float(angle))
+
+    def between(self, start: Floats, end: Floats) -> float:
+        """Degrees, within half a turn of the leaf as fitted."""
+        first, second = (complex(d @ self.ahead, d @ self.across) for d in (start, end))
+        turned = second * first.conjugate() * np.exp(-1j * np.radians(self.degrees))
+        return self.degrees + float(np.degrees(np.angle(turned)))

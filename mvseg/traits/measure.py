@@ -1,0 +1,189 @@
+"""The traits of a plant and of its leaves, start to finish."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvseg.matching.result import Matching
+from mvseg.reconstruction.shapes import Surfaces, Voxels, best_shape
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid
+from mvseg.regions import Regions
+from mvseg.scene import Scene
+from mvseg.traits.appearance import measure_appearance
+from mvseg.traits.config import TraitsConfig
+from mvseg.traits.filters import Rejection, Support, find_rejected, median_iou
+from mvseg.traits.from_above import Cells, look_from_above
+from mvseg.traits.leaf import UP_UNKNOWN, Floats, Measurement, measure_leaf, measure_voxels, missing
+from mvseg.traits.ontology import LEAF_TRAITS
+from mvseg.traits.plant import measure_whole
+from mvseg.traits.up import level_frame
+
+NO_SURE_VIEWS = missing("not measured: the matcher gives no probabilities")
+NO_VIEWS = torch.zeros(0, dtype=torch.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class LeafTraits:
+    """One instance.
+
+    Attributes:
+        leaf: its id.
+        numbers: {trait: number} of all `LEAF_TRAITS`.
+        method: "surface", "voxels", or "none" for an instance without a shape.
+        reasons: to doubt the numbers, or why there are none; empty for a good leaf.
+        rejection: why it does not count as a leaf, None where it does.
+    """
+
+    leaf: int
+    numbers: Mapping[str, Measurement]
+    method: str
+    reasons: tuple[str, ...]
+    rejection: Rejection | None
+
+
+@dataclass(frozen=True, eq=False)
+class Traits:
+    """All traits of one scene.
+
+    Attributes:
+        plant: name of the scene.
+        unit: of its lengths, "" when unknown.
+        leaves: one entry per instance, by id.
+        whole: {trait: number} of all `PLANT_TRAITS`.
+        up: unit vector, None when unknown.
+    """
+
+    plant: str
+    unit: str
+    leaves: tuple[LeafTraits, ...]
+    whole: Mapping[str, Measurement]
+    up: tuple[float, float, float] | None
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """{kind of rejection: how many instances}."""
+        return dict(Counter(leaf.rejection.kind for leaf in self.leaves if leaf.rejection is not None))
+
+
+def measure_plant(
+    scene: Scene,
+    regions: Regions,
+    matching: Matching,
+    *,
+    surfaces: Surfaces | None,
+    voxels: Voxels,
+    config: TraitsConfig = TraitsConfig(),
+) -> Traits:
+    """Measure all instances, and the plant that those make which count as leaves.
+
+    Args:
+        scene: gives unit, the direction of up (None: angles and heights are left out) and the photos.
+        regions: D regions.
+        matching: their ids.
+        surfaces: {instance id: surface}; None where none were asked for.
+        voxels: {instance id: voxels}.
+        config: what counts as a leaf.
+
+    Returns:
+        The traits; an instance that cannot be measured, or is rejected, has empty numbers that say why.
+
+    Raises:
+        InputError: a photo is broken, or missing while others exist.
+    """
+    instances = range(1, matching.num_instances + 1)
+    best = {instance: best_shape(instance, surfaces, voxels) for instance in instances}
+    frame = None if scene.up is None else level_frame(scene.up)
+    up = None if frame is None else frame[2]
+    sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
+    shapes = {instance: shape for instance, shape in best.items() if shape is not None}
+    every = {instance: shape for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
+    appearance = measure_appearance(every, regions, matching.instance_ids, scene=scene)
+    visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
+    rejected = find_rejected(shapes, Support(sure_views, visible), up, config=config)
+    blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
+    cells = {} if frame is None else look_from_above(blades, frame)
+    numbers = {
+        instance: _count(instance, regions, matching.instance_ids, sure_views=sure_views) for instance in instances
+    }
+    for instance, found in measure_blades(blades, frame, cells=cells).items():
+        numbers[instance] |= found | appearance[instance]
+    for instance in voxels.keys() - rejected.keys():
+        numbers[instance] |= measure_voxels(voxels[instance])
+    leaves = []
+    for instance in instances:
+        fitted = None if surfaces is None else surfaces.get(instance, LeafSurface.none(NO_VIEWS, "has no masks"))
+        rejection = rejected.get(instance)
+        leaves.append(describe_leaf(instance, numbers[instance], best[instance], fitted=fitted, rejection=rejection))
+    whole = measure_whole(blades, cells, frame, num_leaves=len(instances) - len(rejected))
+    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up)
+
+
+def measure_blades(
+    blades: Mapping[int, LeafSurface], frame: Floats | None, *, cells: Mapping[int, Cells]
+) -> dict[int, dict[str, Measurement]]:
+    """{instance id: sizes, angles and lit share}; heights start from the lowest point of all blades."""
+    ground = 0.0
+    if frame is not None and blades:
+        ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
+    measured = {}
+    for instance, surface in blades.items():
+        lit = UP_UNKNOWN if frame is None else Measurement(cells[instance].lit_share, float("nan"), "surface")
+        measured[instance] = measure_leaf(surface, frame, ground=ground) | {"lit_share": lit}
+    return measured
+
+
+def describe_leaf(
+    instance: int,
+    numbers: Mapping[str, Measurement],
+    shape: LeafSurface | VoxelGrid | None,
+    *,
+    fitted: LeafSurface | None,
+    rejection: Rejection | None,
+) -> LeafTraits:
+    """The leaf with all of its traits; those that are missing with the reason.
+
+    Args:
+        instance: its id.
+        numbers: {trait: number} of what was measured.
+        shape: the one that stands for it.
+        fitted: its surface, credible or not; None where no surfaces were asked for.
+        rejection: why it does not count as a leaf.
+    """
+    if fitted is not None:
+        reasons = fitted.quality.reasons
+    else:
+        reasons = () if shape is not None else ("has no shape: seen in one view, or its masks agree on no point",)
+    if rejection is not None:
+        reasons = (f"rejected: {rejection.reason}", *reasons)
+        why = reasons[0]
+    elif fitted is None:
+        why = "no surface was asked for"
+    elif isinstance(shape, LeafSurface):
+        why = "not measured: only voxels have it"
+    else:
+        why = "; ".join(("no credible surface", *reasons))
+    found = dict(numbers)
+    if isinstance(shape, LeafSurface):
+        found["quality"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons)))
+    elif fitted is not None and rejection is None:
+        reasons = (why,)
+    method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
+    full = {trait.name: found.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
+    return LeafTraits(leaf=instance, numbers=full, method=method, reasons=reasons, rejection=rejection)
+
+
+def _count(
+    instance: int, regions: Regions, instance_ids: Tensor, *, sure_views: Mapping[int, int]
+) -> dict[str, Measurement]:
+    num_views = len(torch.unique(regions.view_index[instance_ids == instance]))
+    sure = sure_views.get(instance)
+    return {
+        "num_views": Measurement(float(num_views), float("nan"), "masks"),
+        "sure_views": NO_SURE_VIEWS if sure is None else Measurement(float(sure), float("nan"), "matching"),
+    }

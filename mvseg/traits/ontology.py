@@ -1,0 +1,92 @@
+"""The names of the traits, what they mean and in which unit; docs/traits.md has the formulas.
+
+Accessions are of the Plant Trait Ontology (TO), where it has a term for exactly this.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Kind = Literal["length", "area", "volume", "degree", "1"]
+
+
+@dataclass(frozen=True)
+class Definition:
+    """One trait.
+
+    Attributes:
+        name: as in the tables.
+        kind: what its unit is made of; "1" for counts, shares and ratios.
+        meaning: in one line.
+        ontology: accession, "" without one.
+        has_sd: is there a standard deviation (and a column for it)?
+    """
+
+    name: str
+    kind: Kind
+    meaning: str
+    ontology: str = ""
+    has_sd: bool = True
+
+
+def _counted(name: str, meaning: str, ontology: str = "") -> Definition:
+    return Definition(name, "1", meaning, ontology, has_sd=False)
+
+
+SURFACE_TRAITS = (
+    Definition("area", "area", "one side of the blade", "TO:0000540"),
+    Definition("length", "length", "along the midrib from base to tip", "TO:0000135"),
+    Definition("width", "length", "along the surface from edge to edge, at the widest place", "TO:0000370"),
+    Definition("length_width_ratio", "1", "length / width"),
+    Definition("inclination", "degree", "between the mean normal and up: 0 = horizontal blade, 90 = vertical"),
+    Definition("base_inclination", "degree", "of the midrib at the base against the horizontal, positive = rising"),
+    Definition("tip_inclination", "degree", "of the midrib at the tip against the horizontal, positive = rising"),
+    Definition("azimuth", "degree", "direction from base to tip, counterclockwise seen from above, in [0, 360)"),
+    Definition("insertion_height", "length", "of the base above the lowest point of all measured leaves"),
+    Definition("insertion_angle", "degree", "between the midrib at the base and up (the stem)", "TO:0000206"),
+    Definition("curvature", "degree", "between the midrib's directions at base and tip: 0 = straight"),
+    Definition("fold_angle", "degree", "between the two halves of the blade at mid length: 180 = flat"),
+)
+SEEN_TRAITS = (
+    _counted("visible_share", "share of the surface's projections that the leaf's own masks cover"),
+    _counted("lit_share", "share of the area that no leaf hides from a viewer above"),
+    Definition("mean_red", "1", "mean red of the surely seen pixels, 0 to 1"),
+    Definition("mean_green", "1", "mean green of the surely seen pixels, 0 to 1"),
+    Definition("mean_blue", "1", "mean blue of the surely seen pixels, 0 to 1"),
+    Definition("greenness_index", "1", "green leaf index (2G - R - B) / (2G + R + B), -1 to 1"),
+)
+VOXEL_TRAITS = (
+    Definition("volume", "volume", "of the occupied voxels", has_sd=False),
+    *(
+        Definition(f"{axis}_{end}", "length", f"{word} {axis} of the voxels in the world", has_sd=False)
+        for end, word in (("min", "least"), ("max", "largest"))
+        for axis in "xyz"
+    ),
+)
+COUNTED_TRAITS = (
+    _counted("num_views", "views with a mask of the leaf"),
+    _counted("sure_views", "views with a sure match"),
+    _counted("quality", "median IoU of the surface with the leaf's masks"),
+)
+LEAF_TRAITS = (*SURFACE_TRAITS, *SEEN_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS)
+PLANT_TRAITS = (
+    _counted("number_of_leaves", "instances that are not rejected", "TO:0000241"),
+    Definition("total_leaf_area", "area", "sum of the leaves' areas"),
+    Definition("height", "length", "from the lowest to the highest point of the leaves"),
+    Definition("convex_hull_volume", "volume", "of the convex hull of the leaves"),
+    Definition("projected_area", "area", "what the leaves cover, seen from above"),
+    Definition("light_interception", "1", "projected_area / total_leaf_area: 1 = flat and side by side"),
+    *(
+        Definition(f"leaf_area_decile_{decile}", "area", f"{decile} in 10 leaves have a smaller area")
+        for decile in range(1, 10)
+    ),
+)
+DEFINITIONS = {definition.name: definition for definition in (*LEAF_TRAITS, *PLANT_TRAITS)}
+POWERS = {"length": "", "area": "^2", "volume": "^3"}
+UNKNOWN_UNIT = "world unit"  # where the cameras do not say what their lengths are
+
+
+def unit_of(kind: Kind, unit: str) -> str:
+    """The unit of a kind of number in a world whose lengths are in `unit`; "" is the unknown one."""
+    return (unit or UNKNOWN_UNIT) + POWERS[kind] if kind in POWERS else kind

@@ -1,0 +1,62 @@
+"""Which way is up.
+
+Photographers hold cameras level: the horizontal axis of a photo is horizontal in the world, too. Up is the direction
+that is perpendicular to the horizontal axes of all cameras.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.errors import InputError
+from mvseg.scene import Cameras, Scene
+from mvseg.traits.config import Up
+
+Floats = NDArray[np.float64]
+
+LEVEL = np.radians(2.0)  # how level cameras are at best
+MOST_TILT = np.radians(10.0)  # root mean square, of cameras that were held level
+MOST_DOUBT = np.radians(6.0)  # standard deviation of the answer
+
+
+def find_up(scene: Scene, up: Up | None) -> Scene:
+    """The scene with the direction of up that the user says, or else its own.
+
+    Raises:
+        InputError: "rig" with cameras that do not tell it, see `up_of_cameras`; a vector without a direction.
+    """
+    if up is None:
+        return scene
+    x, y, z = up_of_cameras(scene.cameras).tolist() if up == "rig" else up
+    return replace(scene, up=(x, y, z))
+
+
+def up_of_cameras(cameras: Cameras) -> Floats:
+    """(3,) unit vector up, from V cameras that were held level, at any height and pitch.
+
+    Raises:
+        InputError: the cameras were not held level, or all look in nearly the same direction.
+    """
+    R = cameras.R.cpu().numpy()
+    _, sizes, axes = np.linalg.svd(R[:, 0], full_matrices=True)
+    sizes = np.append(sizes, [0.0] * (3 - len(sizes))) / np.sqrt(len(R))
+    tilt = max(float(sizes[2]), LEVEL)
+    if tilt > MOST_TILT or tilt > MOST_DOUBT * sizes[1] * np.sqrt(len(R)):
+        reason = "were not held level" if tilt > MOST_TILT else "all look in nearly the same direction"
+        raise InputError(f"up is 'rig', but the cameras {reason}: expected the direction as three numbers, as in 0 0 1")
+    # Level cameras have their own up on the upper side, and look down on plants rather than up at them.
+    towards = -R[:, 1].mean(0) - R[:, 2].mean(0)
+    return axes[2] if axes[2] @ towards >= 0 else -axes[2]
+
+
+def level_frame(up: Floats | tuple[float, float, float]) -> Floats:
+    """(3, 3) rows: east, north, up, a right-handed frame. East, azimuth 0, is the world's +x made horizontal (its +y
+    where +x is steep)."""
+    upwards = np.asarray(up, dtype=np.float64)
+    axis = np.eye(3)[0 if abs(upwards[0]) < 0.9 else 1]
+    east = axis - (axis @ upwards) * upwards
+    east /= np.linalg.norm(east)
+    return np.stack([east, np.cross(upwards, east), upwards])

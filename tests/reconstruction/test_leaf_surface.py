@@ -1,0 +1,54 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from known_leaves import bent_blade, fit_coefficients, flat_sheet, make_surface
+from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS, Floats, measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_surface import MEASURE_FACTOR, LeafSurface, measure_slopes
+
+
+def area_and_length(coefficients: Floats) -> Floats:
+    points = patch_grid(24, 9).points(coefficients)
+    first, second = points[1:, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, 1:]
+    area = np.linalg.norm(np.cross(first, second), axis=-1).sum() / 2
+    return np.array([area, measure_patch(coefficients).length])
+
+
+def random_covariance(sd: float) -> torch.Tensor:
+    factors = np.random.default_rng(4).normal(size=(3 * NUM_COEFFICIENTS, 3 * NUM_COEFFICIENTS)) * sd / 9
+    return torch.from_numpy(factors @ factors.T)
+
+
+def test_deviations_are_those_of_samples() -> None:
+    """The naive twin: measure leaves drawn from the covariance, whose errors are correlated."""
+    coefficients = bent_blade().coefficients.numpy()
+    surface = make_surface(coefficients)
+    object.__setattr__(surface, "covariance", random_covariance(0.05))
+    draws = np.random.default_rng(5).multivariate_normal(coefficients.ravel(), surface.covariance.numpy(), 4000)
+    measured = np.stack([area_and_length(draw.reshape(-1, 3)) for draw in draws])
+    assert surface.deviation(area_and_length) / MEASURE_FACTOR == pytest.approx(measured.std(0), rel=0.06)
+
+
+def test_deviations_agree_with_analytic_slopes() -> None:
+    surface = make_surface(fit_coefficients(flat_sheet, length=30, half_width=9) + 0.02 * np.arange(3), sd=0.03)
+    slopes = measure_slopes(surface.coefficients.numpy())[:2]
+    expected = MEASURE_FACTOR * 0.03 * np.linalg.norm(slopes, axis=1)
+    assert surface.deviation(area_and_length) == pytest.approx(expected, rel=0.02)
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
+def test_deviations_of_a_linear_measure_are_exact_in_any_unit(factor: float) -> None:
+    surface = make_surface(factor * bent_blade().coefficients.numpy() + 1e3 * factor, sd=factor)
+    deviation = surface.deviation(lambda coefficients: coefficients.sum(0)[:1])
+    assert deviation == pytest.approx([MEASURE_FACTOR * factor * NUM_COEFFICIENTS**0.5], rel=1e-6)
+
+
+def test_numbers_that_are_none_have_no_deviation() -> None:
+    surface = bent_blade()
+    assert np.isfinite(surface.deviation(lambda c: np.array([c[0, 0], np.nan]))).tolist() == [True, False]
+    nothing = LeafSurface.none(torch.tensor([0]), "seen in one view only")
+    assert not nothing.is_credible
+    assert surface.is_credible
+    assert np.isnan(nothing.deviation(area_and_length)).all()

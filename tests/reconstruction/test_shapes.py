@@ -1,0 +1,57 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import EllipticBlade, as_regions, blade_masks, ring_cameras
+from mvseg.reconstruction import shapes
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.shapes import best_shape, reconstruct_shapes
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid, reconstruct_instances
+from mvseg.regions import Regions
+
+CAMERAS = ring_cameras(4)
+COARSE = ReconstructConfig(voxel_budget=2000)
+
+
+@pytest.fixture(scope="module")
+def two_blades() -> tuple[Regions, torch.Tensor]:
+    """The same blade as instance 1 and, mirrored in every picture, as instance 2, which is thus nowhere in space."""
+    maps = []
+    for view, mask in enumerate(blade_masks(EllipticBlade(half_length=0.6), CAMERAS)):
+        labels = mask.astype(np.int64)
+        labels[:20, :20] = 2 if view == 0 else 0
+        labels[-20:, -20:] = 2 if view == 1 else 0
+        maps.append(labels)
+    return as_regions(maps)
+
+
+def test_instances_without_a_credible_surface_get_voxels(
+    two_blades: tuple[Regions, torch.Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The voxels that voxels alone would give: other instances hide as before."""
+    monkeypatch.setattr(shapes, "fit_surfaces", lambda regions, ids, cameras, progress: {
+        1: LeafSurface.none(torch.arange(4), "for the test"), 2: LeafSurface.none(torch.arange(2), "for the test")
+    })  # fmt: skip
+    with pytest.warns(UserWarning, match="instance 2 has no shape"):
+        surfaces, voxels = reconstruct_shapes(*two_blades, CAMERAS, config=COARSE)
+    with pytest.warns(UserWarning, match="instance 2 has no shape"):
+        expected = reconstruct_instances(*two_blades, CAMERAS, config=COARSE)
+    assert surfaces is not None
+    assert surfaces.keys() == {1, 2}
+    assert voxels.keys() == expected.keys() == {1}
+    assert torch.equal(voxels[1].votes, expected[1].votes)
+    assert isinstance(best_shape(1, surfaces, voxels), VoxelGrid)
+    assert best_shape(2, surfaces, voxels) is None
+
+
+@pytest.mark.parametrize("shape", ["surface", "both", "voxels"])
+def test_what_is_made_is_what_was_asked_for(shape: str) -> None:
+    masks = as_regions(blade_masks(EllipticBlade(), CAMERAS))
+    config = ReconstructConfig(shape=shape, voxel_budget=2000)  # type: ignore[arg-type]
+    surfaces, voxels = reconstruct_shapes(*masks, CAMERAS, config=config)
+    assert (surfaces is None) == (shape == "voxels")
+    assert voxels.keys() == (set() if shape == "surface" else {1})
+    assert isinstance(best_shape(1, surfaces, voxels), VoxelGrid if shape == "voxels" else LeafSurface)

@@ -1,0 +1,107 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import SIZE, ring_cameras
+from known_leaves import flat_leaf
+from mvseg.formats.image_file import write_png
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Cameras, Scene, View
+from mvseg.traits.appearance import COLORS, mean_colors, measure_appearance, project_crop, shrink
+
+CAMERAS = ring_cameras(3)
+LEAF = flat_leaf(length=2, half_width=0.45, at=(-1, 0, 0))
+GREEN, RED = (60, 180, 30), (250, 10, 20)
+
+
+def scene_of(folder: Path, photos: list[np.ndarray] | None, cameras: Cameras = CAMERAS) -> Scene:
+    views = tuple(View(f"{view}", folder / f"{view}.png") for view in range(len(cameras)))
+    for view, photo in zip(views, photos or [], strict=False):
+        write_png(view.path, photo)
+    return Scene("plant", views, cameras)
+
+
+def labels_of(masks: list[np.ndarray]) -> tuple[Regions, torch.Tensor]:
+    regions = regions_from_label_maps([mask.astype(np.int64) for mask in masks])
+    return regions, regions.labels
+
+
+def painted(mask: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
+    """A photo whose leaf has a colour, but its outermost two pixels, and all else, are red."""
+    photo = np.full((SIZE, SIZE, 3), RED, np.uint8)
+    photo[cv2.erode(mask.astype(np.uint8), np.ones((5, 5), np.uint8)) > 0] = color
+    return photo
+
+
+def test_colours_are_those_of_sure_pixels(tmp_path: Path) -> None:
+    masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
+    scene = scene_of(tmp_path, [painted(mask, GREEN) for mask in masks])
+    found = measure_appearance({5: LEAF}, *labels_of([5 * mask for mask in masks]), scene=scene)[5]
+    assert found.keys() == {"visible_share", *COLORS}
+    assert found["visible_share"].value == 1
+    assert [found[name].value for name in COLORS[:3]] == pytest.approx(np.array(GREEN) / 255)
+    assert found["greenness_index"].value == pytest.approx((360 - 60 - 30) / (360 + 60 + 30))
+    assert found["greenness_index"].sd == pytest.approx(0, abs=1e-9)
+
+
+def test_masks_that_reach_beyond_the_leaf_add_no_colour(tmp_path: Path) -> None:
+    masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
+    wide = [cv2.dilate(mask.astype(np.uint8), np.ones((21, 21), np.uint8)) for mask in masks]
+    photos = [np.where(mask[..., None], GREEN, RED).astype(np.uint8) for mask in masks]
+    found = measure_appearance({1: LEAF}, *labels_of(wide), scene=scene_of(tmp_path, photos))[1]
+    assert found["mean_green"].value == pytest.approx(180 / 255, abs=0.01)
+
+
+def test_visible_share_counts_all_views(tmp_path: Path) -> None:
+    """Half of the leaf is hidden in the first view, and all of it in the second."""
+    masks = [mask.numpy().copy() for mask in LEAF.project(CAMERAS)]
+    sizes = [int(mask.sum()) for mask in masks]
+    columns = np.flatnonzero(masks[0].any(0))
+    masks[0][:, int(columns.mean()) :] = False
+    masks[1][:] = False
+    found = measure_appearance({1: LEAF}, *labels_of(masks), scene=scene_of(tmp_path, None))[1]
+    assert found["visible_share"].value == pytest.approx((masks[0].sum() + sizes[2]) / sum(sizes))
+    assert not found["mean_red"].exists
+    assert found["mean_red"].method == "not measured: there are no photos"
+
+
+def test_crops_are_the_projections(tmp_path: Path) -> None:
+    """The naive twin draws whole pictures; leaves at the edge of the picture, and outside of it, too."""
+    for at in ((-1, 0, 0), (0.5, 1, 0), (-40, 30, 0), (0, 0, 7)):
+        leaf = flat_leaf(length=2, half_width=0.45, at=at)
+        for view, whole in enumerate(leaf.project(CAMERAS)):
+            crop, (x, y) = project_crop(leaf, CAMERAS, view)
+            frame = np.zeros((SIZE, SIZE), bool)
+            frame[y : y + crop.shape[0], x : x + crop.shape[1]] = crop
+            assert (frame != whole.numpy()).sum() == 0
+
+
+def test_a_leaf_outside_all_photos_has_no_share(tmp_path: Path) -> None:
+    far = flat_leaf(length=2, half_width=0.45, at=(-40, 30, 0))
+    empty = [np.zeros((SIZE, SIZE), bool)] * 3
+    found = measure_appearance({1: far}, *labels_of(empty), scene=scene_of(tmp_path, [painted(empty[0], GREEN)] * 3))
+    assert not any(number.exists for number in found[1].values())
+
+
+def test_shrunken_masks_keep_to_the_edge_of_the_picture() -> None:
+    mask = np.zeros((9, 9), bool)
+    mask[:6, :6] = True
+    expected = np.zeros((9, 9), bool)
+    expected[:4, :4] = True
+    assert (shrink(mask) == expected).all()
+
+
+def test_views_weigh_as_much_as_their_pixels() -> None:
+    views = [(300, np.array([0.2, 0.4, 0.2])), (100, np.array([0.6, 0.8, 0.4]))]
+    found = mean_colors(views)
+    assert found["mean_red"].value == pytest.approx(0.3)
+    assert found["mean_red"].sd == pytest.approx(0.2)  # (0.6 - 0.2) / sqrt(2) between views, / sqrt(2) of their mean
+    (first, second) = ((0.8 - 0.4) / (0.8 + 0.4), (1.6 - 1.0) / (1.6 + 1.0))
+    assert found["greenness_index"].value == pytest.approx(0.75 * first + 0.25 * second)
+    assert not np.isfinite(mean_colors(views[:1])["mean_red"].sd)
+    assert not mean_colors([])["mean_red"].exists

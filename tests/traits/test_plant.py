@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.spatial import ConvexHull
+
+from known_leaves import bent_blade, flat_leaf, move, turn_about
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.traits.from_above import look_from_above
+from mvseg.traits.leaf import Measurement, measure_leaf
+from mvseg.traits.ontology import PLANT_TRAITS
+from mvseg.traits.plant import NEED_UP, area_deciles, height_of, hull_volume, measure_whole
+from mvseg.traits.up import level_frame
+
+FRAME = level_frame((0.0, 0.0, 1.0))
+
+
+def some_leaves() -> dict[int, LeafSurface]:
+    """Three bent leaves around a stem, at three heights, of three sizes."""
+    return {
+        i: move(bent_blade(length=30 + 5 * i), turn_about(FRAME[2], 120 * i), shift=(0, 0, 12 * i)) for i in (1, 2, 3)
+    }
+
+
+def measure(surfaces: dict[int, LeafSurface], *, num_leaves: int = 3) -> dict[str, Measurement]:
+    return measure_whole(surfaces, look_from_above(surfaces, FRAME), FRAME, num_leaves=num_leaves)
+
+
+def test_it_agrees_with_meshes() -> None:
+    leaves = some_leaves()
+    found = measure(leaves)
+    whole = trimesh.util.concatenate([leaf.mesh() for leaf in leaves.values()])
+    assert found.keys() == {trait.name for trait in PLANT_TRAITS}
+    assert found["number_of_leaves"].value == 3
+    assert found["total_leaf_area"].value == pytest.approx(whole.area, rel=1e-6)
+    assert found["convex_hull_volume"].value == pytest.approx(whole.convex_hull.volume, rel=1e-4)
+    assert found["height"].value == pytest.approx(np.ptp(whole.vertices[:, 2]))
+    share = found["projected_area"].value / found["total_leaf_area"].value
+    assert found["light_interception"].value == pytest.approx(share)
+    assert 0.5 < share < 0.95
+
+
+def test_deviations_are_those_of_independent_leaves() -> None:
+    leaves = some_leaves()
+    found = measure(leaves)
+    sds = [measure_leaf(leaf, FRAME)["area"].sd for leaf in leaves.values()]
+    assert found["total_leaf_area"].sd == pytest.approx(np.linalg.norm(sds), rel=0.01)
+    for name in ("height", "convex_hull_volume", "projected_area", "light_interception"):
+        assert 0 < found[name].sd < 0.2 * found[name].value
+
+
+def test_slopes_of_hull_and_height_are_their_differences() -> None:
+    rng = np.random.default_rng(1)
+    points, direction = rng.normal(size=(4, 30, 3)), rng.normal(size=(4, 30, 3))
+    for measured in (hull_volume, lambda p: height_of(p, FRAME[2])):
+        value, slopes = measured(points)
+        ahead, behind = (measured(points + sign * 1e-6 * direction)[0] for sign in (1, -1))
+        assert (slopes * direction).sum() == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
+        assert value > 0
+    assert hull_volume(points)[0] == pytest.approx(ConvexHull(points.reshape(-1, 3)).volume)
+
+
+def test_one_flat_leaf_spans_no_volume() -> None:
+    found = measure({1: flat_leaf()}, num_leaves=1)
+    assert not found["convex_hull_volume"].exists
+    assert found["convex_hull_volume"].method == "not measured: the leaves span no volume"
+    assert found["light_interception"].value == pytest.approx(1, abs=1e-3)
+
+
+def test_leaves_without_a_surface_are_counted_and_said() -> None:
+    found = measure(some_leaves(), num_leaves=5)
+    assert found["number_of_leaves"].value == 5
+    assert found["total_leaf_area"].method == "surface (3 of 5 leaves)"
+
+
+def test_without_up_what_needs_it_is_empty() -> None:
+    found = measure_whole(some_leaves(), {}, None, num_leaves=3)
+    assert {name for name, number in found.items() if not number.exists} == set(NEED_UP)
+
+
+def test_without_surfaces_there_is_a_number_of_leaves_only() -> None:
+    found = measure_whole({}, {}, FRAME, num_leaves=2)
+    assert found.keys() == {trait.name for trait in PLANT_TRAITS}
+    assert {name for name, number in found.items() if number.exists} == {"number_of_leaves"}
+
+
+def test_deciles_are_numpys_quantiles() -> None:
+    rng = np.random.default_rng(2)
+    areas, sds = rng.uniform(10, 90, 7), rng.uniform(1, 2, 7)
+    found = area_deciles(areas, sds, method="surface")
+    assert [number.value for number in found.values()] == pytest.approx(np.quantile(areas, np.arange(1, 10) / 10))
+    fifth = found["leaf_area_decile_5"]
+    assert fifth.sd == pytest.approx(sds[np.argsort(areas)[3]])
+    (alone,) = {number.value for number in area_deciles(areas[:1], sds[:1], method="surface").values()}
+    assert alone == areas[0]
