@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import torch
@@ -16,13 +17,14 @@ from torch import Tensor
 
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.atomic import write_whole
+from mvseg.formats.image_file import read_rgb
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index, scene_cameras
 from mvseg.simulation.faults import Faults, degrade_labels
 from mvseg.simulation.growth import Plant, grow_plant
-from mvseg.simulation.ray_cast import build_bvh, merge_meshes
-from mvseg.simulation.scene_writer import drop_small
+from mvseg.simulation.ray_cast import build_bvh, build_stage, merge_meshes, render_stage
+from mvseg.simulation.scene_writer import drop_small, write_jpeg
 
 MIN_PIXELS = 30
 KINDS = ("true", "degraded")
@@ -73,6 +75,31 @@ def render_maps(spec: SceneSpec) -> LabelledScene:
     seeds = np.random.SeedSequence([spec.seed, spec.num_views]).generate_state(len(true))
     degraded = [degrade_labels(ids, Faults(), seed=int(seed)) for ids, seed in zip(true, seeds, strict=True)]
     return LabelledScene(true, np.stack(degraded), cameras)
+
+
+def load_photos(spec: SceneSpec, cache: Path) -> np.ndarray:
+    """(V, H, W, 3) uint8, the photos of a scene as `write_scene` writes them; rendered when not in the cache."""
+    path = cache / "photos" / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
+    if not path.exists():
+        plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
+        cameras = scene_cameras(spec, plant, PRESETS["paper-eval"])
+        stage = build_stage(plant, seed=spec.seed)
+        shots = [render_stage(stage, cameras, view).rgb for view in range(len(cameras))]
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with TemporaryDirectory() as folder:
+            files = [Path(folder) / f"{view:03d}.jpg" for view in range(len(shots))]
+            for file, shot in zip(files, shots, strict=True):
+                write_jpeg(file, shot)
+            photos = np.stack([read_rgb(file) for file in files])
+
+        def save(partial: Path) -> None:
+            with partial.open("wb") as file:
+                np.savez_compressed(file, photos=photos)
+
+        write_whole(path, save)
+    with np.load(path) as saved:
+        loaded: np.ndarray = saved["photos"]
+        return loaded
 
 
 def visible_ids(plant: Plant, cameras: Cameras) -> np.ndarray:

@@ -7,6 +7,7 @@ import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -67,8 +68,14 @@ def run_scene(
     if config.reconstruct is None:
         return Result(scene=scene, regions=regions, matching=matching, seconds=seconds, detection_scores=scores)
     with _timed(seconds, "reconstruct"):
+        has_photos = scene.views[0].path.is_file()
         surfaces, voxels = reconstruct_shapes(
-            regions, matching.instance_ids, scene.cameras, config=config.reconstruct, progress=progress
+            regions,
+            matching.instance_ids,
+            scene.cameras,
+            config=config.reconstruct,
+            photos=partial(read_photo, scene) if has_photos else None,
+            progress=progress,
         )
     with _timed(seconds, "measure"):
         traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels, config=config.traits)

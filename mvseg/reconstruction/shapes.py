@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.reconstruction.config import ReconstructConfig
@@ -19,7 +21,13 @@ Voxels = Mapping[int, VoxelGrid]
 
 
 def reconstruct_shapes(
-    regions: Regions, instance_ids: Tensor, cameras: Cameras, *, config: ReconstructConfig, progress: bool = False
+    regions: Regions,
+    instance_ids: Tensor,
+    cameras: Cameras,
+    *,
+    config: ReconstructConfig,
+    photos: Callable[[int], NDArray[np.uint8]] | None = None,
+    progress: bool = False,
 ) -> tuple[Surfaces | None, Voxels]:
     """The shapes of all instances, as `config.shape` says.
 
@@ -28,6 +36,7 @@ def reconstruct_shapes(
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
         config: what to make, and how.
+        photos: view index -> (H, W, 3) uint8 RGB, undistorted; None: there are none.
         progress: show progress bars over the instances.
 
     Returns:
@@ -39,7 +48,14 @@ def reconstruct_shapes(
     """
     surfaces = None
     if config.shape != "voxels":
-        surfaces = fit_surfaces(regions, instance_ids, cameras, progress=progress)
+        surfaces = fit_surfaces(
+            regions,
+            instance_ids,
+            cameras,
+            photos=photos if config.photos else None,
+            jackknife=config.jackknife,
+            progress=progress,
+        )
         if config.shape == "surface":
             credible = [instance for instance, surface in surfaces.items() if surface.is_credible]
             instance_ids = instance_ids.where(~torch.isin(instance_ids, torch.tensor(credible).to(instance_ids)), -1)

@@ -105,6 +105,35 @@ def test_masks_too_large_in_one_view_and_too_small_in_another_cancel() -> None:
     assert np.abs(errors(fit(masks), BENT)).max() < 0.03
 
 
+def test_jackknife_deviations_grow_with_the_faults_of_the_masks() -> None:
+    """Slow twin: the deviation of an area is that of the areas without each view in turn."""
+    rng = np.random.default_rng(2)
+    masks = [np.roll(mask, rng.integers(-3, 4, 2), (0, 1)) for mask in blade_masks(BENT, CAMERAS[:5])]
+    few = CAMERAS[:5]
+    regions, ids = as_regions(masks)
+    with_it, without = (fit_surfaces(regions, ids, few, jackknife=choice)[1] for choice in (True, False))
+    assert torch.equal(with_it.coefficients, without.coefficients)
+    areas = []
+    for view in range(5):
+        keep = regions.view_index != view
+        areas.append(fit_surfaces(regions.select(keep), ids[keep], few)[1].area)
+    naive = np.sqrt(4 / 5 * ((np.array(areas) - np.mean(areas)) ** 2).sum())
+    assert 0.4 < with_it.deviations[0] / naive < 2.5
+    clean_regions, clean_ids = as_regions(blade_masks(BENT, few))
+    clean = fit_surfaces(clean_regions, clean_ids, few, jackknife=True)[1]
+    assert clean.deviations[0] < 0.5 * with_it.deviations[0]
+
+
+def test_masks_that_no_blade_explains_give_no_credible_surface() -> None:
+    """Two stars of four arms about one point in space: of their masks the patch covers little."""
+    rng = np.random.default_rng(0)
+    masks = [rng.random(mask.shape) < 0.3 for mask in blade_masks(FLAT, CAMERAS)]
+    masks = [mask & blade for mask, blade in zip(masks, blade_masks(FLAT, CAMERAS), strict=True)]
+    surface = fit(masks)
+    assert not surface.is_credible
+    assert not surface.quality.is_good
+
+
 def half_hidden(label: int) -> list[np.ndarray]:
     """Label maps in which something hides one half of the blade in four of ten views."""
     maps = [mask.astype(np.int64) for mask in blade_masks(BENT, CAMERAS)]

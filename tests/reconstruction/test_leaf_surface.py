@@ -6,7 +6,7 @@ import torch
 
 from known_leaves import bent_blade, fit_coefficients, flat_sheet, make_surface
 from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS, Floats, measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import MEASURE_FACTOR, LeafSurface, measure_slopes
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, measure_slopes
 
 
 def area_and_length(coefficients: Floats) -> Floats:
@@ -28,13 +28,13 @@ def test_deviations_are_those_of_samples() -> None:
     object.__setattr__(surface, "covariance", random_covariance(0.05))
     draws = np.random.default_rng(5).multivariate_normal(coefficients.ravel(), surface.covariance.numpy(), 4000)
     measured = np.stack([area_and_length(draw.reshape(-1, 3)) for draw in draws])
-    assert surface.deviation(area_and_length) / MEASURE_FACTOR == pytest.approx(measured.std(0), rel=0.06)
+    assert surface.deviation(area_and_length) == pytest.approx(measured.std(0), rel=0.06)
 
 
 def test_deviations_agree_with_analytic_slopes() -> None:
     surface = make_surface(fit_coefficients(flat_sheet, length=30, half_width=9) + 0.02 * np.arange(3), sd=0.03)
     slopes = measure_slopes(surface.coefficients.numpy())[:2]
-    expected = MEASURE_FACTOR * 0.03 * np.linalg.norm(slopes, axis=1)
+    expected = 0.03 * np.linalg.norm(slopes, axis=1)
     assert surface.deviation(area_and_length) == pytest.approx(expected, rel=0.02)
 
 
@@ -42,7 +42,7 @@ def test_deviations_agree_with_analytic_slopes() -> None:
 def test_deviations_of_a_linear_measure_are_exact_in_any_unit(factor: float) -> None:
     surface = make_surface(factor * bent_blade().coefficients.numpy() + 1e3 * factor, sd=factor)
     deviation = surface.deviation(lambda coefficients: coefficients.sum(0)[:1])
-    assert deviation == pytest.approx([MEASURE_FACTOR * factor * NUM_COEFFICIENTS**0.5], rel=1e-6)
+    assert deviation == pytest.approx([factor * NUM_COEFFICIENTS**0.5], rel=1e-6)
 
 
 def test_numbers_that_are_none_have_no_deviation() -> None:

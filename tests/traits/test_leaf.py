@@ -15,7 +15,7 @@ from known_leaves import (
     move,
     turn_about,
 )
-from mvseg.reconstruction.surface.leaf_surface import MEASURE_FACTOR, LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.traits.leaf import END, NEED_BASE, NEED_UP, Measurement, measure_leaf, measure_voxels
 from mvseg.traits.ontology import SURFACE_TRAITS, VOXEL_TRAITS
@@ -137,7 +137,7 @@ def test_deviations_are_those_of_samples(monkeypatch: pytest.MonkeyPatch) -> Non
         samples = np.array([sample[name] for sample in drawn])
         if name in ANGLES:
             samples = (samples - numbers[name].value + 180) % 360
-        assert numbers[name].sd / MEASURE_FACTOR == pytest.approx(samples.std(), rel=0.15), name
+        assert numbers[name].sd == pytest.approx(samples.std(), rel=0.15), name
 
 
 def test_angles_at_their_kinks_have_deviations_too() -> None:

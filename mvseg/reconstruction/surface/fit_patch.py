@@ -5,11 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid, patch_prior
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
+from mvseg.reconstruction.surface.photo_consistency import (
+    COARSE_PX,
+    FINE_PX,
+    Comparison,
+    LeafPhotos,
+    compare_views,
+    photo_equations,
+)
 
 FIT_GRID = (36, 9)
 NUM_STEPS, NUM_WARM_STEPS = 18, 7
@@ -22,6 +31,11 @@ OFFSET_FROM, OFFSET_SHARE = 6, 0.8  # step from which masks may be too large or 
 CLEAN_PX = 1.0  # deviation of the distances up to which masks are clean; beyond it fold and curl stay nearer to none
 NARROW = 0.15  # of the length: steps along narrow leaves may be as long as those of a leaf with this half-width
 NOISY_VIEW = 1.5  # times the usual spread: such views count less
+
+LEAST_JACKKNIFED = 4  # views
+# Of the covariance.
+FIT_FACTOR, QUIET_PX = 2.0, 0.3  # of the deviations; they grow with the distances from this rms on
+CENTRE_FACTOR, LEAST_CENTRE_SD = 1.5, 0.1  # of what all masks may be too large by, pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,10 +61,16 @@ class PatchFit:
 
 
 def fit_patch(
-    masks: MaskStack, start: Floats, *, num_steps: int, errors: MaskErrors | None = None
+    masks: MaskStack,
+    start: Floats,
+    *,
+    num_steps: int,
+    errors: MaskErrors | None = None,
+    photos: LeafPhotos | None = None,
 ) -> PatchFit:
     """Move a patch until its outlines are those of the masks: reweighted Gauss-Newton.
 
+    With photos, what the views see of its texture has to agree as well: coarse texture at first, then the fine one.
     Works in a world moved and scaled to the start, so nothing depends on the scene's origin and unit.
 
     Args:
@@ -67,6 +87,7 @@ def fit_patch(
     grid = patch_grid(*FIT_GRID)
     is_warm = num_steps <= NUM_WARM_STEPS
     offsets = np.zeros(len(masks))
+    comparison: Comparison | None = None
     for step in range(num_steps):
         progress = 1.0 if is_warm else min(1.0, step / REACH_STEPS)
         reach = masks.enlargement * (FAR_REACH + (NEAR_REACH - FAR_REACH) * progress)
@@ -78,21 +99,44 @@ def fit_patch(
         scale_px = FAR_SCALE_PX + (LEAST_SCALE_PX - FAR_SCALE_PX) * progress
         equations = _weigh(distances, offsets - drawn, scale_px=scale_px)
         is_late = is_warm or step >= NUM_STEPS // 2
-        coefficients = _step(coefficients, equations, damping=0.005 if is_late else 0.05, cap=0.12 if is_late else 0.25)
+        matrix, right = _normal_matrix(coefficients, equations)
+        if photos is not None:
+            if comparison is None or step == num_steps // 2:
+                step_px = COARSE_PX if step < num_steps // 2 else FINE_PX
+                comparison = compare_views(moved, photos, coefficients, step_px=step_px)
+            seen = photo_equations(comparison, coefficients)
+            matrix, right = matrix + seen.matrix, right + seen.right
+        damping, cap = (0.005, 0.12) if is_late else (0.05, 0.25)
+        coefficients = _step(coefficients, matrix, right, damping=damping, cap=cap)
     drawn = offsets if errors else np.zeros(len(masks))
     reach = NEAR_REACH * masks.enlargement
     distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=True, offsets=drawn)
     measured = drawn + _per_view(distances.px, distances.stack, len(masks))
     equations = _weigh(distances, _believe(measured, errors) - drawn, scale_px=LEAST_SCALE_PX)
-    covariance = np.linalg.inv(_normal_matrix(coefficients, equations)[0])
+    covariance = _covariance(coefficients, equations, distances.stack, centre_sd=_centre_sd(measured, errors))
     coefficients = coefficients * scale
     coefficients[MIDRIB] += centre
     return PatchFit(
         coefficients=coefficients,
-        covariance=np.asarray(covariance * scale**2, dtype=float),
+        covariance=covariance * scale**2,
         residual_px=_rms_per_view(distances, equations, len(masks)),
         offsets_px=measured - _centre(measured, errors),
     )
+
+
+def jackknife_covariance(masks: MaskStack, fit: PatchFit, *, errors: MaskErrors | None) -> Floats:
+    """(78, 78) covariance of a fit from the fits without each of its S views in turn.
+
+    With fewer than four views the fit's own: three views less one say little.
+    """
+    if len(masks) < LEAST_JACKKNIFED:
+        return fit.covariance
+    parts = []
+    for index in range(len(masks)):
+        others = masks.select(np.arange(len(masks)) != index)
+        parts.append(fit_patch(others, fit.coefficients, num_steps=NUM_WARM_STEPS, errors=errors).coefficients.ravel())
+    away = np.stack(parts) - np.mean(parts, axis=0)
+    return np.asarray((len(masks) - 1) / len(masks) * away.T @ away, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,6 +150,25 @@ class _Equations:
     px: Floats
     weight: Floats
     noise: float
+
+
+def _covariance(coefficients: Floats, equations: _Equations, stack: NDArray, *, centre_sd: float) -> Floats:
+    """(78, 78): the fit's own, what the views contradict each other by, and what all masks may share.
+
+    The factors were found on simulated leaves, see docs/surfaces.md.
+    """
+    inverse = np.asarray(np.linalg.inv(_normal_matrix(coefficients, equations)[0]), dtype=float)
+    weight, px = equations.weight, equations.px
+    num_views = int(stack.max(initial=0)) + 1
+    pulls = np.zeros((num_views, len(inverse)))
+    np.add.at(pulls, stack, equations.jacobian * (weight * px)[:, None])
+    between = inverse @ pulls.T
+    growth = inverse @ (equations.jacobian.T @ weight)  # by which everything changes when all masks grow by a pixel
+    rms = np.sqrt((weight * px**2).sum() / max(weight.sum(), 1e-12))
+    few = num_views / max(num_views - 2, 0.5)
+    shared = CENTRE_FACTOR * few * max(centre_sd, LEAST_CENTRE_SD)
+    fitted = (FIT_FACTOR * max(1.0, rms / QUIET_PX)) ** 2 * inverse
+    return fitted + between @ between.T + shared**2 * np.outer(growth, growth)
 
 
 def _weigh(distances: Distances, offsets: Floats, *, scale_px: float) -> _Equations:
@@ -133,6 +196,14 @@ def _centre(measured: Floats, errors: MaskErrors | None) -> float:
     return errors.centre(known)[0] if errors else winsorised_mean(known)
 
 
+def _centre_sd(measured: Floats, errors: MaskErrors | None) -> float:
+    """Standard deviation of `_centre`, pixels."""
+    known = measured[np.isfinite(measured)]
+    if not len(known):
+        return 0.0
+    return errors.centre(known)[1] if errors else float(known.std() / np.sqrt(len(known)))
+
+
 def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
     """(S,) 1, or less for views whose distances spread more than is usual in the others."""
     spreads = np.nan_to_num(_per_view(np.abs(px), stack, num_views))
@@ -154,9 +225,8 @@ def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats,
     return matrix, weighted.T @ equations.px + prior.T @ (target - prior @ coefficients.ravel())
 
 
-def _step(coefficients: Floats, equations: _Equations, *, damping: float, cap: float) -> Floats:
+def _step(coefficients: Floats, matrix: Floats, right: Floats, *, damping: float, cap: float) -> Floats:
     """One damped Gauss-Newton step; no point of the patch moves by more than `cap` half-widths."""
-    matrix, right = _normal_matrix(coefficients, equations)
     matrix[np.diag_indices_from(matrix)] *= 1 + damping
     step = np.linalg.solve(matrix, right).reshape(-1, 3)
     longest = np.linalg.norm(patch_grid(*FIT_GRID).basis @ step, axis=1).max()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,10 +19,12 @@ from mvseg.reconstruction.surface.fit_patch import (
     NUM_WARM_STEPS,
     PatchFit,
     fit_patch,
+    jackknife_covariance,
 )
+from mvseg.reconstruction.surface.fit_photos import fit_photos
 from mvseg.reconstruction.surface.leaf_patch import Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
-from mvseg.reconstruction.surface.mask_errors import learn_mask_errors
+from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
 from mvseg.reconstruction.surface.patch_image import hiding_pixels, project_points, view_ious
@@ -40,11 +43,17 @@ MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
 
 # What a surface must reach not to be doubted.
-LEAST_IOU, MOST_RMS_PX, MOST_AREA_SHARE = 0.8, 0.6, 0.06
+LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
 
 
 def fit_surfaces(
-    regions: Regions, instance_ids: Tensor, cameras: Cameras, *, has_second_pass: bool = True, progress: bool = False
+    regions: Regions,
+    instance_ids: Tensor,
+    cameras: Cameras,
+    *,
+    photos: Callable[[int], NDArray[np.uint8]] | None = None,
+    jackknife: bool = False,
+    progress: bool = False,
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
 
@@ -52,7 +61,10 @@ def fit_surfaces(
         regions: D regions. Those matched to nothing hide leaves as well.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
-        has_second_pass: fit again once it is known which leaf lies in front of which.
+        photos: view index -> (H, W, 3) uint8 RGB, `list.__getitem__` for photos in memory; each is asked for once. The
+            texture of the leaves then says more of their shape between the outlines, see docs/surfaces.md.
+        jackknife: fit each leaf again without each of its views in turn; deviations come from how much that changes it.
+            Takes as many times longer as there are views.
         progress: show a progress bar over the instances.
 
     Returns:
@@ -60,7 +72,7 @@ def fit_surfaces(
         point) its coefficients are NaN and its `quality` says why.
 
     Raises:
-        InputError: as many ids as regions are expected.
+        InputError: as many ids as regions are expected; a photo is of another size than its camera says.
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
@@ -82,9 +94,14 @@ def fit_surfaces(
             surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
             fits[instance] = fit
-    if has_second_pass:
-        stacks, fits = _fit_again(stacks, fits)
-    for instance, fit in fits.items():
+    offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
+    errors = learn_mask_errors([each for each in offsets if len(each) > 1])
+    stacks, fits = _fit_again(stacks, fits, errors)
+    if photos is not None:
+        fits = fit_photos(stacks, fits, photos, sizes=cameras.sizes.tolist(), errors=errors)
+    for instance, fit in tqdm(fits.items(), desc="jackknife", unit="instance", disable=not (progress and jackknife)):
+        if jackknife:
+            fit = replace(fit, covariance=jackknife_covariance(stacks[instance], fit, errors=errors))
         surfaces[instance] = _surface(stacks[instance], fit)
     return orient_surfaces(dict(sorted(surfaces.items())), cameras)
 
@@ -157,12 +174,10 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
 
 
 def _fit_again(
-    stacks: dict[int, MaskStack], fits: dict[int, PatchFit]
+    stacks: dict[int, MaskStack], fits: dict[int, PatchFit], errors: MaskErrors | None
 ) -> tuple[dict[int, MaskStack], dict[int, PatchFit]]:
-    """Leaves fitted to what is their rim now that all leaves are known, and the errors of the masks."""
+    """Leaves fitted to what is their rim, now that all leaves and the errors of the masks are known."""
     points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
-    offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
-    errors = learn_mask_errors([each for each in offsets if len(each) > 1])
     again: dict[int, PatchFit] = {}
     for instance, fit in fits.items():
         margin = BEHIND * measure_patch(fit.coefficients).length
@@ -176,7 +191,8 @@ def _fit_again(
 
 
 def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
-    iou = view_ious(masks, patch_grid(*FIT_GRID).points(fit.coefficients))
+    points = patch_grid(*FIT_GRID).points(fit.coefficients)
+    iou = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
     surface = LeafSurface(
         coefficients=torch.from_numpy(fit.coefficients),
         covariance=torch.from_numpy(fit.covariance),
@@ -186,19 +202,19 @@ def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
         is_oriented=False,
         quality=Quality(),
     )
-    return replace(surface, quality=_judge(surface, fit))
+    return replace(surface, quality=_judge(surface))
 
 
-def _judge(surface: LeafSurface, fit: PatchFit) -> Quality:
+def _judge(surface: LeafSurface) -> Quality:
     """The reasons to doubt a fit."""
     reasons = []
+    if not surface.is_credible:
+        reasons.append("no leaf, or its masks contradict each other: no single blade explains them")
     if len(surface.views) == 2:
         reasons.append("seen in two views only")
     iou = float(surface.iou.median())
     if iou < LEAST_IOU:
         reasons.append(f"the surface explains its masks badly (median IoU {iou:.2f})")
-    if not fit.rms_px <= MOST_RMS_PX:
-        reasons.append(f"its outline is {fit.rms_px:.1f} px from those of its masks")
     share = surface.deviations[0] / surface.area
     if share > MOST_AREA_SHARE:
         reasons.append(f"its area is uncertain by {100 * share:.0f} %")

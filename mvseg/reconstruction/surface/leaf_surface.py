@@ -23,9 +23,7 @@ from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
 
 MESH_SHAPE = (64, 17)
-# The covariance of the fit knows nothing of the model's own errors: factors that give its deviations 68 % coverage.
-AREA_FACTOR, LENGTH_FACTOR, WIDTH_FACTOR = 3.0, 2.3, 1.7
-MEASURE_FACTOR = 3.0  # for measures without a factor of their own: the largest of these
+LEAST_CREDIBLE_IOU = 0.6
 STEP = 1e-4  # of the coefficients' spread, for differences
 
 
@@ -51,11 +49,11 @@ class LeafSurface:
 
     Attributes:
         coefficients: (26, 3) float64 of the patch (`leaf_patch`); NaN for an instance that has no surface.
-        covariance: (78, 78) float64 of `coefficients.ravel()`, of the fit alone.
+        covariance: (78, 78) float64 of `coefficients.ravel()`, calibrated on simulated leaves, or by the jackknife.
         views: (S,) int64, the views whose masks it was fitted to.
         residual_px: (S,) float64, root mean square distance between its outline and the mask's edge in each view.
-        iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it; NaN where the
-            fit did not get that far.
+        iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it, of the surface
+            drawn as much too large or small as the mask seems to be; NaN where the fit did not get that far.
         is_oriented: u runs from the stem to the tip; False where the stem's side cannot be told.
         quality: good, or the reasons to doubt it.
     """
@@ -89,8 +87,11 @@ class LeafSurface:
 
     @property
     def is_credible(self) -> bool:
-        """May measures of the surface be given at all? False: the instance is better shown as voxels."""
-        return self.exists
+        """May measures of the surface be given at all? False: the instance is better shown as voxels.
+
+        A patch that explains its masks badly is none of a leaf: buds, fruit and stems have no blade.
+        """
+        return self.exists and float(self.iou.median()) >= LEAST_CREDIBLE_IOU
 
     def points(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> Tensor:
         """(rows, columns, 3) float64 grid from base to tip and from edge to edge; odd columns have the midrib."""
@@ -113,16 +114,16 @@ class LeafSurface:
 
     @cached_property
     def deviations(self) -> tuple[float, float, float]:
-        """Standard deviations of area, length and width: those of the fit, times a factor found on simulated leaves."""
+        """Standard deviations of area, length and width."""
         if not self.exists:
             return (float("nan"),) * 3
         slopes = measure_slopes(self.coefficients.numpy())
         variance = np.einsum("ij,jk,ik->i", slopes, self.covariance.numpy(), slopes)
-        area, length, width = np.sqrt(np.maximum(variance, 0)) * (AREA_FACTOR, LENGTH_FACTOR, WIDTH_FACTOR)
+        area, length, width = np.sqrt(np.maximum(variance, 0))
         return float(area), float(length), float(width)
 
     def deviation(self, measure: Callable[[Floats], Floats]) -> Floats:
-        """Standard deviations of what is measured on the surface: the fit's, propagated linearly, times a factor.
+        """Standard deviations of what is measured on the surface: those of the coefficients, propagated linearly.
 
         Args:
             measure: from coefficients (26, 3) float64 to T numbers, (T,) float64. It is called 157 times and must be
@@ -144,7 +145,7 @@ class LeafSurface:
                 ahead, behind = (measure(center + sign * moved.reshape(center.shape)) for sign in (1, -1))
                 slopes[:, index] = (ahead - behind) / (2 * step)
             variance = np.einsum("ij,jk,ik->i", slopes, self.covariance.numpy(), slopes)
-            return np.where(np.isfinite(numbers), MEASURE_FACTOR * np.sqrt(np.maximum(variance, 0)), np.nan)
+            return np.where(np.isfinite(numbers), np.sqrt(np.maximum(variance, 0)), np.nan)
 
     @property
     def midrib(self) -> Tensor:
