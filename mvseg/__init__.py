@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mvseg.errors import InputWarning as InputWarning
     from mvseg.evaluation.id_metrics import matching_metrics as matching_metrics
     from mvseg.evaluation.shape_distance import shape_distance as shape_distance
+    from mvseg.formats.masks.arrays import regions_from_masks as regions_from_masks
+    from mvseg.formats.masks.arrays import with_instance_ids as with_instance_ids
     from mvseg.formats.photos import load_photos as load_photos
     from mvseg.formats.scene_folder import load_masks as load_masks
     from mvseg.formats.scene_folder import load_scene as load_scene
@@ -58,6 +60,7 @@ _HOME = {
     "demo": ("demo_scene",),
     "formats.scene_folder": ("load_masks", "load_scene"),
     "formats.photos": ("load_photos",),
+    "formats.masks.arrays": ("regions_from_masks", "with_instance_ids"),
     "detectors.zoo": ("load_detector",),
     "matching.config": ("MatchConfig",),
     "matching.epipolar": ("epipolar_map",),

@@ -69,7 +69,7 @@ def build_parser() -> ArgumentParser:
     verbs = parser.add_subcommands(dest="verb")
 
     infer = ArgumentParser(exit_on_error=False, description="Ids in every view, shapes in 3D and traits, of one scene.")
-    help_scene = "scene folder; without it, the plant that ships with mvseg"
+    help_scene = "scene folder (photos, cameras of any kind in docs/formats.md); without it, the plant that ships"
     infer.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     _add_options(infer, masks=None)
     infer.add_class_arguments(DetectConfig, "detect")
@@ -89,7 +89,7 @@ def build_parser() -> ArgumentParser:
     verbs.add_subcommand("match", match, help="ids only, of any number of scenes")
 
     evaluate = ArgumentParser(exit_on_error=False, description="Compare the ids of a result with true labels.")
-    evaluate.add_argument("result", type=Path, help="result folder")
+    evaluate.add_argument("result", type=Path, help="result folder, or the --out of mvseg match")
     evaluate.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids")
     verbs.add_subcommand("eval", evaluate, help="compare a result with true labels")
 
@@ -119,7 +119,8 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
         "--masks",
         type=Path | None,
         default=masks,
-        help="folder of label PNGs or COCO .json, in the scene folder or anywhere; without it, infer detects leaves",
+        help="masks (label images, COCO, labelme, YOLO, SAM, NumPy, cellpose; docs/formats.md), in the scene folder or "
+        "anywhere; without it, infer detects leaves",
     )
     parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
@@ -129,6 +130,9 @@ def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
         type=Literal["mask", "ignore"],
         default="mask",
         help="whether COCO annotations with iscrowd are masks like all others, or left out",
+    )
+    parser.add_argument(
+        "--categories", type=str | None, help="names of the categories of masks to take, as leaf,petiole (default: all)"
     )
     parser.add_class_arguments(MatchConfig, "match")
 
@@ -148,6 +152,7 @@ def _infer(args: Namespace) -> int:
         up=_read_up(args.up),
         split_merged=args.split_merged,
         coco_crowd=args.coco_crowd,
+        categories=args.categories,
     )
     _run(scene, args.masks, out, config=config, quiet=args.quiet)
     return 0
@@ -195,6 +200,7 @@ def _match(args: Namespace) -> int:
         reconstruct=None,
         split_merged=args.split_merged,
         coco_crowd=args.coco_crowd,
+        categories=args.categories,
     )
     for scene, name in zip(args.scenes, names, strict=True):
         try:
@@ -229,7 +235,8 @@ def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet
     run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
     save_result(result, out, run, progress=not quiet)
     num_masks, num_views = len(result.regions), len(result.scene.views)
-    print(f"{out}: {result.matching.num_instances} instances from {num_masks} masks in {num_views} views{replaces}")
+    masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
+    print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
 
 
 def _find_masks(scene: Path, masks: Path) -> Path:
@@ -243,9 +250,12 @@ def _find_masks(scene: Path, masks: Path) -> Path:
 def _eval(args: Namespace) -> int:
     from mvseg.evaluation.id_metrics import matching_metrics
     from mvseg.regions import IGNORE_LABEL
-    from mvseg.results.read import read_instances
+    from mvseg.results.read import find_result, read_instances
 
-    ids, true = read_instances(args.result, args.truth)
+    result = find_result(args.result)
+    if result != args.result:
+        print(f"mvseg: {result}: the only result in {args.result}", file=sys.stderr)
+    ids, true = read_instances(result, args.truth)
     is_scored = (true != 0) & (true != IGNORE_LABEL)
     metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[is_scored], true[is_scored]))
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
@@ -255,9 +265,9 @@ def _eval(args: Namespace) -> int:
     for name, value in metrics.items():
         print(f"{name:15} {value:.4f}" if isinstance(value, float) else f"{name:15} {value}")
     try:
-        (args.result / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
+        (result / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
     except OSError as error:
-        raise InputError(f"{args.result}: cannot write metrics.json ({error.strerror})") from None
+        raise InputError(f"{result}: cannot write metrics.json ({error.strerror})") from None
     return 0
 
 

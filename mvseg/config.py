@@ -29,6 +29,8 @@ class RunConfig:
         split_merged: cut a mask that seems to cover two instances in two.
         coco_crowd: what annotations with `iscrowd` are in a COCO file of masks: "mask", one like all others, or
             "ignore", left out.
+        categories: names of the categories whose masks are taken, with commas between them ("leaf,petiole"), where the
+            masks have categories; None for all.
     """
 
     detect: DetectConfig = DetectConfig()
@@ -40,6 +42,7 @@ class RunConfig:
     up: Up | None = None
     split_merged: bool = False
     coco_crowd: Literal["mask", "ignore"] = "mask"
+    categories: str | None = None
 
     def __post_init__(self) -> None:
         if self.scale is not None and not 0 < self.scale < math.inf:

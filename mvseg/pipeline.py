@@ -16,8 +16,9 @@ from tqdm import tqdm
 from mvseg.config import RunConfig
 from mvseg.detectors.zoo import load_detector
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import check_photos, read_photo
-from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
@@ -37,7 +38,7 @@ def run_scene(
 
     Args:
         folder: the scene, see `load_scene`.
-        masks: label PNGs or COCO JSON, see `load_masks`; None: a detector finds them in the photos.
+        masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
         config: the options of all stages.
         progress: show progress bars.
 
@@ -52,7 +53,9 @@ def run_scene(
     with _timed(seconds, "load"):
         scene = place_scene(load_scene(folder), config)
         check_photos(scene)
-        regions = load_masks(scene, masks, crowd=config.coco_crowd) if masks is not None else None
+        wanted = () if config.categories is None else [name.strip() for name in config.categories.split(",")]
+        found = None if masks is None else recognise_masks(scene, masks)
+        regions = None if found is None else read_masks(scene, found, crowd=config.coco_crowd, categories=wanted)
     if masks is None and not scene.views[0].path.is_file():
         raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them")
     if regions is None:
@@ -65,8 +68,16 @@ def run_scene(
     if config.split_merged:
         regions, matching, source = split_merged(regions, matching)
         scores = None if scores is None else scores[source]
+    kind = "" if found is None else found.kind
     if config.reconstruct is None:
-        return Result(scene=scene, regions=regions, matching=matching, seconds=seconds, detection_scores=scores)
+        return Result(
+            scene=scene,
+            regions=regions,
+            matching=matching,
+            seconds=seconds,
+            detection_scores=scores,
+            mask_kind=kind,
+        )
     with _timed(seconds, "reconstruct"):
         has_photos = scene.views[0].path.is_file()
         surfaces, voxels = reconstruct_shapes(
@@ -88,6 +99,7 @@ def run_scene(
         traits=traits,
         seconds=seconds,
         detection_scores=scores,
+        mask_kind=kind,
     )
 
 

@@ -25,6 +25,7 @@ import mvseg
 from mvseg.cli import main
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
+from mvseg.formats.coco import encode_mask
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
@@ -170,7 +171,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
     arguments = ["infer", str(plant), "--config", str(config), "--match.seed", "9", "--out", str(tmp_path / "out")]
     assert main(arguments) == 0
     captured = capsys.readouterr()
-    assert captured.out == f"{tmp_path / 'out'}: 3 instances from 12 masks in 4 views\n"
+    assert captured.out == f"{tmp_path / 'out'}: 3 instances from 12 masks (label images) in 4 views\n"
     assert captured.err == ""
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert run["config"] == {
@@ -187,6 +188,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         },
         "split_merged": False,
         "coco_crowd": "mask",
+        "categories": None,
         "reconstruct": {
             "shape": "voxels",
             "threshold": 0.4,
@@ -202,6 +204,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "up": None,
     }
     assert run["mvseg"] == mvseg.__version__
+    assert run["mask_kind"] == "label images"
     assert run["inputs"].keys() == {str(plant / "cameras.json"), str(plant / "masks")}
     assert run["warnings"] == []
 
@@ -330,8 +333,8 @@ def test_match_takes_several_scenes(plant: Path, tmp_path: Path, capsys: pytest.
     out = tmp_path / "out"
     assert main(["match", str(plant), str(other), "--out", str(out), "--quiet"]) == 0
     assert capsys.readouterr().out.splitlines() == [
-        f"{out / 'plant'}: 3 instances from 12 masks in 4 views",
-        f"{out / 'other'}: 3 instances from 9 masks in 3 views",
+        f"{out / 'plant'}: 3 instances from 12 masks (label images) in 4 views",
+        f"{out / 'other'}: 3 instances from 9 masks (label images) in 3 views",
     ]
     assert sorted(path.name for path in out.iterdir()) == ["other", "plant"]
     assert not (out / "plant" / "scene.glb").exists()
@@ -389,7 +392,7 @@ def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: py
     assert main([verb, str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet"]) == 0
     captured = capsys.readouterr()
     assert captured.err == "mvseg: warning: the masks of all views are empty: there are no instances\n"
-    assert captured.out.endswith(": 0 instances from 0 masks in 4 views\n")
+    assert captured.out.endswith(": 0 instances from 0 masks (label images) in 4 views\n")
     out = tmp_path / "out" if verb == "infer" else tmp_path / "out" / "plant"
     content = json.loads((out / "instances.json").read_text())
     assert len(content["images"]) == 4
@@ -427,6 +430,17 @@ def cut(name: str, share: float) -> Break:
 
 def picture(name: str, *shape: int, dtype: type = np.uint8) -> Break:
     return lambda folder: write_image(folder / name, np.zeros(shape, dtype))
+
+
+def noise(kind: str) -> Break:
+    """Mask 1 as a photo, which is PNG or JPEG whatever its name says."""
+
+    def change(folder: Path) -> None:
+        pixels = np.random.default_rng(0).integers(0, 255, (HEIGHT, WIDTH, 3), dtype=np.uint8)
+        write_image(folder / f"noise.{kind}", pixels)
+        (folder / f"noise.{kind}").rename(folder / "masks" / "001.png")
+
+    return change
 
 
 def as_jpeg(share: float) -> Break:
@@ -516,13 +530,14 @@ BAD_INPUT: dict[str, tuple[Break, str]] = {
     "name of a folder": (rig(2, file="images/.."), "view 2 (images/..): this is not the name of a file"),
     "missing mask": (remove("masks/001.png"), "masks/001.png: the mask file is missing (view 1)"),
     "mask of another size": (picture("masks/001.png", 95, 128), "masks/001.png: the mask is 128 x 95, its camera says"),
-    "mask with colours": (picture("masks/001.png", 96, 128, 3), "masks/001.png: has 3 colour channels"),
+    "mask is a photo": (noise("png"), "masks/001.png: holds 12"),
+    "mask is a JPEG": (noise("jpg"), "masks/001.png: is a JPEG, which blurs the numbers"),
     "mask cut": (cut("masks/001.png", 0.6), "masks/001.png: cannot be read, expected a whole label PNG: it is"),
     "mask empty": (cut("masks/001.png", 0), "masks/001.png: cannot be read, expected a whole label PNG: it is"),
     "COCO cut": (coco(json.dumps({"images": IMAGES, "annotations": []})[:50]), "masks.json: not a whole JSON file"),
-    "COCO without a view": (
-        coco(json.dumps({"images": IMAGES[:3], "annotations": []})),
-        "masks.json: view 3 (003) has no entry",
+    "COCO of other photos": (
+        coco(json.dumps({"images": [image | {"file_name": f"x{image['id']}"} for image in IMAGES], "annotations": []})),
+        "none of its images is a photo of the scene, expected 000.png, 001.png, 002.png and 1 more, found x0, x1, x2",
     ),
     "COCO of another size": (
         coco(json.dumps({"images": [IMAGES[0] | {"width": 5}, *IMAGES[1:]], "annotations": []})),
@@ -532,7 +547,7 @@ BAD_INPUT: dict[str, tuple[Break, str]] = {
         coco(json.dumps({"images": IMAGES, "annotations": [BAD_RLE]})),
         "masks.json: annotation 7: its run lengths do not add up",
     ),
-    "COCO of another form": (coco("[1, 2]"), "masks.json: Input should be a valid dictionary"),
+    "COCO of another form": (coco("[1, 2]"), "masks.json: [0]: Input should be a valid dictionary"),
     "single view": (rig(views=rig_content()["views"][:1]), "cameras.json: there is a single view"),
     "rig without views": (rig(views=[]), "cameras.json: there are no views"),
     "rig of another format": (rig(format="mvseg-rig/9"), "cameras.json: format: Input should be 'mvseg-rig/1'"),
@@ -667,6 +682,42 @@ def test_masks_that_show_no_true_leaf_are_counted(
     capsys.readouterr()
     assert main(["eval", str(out / "plant"), "--truth", str(truth)]) == 0
     assert "3 of 12 masks show no true leaf" in capsys.readouterr().err
+
+
+def test_eval_takes_the_folder_that_match_wrote(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["match", str(plant), "--out", str(out), "--quiet"]) == 0
+    capsys.readouterr()
+    assert main(["eval", str(out), "--truth", str(plant / "truth")]) == 0
+    assert capsys.readouterr().err == f"mvseg: {out / 'plant'}: the only result in {out}\n"
+    assert (out / "plant" / "metrics.json").is_file()
+    shutil.copytree(out / "plant", out / "other")
+    assert main(["eval", str(out), "--truth", str(plant / "truth")]) == 2
+    assert complaint(capsys) == f"{out}: holds 2 results (other, plant), expected one of them: {out / 'other'}"
+
+
+def test_categories_are_selected(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    labels = {view: read_label_png(plant / "masks" / f"{view:03d}.png", WIDTH, HEIGHT) for view in range(4)}
+    annotations = [
+        {"image_id": view, "category_id": 1 + place // 2, "segmentation": encode_mask(labels[view] == number)}
+        for view in labels
+        for place, number in enumerate(np.unique(labels[view])[1:].tolist())
+    ]
+    categories = [{"id": 1, "name": "leaf"}, {"id": 2, "name": "flower pot"}]
+    content = {"images": IMAGES, "annotations": annotations, "categories": categories}
+    (plant / "masks.json").write_text(json.dumps(content))
+    arguments = ["match", str(plant), "--masks", "masks.json", "--out", str(tmp_path / "out"), "--quiet"]
+    for wanted, count in (("leaf", 8), ("leaf,flower pot", 12), ("flower pot", 4)):
+        assert main([*arguments, "--categories", wanted]) == 0
+        captured = capsys.readouterr()
+        assert f"from {count} masks (COCO) in 4 views" in captured.out
+        assert "categories" not in captured.err
+    assert main(arguments) == 0
+    assert "masks of 2 categories are taken alike (8 leaf, 4 flower pot)" in capsys.readouterr().err
+    assert main([*arguments, "--categories", "pot"]) == 2
+    assert "there is no category 'pot', expected of these: leaf, flower pot" in complaint(capsys)
 
 
 def test_detect_options_beside_masks_are_warned_of(

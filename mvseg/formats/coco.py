@@ -7,15 +7,20 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections import Counter
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 from pycocotools import mask as coco_mask
-from pydantic import BaseModel, FiniteFloat, NonNegativeInt, TypeAdapter, ValidationError
+from pydantic import BaseModel, FiniteFloat, NonNegativeInt, RootModel, TypeAdapter, ValidationError
 
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.find_views import base_name, find_views, list_some, warn_of_base_names
 from mvseg.formats.json_file import read_json
+from mvseg.formats.masks.found_mask import check_categories
+from mvseg.formats.photos import describe_turn
 from mvseg.scene import Scene
 
 
@@ -31,7 +36,7 @@ class CocoImage(BaseModel):
 class CocoAnnotation(BaseModel):
     """An annotation as it stands in the file; `decode_segmentation` checks the mask, whoever needs it the category."""
 
-    id: int
+    id: int | str | None = None
     image_id: int | str
     category_id: Any = None
     segmentation: Any = None
@@ -45,6 +50,19 @@ class CocoFile(BaseModel):
     annotations: list[CocoAnnotation]
 
 
+class _Category(BaseModel):
+    id: int | str
+    name: str
+
+
+class _MaskFile(CocoFile):
+    categories: list[_Category] = []
+
+
+class _Results(RootModel[list[CocoAnnotation]]):
+    """COCO's results format: annotations alone."""
+
+
 class Rle(BaseModel):
     """A run-length encoded mask as it stands in the file; size is (height, width)."""
 
@@ -56,74 +74,126 @@ Crowd = Literal["mask", "ignore"]
 _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(list[list[FiniteFloat]] | Rle)
 
 
-def read_coco(path: Path, scene: Scene, *, crowd: Crowd = "mask") -> list[list[tuple[int, np.ndarray]]]:
+def read_coco(
+    path: Path, scene: Scene, *, crowd: Crowd = "mask", categories: Collection[str] = ()
+) -> list[list[tuple[int, np.ndarray]]]:
     """The masks of a COCO file, view by view, as they stand there (in the frame of the photo).
 
-    Images are found by file name: the path of the view's photo, or the view's name with or without suffix; a shorter
-    path will do if it fits one view only. Images that are not in the scene are left out. Warns (InputWarning) of
-    crowds, and of annotations of images that the file does not list.
+    Images are found by file name, see `find_views`; those that are not in the scene are left out. A list of results
+    (annotations alone) is read, too: there the `image_id` is the name of a photo, or the number that it consists of.
+    Warns (InputWarning) of everything that is left out or taken loosely: crowds, boxes without a mask, views that the
+    file does not list, annotations of images that it does not list, several categories.
 
     Args:
         path: the file.
         scene: gives the views and their sizes.
         crowd: what an annotation with `iscrowd` is: "mask", one like all others (supervision writes so for every mask
             with holes or several parts, datumaro for all masks), or "ignore", left out as COCO's own evaluation does.
+        categories: names of the categories that are taken; all, if empty. A category without a name goes by its id.
 
     Returns:
-        V lists of (annotation id, (height, width) bool mask); a view without annotations has an empty list.
+        V lists of (number, (height, width) bool mask); a view without annotations has an empty list. The numbers are
+        the annotation ids or, where an id is missing or no integer, the places in the file, from 1.
 
     Raises:
-        InputError: the file is broken, a view has no image entry, an entry fits several views or has another size than
-            its camera, or a segmentation cannot be decoded.
+        InputError: the file is broken, none of its images is in the scene, an entry fits several views or has another
+            size than its camera, a segmentation cannot be decoded, or a category is not there.
     """
-    coco = read_json(path, CocoFile)
-    image_ids = {image.id for image in coco.images}
-    orphans = [annotation.id for annotation in coco.annotations if annotation.image_id not in image_ids]
-    if orphans:
-        message = f"{len(orphans)} annotations are of no image in the file, the first is annotation {orphans[0]}"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
-    view_of = [_find_view(path, image.file_name, scene) for image in coco.images]
-    masks: list[list[tuple[int, np.ndarray]]] = []
-    num_crowds = 0
-    for index, view in enumerate(scene.views):
-        entries = [image for image, image_view in zip(coco.images, view_of, strict=True) if image_view == index]
-        if not entries:
-            raise InputError(f"{path}: view {index} ({view.name}) has no entry among the images")
-        width, height = scene.cameras.sizes[index].tolist()
-        for image in entries:
-            if (image.width, image.height) != (width, height):
-                raise InputError(
-                    f"{path}: image {image.file_name} is {image.width} x {image.height}, "
-                    f"its camera says {width} x {height}"
-                )
-        entry_ids = {image.id for image in entries}
-        shown = [annotation for annotation in coco.annotations if annotation.image_id in entry_ids]
-        kept = [annotation for annotation in shown if crowd == "mask" or not annotation.iscrowd]
-        masks.append([(annotation.id, _decode(path, annotation, (width, height))) for annotation in kept])
-        num_crowds += sum(bool(annotation.iscrowd) for annotation in shown)
+    coco = _read_file(path, scene)
+    view_of = _find_images(path, coco, scene)
+    names = {str(category.id): category.name for category in coco.categories}
+    has_ids = all(isinstance(annotation.id, int) for annotation in coco.annotations)
+    masks: list[list[tuple[int, np.ndarray]]] = [[] for _ in scene.views]
+    counts: Counter[str] = Counter()
+    num_crowds = num_boxes = 0
+    for place, annotation in enumerate(coco.annotations, start=1):
+        view = view_of.get(str(annotation.image_id))
+        if view is None:
+            continue
+        num_crowds += bool(annotation.iscrowd)
+        if annotation.segmentation in (None, [], [[]]):
+            num_boxes += 1
+            continue
+        category = names.get(str(annotation.category_id), str(annotation.category_id or ""))
+        counts[category] += 1
+        if (crowd == "ignore" and annotation.iscrowd) or (categories and category not in categories):
+            continue
+        width, height = scene.cameras.sizes[view].tolist()
+        number = annotation.id if has_ids and isinstance(annotation.id, int) else place
+        masks[view].append((number, _decode(path, annotation, (width, height), place=place)))
     if num_crowds:
         what = "taken as masks (--coco_crowd ignore leaves them out)" if crowd == "mask" else "left out"
         warnings.warn(f"{path}: {num_crowds} annotations with iscrowd are {what}", InputWarning, stacklevel=4)
+    if num_boxes:
+        message = f"{num_boxes} annotations have no mask (a box at most) and are left out"
+        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
+    check_categories(counts, categories, known=names.values(), source=path)
     return masks
 
 
-def _find_view(path: Path, file_name: str, scene: Scene) -> int | None:
-    name = file_name.replace("\\", "/").removeprefix("./")
-    same_name = [i for i, view in enumerate(scene.views) if view.name in (name, name.rsplit(".", 1)[0])]
-    fitting = same_name or [
-        i for i, view in enumerate(scene.views) if f"/{view.path.as_posix()}".endswith("/" + name)
-    ]
-    if len(fitting) > 1:
-        views = " or ".join(f"{i} ({scene.views[i].name})" for i in fitting)
-        raise InputError(f"{path}: image {file_name} could be view {views}, expected its path")
-    return fitting[0] if fitting else None
+def _read_file(path: Path, scene: Scene) -> _MaskFile:
+    """The file; a list of results gets the images that it refers to."""
+    try:
+        with path.open("rb") as file:
+            is_list = file.read(100).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if not is_list:
+        return read_json(path, _MaskFile)
+    results = read_json(path, _Results).root
+    stems = [base_name(view.name) for view in scene.views]
+    by_number = {int(stem): view.name for stem, view in zip(stems, scene.views, strict=True) if stem.isdecimal()}
+    if len(by_number) < len(stems):  # not every photo has a number of its own
+        by_number = {}
+    images = []
+    for image_id in dict.fromkeys(result.image_id for result in results):
+        name = by_number.get(image_id, str(image_id)) if isinstance(image_id, int) else image_id
+        images.append(CocoImage(id=image_id, file_name=name, width=0, height=0))
+    views = find_views([image.file_name for image in images], scene, source=path)
+    for image, view in zip(images, views, strict=True):
+        image.width, image.height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
+    return _MaskFile(images=images, annotations=results)
 
 
-def _decode(path: Path, annotation: CocoAnnotation, size: tuple[int, int]) -> np.ndarray:
+def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | None]:
+    """{image id as text: view, or None}, checked."""
+    image_ids = {str(image.id) for image in coco.images}
+    orphans = [place for place, one in enumerate(coco.annotations, start=1) if str(one.image_id) not in image_ids]
+    if orphans:
+        first = coco.annotations[orphans[0] - 1].id
+        where = f"annotation {orphans[0] if first is None else first}"
+        message = f"{len(orphans)} annotations are of no image in the file, the first is {where}"
+        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=5)
+    if len(image_ids) < len(coco.images):
+        raise InputError(f"{path}: {len(coco.images)} images have {len(image_ids)} ids, expected one each")
+    names = [image.file_name for image in coco.images]
+    views = find_views(names, scene, source=path)
+    missing = [view for view in range(len(scene.views)) if view not in set(views)]
+    if len(missing) == len(scene.views):
+        photos, found = list_some([view.path.name for view in scene.views]), list_some(names)
+        raise InputError(f"{path}: none of its images is a photo of the scene, expected {photos}, found {found}")
+    if missing:
+        first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
+        message = f"{len(missing)} views have no entry among the images and no masks, the first is {first_view}"
+        warnings.warn(f"{path}: {message}; the file holds {list_some(names)}", InputWarning, stacklevel=5)
+    warn_of_base_names(names, views, scene, source=path)
+    for image, view in zip(coco.images, views, strict=True):
+        width, height = (image.width, image.height) if view is None else scene.cameras.sizes[view].tolist()
+        if (image.width, image.height) != (width, height):
+            turn = "" if view is None else describe_turn(scene.views[view].path)
+            raise InputError(
+                f"{path}: image {image.file_name} is {image.width} x {image.height}, "
+                f"its camera says {width} x {height}{turn and '; ' + turn}"
+            )
+    return {str(image.id): view for image, view in zip(coco.images, views, strict=True)}
+
+
+def _decode(path: Path, annotation: CocoAnnotation, size: tuple[int, int], *, place: int) -> np.ndarray:
     try:
         return decode_segmentation(annotation.segmentation, *size)
     except InputError as error:
-        raise InputError(f"{path}: annotation {annotation.id}: {error}") from None
+        name = place if annotation.id is None else annotation.id
+        raise InputError(f"{path}: annotation {name}: {error}") from None
 
 
 def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarray:

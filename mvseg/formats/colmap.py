@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 import warnings
 from pathlib import Path
 
@@ -18,6 +19,46 @@ from mvseg.scene import Scene
 def is_colmap_model(folder: Path) -> bool:
     """A folder with cameras.bin or cameras.txt."""
     return (folder / "cameras.bin").is_file() or (folder / "cameras.txt").is_file()
+
+
+def find_colmap_model(folder: Path) -> Path | None:
+    """The COLMAP model of a scene folder: `sparse/` itself, or the folder of `sparse/` (else of `colmap/sparse/`) whose
+    model has the most photos, the first of equals; None if there is none.
+
+    COLMAP writes `sparse/0`, `sparse/1`, ... where it could not connect all photos. Warns (InputWarning) of the models
+    that are not taken: each has a world of its own.
+    """
+    for place in (folder / "sparse", folder / "colmap" / "sparse"):
+        if is_colmap_model(place):
+            return place
+        models = [path for path in sorted(place.glob("*"), key=_by_number) if is_colmap_model(path)]
+        if not models:
+            continue
+        counts = [_count_photos(model) for model in models]
+        best = models[counts.index(max(counts))]
+        if len(models) > 1:
+            shown = ", ".join(f"{model.name} with {count} photos" for model, count in zip(models, counts, strict=True))
+            message = f"there are {len(models)} models ({shown}); {best.name} is taken, the others have no common world"
+            warnings.warn(f"{place}: {message}", InputWarning, stacklevel=3)
+        return best
+    return None
+
+
+def _by_number(path: Path) -> tuple[bool, int, str]:
+    is_number = path.name.isdecimal()
+    return not is_number, int(path.name) if is_number else 0, path.name
+
+
+def _count_photos(model: Path) -> int:
+    """How many photos a model registers, without reading it; 0 where that cannot be told."""
+    try:
+        if (model / "images.bin").is_file():
+            with (model / "images.bin").open("rb") as file:
+                return int(struct.unpack("<Q", file.read(8))[0])
+        with (model / "images.txt").open(encoding="utf-8", errors="replace") as file:
+            return sum(not line.startswith("#") for line in file) // 2  # of each photo: its pose, its points
+    except (OSError, struct.error):
+        return 0
 
 
 def read_colmap(model: Path, folder: Path) -> Scene:
@@ -42,7 +83,7 @@ def read_colmap(model: Path, folder: Path) -> Scene:
         if image.has_pose:
             photos.append(_photo(model, image, reconstruction.cameras[image.camera_id]))
     scene = build_scene(folder, photos, unit="", source=model)
-    _warn_of_photos_without_pose(model, folder / "images", {photo.file for photo in photos})
+    _warn_of_photos_without_pose(model, folder / "images", {view.path for view in scene.views})
     return scene
 
 
@@ -61,11 +102,9 @@ def _photo(model: Path, image: pycolmap.Image, lens: pycolmap.Camera) -> Photo:
     )
 
 
-def _warn_of_photos_without_pose(model: Path, images: Path, registered: set[str]) -> None:
-    files = [path.relative_to(images).as_posix() for path in sorted(images.rglob("*.*"))]
-    left_out = [
-        file for file in files if file.lower().endswith(PHOTO_SUFFIXES) and f"images/{file}" not in registered
-    ]
+def _warn_of_photos_without_pose(model: Path, images: Path, registered: set[Path]) -> None:
+    files = [path for path in sorted(images.rglob("*.*")) if path.name.lower().endswith(PHOTO_SUFFIXES)]
+    left_out = [path.relative_to(images).as_posix() for path in files if path not in registered]
     if left_out:
         message = (
             f"{len(left_out)} photos in images/ have no pose in the model and are left out, the first is {left_out[0]}"

@@ -13,6 +13,7 @@ import zlib
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -29,6 +30,7 @@ from mvseg.errors import InputError
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MAX_SIDE = 1 << 20  # pixels
 ORIENTATION = 0x0112  # EXIF tag
+BITS_PER_SAMPLE = 0x0102  # TIFF tag
 MAX_PIXELS = 1 << 30
 LARGE = 1 << 26  # pixels; Pillow's own limit lies above
 
@@ -61,7 +63,7 @@ def read_image(path: Path) -> Image.Image:
         raise InputError(error.strerror or "no such file") from None
     reader = next((reader for start, reader in READERS if data.startswith(start)), None)
     if reader is None:
-        raise InputError("it is not a JPEG, PNG, TIFF, BMP or WebP file")
+        raise InputError(no_image_message(data[:16]))
     if reader is PngImageFile and not _has_sound_chunks(data):
         raise InputError("it is cut short, or a checksum is wrong")
     try:
@@ -76,15 +78,52 @@ def read_image(path: Path) -> Image.Image:
     return image
 
 
+def read_image_size(path: Path) -> tuple[int, int]:
+    """Width and height in pixels, as stored; only the head of the file is read.
+
+    Raises:
+        InputError: as `read_image`, as far as the head tells.
+    """
+    try:
+        with path.open("rb") as file:
+            start = file.read(16)
+            reader = next((reader for magic, reader in READERS if start.startswith(magic)), None)
+            if reader is None:
+                raise InputError(no_image_message(start))
+            file.seek(0)
+            width, height = reader(file).size
+    except OSError as error:
+        raise InputError(error.strerror or "no such file") from None
+    except InputError:
+        raise
+    except Exception as error:  # Pillow raises almost anything on a damaged file
+        raise InputError(" ".join(str(error).split()) or type(error).__name__) from None
+    return width, height
+
+
+def no_image_message(start: bytes) -> str:
+    """What a file is that is none of the images read here, by its first bytes."""
+    if start[4:8] == b"ftyp" and start[8:12] in (b"heic", b"heix", b"mif1", b"msf1", b"hevc", b"heim", b"avif"):
+        return "it is a HEIC file, expected JPEG, PNG, TIFF, BMP or WebP: convert it without turning or scaling it"
+    return "it is not a JPEG, PNG, TIFF, BMP or WebP file"
+
+
 def read_rgb(path: Path) -> np.ndarray:
     """(H, W, 3) uint8: an image in colour, without transparency, the upper 8 of 16 bits.
+
+    Files of 16 bits that hold smaller numbers only, as cameras of 10, 12 or 14 bits write them, give the upper 8 of
+    those; see `sensor_bits`.
 
     Raises:
         InputError: see `read_image`; or the pixels are signed, or have 32 bits.
     """
     image = read_image(path)
-    if image.mode.startswith("I;16"):
-        return np.repeat((np.asarray(image) >> 8).astype(np.uint8)[..., None], 3, axis=2)
+    deep = _read_deep(path, image)
+    if deep is not None:
+        bits = _bits_of(deep)
+        if bits < 16 or deep.ndim == 2:
+            pixels = (deep >> (bits - 8)).astype(np.uint8)
+            return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
     if image.mode in ("I", "F"):
         raise InputError("its pixels are signed or 32-bit numbers, expected 8 or 16 bits without sign")
     image.info.pop("transparency", None)  # Pillow would look for a colour that stands for it
@@ -92,6 +131,58 @@ def read_rgb(path: Path) -> np.ndarray:
         return np.array(image if image.mode == "RGB" else image.convert("RGB"))
     except ValueError as error:
         raise InputError(str(error)) from None
+
+
+def sensor_bits(path: Path) -> int:
+    """How many bits the numbers of an image use: 8, or 10, 12, 14 or 16 in a file of 16 bits.
+
+    Files of 8 bits are told by their heads; others are decoded.
+
+    Raises:
+        InputError: see `read_image`.
+    """
+    with path.open("rb") as file:
+        head = file.read(26)
+        if head.startswith((b"II", b"MM")):
+            is_deep = _tiff_bits(file) == 16
+        else:
+            is_deep = head.startswith(PNG_START) and head[24:25] == b"\x10"
+    if not is_deep:
+        return 8
+    deep = _read_deep(path, read_image(path))
+    return 8 if deep is None else _bits_of(deep)
+
+
+def _tiff_bits(file: BinaryIO) -> int:
+    """Bits of a TIFF file's first channel, by its head; 8 where that cannot be told."""
+    file.seek(0)
+    try:
+        return int(TiffImageFile(file).tag_v2.get(BITS_PER_SAMPLE, (8,))[0])
+    except Exception:  # Pillow raises almost anything on a damaged file
+        return 8
+
+
+def _bits_of(deep: np.ndarray) -> int:
+    highest = int(deep.max(initial=0))
+    return next(bits for bits in (10, 12, 14, 16) if highest < 1 << bits)
+
+
+def _read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
+    """(H, W) or (H, W, 3) uint16, RGB, of an image of 16 bits; None of others. Pillow cuts colours to 8 bits, so that
+    OpenCV reads them, after Pillow has found the file whole."""
+    if image.mode.startswith("I;16"):
+        return np.asarray(image).astype(np.uint16)
+    if image.mode not in ("RGB", "RGBA", "LA") or not isinstance(image, (PngImageFile, TiffImageFile)):
+        return None
+    data = path.read_bytes()
+    if isinstance(image, PngImageFile):
+        is_deep = data[24:25] == b"\x10"
+    else:
+        is_deep = image.tag_v2.get(BITS_PER_SAMPLE, (8,))[0] == 16
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if is_deep else None
+    if pixels is None or pixels.dtype != np.uint16 or pixels.shape[:2] != (image.height, image.width):
+        return None
+    return pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., 2::-1])
 
 
 def is_turned(path: Path) -> bool:

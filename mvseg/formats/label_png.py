@@ -1,7 +1,7 @@
 """Label images: PNGs of 16 (or 8) bits with a single channel; 0 = nothing, 65535 = ignore, any other number = one mask.
 
 A palette PNG gives its indices, not its colours: the tools that write labels with a palette (as PASCAL VOC's are) mean
-the index.
+the index. VOC's border of 255 around its numbers is ignored. `masks/label_image.py` reads more kinds of label images.
 """
 
 from __future__ import annotations
@@ -9,9 +9,13 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from PIL import Image
 
 from mvseg.errors import InputError
 from mvseg.formats.image_file import read_image, write_png
+from mvseg.regions import IGNORE_LABEL
+
+VOC_BORDER = 255  # index, in palette PNGs
 
 
 def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
@@ -31,21 +35,40 @@ def read_labels(path: Path) -> np.ndarray:
     """(H, W) uint16 label map of whatever size.
 
     Raises:
-        InputError: the file is missing, cannot be decoded, has colour channels, or does not hold
+        InputError: the file is missing, cannot be decoded, is a JPEG, has colour channels, or does not hold
             unsigned numbers of at most 16 bits.
     """
     if not path.is_file():
         raise InputError(f"{path}: the mask file is missing")
+    return labels_of(open_labels(path), path)
+
+
+def open_labels(path: Path) -> Image.Image:
+    """The decoded image of a label file.
+
+    Raises:
+        InputError: it cannot be decoded, or is a JPEG.
+    """
     try:
         image = read_image(path)
     except InputError as error:
         raise InputError(f"{path}: cannot be read, expected a whole label PNG: {error}") from None
+    if image.format == "JPEG":
+        raise InputError(f"{path}: is a JPEG, which blurs the numbers of masks: export PNG instead")
+    return image
+
+
+def labels_of(image: Image.Image, path: Path) -> np.ndarray:
+    """(H, W) uint16 from a decoded image; see `read_labels`."""
     num_channels = len(image.getbands())
     if num_channels > 1:
         raise InputError(f"{path}: has {num_channels} colour channels, expected a label PNG with a single channel")
     if image.mode in ("I", "F"):
         raise InputError(f"{path}: holds signed or 32-bit numbers, expected 8 or 16 bits without sign")
-    return np.array(image.convert("L") if image.mode == "1" else image).astype(np.uint16)
+    labels = np.array(image.convert("L") if image.mode == "1" else image).astype(np.uint16)
+    if image.mode == "P" and ((labels > 0) & (labels < VOC_BORDER)).any():
+        labels[labels == VOC_BORDER] = IGNORE_LABEL
+    return labels
 
 
 def write_label_png(path: Path, labels: np.ndarray) -> None:

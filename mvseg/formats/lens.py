@@ -18,6 +18,13 @@ import pycolmap
 Mapping = Callable[[pycolmap.Camera, np.ndarray, np.ndarray], np.ndarray]
 
 
+def opencv_lens(K: np.ndarray, distortion: list[float], *, width: int, height: int) -> pycolmap.Camera:
+    """OpenCV's k1, k2, p1, p2 (, k3 (, k4, k5, k6)) as COLMAP's FULL_OPENCV; K in this project's pixels."""
+    coefficients = [*distortion, *[0.0] * (8 - len(distortion))]
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients]
+    return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+
+
 def photo_from_pinhole(lens: pycolmap.Camera, K: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Where undistorted pixel positions lie in the photo: (P, 2) -> (P, 2) float64, pixel centres at half integers."""
     rays = np.linalg.solve(K, np.concatenate([xy, np.ones((len(xy), 1))], 1).T).T

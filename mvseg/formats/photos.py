@@ -13,7 +13,15 @@ import pycolmap
 import torch
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.image_file import MAX_SIDE, file_name_problem, is_turned, read_rgb
+from mvseg.formats.image_file import (
+    MAX_SIDE,
+    PHOTO_SUFFIXES,
+    file_name_problem,
+    is_turned,
+    read_image_size,
+    read_rgb,
+    sensor_bits,
+)
 from mvseg.formats.lens import undistort
 from mvseg.scene import Cameras, Scene, View, camera_problem
 
@@ -58,14 +66,17 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         raise InputError(f"{source}: there are no views, expected at least two")
     if len(photos) < 2:
         raise InputError(f"{source}: there is a single view, expected at least two")
-    for index, photo in enumerate(photos):
-        problem = _problem(photo)
+    files = [find_photo(folder, photo.file) for photo in photos]
+    for index, (photo, file) in enumerate(zip(photos, files, strict=True)):
+        problem = _problem(photo, file)
         if problem:
             raise InputError(f"{source}: view {index} ({photo.file}): {problem}")
-    views = tuple(
-        View(name, folder / photo.file, photo.lens)
-        for name, photo in zip(view_names([photo.file for photo in photos]), photos, strict=True)
-    )
+    moved = [(photo.file, file) for photo, file in zip(photos, files, strict=True) if is_elsewhere(photo.file, file)]
+    if moved:
+        message = f"{len(moved)} photos are told by their names alone, the first is {moved[0][1]} for {moved[0][0]}"
+        warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
+    named = zip(view_names(files), files, photos, strict=True)
+    views = tuple(View(name, folder / file, photo.lens) for name, file, photo in named)
     cameras = Cameras(
         K=torch.from_numpy(np.stack([photo.K for photo in photos])),
         R=torch.from_numpy(np.stack([photo.R for photo in photos])),
@@ -78,6 +89,62 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         raise InputError(f"{source}: {error}") from None
 
 
+def find_photo(folder: Path, file: str) -> str:
+    """The photo that a camera file means, as a path relative to the scene folder.
+
+    It is the file of this path; or the one there with the same name in other capitals, or with a suffix where the name
+    has none (nerfstudio, Blender); or, for a path of another machine, the only photo of this name in the scene folder
+    or below its `images/`.
+
+    Returns:
+        The path; `file` itself, if there is no such photo.
+    """
+    name, problem = file.replace("\\", "/").rsplit("/", 1)[-1].lower(), file_name_problem(file)
+    if problem and not os.path.isabs(file):
+        return file
+    if not problem:
+        if (folder / file).is_file():
+            return file
+        parent = (folder / file).parent
+        found = [path for path in _list_photos(parent, "*") if _is_named(path, name)]
+        if len(found) == 1:
+            return found[0].relative_to(folder).as_posix()
+    photos = [*_list_photos(folder, "*"), *_list_photos(folder / "images", "**/*")]
+    found = [path for path in photos if _is_named(path, name)]
+    return found[0].relative_to(folder).as_posix() if len(found) == 1 else file
+
+
+def size_of_photo(folder: Path, file: str) -> tuple[int, int]:
+    """Width and height of the photo that a camera file means, where the file does not say them.
+
+    Raises:
+        InputError: the photo is missing, too, or cannot be read. The message is a reason, without the photo's name.
+    """
+    photo = folder / find_photo(folder, file)
+    if file_name_problem(os.path.relpath(photo, folder)) or not photo.is_file():
+        raise InputError("width and height are missing, and so is the photo that could tell")
+    try:
+        return read_image_size(photo)
+    except InputError as error:
+        raise InputError(f"width and height are missing, and the photo cannot be read: {error}") from None
+
+
+def is_elsewhere(file: str, found: str) -> bool:
+    """Whether a photo was found in another folder than the camera file says."""
+    return os.path.dirname(os.path.normpath(file)) != os.path.dirname(os.path.normpath(found))
+
+
+def _list_photos(folder: Path, pattern: str) -> list[Path]:
+    try:
+        return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file())
+    except (OSError, ValueError):  # not readable, or a name that no file system takes
+        return []
+
+
+def _is_named(path: Path, name: str) -> bool:
+    return name in (path.name.lower(), path.stem.lower())
+
+
 def view_names(files: Sequence[str]) -> list[str]:
     """Names of views: the paths of their photos below the folder that all share, without suffix."""
     paths = [PurePosixPath(os.path.normpath(file)) for file in files]
@@ -85,9 +152,9 @@ def view_names(files: Sequence[str]) -> list[str]:
     return [path.relative_to(shared).with_suffix("").as_posix() for path in paths]
 
 
-def _problem(photo: Photo) -> str | None:
-    """What is wrong with a photo's path or camera, as the end of a sentence; None for a sound one."""
-    problem = file_name_problem(photo.file)
+def _problem(photo: Photo, file: str) -> str | None:
+    """What is wrong with a photo's camera or the path of its file, as the end of a sentence; None for a sound one."""
+    problem = file_name_problem(file)
     if problem:
         return problem
     if max(photo.width, photo.height) > MAX_SIDE:
@@ -100,19 +167,59 @@ def check_photos(scene: Scene) -> None:
     """Are the photos of a scene there? None at all is fine: masks are enough for matching and for shapes.
 
     Warns (InputWarning) of photos that EXIF asks viewers to turn: cameras and masks must refer to the stored pixels, as
-    those of COLMAP do.
+    those of COLMAP do; of photos of 16 bits that use fewer; and of files in the place of the photos, if none is there.
 
     Raises:
         InputError: some photos are there and others are missing.
     """
-    present = [view.path.is_file() for view in scene.views]
-    if any(present) and not all(present):
+    paths = [view.path for view in scene.views]
+    present = [path.is_file() for path in paths]
+    if not any(present):
+        beside = _describe_folder(paths[0].parent)
+        if beside:
+            message = f"{paths[0]}: this photo and all others are missing; {beside}"
+            warnings.warn(message, InputWarning, stacklevel=2)
+        return
+    if not all(present):
         missing = present.index(False)
-        raise InputError(f"{scene.views[missing].path}: the image of view {missing} is missing")
-    turned = [view.path for view in scene.views if view.path.is_file() and is_turned(view.path)]
+        beside = _describe_folder(paths[missing].parent)
+        raise InputError(f"{paths[missing]}: the image of view {missing} is missing{beside and '; ' + beside}")
+    turned = [path for path in paths if is_turned(path)]
     if turned:
         message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
         warnings.warn(f"{turned[0]}: {message}", InputWarning, stacklevel=2)
+    few = [(path, bits) for path in paths if (bits := _known_bits(path)) not in (8, 16)]
+    if few:
+        path, bits = few[0]
+        message = f"{len(few)} photos of 16 bits hold smaller numbers, this one of {bits} bits: they are brightened"
+        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=2)
+
+
+def describe_turn(path: Path) -> str:
+    """That EXIF turns a photo, for a message about sizes that do not fit; "" if it does not."""
+    return f"EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
+
+
+def _known_bits(path: Path) -> int:
+    """As `sensor_bits`; 8 for a photo that cannot be read, which `read_photo` will name."""
+    try:
+        return sensor_bits(path)
+    except (InputError, OSError):
+        return 8
+
+
+def _describe_folder(folder: Path) -> str:
+    """What is in the place where a photo is missing, as the end of a sentence; "" if nothing is."""
+    try:
+        names = sorted(path.name for path in folder.iterdir() if path.is_file())
+    except OSError:
+        return ""
+    phone = [name for name in names if name.lower().endswith((".heic", ".heif"))]
+    if phone:
+        return f"{phone[0]} is a HEIC file: convert it to JPEG or PNG without turning or scaling it"
+    pictures = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
+    more = f" and {len(pictures) - 3} more" if len(pictures) > 3 else ""
+    return f"found {', '.join(pictures[:3])}{more}" if pictures else ""
 
 
 def load_photos(scene: Scene) -> list[torch.Tensor]:

@@ -4,8 +4,9 @@
         {"file": "images/000.jpg", "width": W, "height": H, "K": 3x3, "R": 3x3, "t": 3,
          "distortion": [k1, k2, p1, p2, k3]}]}
 
-R and t are cam_from_world; the centre of the top-left pixel is (0.5, 0.5). `distortion` may be left out, `unit` and
-`up`, the direction that points up in the world, as well where they are not known.
+R and t are cam_from_world; the centre of the top-left pixel is (0.5, 0.5). `distortion` may be left out, and so may
+the size, which then is that of the photo, and `unit` and `up`, the direction that points up in the world, where they
+are not known. `"calibration": "camera.yaml"` stands for K, distortion and size (OpenCV's file).
 """
 
 from __future__ import annotations
@@ -17,26 +18,33 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
-import pycolmap
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.json_file import Matrix3, Pixels, Vector3, read_json
-from mvseg.formats.photos import Photo, build_scene
+from mvseg.formats.lens import opencv_lens
+from mvseg.formats.opencv_yaml import calibration_lens, read_calibration
+from mvseg.formats.photos import Photo, build_scene, size_of_photo
 from mvseg.scene import Scene
 
 RIG_FORMAT = "mvseg-rig/1"
 
 
-class _RigView(BaseModel):
+class RigCamera(BaseModel):
+    """A camera as it stands in the file; `photo_of` checks what belongs together."""
+
     model_config = ConfigDict(extra="allow")
-    file: str
-    width: Pixels
-    height: Pixels
-    K: Matrix3
+    width: Pixels | None = None
+    height: Pixels | None = None
+    K: Matrix3 | None = None
+    calibration: str | None = None
     R: Matrix3
     t: Vector3
     distortion: list[FiniteFloat] | None = None
+
+
+class _RigView(RigCamera):
+    file: str
 
 
 class _Rig(BaseModel):
@@ -58,7 +66,12 @@ def read_rig(path: Path) -> Scene:
     for owner, entry in [("the rig", rig), *((f"view {i}", view) for i, view in enumerate(rig.views))]:
         for key in entry.model_extra or {}:
             warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
-    photos = [_photo(path, index, view) for index, view in enumerate(rig.views)]
+    photos = []
+    for index, view in enumerate(rig.views):
+        try:
+            photos.append(photo_of(path.parent, view.file, view))
+        except InputError as error:
+            raise InputError(f"{path}: view {index} ({view.file}): {error}") from None
     scene = build_scene(path.parent, photos, unit=rig.unit, source=path)
     try:
         return replace(scene, up=rig.up)
@@ -66,26 +79,46 @@ def read_rig(path: Path) -> Scene:
         raise InputError(f"{path}: {error}") from None
 
 
-def _photo(path: Path, index: int, view: _RigView) -> Photo:
-    K, lens = np.array(view.K), None
-    if view.distortion and len(view.distortion) not in (4, 5, 8):
-        raise InputError(
-            f"{path}: view {index} ({view.file}): distortion has {len(view.distortion)} numbers, "
-            "expected k1, k2, p1, p2, k3"
-        )
-    if view.distortion and any(view.distortion):
-        if K[0, 1] != 0:
-            raise InputError(f"{path}: view {index} ({view.file}): K has skew together with distortion, expected none")
-        lens = opencv_lens(K, view.distortion, width=view.width, height=view.height)
-    R, t = np.array(view.R), np.array(view.t)
-    return Photo(file=view.file, width=view.width, height=view.height, K=K, R=R, t=t, lens=lens)
+def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
+    """A photo with its camera, complete.
+
+    Args:
+        folder: the scene; the photo and the calibration are looked for there.
+        file: of the photo, relative to the scene.
+        camera: as it stands in the file.
+
+    Raises:
+        InputError: there is not exactly one of K and a calibration, the calibration cannot be read or is of another
+            size, the size is not known, or the distortion is none that OpenCV has. The message is a reason.
+    """
+    if (camera.K is None) == (camera.calibration is None):
+        raise InputError("expected either K or a calibration file")
+    size = (camera.width, camera.height)
+    if camera.calibration is None:
+        width, height = _complete_size(size, folder, file)
+        K, lens = np.array(camera.K), None
+        if camera.distortion and len(camera.distortion) not in (4, 5, 8):
+            raise InputError(f"distortion has {len(camera.distortion)} numbers, expected k1, k2, p1, p2, k3")
+        if camera.distortion and any(camera.distortion):
+            if K[0, 1] != 0:
+                raise InputError("K has skew together with distortion, expected none")
+            lens = opencv_lens(K, camera.distortion, width=width, height=height)
+    else:
+        if camera.distortion:
+            raise InputError("distortion beside a calibration file, expected one of them")
+        calibration = read_calibration(folder, camera.calibration)
+        known = (calibration.width or camera.width, calibration.height or camera.height)
+        width, height = _complete_size(known, folder, file)
+        if any(given not in (None, found) for given, found in zip(size, (width, height), strict=True)):
+            raise InputError(f"the calibration is of {width} x {height} pixels, the camera says {size[0]} x {size[1]}")
+        K, lens = calibration.K, calibration_lens(calibration, width, height)
+    R, t = np.array(camera.R), np.array(camera.t)
+    return Photo(file=file, width=width, height=height, K=K, R=R, t=t, lens=lens)
 
 
-def opencv_lens(K: np.ndarray, distortion: list[float], *, width: int, height: int) -> pycolmap.Camera:
-    """OpenCV's k1, k2, p1, p2 (, k3 (, k4, k5, k6)) as COLMAP's FULL_OPENCV; K in this project's pixels."""
-    coefficients = [*distortion, *[0.0] * (8 - len(distortion))]
-    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients]
-    return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+def _complete_size(size: tuple[int | None, int | None], folder: Path, file: str) -> tuple[int, int]:
+    width, height = size
+    return size_of_photo(folder, file) if width is None or height is None else (width, height)
 
 
 def write_rig(

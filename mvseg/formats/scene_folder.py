@@ -3,28 +3,36 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Collection
 from pathlib import Path
 
-import numpy as np
-
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
-from mvseg.formats.colmap import is_colmap_model, read_colmap
-from mvseg.formats.label_png import read_label_png
-from mvseg.formats.lens import undistort
+from mvseg.formats.colmap import find_colmap_model, read_colmap
+from mvseg.formats.find_views import list_some
+from mvseg.formats.image_file import PHOTO_SUFFIXES
+from mvseg.formats.masks.read_views import read_views
+from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
+from mvseg.formats.masks.view_regions import stack_views
+from mvseg.formats.metashape import find_metashape, read_metashape
 from mvseg.formats.rig import read_rig
 from mvseg.formats.transforms_json import read_transforms
-from mvseg.regions import Regions, regions_from_label_maps, stack_regions
+from mvseg.formats.turntable import read_turntable
+from mvseg.regions import Regions
 from mvseg.scene import Scene
 
+EXPECTED = "expected cameras.json, a COLMAP model in sparse/, transforms.json, or another kind of docs/formats.md"
+TRANSFORMS = ("transforms.json", "transforms_train.json")  # Blender's scenes of NeRF have train, val and test
 BINARY = 255  # what segmenters write that only tell leaf from background
 
 
 def load_scene(folder: Path | str) -> Scene:
     """Load the cameras of a scene folder; photos are read later, when they are needed, and may be absent.
 
-    Cameras come from the first of these that is there: `cameras.json` (rig file), a COLMAP model in `sparse/`,
-    `sparse/0/` or `colmap/sparse/0/`, `transforms.json` (nerfstudio).
+    Cameras come from the first of these that is there: `cameras.json` (rig file), a COLMAP model in `sparse/` or
+    `colmap/sparse/` (see `find_colmap_model`), `transforms.json` or `transforms_train.json` (nerfstudio, instant-ngp,
+    Blender), `turntable.json`, an XML file of Metashape, `scene_camera.json` (BOP).
 
     Raises:
         InputError: the folder is missing or holds no cameras, or they are not sound; see the readers.
@@ -35,57 +43,66 @@ def load_scene(folder: Path | str) -> Scene:
         raise InputError(f"{folder}: {problem}")
     if (folder / "cameras.json").is_file():
         return read_rig(folder / "cameras.json")
-    for model in (folder / "sparse", folder / "sparse" / "0", folder / "colmap" / "sparse" / "0"):
-        if is_colmap_model(model):
-            return read_colmap(model, folder)
-    if (folder / "transforms.json").is_file():
-        return read_transforms(folder / "transforms.json")
-    raise InputError(f"{folder}: no cameras, expected cameras.json, a COLMAP model in sparse/ or transforms.json")
+    model = find_colmap_model(folder)
+    if model is not None:
+        return read_colmap(model, folder)
+    for name in TRANSFORMS:
+        if (folder / name).is_file():
+            return read_transforms(folder / name)
+    if (folder / "turntable.json").is_file():
+        return read_turntable(folder / "turntable.json")
+    metashape = find_metashape(folder)
+    if metashape is not None:
+        return read_metashape(metashape)
+    if (folder / "scene_camera.json").is_file():
+        return read_bop(folder / "scene_camera.json")
+    raise InputError(f"{folder}: no cameras, {EXPECTED}; {_describe(folder)}")
 
 
-def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask") -> Regions:
+def _describe(folder: Path) -> str:
+    """What a folder without cameras holds, and what to do with it, as the end of a sentence."""
+    photos = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in (*PHOTO_SUFFIXES, ".heic", ".heif")]
+    if photos:
+        first = photos[0].relative_to(folder).as_posix()
+        return f"found {len(photos)} photos ({first}, ...): COLMAP estimates their cameras, put its model into sparse/"
+    names = sorted(path.name for path in folder.iterdir())
+    return f"found {list_some(names)}"
+
+
+def load_masks(
+    scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", categories: Collection[str] = ()
+) -> Regions:
     """Load the masks of every view, with the lens distortion of the scene removed.
 
     Args:
         scene: gives the views and their sizes.
-        masks: a folder with one label PNG per view, `<view name>.png` (`IMG_1.jpg`: `IMG_1.png`), or a COCO JSON file.
+        masks: a COCO JSON file, or a folder with files that are called as the photos: label images (PNG, TIFF), NumPy
+            or cellpose files, labelme or Segment Anything JSON, YOLO text, or one image per mask; see
+            `recognise_masks`.
         crowd: what COCO annotations with `iscrowd` are: masks like all others, or left out; see `read_coco`.
+        categories: names of the categories that are taken, of COCO, labelme and YOLO files; all, if empty.
 
     Returns:
-        Regions in the undistorted frame; `labels` holds the numbers in the PNGs or the annotation ids. Warns
-        (InputWarning) of label PNGs that hold 0 and 255 only.
+        Regions in the undistorted frame; `labels` holds the numbers of the masks in their files. Warns (InputWarning)
+        of everything that is left out or told by a loose rule, and of label images that hold 0 and 255 only.
 
     Raises:
-        InputError: a file is missing, broken, or does not fit its view; see the readers.
+        InputError: a file is missing, broken, or does not fit its view, or a category is not there; see the readers.
     """
-    masks = Path(masks)
-    if masks.is_dir():
-        regions = regions_from_label_maps([_read_view(scene, view, masks) for view in range(len(scene.views))])
-        if len(regions) and bool((regions.labels == BINARY).all()):
-            message = f"{masks}: holds 0 and 255 only, so that each photo shows one instance; leaves need a number each"
-            warnings.warn(message, InputWarning, stacklevel=2)
-        return regions
-    if masks.suffix.lower() == ".json" and masks.is_file():
-        return _regions_from_coco(scene, masks, crowd)
-    raise InputError(f"{masks}: no such masks, expected a folder of label PNGs or a COCO .json file")
+    return read_masks(scene, recognise_masks(scene, Path(masks)), crowd=crowd, categories=categories)
 
 
-def _read_view(scene: Scene, view: int, folder: Path) -> np.ndarray:
-    width, height = scene.cameras.sizes[view].tolist()
-    try:
-        labels = read_label_png(folder / f"{scene.views[view].name}.png", width, height)
-    except InputError as error:
-        raise InputError(f"{error} (view {view})") from None
-    return undistort(labels, scene.views[view].lens, scene.cameras.K[view].cpu().numpy())
-
-
-def _regions_from_coco(scene: Scene, path: Path, crowd: Crowd) -> Regions:
-    parts = []
-    for view, masks in enumerate(read_coco(path, scene, crowd=crowd)):
-        lens, K = scene.views[view].lens, scene.cameras.K[view].cpu().numpy()
-        for label, mask in masks:
-            crop = regions_from_label_maps([undistort(mask.astype(np.uint8), lens, K)])
-            if len(crop):
-                parts.append((view, tuple(crop.boxes[0].tolist()), crop.crops, label))
-    view_index, boxes, crops, labels = (list(column) for column in zip(*parts, strict=True)) if parts else ([],) * 4
-    return stack_regions(view_index, boxes, crops, labels=labels, num_views=len(scene.views))
+def read_masks(
+    scene: Scene, found: MaskFiles, *, crowd: Crowd = "mask", categories: Collection[str] = ()
+) -> Regions:
+    """The second half of `load_masks`: read the files that were recognised."""
+    if categories and found.kind not in ("COCO", "labelme", "YOLO"):
+        raise InputError(f"{found.source}: holds {found.kind}, which have no categories to select from")
+    if found.kind == "COCO":
+        path = found.files[0][0]
+        return stack_views(read_coco(path, scene, crowd=crowd, categories=categories), scene, source=path)
+    regions = stack_views(read_views(scene, found, wanted=categories), scene, source=found.source)
+    if found.kind == "label images" and len(regions) and bool((regions.labels == BINARY).all()):
+        message = "holds 0 and 255 only, so that each photo shows one instance; leaves need a number each"
+        warnings.warn(f"{found.source}: {message}", InputWarning, stacklevel=3)
+    return regions

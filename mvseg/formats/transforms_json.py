@@ -1,25 +1,39 @@
-"""nerfstudio's `transforms.json`: world_from_cam in OpenGL axes (+y up, -z forward), intrinsics per file or frame."""
+"""`transforms.json` of nerfstudio, instant-ngp and Blender: world_from_cam in OpenGL axes (+y up, -z forward).
+
+nerfstudio's `applied_transform` and `applied_scale` are undone: the world is that of the cameras before nerfstudio
+turned and scaled it (COLMAP's). Its `mask_path` says what to train on, not which leaf is where, and is not used.
+"""
 
 from __future__ import annotations
 
+import math
+import warnings
 from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
 import pycolmap
-from pydantic import BaseModel, FiniteFloat
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.json_file import Pixels, read_json
-from mvseg.formats.photos import Photo, build_scene
-from mvseg.formats.rig import opencv_lens
-from mvseg.scene import Scene
+from mvseg.formats.lens import opencv_lens
+from mvseg.formats.photos import Photo, build_scene, size_of_photo
+from mvseg.scene import ROTATION_TOLERANCE, Scene
 
 OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0])
 Row4 = tuple[FiniteFloat, FiniteFloat, FiniteFloat, FiniteFloat]
+Rows = tuple[Row4, Row4, Row4] | tuple[Row4, Row4, Row4, Row4]
+OTHER_LENSES = ("ftheta_p0", "latlong", "equirectangular", "is_latlong", "is_equirectangular")  # of instant-ngp
+Angle = Annotated[float, Field(gt=0, lt=math.pi)]
 
 
 class _Intrinsics(BaseModel):
+    model_config = ConfigDict(extra="allow")
     camera_model: str | None = None
+    is_fisheye: bool | None = None
+    camera_angle_x: Angle | None = None
+    camera_angle_y: Angle | None = None
     w: Pixels | None = None
     h: Pixels | None = None
     fl_x: FiniteFloat | None = None
@@ -36,54 +50,98 @@ class _Intrinsics(BaseModel):
 
 class _Frame(_Intrinsics):
     file_path: str
-    transform_matrix: tuple[Row4, Row4, Row4] | tuple[Row4, Row4, Row4, Row4]
+    transform_matrix: Rows
+    mask_path: str | None = None
 
 
 class _Transforms(_Intrinsics):
     frames: list[_Frame]
+    applied_transform: Rows | None = None
+    applied_scale: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
 
 
 def read_transforms(path: Path) -> Scene:
     """The scene of a transforms.json; its unit is unknown (""). A frame's own intrinsics override those of the file.
 
+    Where the file has no size it is that of the photo; where it has no focal length, `camera_angle_x` (Blender) gives
+    it.
+    Warns (InputWarning) of masks that are not used.
+
     Raises:
-        InputError: the file is missing or broken, an intrinsic is missing, the camera model is not known, or a camera
-            is unsound; see `build_scene`.
+        InputError: the file is missing or broken, an intrinsic is missing, the camera model is not known, the applied
+            transform does not keep shapes, or a camera is unsound; see `build_scene`.
     """
     transforms = read_json(path, _Transforms)
-    shared = transforms.model_dump(exclude={"frames"}, exclude_none=True)
+    shared = transforms.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
+    undo = _undo_applied(path, transforms)
+    _check_lens_keys(path, transforms)
     photos = []
     for index, frame in enumerate(transforms.frames):
-        of_frame = frame.model_dump(exclude={"file_path", "transform_matrix"}, exclude_none=True)
+        of_frame = frame.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
         try:
-            photos.append(_photo(path.parent, frame, shared | of_frame))
+            photos.append(_photo(path.parent, frame, shared | of_frame, undo=undo))
         except InputError as error:
             raise InputError(f"{path}: frame {index} ({frame.file_path}): {error}") from None
+    num_masks = sum(frame.mask_path is not None for frame in transforms.frames)
+    if num_masks:
+        message = f"the mask_path of {num_masks} frames is not used: it does not tell leaves apart, as --masks does"
+        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=3)
     return build_scene(path.parent, photos, unit="", source=path)
 
 
-def _photo(folder: Path, frame: _Frame, intrinsics: dict) -> Photo:
-    for key in ("w", "h", "fl_x", "cx", "cy"):
-        if key not in intrinsics:
-            raise InputError(f"'{key}' is missing")
+def _undo_applied(path: Path, transforms: _Transforms) -> tuple[np.ndarray, float]:
+    """(4, 4) rigid: from the world that `applied_scale` has not scaled yet to that before `applied_transform`; and the
+    scale. nerfstudio moves a point X to scale * (applied_transform X)."""
+    applied = np.eye(4)
+    if transforms.applied_transform is not None:
+        applied[:3] = np.array(transforms.applied_transform)[:3]
+    R = applied[:3, :3]
+    if np.abs(R @ R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
+        raise InputError(f"{path}: applied_transform is not a rotation with a translation, so it cannot be undone")
+    return np.linalg.inv(applied), transforms.applied_scale
+
+
+def _check_lens_keys(path: Path, transforms: _Transforms) -> None:
+    for entry in (transforms, *transforms.frames):
+        for key in OTHER_LENSES:
+            if (entry.model_extra or {}).get(key):
+                raise InputError(f"{path}: the lens is of instant-ngp's kind '{key}', expected OpenCV's or its fisheye")
+
+
+def _photo(folder: Path, frame: _Frame, given: dict[str, Any], *, undo: tuple[np.ndarray, float]) -> Photo:
+    intrinsics = _complete(folder, frame, given)
     width, height, fx = intrinsics["w"], intrinsics["h"], intrinsics["fl_x"]
     fy = intrinsics.get("fl_y", fx)
     K = np.array([[fx, 0, intrinsics["cx"]], [0, fy, intrinsics["cy"]], [0, 0, 1.0]])
     world_from_cam = np.array(frame.transform_matrix)
     if world_from_cam[3:].tolist() not in ([], [[0.0, 0.0, 0.0, 1.0]]):
         raise InputError("the last row of transform_matrix is not 0, 0, 0, 1")
-    R = (world_from_cam[:3, :3] @ OPENGL_FROM_OPENCV).T
-    file = frame.file_path
-    if not (folder / file).is_file():  # nerfstudio allows leaving out ".png"
-        file = next((file + end for end in (".png", ".jpg", ".jpeg") if (folder / (file + end)).is_file()), file)
-    t = -R @ world_from_cam[:3, 3]
-    return Photo(file=file, width=width, height=height, K=K, R=R, t=t, lens=_lens(intrinsics, K))
+    undo_applied, scale = undo
+    R = (undo_applied[:3, :3] @ world_from_cam[:3, :3] @ OPENGL_FROM_OPENCV).T
+    t = -R @ (undo_applied[:3, :3] @ world_from_cam[:3, 3] / scale + undo_applied[:3, 3])
+    return Photo(file=frame.file_path, width=width, height=height, K=K, R=R, t=t, lens=_lens(intrinsics, K))
+
+
+def _complete(folder: Path, frame: _Frame, given: dict[str, Any]) -> dict[str, Any]:
+    """The intrinsics, with the size of the photo and the focal length of the angle of view where they are missing."""
+    found = dict(given)
+    if "w" not in found or "h" not in found:
+        found = dict(zip(("w", "h"), size_of_photo(folder, frame.file_path), strict=True)) | given
+    if "fl_x" not in found and "camera_angle_x" in found:
+        fx = found["w"] / 2 / math.tan(found["camera_angle_x"] / 2)
+        fy = found["h"] / 2 / math.tan(found["camera_angle_y"] / 2) if "camera_angle_y" in found else fx
+        found = {"fl_y": fy, "cx": found["w"] / 2, "cy": found["h"] / 2} | found | {"fl_x": fx}
+    for key in ("fl_x", "cx", "cy"):
+        if key not in found:
+            raise InputError(f"'{key}' is missing")
+    return found
 
 
 def _lens(intrinsics: dict, K: np.ndarray) -> pycolmap.Camera | None:
     model, width, height = intrinsics.get("camera_model", "OPENCV"), intrinsics["w"], intrinsics["h"]
     k1, k2, k3, k4, p1, p2 = (intrinsics.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
-    if model == "OPENCV_FISHEYE":
+    if model == "OPENCV_FISHEYE" or (intrinsics.get("is_fisheye") and "camera_model" not in intrinsics):
+        model = "OPENCV_FISHEYE"
         params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, k4]
         return pycolmap.Camera(model=model, width=width, height=height, params=params)
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):

@@ -42,6 +42,7 @@ def describe_run(
         "scene": result.scene.name,
         "inputs": {str(path): hash_files(path) for path in (result.scene.source, source) if path is not None},
         "config": {"masks": masks and str(masks)} | options,
+        "mask_kind": result.mask_kind or None,
         "warnings": list(messages),
     }
 

@@ -33,6 +33,21 @@ class _Instances(BaseModel):
     annotations: list[_Instance]
 
 
+def find_result(folder: Path) -> Path:
+    """The result folder that a path means: itself, or the only result in it (`mvseg match` writes one per scene).
+
+    Raises:
+        InputError: it holds several results.
+    """
+    if (folder / "instances.json").is_file() or not folder.is_dir():
+        return folder
+    inside = sorted(path.parent for path in folder.glob("*/instances.json"))
+    if len(inside) > 1:
+        names = ", ".join(path.name for path in inside[:3]) + (", ..." if len(inside) > 3 else "")
+        raise InputError(f"{folder}: holds {len(inside)} results ({names}), expected one of them: {inside[0]}")
+    return inside[0] if inside else folder
+
+
 def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
     """Estimated and true instance ids of the regions of a result.
 

@@ -30,6 +30,7 @@ class Result:
         traits: of the plant and its leaves; None when only ids were asked for.
         seconds: {stage: wall time}.
         detection_scores: (D,) float32, the detector's score of each mask; None when the masks were given.
+        mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
     """
 
     scene: Scene
@@ -40,3 +41,4 @@ class Result:
     traits: Traits | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     detection_scores: Tensor | None = None
+    mask_kind: str = ""

@@ -150,8 +150,7 @@ BAD: list[tuple[Any, str]] = [
     ({"size": [HEIGHT, WIDTH], "counts": [0, WIDTH * HEIGHT + 1]}, "do not add up to 60 x 40"),
     ({"size": [WIDTH, HEIGHT], "counts": [0, WIDTH * HEIGHT]}, "its mask is 40 x 60, expected 60 x 40"),
     ({"size": [10**9, 10**9], "counts": "PPYo1"}, "its mask is 1000000000 x 1000000000"),
-    ([], "expected polygons"),
-    ([[]], "expected polygons"),
+    ([[], []], "expected polygons"),
     ([[1.0, 2.0, 3.0, 4.0]], "expected polygons"),
     ([POLYGON, [1.0, 2.0, 3.0, 4.0]], "expected polygons"),
     ([[*POLYGON, 3.0]], "expected polygons"),
@@ -178,7 +177,6 @@ def test_broken_masks_are_named(segmentation: Any, message: str, scene: Scene, t
         [[1.0, 2.0, float("nan"), 4.0, 5.0, 6.0]],
         [[1.0, 2.0, 10**400, 4.0, 5.0, 6.0]],
         "circle",
-        None,
     ],
 )
 def test_masks_of_another_form_are_named(segmentation: Any, scene: Scene, tmp_path: Path) -> None:
@@ -188,9 +186,90 @@ def test_masks_of_another_form_are_named(segmentation: Any, scene: Scene, tmp_pa
         read_coco(path, scene)
 
 
-def test_missing_image_entry(scene: Scene, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"masks.json: view 1 \(b\) has no entry among the images"):
-        read_coco(write(tmp_path, [], ("a.jpg",)), scene)
+def test_views_that_the_file_does_not_list_are_empty_and_named(scene: Scene, tmp_path: Path) -> None:
+    message = r"1 views have no entry among the images and no masks, the first is view 1 \(b\); the file holds a.jpg, c"
+    with pytest.warns(InputWarning, match=message):
+        masks = read_coco(write(tmp_path, [{"segmentation": [POLYGON]}], ("a.jpg", "c.jpg")), scene)
+    assert [len(view) for view in masks] == [1, 0]
+
+
+def test_a_file_of_other_photos_says_what_it_holds(scene: Scene, tmp_path: Path) -> None:
+    files = ("c.jpg", "d.jpg", "e.jpg", "f.jpg", "g.jpg")
+    message = r"none of its images is a photo of the scene, expected a.jpg, b.jpg, found c.jpg, d.jpg, e.jpg and 2 more"
+    with pytest.raises(InputError, match=message):
+        read_coco(write(tmp_path, [], files), scene)
+
+
+@pytest.mark.parametrize("form", ["lm/day1/{}.jpg", "{}_jpg.rf.0a1b2c.jpg", "D:\\x\\{}.JPG", "{}.PNG", "/x/{}"])
+def test_names_of_other_machines_fit_by_their_base_name(form: str, scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": [POLYGON]}], (form.format("a"), form.format("b")))
+    if form == "{}.PNG":  # the suffix alone says nothing
+        assert [len(view) for view in read_coco(path, scene)] == [1, 0]
+        return
+    with pytest.warns(InputWarning, match="2 names fit a photo by the base name only, the first is .* for a$"):
+        assert [len(view) for view in read_coco(path, scene)] == [1, 0]
+
+
+def test_base_names_that_are_not_unique(scene: Scene, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"both x/a.jpg and y/a.jpg could be view 0 \(a\), expected the path"):
+        read_coco(write(tmp_path, [], ("x/a.jpg", "y/a.jpg", "b.jpg")), scene)
+    path = write(tmp_path, [{"segmentation": [POLYGON]}], ("a.jpg", "y/a.jpg", "b.jpg"))
+    assert [len(view) for view in read_coco(path, scene)] == [1, 0]  # what fits better is enough
+
+
+def test_boxes_without_masks_are_counted(scene: Scene, tmp_path: Path) -> None:
+    box = {"bbox": [1, 2, 3, 4]}
+    annotations = [box, {"segmentation": [POLYGON]}, box | {"segmentation": []}, box | {"segmentation": [[]]}]
+    with pytest.warns(InputWarning, match=r"3 annotations have no mask \(a box at most\) and are left out"):
+        assert [number for number, _ in read_coco(write(tmp_path, annotations), scene)[0]] == [2]
+
+
+def test_ids_may_be_text_or_missing(scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": [POLYGON], "id": "x"}, {"segmentation": [OTHER]}])
+    assert [number for number, _ in read_coco(path, scene)[0]] == [1, 2]
+    content = json.loads(path.read_text())
+    content["images"][0]["id"] = "10"  # and its annotations say 10
+    for annotation in content["annotations"]:
+        del annotation["id"]
+    path.write_text(json.dumps(content))
+    assert [number for number, _ in read_coco(path, scene)[0]] == [1, 2]
+    content["annotations"][1]["segmentation"] = [[1.0]]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="annotation 2: its segmentation is not"):
+        read_coco(path, scene)
+    content["images"][1]["id"] = 10
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="2 images have 1 ids, expected one each"):
+        read_coco(path, scene)
+
+
+def test_lists_of_results(tmp_path: Path) -> None:
+    scene = make_scene("images/000.jpg", "images/017.jpg")
+    rles = [encode_mask(random_mask(seed)) for seed in range(2)]
+    for ids in ((17, 0), ("017", "000"), ("017.jpg", "000.jpg")):
+        results = [
+            {"image_id": image, "category_id": 1, "segmentation": rle, "score": 0.5}
+            for image, rle in zip(ids, rles, strict=True)
+        ]
+        (tmp_path / "results.json").write_text(json.dumps(results))
+        first, second = read_coco(tmp_path / "results.json", scene)
+        assert [number for number, _ in [*first, *second]] == [2, 1]
+        np.testing.assert_array_equal(second[0][1], random_mask(0))
+    with pytest.raises(InputError, match=r"none of its images .*, expected a.jpg, b.jpg, found 017.jpg, 000.jpg"):
+        read_coco(tmp_path / "results.json", make_scene("images/a.jpg", "images/b.jpg"))
+
+
+def test_categories_are_selected_or_named(scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": [POLYGON], "category_id": number} for number in (1, 2, 1, 9)])
+    content = json.loads(path.read_text())
+    content["categories"] = [{"id": 1, "name": "leaf"}, {"id": 2, "name": "pot"}, {"id": 3, "name": "stem"}]
+    path.write_text(json.dumps(content))
+    with pytest.warns(InputWarning, match=r"masks of 3 categories are taken alike \(2 leaf, 1 pot, 1 9\); --"):
+        assert len(read_coco(path, scene)[0]) == 4
+    for wanted, numbers in ((["leaf"], [1, 3]), (["pot", "9"], [2, 4]), (["stem"], [])):
+        assert [number for number, _ in read_coco(path, scene, categories=wanted)[0]] == numbers
+    with pytest.raises(InputError, match=r"there is no category 'leaves', expected of these: leaf, pot, stem, 9"):
+        read_coco(path, scene, categories=["leaves"])
 
 
 def test_other_image_size(scene: Scene, tmp_path: Path) -> None:

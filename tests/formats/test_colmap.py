@@ -13,7 +13,7 @@ import pytest
 import torch
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.colmap import is_colmap_model, read_colmap
+from mvseg.formats.colmap import find_colmap_model, is_colmap_model, read_colmap
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import arc_pose
@@ -239,3 +239,31 @@ def test_photos_without_a_pose_are_warned_of(small: Path, tmp_path: Path) -> Non
     with pytest.warns(InputWarning, match=r"1 photos in images/ have no pose .* the first is stranger\.jpg"):
         scene = read_colmap(model, tmp_path / "plant")
     assert "stranger" not in [view.name for view in scene.views]
+
+
+# --- Several models -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["text", "binary"])
+@pytest.mark.parametrize("place", ["sparse", "colmap/sparse"])
+def test_of_several_models_that_with_the_most_photos_is_taken(place: str, kind: str, tmp_path: Path) -> None:
+    for number, count in ((0, 2), (1, 5), (10, 3)):
+        (tmp_path / place / str(number)).mkdir(parents=True)
+        model = build_model(dict(list(LENSES.items())[:count]))
+        getattr(model, f"write_{kind}")(tmp_path / place / str(number))
+    message = r"sparse: there are 3 models \(0 with 2 photos, 1 with 5 photos, 10 with 3 photos\); 1 is taken"
+    with pytest.warns(InputWarning, match=message):
+        scene = load_scene(tmp_path)
+    assert scene.source == tmp_path / place / "1"
+    assert len(scene.views) == 5
+    for number in (0, 10):
+        shutil.rmtree(tmp_path / place / str(number))
+    assert len(load_scene(tmp_path).views) == 5  # alone, under any number, without a warning
+
+
+def test_a_model_in_sparse_itself_goes_first(small: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "plant"
+    shutil.copytree(small, folder)
+    shutil.copytree(small / "sparse", folder / "sparse" / "0")
+    assert load_scene(folder).source == folder / "sparse"
+    assert find_colmap_model(tmp_path) is None

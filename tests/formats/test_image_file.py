@@ -12,7 +12,7 @@ from PIL import Image
 
 from mvseg.errors import InputError
 from mvseg.formats import image_file
-from mvseg.formats.image_file import file_name_problem, read_image, read_rgb, write_png
+from mvseg.formats.image_file import file_name_problem, read_image, read_image_size, read_rgb, sensor_bits, write_png
 
 AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -70,6 +70,19 @@ def test_whole_files_give_the_pixels_of_opencv(name: str, tmp_path: Path) -> Non
     image = read_rgb(tmp_path / "image")
     assert image.flags.writeable  # torch.from_numpy warns of others
     np.testing.assert_array_equal(image[..., ::-1], cv2.imread(str(tmp_path / "image"), AS_STORED))
+
+
+@pytest.mark.parametrize("name", WHOLE)
+def test_the_head_tells_the_size_and_the_bits(name: str, tmp_path: Path) -> None:
+    (tmp_path / "image").write_bytes(WHOLE[name])
+    image = read_image(tmp_path / "image")
+    assert read_image_size(tmp_path / "image") == image.size
+    assert sensor_bits(tmp_path / "image") == (16 if name.startswith("16-bit") else 8)
+    (tmp_path / "image").write_bytes(WHOLE[name][:7])
+    with pytest.raises(InputError):
+        read_image_size(tmp_path / "image")
+    with pytest.raises(InputError, match="No such file"):
+        read_image_size(tmp_path / "absent")
 
 
 def test_a_film_behind_a_jpeg_does_no_harm(tmp_path: Path) -> None:

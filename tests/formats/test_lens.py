@@ -8,8 +8,7 @@ import pycolmap
 import pytest
 from scipy import ndimage
 
-from mvseg.formats.lens import distort, photo_from_pinhole, pinhole_from_photo, undistort
-from mvseg.formats.rig import opencv_lens
+from mvseg.formats.lens import distort, opencv_lens, photo_from_pinhole, pinhole_from_photo, undistort
 
 WIDTH, HEIGHT = 160, 120
 K = np.array([[150.0, 0, 81.3], [0, 155.0, 58.2], [0, 0, 1]])

@@ -12,7 +12,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import Photo, build_scene, check_photos, load_photos, read_photo, view_names
 from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
-from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, write_image, write_scene
+from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, write_image, write_scene
 
 
 def make_photo(file: str, view: int = 0, **changes: object) -> Photo:
@@ -163,3 +163,56 @@ def test_a_size_that_does_not_fit_names_exif(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((WIDTH, HEIGHT, 3), np.uint8)).save(folder / "images" / "000.jpg", exif=exif)
     with pytest.raises(InputError, match=rf"is {HEIGHT} x {WIDTH} \(as it is stored; EXIF turns it for display\)"):
         read_photo(load_scene(folder), 0)
+
+
+def test_photos_in_other_capitals_are_found(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    for view in range(4):
+        (folder / "images" / f"{view:03d}.png").rename(folder / "images" / f"{view:03d}.PNG")
+    scene = load_scene(folder)
+    assert [view.path.name for view in scene.views] == ["000.PNG", "001.PNG", "002.PNG", "003.PNG"]
+    assert [view.name for view in scene.views] == ["000", "001", "002", "003"]
+    check_photos(scene)
+
+
+def test_a_missing_photo_says_what_is_there(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    scene = load_scene(folder)
+    (folder / "images" / "001.png").rename(folder / "images" / "IMG_1.heic")
+    with pytest.raises(InputError, match=r"view 1 is missing; IMG_1.heic is a HEIC file: convert it to JPEG or PNG"):
+        check_photos(scene)
+    (folder / "images" / "IMG_1.heic").rename(folder / "images" / "plant.png")
+    with pytest.raises(InputError, match=r"view 1 is missing; found 000.png, 002.png, 003.png and 1 more"):
+        check_photos(scene)
+    for number in (0, 2, 3):
+        (folder / "images" / f"{number:03d}.png").unlink()
+    with pytest.warns(InputWarning, match=r"000.png: this photo and all others are missing; found plant.png"):
+        check_photos(scene)
+
+
+def test_heic_files_are_named(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    (folder / "images" / "001.png").write_bytes(b"\x00\x00\x00\x28ftypheic\x00\x00\x00\x00" + b"mif1heic" * 8)
+    with pytest.raises(InputError, match=r"view 1 cannot be read, .*: it is a HEIC file, expected JPEG, PNG"):
+        read_photo(load_scene(folder), 1)
+
+
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+@pytest.mark.parametrize("channels", [1, 3])
+def test_photos_of_12_bits_are_brightened_and_said(suffix: str, channels: int, tmp_path: Path) -> None:
+    """A camera of 12 bits writes 0 to 4095 into files of 16 bits."""
+    folder = write_scene(tmp_path / "plant")
+    rng = np.random.default_rng(2)
+    values = rng.integers(0, 4096, (HEIGHT, WIDTH, channels)[: 2 if channels == 1 else 3], dtype=np.uint16)
+    edit_rig(folder, 1, file=f"images/001.{suffix}")
+    write_image(folder / "images" / f"001.{suffix}", values)
+    scene = load_scene(folder)
+    with pytest.warns(InputWarning, match=rf"001.{suffix}: 1 photos of 16 bits hold .*, this one of 12 bits"):
+        check_photos(scene)
+    expected = (values >> 4).astype(np.uint8)
+    np.testing.assert_array_equal(read_photo(scene, 1), expected if channels == 3 else np.dstack([expected] * 3))
+    values[0, 0] = 65535
+    write_image(folder / "images" / f"001.{suffix}", values)
+    check_photos(scene)  # all 16 bits: no warning
+    difference = read_photo(scene, 1)[..., 0].astype(int) - (values.reshape(HEIGHT, WIDTH, -1)[..., 0] >> 8)
+    assert np.abs(difference).max() <= 1

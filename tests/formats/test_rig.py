@@ -16,7 +16,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.formats.rig import read_rig, write_rig
 from mvseg.scene import Scene
-from scene_folders import BALLS, HEIGHT, WIDTH, arc_pose, rig_content
+from scene_folders import BALLS, HEIGHT, WIDTH, arc_pose, edit_rig, rig_content, write_scene
 
 DISTORTION = [-0.2, 0.05, 0.001, -0.002, 0.01]
 
@@ -142,7 +142,7 @@ def test_bad_rigs_are_named(top: dict[str, Any], view: dict[str, Any], message: 
         read(tmp_path, rig | top)
 
 
-@pytest.mark.parametrize("key", ["file", "width", "height", "K", "R", "t"])
+@pytest.mark.parametrize("key", ["file", "R", "t"])
 def test_missing_keys_are_named(key: str, tmp_path: Path) -> None:
     rig = rig_content()
     del rig["views"][2][key]
@@ -179,3 +179,36 @@ def test_missing_file(tmp_path: Path) -> None:
 
 def test_image_size_is_that_of_the_camera(tmp_path: Path) -> None:
     assert read(tmp_path, rig_content()).cameras.sizes.tolist() == [[WIDTH, HEIGHT]] * 4
+
+
+def test_sizes_come_from_the_photos(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    expected = read_rig(folder / "cameras.json").cameras.sizes
+    rig = json.loads((folder / "cameras.json").read_text())
+    for view in rig["views"]:
+        del view["width"], view["height"]
+    (folder / "cameras.json").write_text(json.dumps(rig))
+    assert torch.equal(read_rig(folder / "cameras.json").cameras.sizes, expected)
+    (folder / "images" / "002.png").unlink()
+    with pytest.raises(InputError, match=r"view 2 \(images/002.png\): width and height are missing, and so is"):
+        read_rig(folder / "cameras.json")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"K": None}, "expected either K or a calibration file"),
+        ({"calibration": "a.yaml"}, "expected either K or a calibration file"),
+        ({"K": None, "calibration": "../a.yaml"}, "../a.yaml: the file name leads out of the scene folder"),
+        ({"K": None, "calibration": "absent.yaml"}, "absent.yaml: the calibration cannot be read"),
+        ({"K": None, "calibration": "a.yaml", "distortion": [0.1, 0, 0, 0]}, "distortion beside a calibration file"),
+        ({"K": None, "calibration": "a.yaml"}, "the calibration is of 640 x 480 pixels, the camera says 128 x 96"),
+    ],
+)
+def test_calibrations_that_do_not_fit(change: dict[str, object], message: str, tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    text = "image_width: 640\nimage_height: 480\ncamera_matrix: {data: [700, 0, 320, 0, 700, 240, 0, 0, 1]}\n"
+    (folder / "a.yaml").write_text(text)
+    edit_rig(folder, 1, **change)
+    with pytest.raises(InputError, match=rf"cameras.json: view 1 \(images/001.png\): .*{message}"):
+        read_rig(folder / "cameras.json")

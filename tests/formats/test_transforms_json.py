@@ -10,9 +10,11 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import photo_from_pinhole
+from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.transforms_json import read_transforms
 from mvseg.scene import Scene
 
@@ -143,7 +145,7 @@ BAD: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({"frames": []}, {}, "there are no views"),
     ({"frames": transforms()["frames"][:1]}, {}, "there is a single view"),
     ({"fl_x": None}, {}, r"frame 0 \(images/a.png\): 'fl_x' is missing"),
-    ({"w": None}, {}, r"frame 0 \(images/a.png\): 'w' is missing"),
+    ({"w": None}, {}, r"frame 0 \(images/a.png\): width and height are missing, and so is the photo"),
     ({"w": 10**30}, {}, "w: Input should be less than or equal to"),
     ({"fl_x": 0.0}, {}, "view 0 .*: the focal length is 0, 160"),
     ({"camera_model": "CUBIST"}, {}, r"frame 0 .*: the camera model 'CUBIST' is not known, expected OPENCV"),
@@ -172,3 +174,100 @@ def test_cut_short(length: int, tmp_path: Path) -> None:
     (tmp_path / "transforms.json").write_text(json.dumps(transforms())[:length])
     with pytest.raises(InputError, match=r"transforms.json: not a whole JSON file"):
         read_transforms(tmp_path / "transforms.json")
+
+
+# --- What other programs write into the same file -------------------------------------------------
+
+
+def write_photos(folder: Path, width: int = 200, height: int = 120) -> None:
+    (folder / "images").mkdir()
+    for name in "abc":
+        Image.new("RGB", (width, height)).save(folder / "images" / f"{name}.png")
+
+
+def test_instant_ngps_fisheye_is_opencvs(tmp_path: Path) -> None:
+    content = transforms() | {"is_fisheye": True, "k1": 0.05, "k2": -0.01, "k3": 0.002, "k4": 0.001, "aabb_scale": 4}
+    del content["camera_model"]
+    scene = read(tmp_path, content)
+    px, _ = scene.cameras.project(torch.from_numpy(POINTS))
+    K, coefficients = np.array([[150, 0, 101.0], [0, 160, 61.0], [0, 0, 1]]), np.array([0.05, -0.01, 0.002, 0.001])
+    for view in range(3):
+        R, t = scene.cameras.R[view].numpy(), scene.cameras.t[view].numpy()
+        expected, _ = cv2.fisheye.projectPoints(POINTS[:, None], cv2.Rodrigues(R)[0], t, K, coefficients)
+        found = photo_from_pinhole(scene.views[view].lens, scene.cameras.K[view].numpy(), px[view].numpy())
+        np.testing.assert_allclose(found, expected[:, 0], atol=1e-9)
+    assert read(tmp_path, content | {"is_fisheye": False, "k4": 0.0}).views[0].lens.model_name == "FULL_OPENCV"
+
+
+@pytest.mark.parametrize("key", ["ftheta_p0", "latlong", "equirectangular"])
+def test_other_lenses_of_instant_ngp_are_refused(key: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=f"transforms.json: the lens is of instant-ngp's kind '{key}'"):
+        read(tmp_path, transforms() | {key: 1.5})
+
+
+def test_what_nerfstudio_applied_is_undone(tmp_path: Path) -> None:
+    """Its ns-process-data swaps y and z; here with a shift and a scale, too. Points and cameras move together, so the
+    original points have the original pixels."""
+    applied = np.array([[1.0, 0, 0, 3], [0, 0, 1, -2], [0, -1, 0, 5]])
+    content = transforms()
+    expected = read(tmp_path, content).cameras
+    for frame in content["frames"]:
+        pose = np.array(frame["transform_matrix"])
+        moved = np.eye(4)
+        moved[:3, :3] = applied[:, :3] @ pose[:3, :3]
+        moved[:3, 3] = 0.25 * (applied[:, :3] @ pose[:3, 3] + applied[:, 3])
+        frame["transform_matrix"] = moved.tolist()
+    cameras = read(tmp_path, content | {"applied_transform": applied.tolist(), "applied_scale": 0.25}).cameras
+    np.testing.assert_allclose(cameras.R, expected.R, atol=1e-12)
+    np.testing.assert_allclose(cameras.t, expected.t, atol=1e-12)
+    np.testing.assert_allclose(cameras.project(torch.from_numpy(POINTS))[0][0], expected_px(CENTERS[0]), atol=1e-9)
+
+
+@pytest.mark.parametrize("applied", [np.diag([2.0, 2, 2, 1]), np.diag([1.0, 1, -1, 1])])
+def test_an_applied_transform_that_bends(applied: np.ndarray, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="applied_transform is not a rotation with a translation"):
+        read(tmp_path, transforms() | {"applied_transform": applied.tolist()})
+    with pytest.raises(InputError, match=r"transforms.json: applied_scale: Input should be greater than 0"):
+        read(tmp_path, transforms() | {"applied_scale": 0})
+
+
+def test_masks_of_nerfstudio_are_named(tmp_path: Path) -> None:
+    content = transforms()
+    content["frames"][1]["mask_path"] = "masks/b.png"
+    with pytest.warns(InputWarning, match=r"the mask_path of 1 frames is not used"):
+        read(tmp_path, content)
+
+
+def test_blenders_angle_of_view_and_the_size_of_the_photos(tmp_path: Path) -> None:
+    """As the NeRF paper's scenes: names without suffix, a focal length of half the width over tan of half the angle,
+    and the principal point in the middle."""
+    write_photos(tmp_path)
+    frames = [frame | {"file_path": f"./images/{name}", "rotation": 0.01}
+              for name, frame in zip("abc", transforms()["frames"], strict=True)]  # fmt: skip
+    scene = read(tmp_path, {"camera_angle_x": 2 * np.arctan(100 / 150.0), "frames": frames})
+    assert scene.cameras.sizes.tolist() == [[200, 120]] * 3
+    np.testing.assert_allclose(scene.cameras.K[0], [[150, 0, 100], [0, 150, 60], [0, 0, 1]], atol=1e-12)
+    center = scene.cameras.project(torch.zeros(1, 3))[0]
+    np.testing.assert_allclose(center[:, 0], [[100, 60]] * 3, atol=1e-9)  # all look at the origin
+    assert [view.path.name for view in scene.views] == ["a.png", "b.png", "c.png"]
+    (tmp_path / "transforms.json").rename(tmp_path / "transforms_train.json")
+    assert torch.equal(load_scene(tmp_path).cameras.K, scene.cameras.K)
+    with pytest.raises(InputError, match=r"camera_angle_x: Input should be less than"):
+        read(tmp_path, {"camera_angle_x": 4, "frames": frames})
+    (tmp_path / "images" / "b.png").write_bytes(b"hello")
+    with pytest.raises(InputError, match=r"frame 1 \(./images/b\): width and height are missing, and the photo"):
+        read(tmp_path, {"camera_angle_x": 1.0, "frames": frames})
+
+
+def test_paths_of_another_machine(tmp_path: Path) -> None:
+    write_photos(tmp_path)
+    content = transforms()
+    for name, frame in zip("abc", content["frames"], strict=True):
+        frame["file_path"] = f"/home/me/plant/photos/{name.upper()}.png"
+    with pytest.warns(InputWarning, match=r"3 photos are told by their names alone, the first is images/a"):
+        scene = read(tmp_path, content)
+    assert [view.name for view in scene.views] == ["a", "b", "c"]
+    assert all(view.path.is_file() for view in scene.views)
+    content["frames"][2]["file_path"] = "/home/me/d.png"
+    with pytest.raises(InputError, match=r"view 2 \(/home/me/d.png\): the file name leads out of the scene folder"):
+        read(tmp_path, content)

@@ -1,0 +1,99 @@
+"""Which view a file name means: files of masks come from other machines and tools, which name photos in their ways."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections import defaultdict
+from collections.abc import Sequence
+from pathlib import Path
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.image_file import PHOTO_SUFFIXES
+from mvseg.scene import Scene
+
+SHOWN = 3  # names in a message
+# Roboflow calls the export of 000.jpg "000_jpg.rf.<hash>.jpg".
+ROBOFLOW = re.compile(r"_(jpe?g|png|tiff?|bmp|webp|heic)\.rf\.\w+$", re.IGNORECASE)
+
+
+def find_views(names: Sequence[str], scene: Scene, *, source: Path) -> list[int | None]:
+    """The view that each file name means, None for a photo that is not in the scene.
+
+    A name means a view if it is the path of the view's photo, its last part, or the view's name with or without suffix.
+    Views that nothing means so may be told by the base name alone (folders, suffix and Roboflow's ending left out,
+    capitals as small letters), where only one view and one of the names have it.
+
+    Args:
+        names: paths with "/" or "\\" between folders, with or without suffix; of any machine.
+        scene: gives the views.
+        source: the file or folder that holds the names; messages name it.
+
+    Raises:
+        InputError: a name fits several views, or several names that fit nothing else have the base name of one view.
+    """
+    found = _exact_views(names, scene, source)
+    open_views = [view for view in range(len(scene.views)) if view not in set(found)]
+    bases = [base_name(scene.views[view].name) for view in open_views]
+    view_of = {base: view for base, view in zip(bases, open_views, strict=True) if bases.count(base) == 1}
+    first_of: dict[int, str] = {}
+    for index, name in enumerate(names):
+        view = view_of.get(base_name(name)) if found[index] is None else None
+        if view is None:
+            continue
+        if first_of.setdefault(view, name) != name:
+            message = f"both {first_of[view]} and {name} could be view {view} ({scene.views[view].name})"
+            raise InputError(f"{source}: {message}, expected the path of its photo")
+        found[index] = view
+    return found
+
+
+def base_name(name: str) -> str:
+    """A file name without folders, the suffix of an image and Roboflow's ending, in small letters."""
+    last = name.replace("\\", "/").rsplit("/", 1)[-1]
+    stem, dot, suffix = last.rpartition(".")
+    if dot and f".{suffix.lower()}" in (*PHOTO_SUFFIXES, ".heic", ".heif"):
+        last = stem
+    return ROBOFLOW.sub("", last).lower()
+
+
+def warn_of_base_names(names: Sequence[str], views: Sequence[int | None], scene: Scene, *, source: Path) -> None:
+    """Say (InputWarning) which names `find_views` told by their base name alone."""
+    exact = _exact_views(names, scene, source)
+    loose = [
+        (name, view)
+        for name, view, exact_view in zip(names, views, exact, strict=True)
+        if view is not None and exact_view is None
+    ]
+    if loose:
+        name, view = loose[0]
+        first = f"{name} for {scene.views[view].name}"
+        message = f"{len(loose)} names fit a photo by the base name only, the first is {first}"
+        warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
+
+
+def list_some(names: Sequence[str]) -> str:
+    """The first names, for a message: "a, b, c and 12 more", or "nothing"."""
+    distinct = list(dict.fromkeys(names))
+    more = f" and {len(distinct) - SHOWN} more" if len(distinct) > SHOWN else ""
+    return ", ".join(distinct[:SHOWN]) + more if distinct else "nothing"
+
+
+def _exact_views(names: Sequence[str], scene: Scene, source: Path) -> list[int | None]:
+    """The view of each name by its path or its name, None where that tells nothing."""
+    by_name = {view.name: index for index, view in enumerate(scene.views)}
+    by_path: dict[str, list[int]] = defaultdict(list)
+    for index, view in enumerate(scene.views):
+        parts = view.path.as_posix().split("/")
+        for start in range(len(parts)):
+            by_path["/".join(parts[start:])].append(index)
+    found: list[int | None] = []
+    for file_name in names:
+        name = file_name.replace("\\", "/").removeprefix("./")
+        same_name = by_name.get(name, by_name.get(name.rsplit(".", 1)[0]))
+        fitting = by_path[name] if same_name is None and name in by_path else []
+        if len(fitting) > 1:
+            views = " or ".join(f"{i} ({scene.views[i].name})" for i in fitting)
+            raise InputError(f"{source}: image {file_name} could be view {views}, expected its path")
+        found.append(fitting[0] if fitting else same_name)
+    return found

@@ -1,0 +1,63 @@
+"""What every reader of masks gives, and which of it is wanted."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.find_views import SHOWN
+
+
+@dataclass(frozen=True, eq=False)
+class FoundMask:
+    """One entry of a file of masks.
+
+    Attributes:
+        label: its number in the file.
+        mask: (H, W) bool, in the frame of the photo; None for a box, a line or a point, which show no pixels.
+        category: what it shows ("leaf"); "" where the format has no categories.
+    """
+
+    label: int
+    mask: np.ndarray | None
+    category: str = ""
+
+
+def check_categories(
+    counts: Mapping[str, int], wanted: Collection[str], *, known: Collection[str] = (), source: Path
+) -> None:
+    """Warn (InputWarning) of masks of several categories that are taken alike.
+
+    Args:
+        counts: how many masks each category has.
+        wanted: the categories that were asked for; empty for all.
+        known: categories that the file lists, with or without masks.
+        source: the file or folder; messages name it.
+
+    Raises:
+        InputError: a wanted category is not there.
+    """
+    present = [name for name in dict.fromkeys([*known, *counts]) if name]
+    missing = [name for name in wanted if name not in present]
+    if missing:
+        there = ", ".join(present) or "none"
+        raise InputError(f"{source}: there is no category '{missing[0]}', expected of these: {there}")
+    several = [name for name in counts if name and counts[name]]
+    if len(several) > 1 and not wanted:
+        shown = ", ".join(f"{counts[name]} {name}" for name in several[:SHOWN])
+        more = f" and {len(several) - SHOWN} more" if len(several) > SHOWN else ""
+        message = f"masks of {len(several)} categories are taken alike ({shown}{more}); --categories selects some"
+        warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
+
+
+def select_masks(masks: Sequence[FoundMask], wanted: Collection[str]) -> tuple[list[FoundMask], Counter[str]]:
+    """The wanted entries that show pixels, and how many masks of each category there are; boxes count as ""."""
+    counts = Counter(found.category for found in masks if found.mask is not None)
+    kept = [found for found in masks if found.mask is not None and (not wanted or found.category in wanted)]
+    return kept, counts

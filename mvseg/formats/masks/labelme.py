@@ -1,0 +1,101 @@
+"""labelme: one JSON file per photo, with polygons, rectangles, circles, or masks as small PNGs.
+
+Shapes of one label and one `group_id` are parts of one leaf. Points are continuous, the corner of the top-left pixel is
+(0, 0), as in COCO, whose polygon codec is used.
+"""
+
+from __future__ import annotations
+
+import base64
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL.PngImagePlugin import PngImageFile
+from pydantic import BaseModel, FiniteFloat
+
+from mvseg.errors import InputError
+from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.json_file import read_json
+from mvseg.formats.masks.found_mask import FoundMask
+
+CIRCLE_CORNERS = 64
+
+
+class _Shape(BaseModel):
+    label: str
+    points: list[tuple[FiniteFloat, FiniteFloat]]
+    group_id: int | str | None = None
+    shape_type: str | None = "polygon"
+    mask: str | None = None
+
+
+class LabelmeFile(BaseModel):
+    """What a labelme file holds."""
+
+    shapes: list[_Shape]
+    imageWidth: int | None = None
+    imageHeight: int | None = None
+
+
+def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
+    """The masks of a photo, numbered from 1 in the order of their first shapes; lines and points have no mask.
+
+    Raises:
+        InputError: the file is broken, is of a photo of another size, or a shape is malformed.
+    """
+    content = read_json(path, LabelmeFile)
+    size = (content.imageWidth or width, content.imageHeight or height)
+    if size != (width, height):
+        raise InputError(f"{path}: its photo is {size[0]} x {size[1]}, its camera says {width} x {height}")
+    parts: dict[tuple[str, Any], np.ndarray | None] = {}
+    for index, shape in enumerate(content.shapes):
+        try:
+            mask = _draw(shape, width, height)
+        except InputError as error:
+            raise InputError(f"{path}: shapes[{index}] ({shape.label}): {error}") from None
+        key = (shape.label, ("alone", index) if shape.group_id is None else shape.group_id)
+        earlier = parts.get(key)
+        parts[key] = mask if earlier is None else earlier if mask is None else earlier | mask
+    return [FoundMask(number, mask, label) for number, ((label, _), mask) in enumerate(parts.items(), start=1)]
+
+
+def _draw(shape: _Shape, width: int, height: int) -> np.ndarray | None:
+    """(height, width) bool; None for a shape without area."""
+    kind = shape.shape_type or "polygon"
+    if kind in ("line", "linestrip", "point", "points"):
+        return None
+    points = np.array(shape.points, np.float64).reshape(-1, 2)
+    if kind in ("rectangle", "circle", "mask") and len(points) not in ((2, 4) if kind == "rectangle" else (2,)):
+        raise InputError(f"a {kind} of {len(points)} points, expected 2")
+    if kind == "mask":
+        return _paste(shape.mask or "", points, width, height)
+    if kind == "rectangle":
+        (x1, y1), (x2, y2) = points.min(0), points.max(0)
+        points = np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2]])
+    elif kind == "circle":
+        angles = np.linspace(0, 2 * np.pi, CIRCLE_CORNERS, endpoint=False)
+        points = points[0] + np.hypot(*(points[1] - points[0])) * np.stack((np.cos(angles), np.sin(angles)), 1)
+    elif kind not in ("polygon", "oriented_rectangle"):
+        raise InputError(f"the shape type '{kind}' is not known, expected polygon, rectangle, circle or mask")
+    return decode_segmentation([points.ravel().tolist()], width, height)
+
+
+def _paste(text: str, points: np.ndarray, width: int, height: int) -> np.ndarray:
+    """A mask as a base64 PNG; its first point is the pixel of the top-left corner."""
+    try:
+        with PngImageFile(BytesIO(base64.b64decode(text, validate=True))) as image:
+            if image.width > width or image.height > height:
+                raise InputError(f"its mask is {image.width} x {image.height}, larger than the photo")
+            crop = np.asarray(image).astype(bool)
+    except InputError:
+        raise
+    except Exception:  # Pillow raises almost anything on a damaged file
+        raise InputError("its mask is not a whole PNG in base64") from None
+    left, top = np.round(points.min(0)).astype(int).tolist()
+    if crop.ndim != 2 or left < 0 or top < 0 or left + crop.shape[1] > width or top + crop.shape[0] > height:
+        raise InputError("its mask does not lie in the photo")
+    mask = np.zeros((height, width), bool)
+    mask[top : top + crop.shape[0], left : left + crop.shape[1]] = crop
+    return mask

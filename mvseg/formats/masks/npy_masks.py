@@ -1,0 +1,39 @@
+"""NumPy files: `.npy` with labels (H, W), or with a stack of masks (N, H, W). Nothing is ever unpickled."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from mvseg.errors import InputError
+from mvseg.formats.masks.found_mask import FoundMask
+from mvseg.formats.masks.label_image import labels_of_numbers
+
+
+def read_npy(path: Path, width: int, height: int) -> np.ndarray | list[FoundMask]:
+    """The (height, width) uint16 labels of a photo, or its masks, numbered from 1, where the file holds a stack.
+
+    Raises:
+        InputError: the file is no array of numbers, or has another size.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: the mask file is missing")
+    try:
+        array = np.load(path, mmap_mode="r", allow_pickle=False)  # the size is checked before anything is read
+    except Exception as error:  # numpy raises many kinds on a damaged head
+        has_objects = "Object arrays" in str(error) or "memory-mapped" in str(error)
+        reason = "it holds Python objects" if has_objects else "it is damaged"
+        raise InputError(f"{path}: cannot be read, expected an array of labels or masks ({reason})") from None
+    if not isinstance(array, np.ndarray):
+        array.close()
+        raise InputError(f"{path}: holds several arrays, expected one in a .npy file")
+    if array.shape[-2:] != (height, width) or array.ndim not in (2, 3):
+        shape = " x ".join(map(str, array.shape))
+        expected = f"expected {height} x {width}, or N x {height} x {width}"
+        raise InputError(f"{path}: its shape is {shape or 'empty'}, {expected}")
+    if array.ndim == 2:
+        return labels_of_numbers(path, np.asarray(array, np.uint8) if array.dtype == bool else np.asarray(array))
+    if array.dtype not in (bool, np.uint8, np.int64, np.int32, np.uint16):
+        raise InputError(f"{path}: holds a stack of {array.dtype}, expected masks of bool or whole numbers")
+    return [FoundMask(number, np.asarray(mask) != 0) for number, mask in enumerate(array, start=1)]

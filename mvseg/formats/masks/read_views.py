@@ -1,0 +1,75 @@
+"""The masks of a scene photo by photo, whatever kind of files they are in."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from collections.abc import Collection, Iterator
+
+import numpy as np
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.masks.cellpose import read_cellpose
+from mvseg.formats.masks.found_mask import FoundMask, check_categories, select_masks
+from mvseg.formats.masks.label_image import read_label_image
+from mvseg.formats.masks.labelme import read_labelme
+from mvseg.formats.masks.mask_images import read_mask_images
+from mvseg.formats.masks.npy_masks import read_npy
+from mvseg.formats.masks.recognise import MaskFiles
+from mvseg.formats.masks.sam import read_sam
+from mvseg.formats.masks.view_regions import ViewMasks
+from mvseg.formats.masks.yolo import read_class_names, read_yolo
+from mvseg.formats.photos import describe_turn
+from mvseg.scene import Scene
+
+
+def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> Iterator[ViewMasks]:
+    """The masks of each view in turn, in the frame of its photo: see `stack_views`.
+
+    At the end, warns (InputWarning) of entries without a mask, and of several categories if none is wanted.
+
+    Raises:
+        InputError: a file is missing, broken, or of another size than its view; or a wanted category is not there.
+    """
+    counts: Counter[str] = Counter()
+    num_boxes = 0
+    for view in range(len(found.files)):
+        try:
+            content = _read_view(scene, view, found)
+        except InputError as error:
+            turn = describe_turn(scene.views[view].path)
+            raise InputError(f"{error} (view {view}{turn and '; ' + turn})") from None
+        if isinstance(content, np.ndarray):
+            yield content
+            continue
+        masks, of_view = select_masks(content, wanted)
+        counts += of_view
+        num_boxes += len(content) - sum(of_view.values())
+        yield [(each.label, each.mask) for each in masks if each.mask is not None]
+    if num_boxes:
+        message = f"{num_boxes} entries are boxes, lines or points without a mask and are left out"
+        warnings.warn(f"{found.source}: {message}", InputWarning, stacklevel=4)
+    if any(map(bool, counts)) or wanted:
+        check_categories(counts, wanted, source=found.source)
+
+
+def _read_view(scene: Scene, view: int, found: MaskFiles) -> np.ndarray | list[FoundMask]:
+    paths = found.files[view]
+    width, height = scene.cameras.sizes[view].tolist()
+    if not paths:
+        return []
+    match found.kind:
+        case "label images":
+            return read_label_image(paths[0], width, height)
+        case "NumPy arrays":
+            return read_npy(paths[0], width, height)
+        case "cellpose":
+            return read_cellpose(paths[0], width, height)
+        case "labelme":
+            return read_labelme(paths[0], width, height)
+        case "SAM":
+            return read_sam(paths[0], width, height)
+        case "YOLO":
+            return read_yolo(paths[0], width, height, names=read_class_names(paths[0].parent))
+        case _:
+            return read_mask_images(paths, width, height)

@@ -1,0 +1,42 @@
+"""Segment Anything's automatic masks, one JSON file per photo: SA-1B's (`annotations`), or the list of
+`SamAutomaticMaskGenerator` with run lengths. Masks may overlap."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import RootModel
+
+from mvseg.errors import InputError
+from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.json_file import read_json
+from mvseg.formats.masks.found_mask import FoundMask
+
+
+class _SamFile(RootModel[Any]):
+    """Of either form; `read_sam` checks it."""
+
+
+def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
+    """The masks of a photo, numbered from 1 in the order of the file.
+
+    Raises:
+        InputError: the file is of another form, or a mask is broken or of another size.
+    """
+    root = read_json(path, _SamFile).root
+    entries = root.get("annotations") if isinstance(root, dict) else root
+    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
+        expected = "expected labelme's (shapes) or Segment Anything's (annotations, or a list of masks)"
+        raise InputError(f"{path}: is JSON of another form, {expected}")
+    masks = []
+    for number, entry in enumerate(entries, start=1):
+        segmentation = entry.get("segmentation")
+        if segmentation in (None, []):
+            masks.append(FoundMask(number, None))
+            continue
+        try:
+            masks.append(FoundMask(number, decode_segmentation(segmentation, width, height)))
+        except InputError as error:
+            raise InputError(f"{path}: mask {number}: {error}") from None
+    return masks

@@ -1,0 +1,91 @@
+"""YOLO segmentation: one .txt file per photo, one line per mask: `class x1 y1 x2 y2 ...`, from 0 to 1 over the photo.
+
+A confidence may stand at the end of each line (`save_conf` of ultralytics). Names of the classes come from a
+`classes.txt`, `obj.names` or `data.yaml` beside the files or in the folder above.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import yaml  # type: ignore[import-untyped]
+
+from mvseg.errors import InputError
+from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.masks.found_mask import FoundMask
+
+NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
+MAX_BYTES = 1 << 20  # of a file of names
+
+
+def read_yolo(path: Path, width: int, height: int, *, names: dict[int, str]) -> list[FoundMask]:
+    """The masks of a photo, numbered by their lines from 1; boxes (4 numbers) have no mask.
+
+    Args:
+        path: the .txt file.
+        width: of the photo, pixels.
+        height: of the photo, pixels.
+        names: of the classes, see `read_class_names`; others go by their numbers.
+
+    Raises:
+        InputError: the file cannot be read, a line is not as above, or a polygon leaves the photo by far.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
+    except (OSError, ValueError) as error:
+        raise InputError(f"{path}: cannot be read as text ({type(error).__name__})") from None
+    masks = []
+    for number, line in enumerate(lines, start=1):
+        if not line.strip():
+            continue
+        try:
+            masks.append(_read_line(line, number, (width, height), names=names))
+        except InputError as error:
+            raise InputError(f"{path}: line {number}: {error}") from None
+    return masks
+
+
+def _read_line(line: str, number: int, size: tuple[int, int], *, names: dict[int, str]) -> FoundMask:
+    first, *rest = line.split()
+    try:
+        kind, values = int(float(first)), [float(value) for value in rest]
+    except (ValueError, OverflowError):
+        raise InputError("holds something that is no number, expected: class x1 y1 x2 y2 x3 y3 ...") from None
+    category = names.get(kind, str(kind))
+    if len(values) in (4, 5):
+        return FoundMask(number, None, category)
+    if len(values) < 6:
+        raise InputError(f"has {len(values)} numbers after the class, expected three corners or more")
+    corners = np.array(values[: len(values) // 2 * 2]).reshape(-1, 2)  # an odd last one is the confidence
+    if not np.isfinite(corners).all() or np.abs(corners - 0.5).max() > 1:
+        raise InputError("its corners are not between 0 and 1 (shares of the photo's width and height)")
+    return FoundMask(number, decode_segmentation([(corners * size).ravel().tolist()], *size), category)
+
+
+def read_class_names(folder: Path) -> dict[int, str]:
+    """{class number: name}; empty where no file tells.
+
+    Raises:
+        InputError: a file of names cannot be read.
+    """
+    for place in (folder, folder.parent):
+        for name in NAME_FILES:
+            path = place / name
+            if path.is_file():
+                return _read_names(path)
+    return {}
+
+
+def _read_names(path: Path) -> dict[int, str]:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: is too large for a file of class names")
+        text = path.read_text(encoding="utf-8-sig")
+        names = (yaml.safe_load(text) or {}).get("names", []) if path.suffix == ".yaml" else text.split("\n")
+        pairs = names.items() if isinstance(names, dict) else enumerate(names)
+        return {int(number): str(name).strip() for number, name in pairs if str(name).strip()}
+    except InputError:
+        raise
+    except Exception:  # yaml and the shapes it may give
+        raise InputError(f"{path}: cannot be read as names of classes") from None

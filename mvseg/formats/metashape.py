@@ -1,0 +1,185 @@
+"""Agisoft Metashape's cameras in XML (File > Export > Export Cameras).
+
+`transform` of a camera is chunk_from_cam, with +x right, +y down and +z forward; that of the chunk or component
+(rotation, translation, scale) leads to the world, in metres. Metashape's manual gives the pixel of a ray (x, y, 1):
+
+    x' = x (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p1 (r^2 + 2 x^2) + 2 p2 x y
+    y' = y (1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8) + p2 (r^2 + 2 y^2) + 2 p1 x y
+    u = w / 2 + cx + x' (f + b1) + y' b2,    v = h / 2 + cy + y' f
+
+with the corner of the top-left pixel at (0, 0). p1 and p2 are OpenCV's p2 and p1.
+"""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.image_file import MAX_SIDE
+from mvseg.formats.lens import opencv_lens
+from mvseg.formats.photos import Photo, build_scene, find_photo
+from mvseg.scene import Scene
+
+MAX_BYTES = 1 << 26
+GEOCENTRIC = 1e5  # metres: farther from the origin, float32 has no millimetres left
+NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+
+
+def find_metashape(folder: Path) -> Path | None:
+    """The XML file of cameras in a scene folder: the first whose content looks like Metashape's; None if none does."""
+    for path in sorted(folder.glob("*.xml")):
+        try:
+            with path.open("rb") as file:
+                head = file.read(4096)
+        except OSError:
+            continue
+        if b"<document" in head and b"<chunk" in head:
+            return path
+    return None
+
+
+def read_metashape(path: Path) -> Scene:
+    """The scene of the cameras of a Metashape chunk, in the order of the file; photos are found by their labels.
+
+    The unit is "m" where the chunk has a transform (markers, scale bars or positions), else unknown. Of a geocentric
+    one, the translation is left out. A warning (InputWarning) says so, and how many cameras are not aligned.
+
+    Raises:
+        InputError: the file is no whole XML of Metashape's, holds several chunks or components, or a camera whose
+            sensor is unknown or not supported (fisheye, spherical, k4, p3, p4, b2 with distortion).
+    """
+    chunk = _read_chunk(path)
+    sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
+    try:
+        world_from_chunk = _find_transform(path, chunk)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    photos, num_left_out = [], 0
+    for index, camera in enumerate(chunk.iter("camera")):
+        text = camera.findtext("transform")
+        if text is None or camera.get("enabled") in ("0", "false"):
+            num_left_out += 1
+            continue
+        label = camera.get("label") or str(index)
+        try:
+            sensor = sensors.get(camera.get("sensor_id"))
+            photos.append(_photo(path.parent, label, sensor, transform=text, world_from_chunk=world_from_chunk))
+        except InputError as error:
+            raise InputError(f"{path}: camera {label}: {error}") from None
+    if num_left_out:
+        message = f"{num_left_out} cameras are not aligned or not enabled and are left out"
+        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=3)
+    unit = "" if world_from_chunk is None else "m"
+    return build_scene(path.parent, photos, unit=unit, source=path)
+
+
+def _read_chunk(path: Path) -> ElementTree.Element:
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"{path}: is larger than {MAX_BYTES >> 20} MiB, expected the cameras alone")
+        data = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # entities can ask for memory without end
+        raise InputError(f"{path}: declares a document type, which Metashape does not")
+    try:
+        document = ElementTree.fromstring(data)
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        raise InputError(f"{path}: not a whole XML file ({error})") from None
+    chunks = document.findall("chunk")
+    if document.tag != "document" or len(chunks) != 1:
+        raise InputError(f"{path}: holds {len(chunks)} chunks, expected the cameras of one chunk of Metashape")
+    return chunks[0]
+
+
+def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float] | None:
+    """R, T and scale of world_from_chunk: X = scale R x + T; None if the chunk has no scale of its own."""
+    components = chunk.findall("components/component")
+    used = {camera.get("component_id") for camera in chunk.iter("camera") if camera.find("transform") is not None}
+    if len(used) > 1:
+        raise InputError(f"the cameras are of {len(used)} components, expected one that holds all")
+    owners = [each for each in components if each.get("id") in used] or [chunk]
+    transform = owners[0].find("transform")
+    if transform is None or transform.find("scale") is None:
+        return None
+    R = _numbers(transform.findtext("rotation", "1 0 0 0 1 0 0 0 1"), 9).reshape(3, 3)
+    T = _numbers(transform.findtext("translation", "0 0 0"), 3)
+    scale = float(_numbers(transform.findtext("scale", "1"), 1)[0])
+    if scale <= 0:
+        raise InputError(f"the scale of the chunk is {scale:g}, expected a positive number")
+    if np.abs(T).max() > GEOCENTRIC:
+        message = f"the world is {np.linalg.norm(T):.3g} m from the origin (geocentric); its translation is left out"
+        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
+        T = np.zeros(3)
+    return R, T, scale
+
+
+def _photo(
+    folder: Path,
+    label: str,
+    sensor: ElementTree.Element | None,
+    *,
+    transform: str,
+    world_from_chunk: tuple[np.ndarray, np.ndarray, float] | None,
+) -> Photo:
+    if sensor is None:
+        raise InputError("its sensor is not in the file")
+    width, height, values = _read_sensor(sensor)
+    K = np.array(
+        [
+            [values["f"] + values["b1"], values["b2"], width / 2 + values["cx"]],
+            [0, values["f"], height / 2 + values["cy"]],
+            [0, 0, 1],
+        ]
+    )
+    distortion = [values[name] for name in ("k1", "k2", "p2", "p1", "k3")]
+    lens = opencv_lens(K, distortion, width=width, height=height) if any(distortion) else None
+    if lens is not None and values["b2"]:
+        raise InputError("its sensor has skew (b2) together with distortion, expected b2 = 0")
+    chunk_from_cam = _numbers(transform, 16).reshape(4, 4)
+    if chunk_from_cam[3].tolist() != [0, 0, 0, 1]:
+        raise InputError("the last row of its transform is not 0, 0, 0, 1")
+    R, center = chunk_from_cam[:3, :3], chunk_from_cam[:3, 3]
+    if world_from_chunk is not None:
+        turn, shift, scale = world_from_chunk
+        R, center = turn @ R, scale * turn @ center + shift
+    file = find_photo(folder, f"images/{label}")
+    return Photo(file=file, width=width, height=height, K=K, R=R.T, t=-R.T @ center, lens=lens)
+
+
+def _read_sensor(sensor: ElementTree.Element) -> tuple[int, int, dict[str, float]]:
+    """Width, height and the numbers of the calibration, adjusted if there is such a one."""
+    kind = sensor.get("type", "frame")
+    if kind != "frame":
+        raise InputError(f"its sensor is of the type {kind}, expected frame")
+    found = {each.get("class"): each for each in sensor.iterfind("calibration")}
+    calibration = found.get("adjusted", next(iter(found.values()), None))
+    if calibration is None:
+        raise InputError("its sensor has no calibration")
+    size = calibration.find("resolution")
+    size = sensor.find("resolution") if size is None else size
+    if size is None:
+        raise InputError("its sensor has no resolution")
+    width, height = (_numbers(size.get(side, ""), 1)[0] for side in ("width", "height"))
+    if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        raise InputError(f"the resolution of its sensor is {width:g} x {height:g}")
+    values = {name: float(_numbers(calibration.findtext(name, "0"), 1)[0]) for name in NAMES}
+    for name in ("k4", "p3", "p4"):
+        if values[name]:
+            advice = f"expected 0: optimise the cameras without {name}"
+            raise InputError(f"its sensor has {name} = {values[name]:g}, {advice}")
+    return int(width), int(height), values
+
+
+def _numbers(text: str, count: int) -> np.ndarray:
+    try:
+        numbers = np.array([float(word) for word in text.split()])
+    except ValueError:
+        numbers = np.array([np.nan])
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f"'{text.strip()[:40]}' is not {count} finite numbers")
+    return numbers

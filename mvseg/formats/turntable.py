@@ -1,0 +1,90 @@
+"""The turntable file `turntable.json`: one or more calibrated cameras that stand still, an axis, an angle per photo.
+
+    {"format": "mvseg-turntable/1", "unit": "mm",
+     "axis": {"point": [0, 0, 0], "direction": [0, 0, 1]},
+     "cameras": {"top": {"width": W, "height": H, "K": 3x3, "R": 3x3, "t": 3, "distortion": [k1, k2, p1, p2, k3]},
+                 "side": {"calibration": "side.yaml", "R": 3x3, "t": 3}},
+     "views": [{"file": "images/top_000.jpg", "camera": "top", "angle": 0},
+               {"file": "images/top_030.jpg", "camera": "top", "angle": 30}]}
+
+A camera is given as in a rig file; its R and t hold at the angle 0. The world stands on the table and turns with it.
+`angle` is in degrees and says how far the table has turned: anticlockwise, if the direction of the axis points towards
+who looks. Where the cameras go round a plant that stands still, the angles have the other sign.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import warnings
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, FiniteFloat
+from scipy.spatial.transform import Rotation
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.json_file import Vector3, read_json
+from mvseg.formats.photos import build_scene
+from mvseg.formats.rig import RigCamera, photo_of
+from mvseg.scene import Scene
+
+TURNTABLE_FORMAT = "mvseg-turntable/1"
+
+
+class _Axis(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+    point: Vector3
+    direction: Vector3
+
+
+class _View(BaseModel):
+    model_config = ConfigDict(extra="allow")
+    file: str
+    camera: str
+    angle: FiniteFloat
+
+
+class _Turntable(BaseModel):
+    model_config = ConfigDict(extra="allow")
+    format: Literal["mvseg-turntable/1"]
+    unit: str = ""
+    axis: _Axis
+    cameras: dict[str, RigCamera]
+    views: list[_View]
+
+
+def read_turntable(path: Path) -> Scene:
+    """The scene of a turntable file; photos are looked for beside it. Warns (InputWarning) of unknown keys.
+
+    Raises:
+        InputError: the file is missing, broken or of another format, a view names no camera of the file, the axis has
+            no direction, or a camera is unsound; see `photo_of` and `build_scene`.
+    """
+    table = read_json(path, _Turntable)
+    owners = [("the turntable", table), *((f"camera {name}", each) for name, each in table.cameras.items())]
+    for owner, entry in [*owners, *((f"view {index}", view) for index, view in enumerate(table.views))]:
+        for key in entry.model_extra or {}:
+            warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
+    if not any(table.axis.direction):
+        raise InputError(f"{path}: the direction of the axis is 0, 0, 0, expected a vector along the axis")
+    photos = []
+    for index, view in enumerate(table.views):
+        where = f"{path}: view {index} ({view.file})"
+        if view.camera not in table.cameras:
+            names = ", ".join(table.cameras)
+            raise InputError(f"{where}: there is no camera '{view.camera}', expected of these: {names}")
+        try:
+            photo = photo_of(path.parent, view.file, table.cameras[view.camera])
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from None
+        turn, shift = turn_about(np.array(table.axis.point), np.array(table.axis.direction), view.angle)
+        photos.append(dataclasses.replace(photo, R=photo.R @ turn, t=photo.R @ shift + photo.t))
+    return build_scene(path.parent, photos, unit=table.unit, source=path)
+
+
+def turn_about(point: np.ndarray, direction: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
+    """A turn about an axis: (3, 3) rotation and (3,) shift, so that X goes to rotation @ X + shift."""
+    axis = direction / np.linalg.norm(direction)
+    turn = Rotation.from_rotvec(axis * np.radians(degrees % 360)).as_matrix()
+    return turn, point - turn @ point

@@ -1,0 +1,84 @@
+"""YOLO's text files, as ultralytics reads and writes them (its source is not used: the form is four lines long)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvseg.errors import InputError
+from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.masks.yolo import read_class_names, read_yolo
+
+TRIANGLE = "0.1 0.1 0.9 0.2 0.5 0.8"
+
+
+def write(folder: Path, *lines: str) -> Path:
+    path = folder / "000.txt"
+    path.write_text("\n".join(lines))
+    return path
+
+
+def test_polygons_boxes_and_confidences(tmp_path: Path) -> None:
+    path = write(tmp_path, f"1 {TRIANGLE}", "", "0 0.5 0.5 0.2 0.2", f"0 {TRIANGLE} 0.87", "0 0.5 0.5 0.2 0.2 0.9")
+    found = read_yolo(path, 80, 60, names={0: "leaf"})
+    assert [(each.label, each.category, each.mask is None) for each in found] == [
+        (1, "1", False), (3, "leaf", True), (4, "leaf", False), (5, "leaf", True)
+    ]  # fmt: skip
+    expected = decode_segmentation([[8.0, 6, 72, 12, 40, 48]], 80, 60)
+    np.testing.assert_array_equal(found[0].mask, expected)
+    np.testing.assert_array_equal(found[2].mask, expected)
+
+
+def test_a_rectangle_has_exact_pixels(tmp_path: Path) -> None:
+    """Shares of the photo count from the corner of its top-left pixel."""
+    path = write(tmp_path, "0 0.1 0.2 0.5 0.2 0.5 0.7 0.1 0.7")
+    mask = np.zeros((10, 10), bool)
+    mask[2:7, 1:5] = True
+    np.testing.assert_array_equal(read_yolo(path, 10, 10, names={})[0].mask, mask)
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("leaf 0.1 0.1 0.2 0.2 0.3 0.3", "line 2: holds something that is no number, expected: class x1 y1"),
+        ("0 0.1 0.1", "line 2: has 2 numbers after the class, expected three corners or more"),
+        ("0 10 10 20 10 20 20", "line 2: its corners are not between 0 and 1"),
+        ("0 nan 0.1 0.2 0.2 0.3 0.3", "line 2: its corners are not between 0 and 1"),
+        ("1e999 0.1 0.1 0.2 0.2 0.3 0.3", "line 2: holds something that is no number"),
+    ],
+)
+def test_bad_lines_are_named(line: str, message: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=rf"000.txt: {message}"):
+        read_yolo(write(tmp_path, f"0 {TRIANGLE}", line), 80, 60, names={})
+
+
+def test_files_that_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "000.txt").write_bytes(b"\xff\xfe\x00")
+    for name in ("000.txt", "absent.txt"):
+        with pytest.raises(InputError, match=f"{name}: cannot be read as text"):
+            read_yolo(tmp_path / name, 80, 60, names={})
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("classes.txt", "leaf\npot\n"),
+        ("obj.names", "leaf\npot\n"),
+        ("data.yaml", "train: x\nnames: [leaf, pot]\n"),
+        ("data.yaml", "nc: 2\nnames:\n  0: leaf\n  1: pot\n"),
+    ],
+)
+def test_names_of_classes(file: str, text: str, tmp_path: Path) -> None:
+    (tmp_path / "labels").mkdir()
+    assert read_class_names(tmp_path / "labels") == {}
+    (tmp_path / file).write_text(text)
+    assert read_class_names(tmp_path) == read_class_names(tmp_path / "labels") == {0: "leaf", 1: "pot"}
+
+
+@pytest.mark.parametrize("text", ["names: [", "[1, 2]", "names: {a: b}", "names: !!python/object/apply:os.getcwd []"])
+def test_bad_names_of_classes(text: str, tmp_path: Path) -> None:
+    (tmp_path / "data.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"data.yaml: cannot be read as names of classes"):
+        read_class_names(tmp_path)
