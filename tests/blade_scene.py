@@ -43,11 +43,18 @@ class EllipticBlade:
         return hit
 
 
-def ring_cameras(num_views: int, *, distance: float = 6.0) -> Cameras:
+def ring_cameras(
+    num_views: int,
+    *,
+    distance: float = 6.0,
+    elevations_deg: tuple[float, ...] = (25, 60, 40),
+    arc_deg: float = 360,
+) -> Cameras:
     """Cameras around and above the origin, at changing heights."""
     rotations, centers = [], []
     for view in range(num_views):
-        azimuth, elevation = 2 * np.pi * view / num_views + 0.3, np.radians((25, 60, 40)[view % 3])
+        azimuth = np.radians(arc_deg) * view / num_views + 0.3
+        elevation = np.radians(elevations_deg[view % len(elevations_deg)])
         out = np.array([
             np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
         ])  # fmt: skip

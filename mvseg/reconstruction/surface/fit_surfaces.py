@@ -23,7 +23,7 @@ from mvseg.reconstruction.surface.fit_patch import (
 )
 from mvseg.reconstruction.surface.fit_photos import fit_photos
 from mvseg.reconstruction.surface.leaf_patch import Floats, measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
@@ -35,9 +35,12 @@ from mvseg.scene import Cameras
 
 HULL = ReconstructConfig(voxel_budget=25_000)
 HULL_BY_VOTE = ReconstructConfig(voxel_budget=25_000, seen_share=0.0)  # where faulty masks leave nothing of the first
-GOOD_IOU, IOU_PER_PX = 0.92, 0.2  # of a fit after which no other start is tried; less where the masks are noisy
-CLEAN_RMS_PX = 0.5  # up to which masks are not noisy
+GOOD_IOU = 0.9  # of a fit after which no less likely start is tried
 LEAST_GAIN = 0.03  # in IoU, for another start to be better
+AREA_COST = 0.1  # in IoU, of a surface e times as large: bulges can hide behind the outlines of a level leaf
+CLEAR_IOU = 0.75  # of a start that shows how the blade lies
+WIDE_COST = 0.1  # in IoU, of a start that is wider than long
+UNCLEAR, MOST_FITS = 0.05, 3  # starts that are worse by less than this are tried as well, and so many at most
 WRONG_SHARE = 0.25  # of the median share of voxels in a mask: with less of them it is another leaf's
 MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
@@ -125,7 +128,7 @@ def _fit_from_hull(
 
     The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
     """
-    best, best_iou, is_checked = None, -1.0, False
+    best, best_score, is_good, is_checked = None, -np.inf, False, False
     for config in (HULL, HULL_BY_VOTE):
         hull = back_project(members, cameras, config=config, free=free)
         if hull is None or not hull.occupied.any():
@@ -136,14 +139,41 @@ def _fit_from_hull(
                 masks = masks.select(is_right)
                 members = members.select(torch.isin(members.view_index, torch.from_numpy(masks.views)))
                 hull = back_project(members, cameras, config=HULL, free=free) or hull
-        for start in start_patches(hull.points.numpy()):
+        starts, ranks = _likely_starts(masks, hull.points.numpy())
+        for start, rank in zip(starts, ranks, strict=True):
+            if is_good and rank < ranks[0] - UNCLEAR:
+                break
             fit = fit_patch(masks, start, num_steps=NUM_STEPS)
-            iou = float(np.median(view_ious(masks, patch_grid(*FIT_GRID).points(fit.coefficients))))
-            if iou > best_iou + LEAST_GAIN:
-                best, best_iou = fit, iou
-            if best is not None and best_iou > GOOD_IOU - IOU_PER_PX * max(0.0, best.rms_px - CLEAN_RMS_PX):
-                return masks, best
+            iou = _median_iou(masks, fit.coefficients, offsets=np.nan_to_num(fit.offsets_px))
+            score = iou - AREA_COST * np.log(measure_sizes(fit.coefficients)[0])
+            if score > best_score + LEAST_GAIN:
+                best, best_score, is_good = fit, score, iou > GOOD_IOU
+        if is_good:
+            break
     return masks, best
+
+
+def _likely_starts(masks: MaskStack, points: Floats) -> tuple[list[Floats], list[float]]:
+    """At most MOST_FITS starts from the voxels (P, 3) of the hull, the likeliest first, and how likely each is.
+
+    They are told by how well they explain the masks as they are, before any fit.
+    """
+    starts = start_patches(points)
+    ranks = [_rank(masks, start) for start in starts]
+    if ranks and max(ranks) < CLEAR_IOU:
+        starts = start_patches(points, is_clear=False)
+        ranks = [_rank(masks, start) for start in starts]
+    order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_FITS]
+    return [starts[index] for index in order], [ranks[index] for index in order]
+
+
+def _rank(masks: MaskStack, start: Floats) -> float:
+    size = measure_patch(start)
+    return _median_iou(masks, start) - (WIDE_COST if 2 * size.half_width > size.length else 0.0)
+
+
+def _median_iou(masks: MaskStack, coefficients: Floats, *, offsets: Floats | None = None) -> float:
+    return float(np.median(view_ious(masks, patch_grid(*FIT_GRID).points(coefficients), offsets=offsets)))
 
 
 def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:

@@ -100,17 +100,17 @@ class LeafSurface:
     @cached_property
     def area(self) -> float:
         """One-sided area of the mesh; NaN without a surface."""
-        return _measures(self.coefficients.numpy())[0]
+        return measure_sizes(self.coefficients.numpy())[0]
 
     @cached_property
     def length(self) -> float:
         """Along the midrib from base to tip."""
-        return _measures(self.coefficients.numpy())[1]
+        return measure_sizes(self.coefficients.numpy())[1]
 
     @cached_property
     def width(self) -> float:
         """From edge to edge along the surface, at the widest place."""
-        return _measures(self.coefficients.numpy())[2]
+        return measure_sizes(self.coefficients.numpy())[2]
 
     @cached_property
     def deviations(self) -> tuple[float, float, float]:
@@ -194,7 +194,7 @@ class LeafSurface:
         return masks
 
 
-def _measures(coefficients: Floats) -> tuple[float, float, float]:
+def measure_sizes(coefficients: Floats) -> tuple[float, float, float]:
     """Area, length and width."""
     corners = grid_vertices(patch_grid(*MESH_SHAPE).points(coefficients))[grid_triangles(*MESH_SHAPE)]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])

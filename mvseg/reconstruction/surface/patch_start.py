@@ -24,21 +24,25 @@ NEIGHBOURS = 8
 ELONGATED = 2.0  # ratio of the two largest spreads from which a leaf may be bent so far that its axis is a curve
 BENT = 1.35  # or from this ratio of the way along the leaf to the straight one; graphs make detours of a tenth
 ROUND = 1.6  # ratio below which the midrib may as well run along the shorter axis
+TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # of the side about the midrib, where it is not clear
 LEAST_POINTS = 12
 
 
-def start_patches(points: Floats) -> list[Floats]:
+def start_patches(points: Floats, *, is_clear: bool = True) -> list[Floats]:
     """Rough patches through a cloud of points, the likeliest first.
 
     The long axis is straight (PCA), or a geodesic one for elongated clouds, so that strongly bent blades keep their
-    two ends. Windowed centroids along it are the midrib, in-plane spreads across it the sides.
+    two ends. Windowed centroids along it are the midrib, spreads across it the sides. Cameras that all look down at
+    one angle, or from one side, leave hulls of level leaves as thick as these are wide: there the spreads are no guide.
 
     Args:
         points: (P, 3) float64, centres of occupied voxels.
+        is_clear: the spreads show how the blade lies.
 
     Returns:
-        (26, 3) coefficients each, fold and curl 0: along the longest axis, and for round leaves also across it. None
-        with fewer than 12 points, or without any spread.
+        (26, 3) coefficients each, fold and curl 0: along the longest axis, and for round leaves also across it; where
+        it is not clear along both axes and with sides in four directions. None with fewer than 12 points, or without
+        any spread.
     """
     points = _thin(points)
     if len(points) < LEAST_POINTS:
@@ -48,19 +52,22 @@ def start_patches(points: Floats) -> list[Floats]:
     if spreads[1] <= 1e-9 * spreads[0] or spreads[0] == 0:
         return []
     straight, along = centred @ axes[0], _geodesic_places(points)
-    if spreads[0] > ELONGATED * spreads[1] or along.max() > BENT * np.ptp(straight):
-        return [_patch_along(points, along, axes[1])]
-    starts = [_patch_along(points, straight, axes[1])]
-    if spreads[0] < ROUND * spreads[1]:
-        starts.append(_patch_along(points, centred @ axes[1], axes[0]))
-    return starts
+    is_bent = spreads[0] > ELONGATED * spreads[1] or along.max() > BENT * np.ptp(straight)
+    places = [(along if is_bent else straight, axes[1])]
+    if not is_clear or (not is_bent and spreads[0] < ROUND * spreads[1]):
+        places.append((centred @ axes[1], axes[0]))
+    turns = (0.0,) if is_clear else TURNS_DEG
+    return [_patch_along(points, place, side, turn_deg=turn) for place, side in places for turn in turns]
 
 
-def _patch_along(points: Floats, place: Floats, side: Floats) -> Floats:
-    """A patch whose u follows `place` (P,); `side` (3,) is roughly where v points to."""
+def _patch_along(points: Floats, place: Floats, side: Floats, *, turn_deg: float) -> Floats:
+    """A patch whose u follows `place` (P,).
+
+    `side` (3,) is roughly where v points to: along the largest spread across, turned about the midrib.
+    """
     low, high = np.quantile(place, [0.005, 0.995])
     t = np.clip((place - low) / max(high - low, 1e-12), 0, 1)
-    return _coefficients(*_windows(points, t, side))
+    return _coefficients(*_windows(points, t, side, turn_deg=turn_deg))
 
 
 def _thin(points: Floats) -> Floats:
@@ -90,7 +97,7 @@ def _geodesic_places(points: Floats) -> Floats:
     return places
 
 
-def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
+def _windows(points: Floats, t: Floats, side: Floats, *, turn_deg: float) -> tuple[Floats, Floats]:
     """Centroid and half-width vector, (9, 3) each, of overlapping windows along t in [0, 1]."""
     centres = (np.arange(NUM_WINDOWS) + 0.5) / NUM_WINDOWS
     middles, sides = np.zeros((NUM_WINDOWS, 3)), np.zeros((NUM_WINDOWS, 3))
@@ -103,17 +110,19 @@ def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
         middles[index] = weight @ points / weight.sum()
     along = np.gradient(middles, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    turn = np.radians(turn_deg)
     directions = np.zeros((NUM_WINDOWS, 3))
     for index in order:
         near = np.abs(t - centres[index]) < 0.75 / NUM_WINDOWS
         flat = points[near] - middles[index] if near.sum() >= 4 else points - middles[index]
         flat = flat - (flat @ along[index])[:, None] * along[index]
-        direction = np.linalg.eigh(flat.T @ flat)[1][:, 2]
+        widest = np.linalg.eigh(flat.T @ flat)[1][:, 2]
         # Windows next to the middle one come first: each takes the sign of the nearest window that has a direction.
         done = np.flatnonzero(directions.any(1))
         before = directions[done[np.abs(done - index).argmin()]] if len(done) else side
-        directions[index] = direction * (1.0 if direction @ before >= 0 else -1.0)
-        sides[index] = np.quantile(np.abs(flat @ direction), 0.93) * directions[index]
+        directions[index] = widest * (1.0 if widest @ before >= 0 else -1.0)
+        turned = np.cos(turn) * directions[index] + np.sin(turn) * np.cross(along[index], directions[index])
+        sides[index] = np.quantile(np.abs(flat @ turned), 0.93) * turned
     return middles, sides
 
 
