@@ -1,7 +1,8 @@
 """How good are areas, lengths and widths? `python benchmarks/traits.py --cache ~/mvseg-cells [--views 10] [--plants 6]`
 
 Surfaces of simulated leaves against their meshes, by family, number of views and kind of masks ("true": the visible
-parts; "degraded": with the faults of a segmenter; ids are the true ones). Plants of 8 leaves, 480 x 480, cameras on a
+parts; "degraded": with the faults of a segmenter; "detected": what the shipped detector finds in the photos; ids are
+those of the leaves that the masks show). Plants of 8 leaves, 480 x 480, cameras on a
 200 degree arc, as in the preset "paper-eval". Rows are median / 90th percentile of |error| over all leaves, also those
 that the quality flag doubts; leaves without a surface are counted, not averaged. Width is the simulator's without the
 teeth of the edge. "distance" is the symmetric mean distance of the two surfaces in % of the length, "inside" the share
@@ -28,16 +29,18 @@ import numpy as np
 import torch
 import trimesh
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.label_maps import KINDS, load_maps, load_photos
+from benchmarks.label_maps import KINDS, LabelledScene, load_maps, load_photos
+from benchmarks.paper_tables.masks import find_masks
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.regions import regions_from_label_maps
+from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.simulation.blades import Leaf
 from mvseg.simulation.dataset import EVALUATED_FAMILIES, Preset, SceneSpec, list_scenes, run_all
 from mvseg.simulation.families import FAMILIES
@@ -55,7 +58,7 @@ def run_scene(spec: SceneSpec, *, cache: Path, kinds: list[str], has_photos: boo
     photos = load_photos(spec, cache).__getitem__ if has_photos else None
     records = []
     for kind in kinds:
-        regions, ids = scene.masks(kind)
+        regions, ids = scene.masks(kind) if kind in KINDS else detect_masks(spec, scene, cache)
         start = time.perf_counter()
         surfaces = fit_surfaces(regions, torch.where(ids > 0, ids, -1), scene.cameras, photos=photos)
         seconds = (time.perf_counter() - start) / max(len(surfaces), 1)
@@ -65,6 +68,13 @@ def run_scene(spec: SceneSpec, *, cache: Path, kinds: list[str], has_photos: boo
                 errors = compare(surfaces[leaf.leaf_id], leaf, FAMILIES[spec.family].teeth)
                 records.append({**cell, "leaf": leaf.leaf_id, "seconds": seconds, **errors})
     return records
+
+
+def detect_masks(spec: SceneSpec, scene: LabelledScene, cache: Path) -> tuple[Regions, Tensor]:
+    """The D masks of the shipped detector, and (D,) the leaf that each of them shows, 0 = none."""
+    photos = torch.from_numpy(load_photos(spec, cache)).permute(0, 3, 1, 2)
+    found = find_masks((photo.float() / 255 for photo in photos), scene.true, detector="leaf-slim")
+    return found.regions, found.true_ids
 
 
 def compare(surface: LeafSurface, leaf: Leaf, teeth: float) -> dict[str, Any]:
@@ -165,7 +175,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the plants; another one for plants never looked at")
     parser.add_argument("--families", nargs="+", choices=EVALUATED_FAMILIES, default=EVALUATED_FAMILIES)
     parser.add_argument("--views", nargs="+", type=int, default=(5, 10, 20))
-    parser.add_argument("--masks", nargs="+", choices=KINDS, default=KINDS)
+    parser.add_argument("--masks", nargs="+", choices=(*KINDS, "detected"), default=KINDS)
     parser.add_argument("--photos", action="store_true", help="fit to the texture in the photos as well")
     parser.add_argument("--plants", type=int, default=1, help="per family")
     parser.add_argument("--workers", type=int, default=2)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,13 +52,18 @@ def degraded_masks(cell: Cell) -> Masks:
 
 def detected_masks(cell: Cell, detector: str) -> Masks:
     """The masks that a shipped detector, or one in a .safetensors file, finds in each photo separately."""
+    return find_masks(load_photos(cell.scene), cell.truth, detector=detector)
+
+
+def find_masks(photos: Iterable[Tensor], truth: Sequence[np.ndarray], *, detector: str) -> Masks:
+    """The same for photos (3, H, W) float32 in [0, 1] with true label maps (H, W)."""
     from mvseg.detectors.run import detect
     from mvseg.detectors.zoo import load_detector
 
     model = load_detector(detector)
     view_index, boxes, crops = [], [], []
     with torch.no_grad():
-        for view, photo in enumerate(load_photos(cell.scene)):
+        for view, photo in enumerate(photos):
             detections, pasted = detect(model, photo)
             for score, soft in zip(detections["scores"].tolist(), pasted, strict=True):
                 mask = soft > 0.5
@@ -67,17 +73,17 @@ def detected_masks(cell: Cell, detector: str) -> Masks:
                 view_index.append(view)
                 boxes.append((x1, y1, x2, y2))
                 crops.append(mask[y1:y2, x1:x2].flatten())
-    regions = stack_regions(view_index, boxes, crops, labels=range(len(crops)), num_views=len(cell.truth))
-    return tie_detections(regions, cell.truth)
+    regions = stack_regions(view_index, boxes, crops, labels=range(len(crops)), num_views=len(truth))
+    return tie_detections(regions, truth)
 
 
-def most_shown(regions: Regions, truth: tuple[np.ndarray, ...]) -> Tensor:
+def most_shown(regions: Regions, truth: Sequence[np.ndarray]) -> Tensor:
     """(D,) int64: the leaf that each region shows most of, 0 when it shows none or mostly ignored pixels."""
     shown = shown_instances(regions, truth, count_background=False)
     return torch.where(shown == IGNORE_LABEL, 0, shown)
 
 
-def tie_detections(regions: Regions, truth: tuple[np.ndarray, ...]) -> Masks:
+def tie_detections(regions: Regions, truth: Sequence[np.ndarray]) -> Masks:
     """The masks of a detector; each shows the leaf whose true mask it has its best IoU with, if that is 0.5 or more."""
     leaf = tied_instances(regions, truth)
     found = set(zip(regions.view_index[leaf > 0].tolist(), leaf[leaf > 0].tolist(), strict=True))
