@@ -79,6 +79,8 @@ def build_parser() -> ArgumentParser:
     infer.add_argument("--unit", type=str | None, help="name of the world's unit, after --scale (default: the scene's)")
     help_up = "which way is up: X Y Z, or 'rig' to find it from level cameras (default: what the scene says, if at all)"
     infer.add_argument("--up", type=str | list[float] | None, help=help_up)
+    help_rims = "draw the rims of the surfaces, as the cameras see them, into overlay/"
+    infer.add_argument("--draw_rims", type=bool, default=True, help=help_rims)
     verbs.add_subcommand("infer", infer, help="ids and 3D shapes of one scene")
 
     match = ArgumentParser(exit_on_error=False, description="Ids only, of any number of scenes.")
@@ -151,6 +153,7 @@ def _infer(args: Namespace) -> int:
         unit=args.unit,
         up=_read_up(args.up),
         split_merged=args.split_merged,
+        draw_rims=args.draw_rims,
         coco_crowd=args.coco_crowd,
         categories=args.categories,
     )
@@ -233,7 +236,7 @@ def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet
         print(f"mvseg: warning: {message}", file=sys.stderr)
     run = describe_run(result, masks, config, messages=messages)
     run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
-    save_result(result, out, run, progress=not quiet)
+    save_result(result, out, run, progress=not quiet, draw_rims=config.draw_rims)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
     print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")

@@ -27,6 +27,7 @@ class RunConfig:
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
             level; None for that of the scene.
         split_merged: cut a mask that seems to cover two instances in two.
+        draw_rims: draw the rims of the surfaces into the overlays.
         coco_crowd: what annotations with `iscrowd` are in a COCO file of masks: "mask", one like all others, or
             "ignore", left out.
         categories: names of the categories whose masks are taken, with commas between them ("leaf,petiole"), where the
@@ -41,6 +42,7 @@ class RunConfig:
     unit: str | None = None
     up: Up | None = None
     split_merged: bool = False
+    draw_rims: bool = True
     coco_crowd: Literal["mask", "ignore"] = "mask"
     categories: str | None = None
 

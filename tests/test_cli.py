@@ -202,6 +202,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "scale": None,
         "unit": None,
         "up": None,
+        "draw_rims": True,
     }
     assert run["mvseg"] == mvseg.__version__
     assert run["mask_kind"] == "label images"
@@ -225,6 +226,15 @@ def test_which_way_is_up(words: list[str], up: list[float] | None, plant: Path, 
     said = json.loads((tmp_path / "out" / "run.json").read_text())["traits"]
     assert said["up"] == up
     assert said["unit"] == ("cm" if "cm" in words else "mm")
+
+
+def test_rims_may_be_left_out(plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    drawn = []
+    monkeypatch.setattr("mvseg.results.folder.save_result", lambda *_, draw_rims, **__: drawn.append(draw_rims))
+    for words in (["--draw_rims", "false"], ["--config", "{draw_rims: false}"], []):
+        out = ["--out", str(tmp_path / "out"), "--quiet", *COARSE]
+        assert main(["infer", *words, *out, "--masks", "masks", str(plant)]) == 0
+    assert drawn == [False, False, True]
 
 
 @pytest.mark.parametrize("words", [["up"], ["0", "1"], ["0 0 0"], ["0 0 x"], ["nan", "0", "1"]])

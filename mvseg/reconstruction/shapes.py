@@ -41,7 +41,7 @@ def reconstruct_shapes(
 
     Returns:
         {instance id: surface}, None with "voxels"; and {instance id: voxels}: of all instances with "voxels" or "both",
-        of those without a credible surface with "surface".
+        of those without a credible surface with "surface". Their crumbs are dropped (`VoxelGrid.without_crumbs`).
 
     Raises:
         InputError: see `fit_surfaces` and `reconstruct_instances`.
@@ -61,7 +61,8 @@ def reconstruct_shapes(
             instance_ids = instance_ids.where(~torch.isin(instance_ids, torch.tensor(credible).to(instance_ids)), -1)
             if not bool((instance_ids > 0).any()):
                 return surfaces, {}
-    return surfaces, reconstruct_instances(regions, instance_ids, cameras, config=config, progress=progress)
+    voxels = reconstruct_instances(regions, instance_ids, cameras, config=config, progress=progress)
+    return surfaces, {instance: grid.without_crumbs() for instance, grid in voxels.items()}
 
 
 def best_shape(instance: int, surfaces: Surfaces | None, voxels: Voxels | None) -> LeafSurface | VoxelGrid | None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 import torch
 import trimesh
+from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 from tqdm import tqdm
@@ -21,6 +22,7 @@ from mvseg.scene import Cameras
 SEARCH_CELLS = 24  # cells along the bounding box of an instance when the search for it ends
 MAX_CELLS = 100_000  # or how many cells there are by then
 MAX_VOXELS = 200_000_000
+CRUMB = 0.02  # of the voxels of the largest piece; smaller pieces are crumbs
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +34,7 @@ class VoxelGrid:
             origin + voxel_size * (a + 0.5, b + 0.5, c + 0.5).
         voxel_size: edge length in world units.
         votes: (X, Y, Z) float32 in [0, 1]: share of the instance's views whose mask contains the centre (I_k, Eq. 6);
-            0 where `ReconstructConfig.seen_share` forbids the voxel.
+            0 where `ReconstructConfig.seen_share` forbids the voxel, and in crumbs that were dropped.
         num_views: views that could vote.
         threshold: a voxel is occupied when its share exceeds this.
     """
@@ -57,6 +59,31 @@ class VoxelGrid:
     def volume(self) -> float:
         """Occupied volume in cubed world units."""
         return int(self.occupied.sum()) * self.voxel_size**3
+
+    @property
+    def num_pieces(self) -> int:
+        """How many pieces the occupied voxels fall into.
+
+        Voxels that share a face are of one piece; those that share only an edge or a corner are not: in the mesh they
+        come apart, as a rule.
+        """
+        return len(self._pieces()[1])
+
+    def without_crumbs(self, least_share: float = CRUMB) -> VoxelGrid:
+        """The grid without pieces that have fewer voxels than this share of the largest one.
+
+        Their votes become 0, so that they are gone from points, volume and mesh alike.
+        """
+        piece, sizes = self._pieces()
+        if not len(sizes) or sizes.min() >= least_share * sizes.max():
+            return self
+        is_crumb = np.append(False, sizes < least_share * sizes.max())[piece]
+        return replace(self, votes=self.votes.masked_fill(torch.from_numpy(is_crumb).to(self.votes.device), 0))
+
+    def _pieces(self) -> tuple[np.ndarray, np.ndarray]:
+        """(X, Y, Z) piece of each voxel, from 1 on, 0 where it is free; (pieces,) their numbers of voxels."""
+        piece, _ = ndimage.label(self.occupied.cpu().numpy())
+        return piece, np.bincount(piece.ravel())[1:]
 
     def mesh(self) -> trimesh.Trimesh:
         """Closed surface of the occupied voxels (marching cubes between the last free and the first occupied share).

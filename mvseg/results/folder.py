@@ -24,13 +24,17 @@ from mvseg.formats.photos import read_photo
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
-from mvseg.results.overlay import draw_contact_sheet, draw_overlay, instance_color
+from mvseg.results.gltf import describe_leaves, describe_world, gltf_from_world
+from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile, instance_color
 from mvseg.results.result import Result
+from mvseg.results.rims import visible_rims
 from mvseg.traits.measure import Traits
 from mvseg.traits.table import write_long, write_wide
 
 
-def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False) -> None:
+def save_result(
+    result: Result, out: Path, run: dict[str, Any], *, progress: bool = False, draw_rims: bool = True
+) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
     The folder appears complete or not at all: it is written next to `out` and moved there at the end; until then an
@@ -41,6 +45,7 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         out: the folder.
         run: what goes into run.json besides timings and counts: version, config, inputs, warnings.
         progress: show a progress bar over the views.
+        draw_rims: draw the rims of the surfaces into the overlays, where there are surfaces.
 
     Raises:
         InputError: `out` cannot be written or holds something that is not a result (see `check_out`), or a photo is
@@ -49,7 +54,7 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
     check_out(out)
     try:
         with folder_whole(out) as folder:
-            _write_images(result, folder, progress)
+            _write_images(result, folder, progress, draw_rims=draw_rims)
             _write_instances(result, folder)
             if result.surfaces is not None or result.voxels is not None:
                 _write_shapes(result, folder)
@@ -68,9 +73,10 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
 
 
-def _write_images(result: Result, folder: Path, progress: bool) -> None:
+def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bool) -> None:
     scene, ids = result.scene, result.matching.instance_ids
-    overlays, has_photos = [], any(view.path.exists() for view in scene.views)
+    tiles, has_photos = [], any(view.path.exists() for view in scene.views)
+    rims = visible_rims((result.surfaces or {}) if draw_rims else {}, scene.cameras)
     views = list(enumerate(scene.views))
     for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
         width, height = scene.cameras.sizes[index].tolist()
@@ -78,11 +84,12 @@ def _write_images(result: Result, folder: Path, progress: bool) -> None:
         labels = distort(labels, view.lens, scene.cameras.K[index].cpu().numpy())
         write_label_png(folder / "labels" / f"{view.name}.png", labels)
         photo = read_photo(scene, index) if has_photos else np.full((height, width, 3), 40, np.uint8)
-        overlays.append(draw_overlay(photo, result.regions, result.matching, view=index))
+        drawn = draw_overlay(photo, result.regions, result.matching, view=index, rims=rims[index])
+        tiles.append(draw_tile(photo, result.regions, result.matching, view=index))
         overlay = folder / "overlay" / f"{view.name}.png"
         overlay.parent.mkdir(parents=True, exist_ok=True)
-        write_png(overlay, overlays[-1])
-    write_png(folder / "contact.png", draw_contact_sheet(overlays, [view.name for view in scene.views]))
+        write_png(overlay, drawn)
+    write_png(folder / "contact.png", draw_contact_sheet(tiles, [view.name for view in scene.views]))
 
 
 def _write_instances(result: Result, folder: Path) -> None:
@@ -134,7 +141,10 @@ def _write_shapes(result: Result, folder: Path) -> None:
             write_ply(folder / "leaves" / f"{name}.ply", mesh, color)
         if isinstance(shape, LeafSurface) and result.voxels and instance in result.voxels:
             write_ply(folder / "leaves" / f"{name}_voxels.ply", result.voxels[instance].mesh(), color)
-    write_glb(folder / "scene.glb", meshes, colors)
+    about, extras = describe_world(result.scene), describe_leaves(result.traits)
+    write_glb(
+        folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras
+    )
 
 
 def _describe_traits(traits: Traits) -> dict[str, Any]:

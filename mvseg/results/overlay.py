@@ -5,16 +5,23 @@ from __future__ import annotations
 import colorsys
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from mvseg.matching.result import SURE, Matching
 from mvseg.regions import Regions
+from mvseg.results.rims import Rims
 
 MAX_SIDE = 1600  # pixels of an overlay's longer side
 TILE_WIDTH = 480
+MARGIN = 0.06  # around the plant in a tile, of its longer side
+LEAST_SHARE = 0.05  # of the photo's width that a tile shows; a photo has no more detail
 UNMATCHED = (150, 150, 150)
+CAPITAL = 26  # pixels, height of a digit at scale 1
+EDGE = (20, 20, 20)  # of rims
+SUB_PIXEL_BITS = 4  # of OpenCV's lines
 
 
 def instance_color(instance: int) -> tuple[int, int, int]:
@@ -27,7 +34,9 @@ def instance_color(instance: int) -> tuple[int, int, int]:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def draw_overlay(photo: np.ndarray, regions: Regions, matching: Matching, *, view: int) -> np.ndarray:
+def draw_overlay(
+    photo: np.ndarray, regions: Regions, matching: Matching, *, view: int, rims: Rims | None = None
+) -> np.ndarray:
     """Tint the regions of one view in the colours of their instances, with outline and number.
 
     Args:
@@ -36,6 +45,7 @@ def draw_overlay(photo: np.ndarray, regions: Regions, matching: Matching, *, vie
         matching: of the regions. Unmatched regions are grey and have no number; numbers get a question mark where the
             match score is below 0.5.
         view: index of the view.
+        rims: {instance id: lines}, see `visible_rims`; drawn on top, in the instance's colour with a dark edge.
 
     Returns:
         uint8 RGB, scaled down so that the longer side has at most 1600 pixels.
@@ -43,26 +53,101 @@ def draw_overlay(photo: np.ndarray, regions: Regions, matching: Matching, *, vie
     height, width = photo.shape[:2]
     scale = min(1.0, MAX_SIDE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    canvas = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA))
-    painted, labels = canvas.copy(), []
+    window = _Window((0, 0, width, height), size)
+    return _draw(photo, regions, matching, view=view, window=window, rims=rims or {})
+
+
+def draw_tile(photo: np.ndarray, regions: Regions, matching: Matching, *, view: int) -> np.ndarray:
+    """The overlay of one view for the contact sheet: 480 pixels wide, cropped to the plant (`find_plant`).
+
+    Arguments as in `draw_overlay`.
+    """
+    height, width = photo.shape[:2]
+    box = find_plant(regions, matching, view=view, size=(width, height))
+    tile_height = max(1, round(TILE_WIDTH * height / width))
+    window = _Window(box, (TILE_WIDTH, tile_height))
+    return _draw(photo, regions, matching, view=view, window=window, rims={})
+
+
+def find_plant(
+    regions: Regions, matching: Matching, *, view: int, size: tuple[int, int]
+) -> tuple[int, int, int, int]:
+    """Box (xyxy, pixels) around all matched regions of one view, with a margin and the proportions of the photo.
+
+    Args:
+        regions: D regions.
+        matching: of the regions.
+        view: index of the view.
+        size: width and height of the photo, pixels.
+
+    Returns:
+        The box, inside the photo; the whole photo where nothing is matched.
+    """
+    boxes = regions.boxes[(regions.view_index == view) & (matching.instance_ids > 0) & (regions.areas > 0)]
+    if not len(boxes):
+        return 0, 0, *size
+    low, high = boxes[:, :2].amin(0).cpu().numpy(), boxes[:, 2:].amax(0).cpu().numpy()
+    share = np.clip((1 + 2 * MARGIN) * ((high - low) / size).max(), LEAST_SHARE, 1.0)
+    wanted = np.maximum(np.round(share * np.array(size)), 1)
+    x, y = np.clip(np.round((low + high - wanted) / 2), 0, size - wanted).astype(int).tolist()
+    width, height = wanted.astype(int).tolist()
+    return x, y, x + width, y + height
+
+
+@dataclass(frozen=True)
+class _Window:
+    """The part of a photo that is drawn: its box (xyxy, pixels), and the width and height of the picture of it."""
+
+    box: tuple[int, int, int, int]
+    size: tuple[int, int]
+
+    def cut(self, image: np.ndarray, interpolation: int) -> np.ndarray:
+        x1, y1, x2, y2 = self.box
+        return np.asarray(cv2.resize(image[y1:y2, x1:x2], self.size, interpolation=interpolation))
+
+    def place(self, xy: np.ndarray) -> np.ndarray:
+        """Pixel positions (n, 2) of the photo, in the picture."""
+        x1, y1, x2, y2 = self.box
+        return (xy - (x1, y1)) * np.array(self.size) / (x2 - x1, y2 - y1)
+
+
+@dataclass(frozen=True)
+class _Number:
+    """What is written, the pixel (column, row) of its middle, and the radius of the circle that fits there."""
+
+    text: str
+    center: tuple[int, int]
+    radius: float
+
+
+def _draw(
+    photo: np.ndarray, regions: Regions, matching: Matching, *, view: int, window: _Window, rims: Rims
+) -> np.ndarray:
+    height, width = photo.shape[:2]
+    longer = max(window.size)
+    enlarges = window.size[0] > window.box[2] - window.box[0]
+    canvas = window.cut(photo, cv2.INTER_CUBIC if enlarges else cv2.INTER_AREA)
+    painted = canvas.copy()
+    labels: list[_Number] = []
     members = (regions.view_index == view).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]  # small ones on top
     for index in members.tolist():
         instance = int(matching.instance_ids[index])
-        mask = regions.mask(index, width, height).cpu().numpy().astype(np.uint8)
-        mask = np.asarray(cv2.resize(mask, size, interpolation=cv2.INTER_NEAREST), np.uint8)
+        mask = window.cut(regions.mask(index, width, height).cpu().numpy().astype(np.uint8), cv2.INTER_NEAREST)
         color = instance_color(instance)
         painted[mask > 0] = 0.45 * canvas[mask > 0] + 0.55 * np.array(color)
         outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(painted, outlines, -1, color, max(1, round(max(size) / 600)))
+        cv2.drawContours(painted, outlines, -1, color, max(1, round(longer / 600)))
         if instance > 0 and mask.any():
             # The number goes where the mask is thickest, which is always inside it.
             depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
             row, column = np.unravel_index(depth.argmax(), depth.shape)
             doubt = "?" if matching.match_scores[index] < SURE else ""
-            labels.append((f"{instance}{doubt}", (int(column), int(row))))
-    for text, center in labels:
-        _write(painted, text, center, scale=max(size) / 1100)
+            labels.append(_Number(f"{instance}{doubt}", (int(column), int(row)), float(depth.max())))
+    for instance, lines in rims.items():
+        placed = [window.place(line) for line in lines]
+        _trace(painted, placed, instance_color(instance), width=max(1, round(longer / 800)))
+    _write(painted, labels, scale=max(0.35, longer / 1100))
     return painted
 
 
@@ -85,10 +170,25 @@ def draw_contact_sheet(overlays: Sequence[np.ndarray], names: Sequence[str]) -> 
     return np.concatenate(rows)
 
 
-def _write(canvas: np.ndarray, text: str, center: tuple[int, int], *, scale: float) -> None:
-    scale = max(0.35, scale)
-    (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, scale, 1)
-    corner = (center[0] - width // 2, center[1] + height // 2)
-    thick = max(1, round(2 * scale))
-    cv2.putText(canvas, text, corner, cv2.FONT_HERSHEY_SIMPLEX, scale, (255, 255, 255), 3 * thick, cv2.LINE_AA)
-    cv2.putText(canvas, text, corner, cv2.FONT_HERSHEY_SIMPLEX, scale, (0, 0, 0), thick, cv2.LINE_AA)
+def _trace(canvas: np.ndarray, lines: list[np.ndarray], color: tuple[int, int, int], *, width: int) -> None:
+    """Lines (n, 2) through pixel positions, with a dark edge, which is seen on any photo."""
+    corners = [np.round((line - 0.5) * (1 << SUB_PIXEL_BITS)).astype(np.int32) for line in lines]
+    for ink, thick in ((EDGE, width + 2), (color, width)):
+        cv2.polylines(canvas, corners, False, ink, thick, cv2.LINE_AA, SUB_PIXEL_BITS)
+
+
+def _write(canvas: np.ndarray, numbers: Sequence[_Number], *, scale: float) -> None:
+    """Black numbers with a white edge, smaller on small leaves."""
+    ink = np.zeros(canvas.shape[:2], np.uint8)
+    for number in numbers:
+        own = float(np.clip(2 * number.radius / CAPITAL, max(0.35, 0.5 * scale), scale))
+        (width, height), _ = cv2.getTextSize(number.text, cv2.FONT_HERSHEY_SIMPLEX, own, 1)
+        corner = (number.center[0] - width // 2, number.center[1] + height // 2)
+        cv2.putText(ink, number.text, corner, cv2.FONT_HERSHEY_SIMPLEX, own, 255, max(1, round(2 * own)), cv2.LINE_AA)
+    # A thicker stroke below would not do for an edge: what thickness means differs between versions of OpenCV.
+    edge = 2 * max(1, round(2 * scale)) + 1
+    halo = cv2.dilate(ink, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge)))
+    for layer, color in ((halo, 255.0), (ink, 0.0)):
+        near = layer > 0
+        share = layer[near, None] / 255
+        canvas[near] = np.round((1 - share) * canvas[near] + share * color)

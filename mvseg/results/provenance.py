@@ -32,7 +32,7 @@ def describe_run(
     if masks is not None:
         del options["detect"]
     if config.reconstruct is None:
-        for name in ("reconstruct", "traits", "scale", "unit", "up"):
+        for name in ("reconstruct", "traits", "scale", "unit", "up", "draw_rims"):
             del options[name]
     source = masks or find_weights(config.detect.weights) or Path(config.detect.weights)
     return {

@@ -109,9 +109,9 @@ def cell_normals(points: Floats) -> Floats:
 
 
 def measure_voxels(grid: VoxelGrid) -> dict[str, Measurement]:
-    """All of `VOXEL_TRAITS`: volume, and the corners of the box along the world's axes."""
+    """All of `VOXEL_TRAITS`: volume, the corners of the box along the world's axes, and the number of pieces."""
     points, half = grid.points, grid.voxel_size / 2
-    values = {"volume": grid.volume}
+    values = {"volume": grid.volume, "num_pieces": float(grid.num_pieces)}
     for end, corner in (("min", points.amin(0) - half), ("max", points.amax(0) + half)):
         values |= {f"{axis}_{end}": float(value) for axis, value in zip("xyz", corner, strict=True)}
     return {name: Measurement(value, float("nan"), "voxels") for name, value in values.items()}

@@ -173,6 +173,9 @@ def describe_leaf(
         found["quality"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons)))
     elif fitted is not None and rejection is None:
         reasons = (why,)
+    if isinstance(shape, VoxelGrid) and (num_pieces := shape.num_pieces) > 1:
+        reasons = (*reasons, f"in {num_pieces} pieces")
+        found["quality"] = missing(f"{why}; in {num_pieces} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
     full = {trait.name: found.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
     return LeafTraits(leaf=instance, numbers=full, method=method, reasons=reasons, rejection=rejection)

@@ -63,6 +63,7 @@ VOXEL_TRAITS = (
         for end, word in (("min", "least"), ("max", "largest"))
         for axis in "xyz"
     ),
+    _counted("num_pieces", "pieces that the voxels fall into"),
 )
 COUNTED_TRAITS = (
     _counted("num_views", "views with a mask of the leaf"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import torch
 import trimesh
 
+from known_leaves import bent_blade
 from mvseg.formats.mesh import write_glb, write_ply
 from mvseg.reconstruction.voxels import VoxelGrid
 
@@ -56,6 +58,41 @@ def test_glb_has_a_node_per_mesh(ball: trimesh.Trimesh, tmp_path: Path) -> None:
 def test_the_mesh_itself_stays_uncoloured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
     write_ply(tmp_path / "leaf.ply", ball, RED)
     assert not ball.visual.defined
+
+
+def test_glb_places_the_world_and_says_what_was_measured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
+    """Coordinates in the file stay the world's; the node above them turns z up to y and millimetres to metres."""
+    matrix = np.array([[0.001, 0, 0, 0], [0, 0, 0.001, 0], [0, -0.001, 0, 0], [0, 0, 0, 1]])
+    path, said = tmp_path / "scene.glb", {"leaf": 1, "traits": {"area": 12.5}}
+    more = {"about": {"unit": "mm"}, "extras": {"leaf_001": said}}
+    write_glb(path, {"leaf_001": ball}, {"leaf_001": RED}, matrix=matrix, **more)
+    content = path.read_bytes()
+    length = int.from_bytes(content[12:16], "little")
+    header = json.loads(content[20 : 20 + length])
+    root = header["nodes"][header["scenes"][0]["nodes"][0]]
+    assert (root["extras"], len(header["scenes"][0]["nodes"])) == ({"unit": "mm"}, 1)
+    np.testing.assert_allclose(np.reshape(root["matrix"], (4, 4)).T, matrix)  # glTF's matrices are column-major
+    (leaf,) = (header["nodes"][child] for child in root["children"])
+    assert (leaf["name"], leaf["extras"]) == ("leaf_001", said)
+    (primitive,) = header["meshes"][leaf["mesh"]]["primitives"]
+    assert primitive["attributes"].keys() == {"POSITION", "NORMAL"}
+    bounds = header["accessors"][primitive["attributes"]["POSITION"]]
+    np.testing.assert_allclose([bounds["min"], bounds["max"]], ball.bounds, rtol=1e-6)
+    placed = trimesh.load_scene(path)
+    np.testing.assert_allclose(placed.bounds, [[0.095, -0.002, 0.015], [0.105, 0.008, 0.025]], atol=3e-4)
+
+
+def test_an_open_surface_stays_open_and_has_its_normals(tmp_path: Path) -> None:
+    leaf = bent_blade()
+    write_ply(tmp_path / "leaf.ply", leaf.mesh(), RED)
+    write_glb(tmp_path / "scene.glb", {"leaf_001": leaf.mesh()}, {"leaf_001": RED})
+    assert b"property float nx" in (tmp_path / "leaf.ply").read_bytes()
+    (shown,) = trimesh.load_scene(tmp_path / "scene.glb").geometry.values()
+    for back in (shown, trimesh.load_mesh(tmp_path / "leaf.ply")):
+        assert not back.is_watertight
+        assert back.area == pytest.approx(leaf.area, rel=1e-5)
+        np.testing.assert_allclose(np.linalg.norm(back.vertex_normals, axis=1), 1, atol=1e-4)
+        assert (back.vertex_normals @ leaf.mesh().face_normals.mean(0) > 0).all()
 
 
 def test_glb_without_meshes_is_a_valid_file(tmp_path: Path) -> None:

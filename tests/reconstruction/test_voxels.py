@@ -10,7 +10,7 @@ import torch
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.voxels import back_project, reconstruct_instances
+from mvseg.reconstruction.voxels import VoxelGrid, back_project, reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from reference import back_project_reference, seen_share_reference
@@ -269,3 +269,39 @@ def test_masks_without_a_pixel_do_not_vote_and_ids_must_fit() -> None:
     assert grid.num_views == 2
     with pytest.raises(InputError, match="2 instance ids for 3 regions"):
         reconstruct_instances(regions, torch.tensor([1, 1]), cameras)
+
+
+def pieces_grid(*, crumb: int) -> VoxelGrid:
+    """Blocks of 1000 and 100 voxels, and a rod of `crumb` voxels that shares an edge with the first."""
+    votes = torch.zeros(30, 30, 40)
+    votes[2:12, 2:12, 2:12] = 1
+    votes[20:24, 20:25, 20:25] = 0.75
+    votes[12, 12, 5 : 5 + crumb] = 1
+    votes[26:, :, :] = 0.5  # not occupied
+    return VoxelGrid(torch.tensor([1.0, 2.0, 3.0]).double(), 0.5, votes, 4, 0.5)
+
+
+def test_pieces_are_those_of_the_mesh() -> None:
+    for crumb, pieces in ((30, 3), (0, 2)):
+        grid = pieces_grid(crumb=crumb)
+        assert grid.num_pieces == len(grid.mesh().split()) == pieces
+    votes = torch.rand(8, 8, 8, generator=torch.Generator().manual_seed(3))
+    noise = VoxelGrid(torch.zeros(3).double(), 0.5, (votes > 0.8).float(), 4, 0.5)
+    outward = [part for part in noise.mesh().split(only_watertight=False) if part.volume > 0]  # others are cavities
+    assert noise.num_pieces == len(outward) > 10
+    empty = VoxelGrid(torch.zeros(3).double(), 0.5, torch.zeros(3, 3, 3), 4, 0.5)
+    assert empty.num_pieces == 0
+    assert empty.without_crumbs() is empty
+
+
+def test_crumbs_are_gone_from_points_volume_and_mesh() -> None:
+    """A crumb has less than 2 % of the largest piece: 19 of 1000 voxels."""
+    with_crumb, kept = pieces_grid(crumb=19), pieces_grid(crumb=20)
+    swept = with_crumb.without_crumbs()
+    assert (with_crumb.num_pieces, swept.num_pieces) == (3, 2)
+    assert kept.without_crumbs() is kept
+    assert len(with_crumb.points) - len(swept.points) == 19
+    assert with_crumb.volume - swept.volume == pytest.approx(19 * 0.5**3)
+    assert len(swept.mesh().split()) == len(with_crumb.mesh().split()) - 1
+    assert torch.equal(swept.votes, pieces_grid(crumb=0).votes)
+    assert swept.without_crumbs(0.5).num_pieces == 1

@@ -15,7 +15,7 @@ import trimesh
 
 import mvseg.results.earlier
 import mvseg.results.folder
-from known_leaves import bent_blade
+from known_leaves import bent_blade, flat_leaf
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
@@ -247,6 +247,36 @@ class TestVariants:
         sizes = {name: len(mesh.faces) for name, mesh in scene.geometry.items()}
         assert sizes["leaf_001"] == sizes["leaf_002"] == len(blade.mesh().faces) != sizes["leaf_003"]
 
+    def test_rims_in_the_overlays(self, result: Result, tmp_path: Path) -> None:
+        """One surface, which is where ball 1 is: with rims the overlays change near it, and nowhere else."""
+        assert result.voxels is not None
+        place = result.voxels[1].points.mean(0)
+        blade = flat_leaf(length=2 * RADIUS, half_width=RADIUS / 2, at=(place - torch.tensor([RADIUS, 0, 0])).tolist())
+        with_surface = replace(result, surfaces={1: blade})
+        for name, draw_rims in (("with", True), ("without", False)):
+            save_result(with_surface, tmp_path / name, {}, draw_rims=draw_rims)
+        save_result(result, tmp_path / "none", {})
+        for view in range(4):
+            drawn, plain, none = (
+                cv2.imread(str(tmp_path / name / "overlay" / f"{view:03d}.png")) for name in ("with", "without", "none")
+            )
+            np.testing.assert_array_equal(plain, none)
+            row, column = np.nonzero((drawn != plain).any(2))
+            px = result.scene.cameras.project(blade.rim)[0][view].numpy()
+            assert len(row) > 20
+            np.testing.assert_allclose([column.min(), row.min()], px.min(0), atol=4)
+            np.testing.assert_allclose([column.max(), row.max()], px.max(0), atol=4)
+
+    def test_scene_glb_is_in_metres_with_y_up(self, result: Result, tmp_path: Path) -> None:
+        placed = replace(result, scene=replace(result.scene, unit="mm", up=(0.0, 0.0, 1.0)))
+        save_result(placed, tmp_path / "out", {})
+        shown = trimesh.load_scene(tmp_path / "out" / "scene.glb")
+        for leaf in (1, 2, 3):
+            x, y, z = np.moveaxis(trimesh.load_mesh(tmp_path / "out" / "leaves" / f"leaf_{leaf:03d}.ply").bounds, 1, 0)
+            pose, name = shown.graph[f"leaf_{leaf:03d}"]
+            back = shown.geometry[name].copy().apply_transform(pose)
+            np.testing.assert_allclose(back.bounds, np.sort(np.stack([x, z, -y], 1) / 1000, axis=0), atol=1e-6)
+
     def test_without_photos_overlays_are_drawn_on_grey(self, tmp_path: Path) -> None:
         plant = write_scene(tmp_path / "plant", images=False)
         save_result(run_scene(plant, plant / "masks", RunConfig(reconstruct=None)), tmp_path / "out", {})
@@ -290,9 +320,12 @@ class TestBrokenPhotos:
 
 
 WRITERS = [
-    "write_label_png", "draw_overlay", "write_png", "draw_contact_sheet", "write_coco", "write_ply", "write_glb",
-    "write_long", "write_wide",
+    "write_label_png", "draw_overlay", "draw_tile", "write_png", "draw_contact_sheet", "write_coco", "write_ply",
+    "write_glb", "write_long", "write_wide",
 ]  # fmt: skip
+
+
+SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_tile", "write_png", "write_ply")
 
 
 class TestWholeOrNotAtAll:
@@ -307,7 +340,7 @@ class TestWholeOrNotAtAll:
 
         def fail_at_the_second_call(*args: object, **named: object) -> object:
             calls.append(args)
-            if len(calls) == 2 or writer not in ("write_label_png", "draw_overlay", "write_png", "write_ply"):
+            if len(calls) == 2 or writer not in SEVERAL_TIMES:
                 raise error
             return original(*args, **named)
 

@@ -11,7 +11,17 @@ import torch
 
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.results.overlay import MAX_SIDE, TILE_WIDTH, UNMATCHED, draw_contact_sheet, draw_overlay, instance_color
+from mvseg.results.overlay import (
+    MARGIN,
+    MAX_SIDE,
+    TILE_WIDTH,
+    UNMATCHED,
+    draw_contact_sheet,
+    draw_overlay,
+    draw_tile,
+    find_plant,
+    instance_color,
+)
 
 GREY = np.full((200, 300, 3), 90, np.uint8)
 
@@ -119,3 +129,82 @@ def test_unsure_matches_are_marked(regions: Regions) -> None:
     )
     np.testing.assert_array_equal(sure, surer)
     assert (unsure != sure).any()
+
+
+def test_numbers_have_a_white_edge_on_large_photos() -> None:
+    labels = np.ones((900, 1200), np.uint16)
+    photo = np.full((900, 1200, 3), 90, np.uint8)
+    painted = draw_overlay(photo, regions_from_label_maps([labels]), matching([1]), view=0)
+    is_black, is_white = (painted == 0).all(2), (painted == 255).all(2)
+    around = cv2.dilate(is_black.astype(np.uint8), np.ones((3, 3))) > 0
+    assert is_black.sum() > 30
+    assert is_white.sum() > is_black.sum() / 2
+    tint = (0.45 * 90 + 0.55 * np.array(instance_color(1))).astype(np.uint8)
+    assert not (painted[around] == tint).all(1).any()  # nothing between the number and its edge
+
+
+def test_numbers_are_smaller_on_small_leaves() -> None:
+    labels = np.zeros((900, 1200), np.uint16)
+    labels[100:800, 100:800], labels[300:316, 1000:1016] = 1, 2
+    painted = draw_overlay(
+        np.full((900, 1200, 3), 90, np.uint8), regions_from_label_maps([labels]), matching([1, 1]), view=0
+    )
+    is_black = (painted == 0).all(2)
+    large, small = is_black[:, :850].any(1).sum(), is_black[:, 850:].any(1).sum()
+    assert 8 <= small < 0.7 * large
+
+
+class TestRims:
+    LINE = np.array([[20.5, 100.5], [280.5, 100.5]])  # pixel centres
+
+    def test_a_line_in_the_colour_of_its_instance_with_a_dark_edge(self, regions: Regions) -> None:
+        nothing = regions.select(regions.view_index == 1)
+        painted = draw_overlay(GREY, nothing, matching([1, 2]), view=0, rims={3: [self.LINE]})
+        assert np.abs(painted[100, 30:270].astype(int) - instance_color(3)).max() < 30  # versions of OpenCV
+        for row in (99, 101):
+            assert painted[row, 30:270].max() < 90  # darker than the photo
+        assert (np.delete(painted, range(97, 104), axis=0) == 90).all()
+
+    def test_rims_are_scaled_with_the_photo(self) -> None:
+        nothing = regions_from_label_maps([np.zeros((1600, 3200), np.uint16)])
+        photo = np.full((1600, 3200, 3), 90, np.uint8)
+        painted = draw_overlay(photo, nothing, matching([1]), view=0, rims={3: [4 * self.LINE]})
+        assert (painted[200:202, 100:500] == instance_color(3)).all(2).any(0).all()
+
+
+class TestTiles:
+    def test_the_plant_fills_the_tile(self) -> None:
+        """A plant of a tenth of the width, and a mask elsewhere that is matched to nothing."""
+        labels = np.zeros((600, 800), np.uint16)
+        labels[300:360, 500:540], labels[300:330, 540:580] = 1, 2
+        labels[10:60, 10:60] = 3
+        found = regions_from_label_maps([labels])
+        x1, y1, x2, y2 = find_plant(found, matching([1, 2, -1]), view=0, size=(800, 600))
+        assert (x1 + x2) / 2 == pytest.approx(540, abs=1)
+        assert (y1 + y2) / 2 == pytest.approx(330, abs=1)
+        assert x2 - x1 == pytest.approx((1 + 2 * MARGIN) * 80, abs=1)
+        assert (x2 - x1) / (y2 - y1) == pytest.approx(4 / 3, abs=0.02)
+        tile = draw_tile(np.full((600, 800, 3), 90, np.uint8), found, matching([1, 2, -1]), view=0)
+        assert tile.shape == (360, TILE_WIDTH, 3)
+        assert (tile != 90).any(2).mean() > 0.4
+        whole = draw_tile(np.full((600, 800, 3), 90, np.uint8), found, matching([-1, -1, -1]), view=0)
+        assert (whole != 90).any(2).mean() < 0.05
+
+    @pytest.mark.parametrize("at", [(0, 0), (0, 760), (560, 0), (560, 760)])
+    def test_the_box_stays_in_the_photo(self, at: tuple[int, int]) -> None:
+        labels = np.zeros((600, 800), np.uint16)
+        labels[at[0] : at[0] + 40, at[1] : at[1] + 40] = 1
+        x1, y1, x2, y2 = find_plant(regions_from_label_maps([labels]), matching([1]), view=0, size=(800, 600))
+        assert 0 <= x1 <= at[1] < at[1] + 40 <= x2 <= 800
+        assert 0 <= y1 <= at[0] < at[0] + 40 <= y2 <= 600
+
+    def test_without_matched_masks_it_is_the_photo(self, regions: Regions) -> None:
+        for ids in ([-1, -1, 1, 2], [1, 2, -1, -1]):
+            boxes = [find_plant(regions, matching(ids), view=view, size=(300, 200)) for view in (0, 1)]
+            assert boxes.count((0, 0, 300, 200)) == 1
+
+    def test_a_tiny_mask_is_not_blown_up_to_fill_the_tile(self) -> None:
+        labels = np.zeros((600, 800), np.uint16)
+        labels[300, 400] = 1
+        x1, y1, x2, y2 = find_plant(regions_from_label_maps([labels]), matching([1]), view=0, size=(800, 600))
+        assert (x2 - x1, y2 - y1) == (40, 30)

@@ -180,5 +180,6 @@ def test_voxels_have_volume_and_box() -> None:
     numbers = measure_voxels(grid)
     assert numbers.keys() == {trait.name for trait in VOXEL_TRAITS}
     assert values(numbers) == {
-        "volume": 48, "x_min": 12, "y_min": 22, "z_min": 34, "x_max": 16, "y_max": 24, "z_max": 40
+        "volume": 48, "x_min": 12, "y_min": 22, "z_min": 34, "x_max": 16, "y_max": 24, "z_max": 40,
+        "num_pieces": 1,
     }  # fmt: skip

@@ -74,7 +74,7 @@ def test_every_leaf_has_every_trait(traits: Traits) -> None:
         assert (leaf.method, leaf.reasons, leaf.rejection) == ("surface", (), None)
         missing = {name for name, number in leaf.numbers.items() if not number.exists}
         assert missing == {"mean_red", "mean_green", "mean_blue", "greenness_index", "volume",
-                           "x_min", "y_min", "z_min", "x_max", "y_max", "z_max"}  # fmt: skip
+                           "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "num_pieces"}  # fmt: skip
         assert {leaf.numbers[name].method for name in missing} == {
             "not measured: there are no photos", "not measured: only voxels have it"
         }  # fmt: skip
@@ -112,7 +112,7 @@ def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
     assert voxels.reasons == ("no credible surface; its masks agree on no point",)
     assert nothing.reasons == ("no credible surface; seen in one view only",)
     assert {name for name, n in voxels.numbers.items() if n.exists} == {
-        "volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "num_views", "sure_views"
+        "volume", "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "num_pieces", "num_views", "sure_views"
     }  # fmt: skip
     assert {name for name, number in nothing.numbers.items() if number.exists} == {"num_views", "sure_views"}
     assert nothing.numbers["area"].method == "no credible surface; seen in one view only"
@@ -147,6 +147,23 @@ def test_voxels_only() -> None:
     assert second.method == "none"
     assert "no shape" in second.reasons[0]
     assert not traits.whole["total_leaf_area"].exists
+
+
+@pytest.mark.parametrize("asked_for", [True, False])
+def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
+    regions, matching, surfaces = make_inputs([1, 2, 3, 4])
+    surfaces[2] = LeafSurface.none(torch.arange(3), "its masks agree on no point")
+    apart = rod().votes.clone()
+    apart[:, :, 1] = 0
+    voxels = {2: replace(rod(), votes=apart)}
+    found = measure_plant(SCENE, regions, matching, surfaces=surfaces if asked_for else None, voxels=voxels)
+    leaf = found.leaves[1]
+    assert leaf.method == "voxels"
+    assert leaf.numbers["num_pieces"].value == 2
+    assert leaf.reasons[-1] == "in 2 pieces"
+    why = "no credible surface; its masks agree on no point" if asked_for else "no surface was asked for"
+    assert leaf.numbers["quality"].method == f"{why}; in 2 pieces"
+    assert leaf.numbers["area"].method == why
 
 
 def test_unknown_up() -> None:
