@@ -2,13 +2,18 @@
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 
-.PHONY: demo test lint clean
+.PHONY: demo test fuzz lint clean
 
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
 
 test: $(VENV)/installed
 	$(PYTHON) -m pytest -n 2
+
+# about ten minutes: broken files for every reader, and runs that are killed at random moments
+fuzz: $(VENV)/installed
+	MVSEG_FUZZ_EXAMPLES=2000 $(PYTHON) -m pytest tests/fuzz
+	MVSEG_KILLS=20 MVSEG_KILL_SEED=$$(date +%s) $(PYTHON) -m pytest tests/test_kill.py
 
 lint: $(VENV)/installed
 	$(PYTHON) -m ruff check .

@@ -12,22 +12,25 @@ import sys
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
-from jsonargparse import ArgumentParser, Namespace
+from jsonargparse import ActionConfigFile, ArgumentParser, Namespace  # type: ignore[attr-defined]  # documented
 
 from mvseg._version import __version__
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.yaml_file import check_yaml
 from mvseg.matching.config import MatchConfig
 from mvseg.multiview.config import DetectConfig
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.sigterm import Terminated, stopped_by_sigterm
 from mvseg.training.config import TrainConfig
 from mvseg.traits.config import TraitsConfig, Up
 
 DEFAULT_OUT = Path("results")
-BAD_INPUT, INTERRUPTED = 2, 130
+Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig)
+BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
 
 
@@ -38,7 +41,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments after the program's name; None for those of the process.
 
     Returns:
-        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 130 after Ctrl-C.
+        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 130 after Ctrl-C,
+        143 after SIGTERM.
     """
     # Let idle threads sleep: on a shared machine, spinning ones slow small tensor operations tenfold. Must be set
     # before torch is loaded, which the verbs do when they start.
@@ -49,8 +53,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
-            args = build_parser().parse_args(_join_up(sys.argv[1:] if argv is None else argv))
-            return verbs[args.verb](args[args.verb])
+            args = _parse(_join_up(sys.argv[1:] if argv is None else argv))
+            with stopped_by_sigterm():
+                return verbs[args.verb](args[args.verb])
     except (InputError, argparse.ArgumentError) as error:
         return _complain(error)
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
@@ -58,9 +63,48 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     except OSError as error:  # a full disk, a folder that cannot be made
         return _complain(error)
+    except MemoryError as error:
+        return _complain(InputError(f"there is not enough memory ({error or 'no more is known'})"))
     except KeyboardInterrupt:
         print("mvseg: interrupted", file=sys.stderr)
         return INTERRUPTED
+    except Terminated:
+        print("mvseg: stopped by SIGTERM", file=sys.stderr)
+        return TERMINATED
+
+
+def _parse(arguments: Sequence[str]) -> Namespace:
+    try:
+        args = build_parser().parse_args(list(arguments))
+        for name in ("quiet", "split_merged", "coco_crowd"):
+            if args.verb and name in args[args.verb] and args[args.verb][name] is None:
+                raise InputError(f"{name} is null, expected a value")
+        return args
+    except (UnicodeDecodeError, RecursionError) as error:  # of a file that an option names
+        raise InputError(f"the options cannot be read ({error})") from None
+    except ValueError as error:
+        if isinstance(error, InputError) or "integer string conversion" not in str(error):
+            raise
+        raise InputError("an option is a number of thousands of digits") from None
+
+
+def _build(kind: type[Options], args: Namespace | None, prefix: str = "") -> Options:
+    """The options of one stage. "epochs:" without a value is null in YAML, which jsonargparse lets pass everywhere."""
+    fields = dataclasses.fields(kind)
+    if args is None:
+        raise InputError(f"{prefix.rstrip('.')} is null, expected options")
+    for field in fields:
+        if args[field.name] is None and "None" not in str(field.type):
+            raise InputError(f"{prefix}{field.name} is null, expected a value")
+    return kind(**{field.name: args[field.name] for field in fields})
+
+
+class _CheckedConfig(ActionConfigFile):
+    """The option --config FILE, whose file is checked before jsonargparse reads it."""
+
+    def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
+        check_yaml(Path(values))
+        super().__call__(parser, cfg, values, option_string)
 
 
 def build_parser() -> ArgumentParser:
@@ -96,7 +140,7 @@ def build_parser() -> ArgumentParser:
     verbs.add_subcommand("eval", evaluate, help="compare a result with true labels")
 
     train = ArgumentParser(exit_on_error=False, description="Fine-tune a Mask R-CNN; see configs/train/.")
-    train.add_argument("--config", action="config", help="YAML file with any of these options")
+    train.add_argument("--config", action=_CheckedConfig, help="YAML file with any of these options")
     train.add_class_arguments(TrainConfig)
     verbs.add_subcommand("train", train, help="fine-tune a Mask R-CNN")
 
@@ -116,7 +160,7 @@ def build_parser() -> ArgumentParser:
 
 
 def _add_options(parser: ArgumentParser, masks: Path | None) -> None:
-    parser.add_argument("--config", action="config", help="YAML file with any of these options")
+    parser.add_argument("--config", action=_CheckedConfig, help="YAML file with any of these options")
     parser.add_argument(
         "--masks",
         type=Path | None,
@@ -145,10 +189,10 @@ def _infer(args: Namespace) -> int:
     scene = args.scene or demo_scene()
     out = args.out or DEFAULT_OUT / scene.resolve().name
     config = RunConfig(
-        detect=DetectConfig(**vars(args.detect)),
-        match=MatchConfig(**vars(args.match)),
-        reconstruct=ReconstructConfig(**vars(args.reconstruct)),
-        traits=TraitsConfig(**vars(args.traits)),
+        detect=_build(DetectConfig, args.detect, "detect."),
+        match=_build(MatchConfig, args.match, "match."),
+        reconstruct=_build(ReconstructConfig, args.reconstruct, "reconstruct."),
+        traits=_build(TraitsConfig, args.traits, "traits."),
         scale=args.scale,
         unit=args.unit,
         up=_read_up(args.up),
@@ -199,7 +243,7 @@ def _match(args: Namespace) -> int:
         raise InputError("masks is null, expected the masks to match; use mvseg infer to detect them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
     config = RunConfig(
-        match=MatchConfig(**vars(args.match)),
+        match=_build(MatchConfig, args.match, "match."),
         reconstruct=None,
         split_merged=args.split_merged,
         coco_crowd=args.coco_crowd,
@@ -215,19 +259,25 @@ def _match(args: Namespace) -> int:
 
 def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet: bool) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
+    from mvseg.formats.atomic import sweep_abandoned
+    from mvseg.multiview.kept_detections import delete_kept
     from mvseg.pipeline import run_scene  # keeps --help and wrong options quick
     from mvseg.results.earlier import check_out
     from mvseg.results.folder import save_result
     from mvseg.results.provenance import describe_run
 
+    sweep_abandoned(out)
     check_out(out)
     replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
     masks = None if masks is None else _find_masks(scene, masks)
+    keep = out.resolve().with_name(f"{out.resolve().name}.detections")
+    if masks is None and keep.is_dir():
+        print(f"mvseg: going on from the detections that a run left in {keep}", file=sys.stderr)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         if masks is not None and config.detect != DetectConfig():
             warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
-        result = run_scene(scene, masks, config, progress=not quiet)
+        result = run_scene(scene, masks, config, keep=keep, progress=not quiet)
     # each matching of a detector's loop may repeat a warning
     messages = list(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning)))
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
@@ -237,6 +287,7 @@ def _run(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet
     run = describe_run(result, masks, config, messages=messages)
     run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
     save_result(result, out, run, progress=not quiet, draw_rims=config.draw_rims)
+    delete_kept(keep)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
     print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
@@ -252,6 +303,7 @@ def _find_masks(scene: Path, masks: Path) -> Path:
 
 def _eval(args: Namespace) -> int:
     from mvseg.evaluation.id_metrics import matching_metrics
+    from mvseg.formats.atomic import write_text_whole
     from mvseg.regions import IGNORE_LABEL
     from mvseg.results.read import find_result, read_instances
 
@@ -268,7 +320,7 @@ def _eval(args: Namespace) -> int:
     for name, value in metrics.items():
         print(f"{name:15} {value:.4f}" if isinstance(value, float) else f"{name:15} {value}")
     try:
-        (result / "metrics.json").write_text(json.dumps(metrics, indent=1) + "\n", encoding="utf-8")
+        write_text_whole(result / "metrics.json", json.dumps(metrics, indent=1) + "\n")
     except OSError as error:
         raise InputError(f"{result}: cannot write metrics.json ({error.strerror})") from None
     return 0
@@ -279,8 +331,7 @@ def _train(args: Namespace) -> int:
 
     is_first = os.environ.get("RANK", "0") == "0"  # under torchrun only one process logs
     logging.basicConfig(level=logging.INFO if is_first else logging.WARNING, format="%(message)s")
-    values = {field.name: args[field.name] for field in dataclasses.fields(TrainConfig)}
-    train(TrainConfig(**values))
+    train(_build(TrainConfig, args))
     return 0
 
 

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
+import json
 import time
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
+from mvseg._version import __version__
 from mvseg.config import RunConfig
-from mvseg.detectors.zoo import load_detector
+from mvseg.detectors.zoo import find_weights, load_detector
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import check_photos, read_photo
 from mvseg.formats.scene_folder import load_scene, read_masks
-from mvseg.matching.match import match_regions
+from mvseg.matching.match import check_baselines, match_regions
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
+from mvseg.multiview.config import DetectConfig
+from mvseg.multiview.kept_detections import KeptDetections, read_detections, write_detections
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
 from mvseg.reconstruction.shapes import reconstruct_shapes
+from mvseg.results.provenance import hash_files
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 from mvseg.traits.measure import measure_plant
@@ -32,7 +37,12 @@ from mvseg.traits.up import find_up
 
 
 def run_scene(
-    folder: Path, masks: Path | None = None, config: RunConfig = RunConfig(), *, progress: bool = False
+    folder: Path,
+    masks: Path | None = None,
+    config: RunConfig = RunConfig(),
+    *,
+    keep: Path | None = None,
+    progress: bool = False,
 ) -> Result:
     """From a scene folder, with or without masks, to ids in every view and, if asked for, shapes in 3D and traits.
 
@@ -40,10 +50,12 @@ def run_scene(
         folder: the scene, see `load_scene`.
         masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
         config: the options of all stages.
+        keep: folder for the detections of each photo, made when it is needed: a run that was cut off goes on from them.
+            `delete_kept` deletes them once the result is safe.
         progress: show progress bars.
 
     Returns:
-        The result; nothing is written.
+        The result; nothing is written but what `keep` says.
 
     Raises:
         InputError: bad input; see the stages.
@@ -53,6 +65,7 @@ def run_scene(
     with _timed(seconds, "load"):
         scene = place_scene(load_scene(folder), config)
         check_photos(scene)
+        check_baselines(scene.cameras)
         wanted = () if config.categories is None else [name.strip() for name in config.categories.split(",")]
         found = None if masks is None else recognise_masks(scene, masks)
         regions = None if found is None else read_masks(scene, found, crowd=config.coco_crowd, categories=wanted)
@@ -60,7 +73,7 @@ def run_scene(
         raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them")
     if regions is None:
         with _timed(seconds, "detect"):
-            detections, matching = detect_regions(scene, config, progress=progress)
+            detections, matching = detect_regions(scene, config, keep=keep, progress=progress)
             regions, scores = detections.regions, detections.scores
     else:
         with _timed(seconds, "match"):
@@ -122,11 +135,12 @@ def place_scene(scene: Scene, config: RunConfig) -> Scene:
 
 
 def detect_regions(
-    scene: Scene, config: RunConfig = RunConfig(), *, progress: bool = False
+    scene: Scene, config: RunConfig = RunConfig(), *, keep: Path | None = None, progress: bool = False
 ) -> tuple[Proposals, Matching]:
     """Find and match the instances in the photos of a scene, see `MultiViewMaskRCNN.find_regions`.
 
-    Runs on the first GPU, if there is one. Torch's thread count and random generators are left alone.
+    Runs on the first GPU, if there is one. Torch's thread count and random generators are left alone. One photo at a
+    time is in memory. For `keep` see `run_scene`.
 
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
@@ -135,13 +149,29 @@ def detect_regions(
     detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(detector, num_iterations=detect.num_iterations, match=config.match).to(device)
-    views = tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress)
-    photos = (torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1).float() / 255 for view in views)
-    detections, matching = model.find_regions(photos, scene.cameras)
+    kept = None if keep is None else KeptDetections(keep, _describe_detector(detect, model, device))
+    found = []
+    for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress):
+        path = kept.path(scene, view) if kept is not None and scene.views[view].path.is_file() else None
+        shown = None if path is None else read_detections(path)
+        if shown is None:
+            shown = model.detect(torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1).float() / 255)
+            if path is not None:
+                write_detections(path, shown)
+        found.append(shown)
+    detections, matching = model.match_detections(found, scene.cameras, progress=progress)
     if not len(detections.regions):
         message = f"the detector finds nothing that scores {detect.min_score:g} or more"
         warnings.warn(message, InputWarning, stacklevel=3)
     return detections, matching
+
+
+def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
+    """Everything but the photo that detections depend on. (How often they are matched does not change them.)"""
+    weights = find_weights(detect.weights) or Path(detect.weights)
+    options = {**asdict(detect), "weights": hash_files(weights), "num_iterations": None}
+    options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "mvseg": __version__}
+    return json.dumps(options | {"torch": torch.__version__, "device": device})
 
 
 @contextmanager

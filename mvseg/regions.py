@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -180,18 +180,19 @@ def masks_to_boxes(masks: Tensor) -> Tensor:
     return torch.stack((x1, y1, x2, y2), 1)
 
 
-def regions_from_label_maps(label_maps: Sequence[np.ndarray]) -> Regions:
+def regions_from_label_maps(label_maps: Iterable[np.ndarray]) -> Regions:
     """Regions from one label map per view.
 
     Args:
-        label_maps: V integer arrays (H, W), each of its own size; 0 is nothing, 65535 is ignored, every other number is
-            one region of that view.
+        label_maps: V integer arrays (H, W), each of its own size, one at a time in memory; 0 is nothing, 65535 is
+            ignored, every other number is one region of that view.
 
     Returns:
         Regions ordered by view, then by number; `labels` holds the numbers.
     """
-    view_index, boxes, crops, labels = [], [], [], []
+    view_index, boxes, crops, labels, num_views = [], [], [], [], 0
     for view, label_map in enumerate(label_maps):
+        num_views = view + 1
         numbers, dense = np.unique(label_map, return_inverse=True)
         slices = ndimage.find_objects(dense.reshape(label_map.shape) + 1)
         for rank, (number, window) in enumerate(zip(numbers.tolist(), slices, strict=True)):
@@ -202,7 +203,7 @@ def regions_from_label_maps(label_maps: Sequence[np.ndarray]) -> Regions:
             boxes.append((columns.start, rows.start, columns.stop, rows.stop))
             crops.append(torch.from_numpy(dense.reshape(label_map.shape)[window] == rank).flatten())
             labels.append(number)
-    return stack_regions(view_index, boxes, crops, labels=labels, num_views=len(label_maps))
+    return stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
 
 
 def stack_regions(

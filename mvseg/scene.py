@@ -37,6 +37,8 @@ if TYPE_CHECKING:
     import pycolmap
 
 ROTATION_TOLERANCE = 1e-4  # |R R^T - I|; hand-typed rig files carry about six digits
+MIN_FOCAL, MAX_PX = 1e-3, 1e9  # of K, pixels; far beyond any lens, and products of them are still numbers
+MAX_WORLD = 1e12  # of t, world units: millimetres on a map of the whole earth fit
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,8 +53,8 @@ class Cameras:
 
     Raises:
         InputError: a wrong shape, a number that is not finite, a focal length <= 0, a K that is not upper triangular
-            with last row (0, 0, 1), an R that is not a rotation (reflections included), an image size < 1. The message
-            names the view by its index.
+            with last row (0, 0, 1), an R that is not a rotation (reflections included), an image size < 1, numbers
+            that no camera has (`MAX_PX`, `MAX_WORLD`). The message names the view by its index.
     """
 
     K: Tensor
@@ -128,6 +130,12 @@ def camera_problem(K: Tensor, R: Tensor, t: Tensor, *, size: Tensor) -> str | No
         return f"the image size is {size[0]} x {size[1]}, expected at least 1 x 1"
     if K[0, 0] <= 0 or K[1, 1] <= 0:
         return f"the focal length is {K[0, 0]:g}, {K[1, 1]:g}, expected positive numbers"
+    if min(K[0, 0], K[1, 1]) < MIN_FOCAL:
+        return f"the focal length is {K[0, 0]:g}, {K[1, 1]:g}, expected pixels"
+    if K.abs().max() > MAX_PX:
+        return f"K holds {K.abs().max():g}, expected pixels, at most {MAX_PX:g}"
+    if t.abs().max() > MAX_WORLD:
+        return f"t holds {t.abs().max():g}, expected at most {MAX_WORLD:g}"
     if K[1, 0] != 0 or K[2].tolist() != [0.0, 0.0, 1.0]:
         return "K is not upper triangular with last row 0, 0, 1"
     deviation = (R @ R.T - torch.eye(3).to(R)).abs().max().item()

@@ -216,12 +216,15 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         (["--up", "0", "0", "2"], [0, 0, 1]),
         (["--up", "-1", "0", "0", "--unit", "cm", "--scale", "0.1"], [-1, 0, 0]),
         (["--up", "0 -1 0"], [0, -1, 0]),
-        (["--config", "{up: [0, 1, 0]}"], [0, 1, 0]),
+        (["--config", "up: [0, 1, 0]"], [0, 1, 0]),
         ([], None),
     ],
 )
 def test_which_way_is_up(words: list[str], up: list[float] | None, plant: Path, tmp_path: Path) -> None:
     out = ["--out", str(tmp_path / "out"), "--quiet", *COARSE]
+    if "--config" in words:
+        (tmp_path / "run.yaml").write_text(words[1])
+        words = ["--config", str(tmp_path / "run.yaml")]
     assert main(["infer", *words, *out, "--masks", "masks", str(plant)]) == 0
     said = json.loads((tmp_path / "out" / "run.json").read_text())["traits"]
     assert said["up"] == up
@@ -231,7 +234,8 @@ def test_which_way_is_up(words: list[str], up: list[float] | None, plant: Path, 
 def test_rims_may_be_left_out(plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
     monkeypatch.setattr("mvseg.results.folder.save_result", lambda *_, draw_rims, **__: drawn.append(draw_rims))
-    for words in (["--draw_rims", "false"], ["--config", "{draw_rims: false}"], []):
+    (tmp_path / "run.yaml").write_text("draw_rims: false\n")
+    for words in (["--draw_rims", "false"], ["--config", str(tmp_path / "run.yaml")], []):
         out = ["--out", str(tmp_path / "out"), "--quiet", *COARSE]
         assert main(["infer", *words, *out, "--masks", "masks", str(plant)]) == 0
     assert drawn == [False, False, True]
@@ -259,6 +263,26 @@ def test_progress_bars_unless_quiet(plant: Path, tmp_path: Path, capsys: pytest.
     assert "pictures: 100%" in capsys.readouterr().err
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert capsys.readouterr().err == ""
+
+
+def test_no_stage_is_silent(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Every stage that takes minutes on a large scene has a bar, matching between detections and shapes too."""
+    options = ["--detect.min_score", "0.05", "--out", str(tmp_path / "out"), *COARSE]
+    assert main(["infer", str(plant), *options]) == 0
+    said = capsys.readouterr().err
+    stages = ["detection", "epipolar weights", "rays, 1 px", "search", "back-projection", "pictures", "masks"]
+    assert [stage for stage in stages if f"{stage}:" not in said] == []
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out", "plant"]
+
+
+def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept = tmp_path / "out.detections"
+    kept.mkdir()
+    assert main(["infer", str(plant), "--quiet", "--out", str(tmp_path / "out"), *COARSE]) == 0
+    assert f"going on from the detections that a run left in {kept}" in capsys.readouterr().err
+    assert not kept.exists()
 
 
 def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
@@ -303,7 +327,7 @@ def test_scripts_of_the_checkout_are_verbs(
         ("match: {num_pionts: 3}", [], "match.num_pionts"),
         ("colour: red", [], "colour"),
         ("reconstruct: {threshold: high}", [], "reconstruct.threshold"),
-        ("match: {num_points: [3", [], "config"),
+        ("match: {num_points: [3", [], "run.yaml: is no YAML file"),
         ("", ["--match.num_pionts", "3"], "--match.num_pionts"),
         ("", ["--match.num_points", "many"], "match.num_points"),
         ("", ["--config", "absent.yaml"], "absent.yaml"),
@@ -492,7 +516,8 @@ def colmap(name: str = "", length: float = 1.0, *, replace: tuple[bytes, bytes] 
 def transforms(**changes: Any) -> Break:
     def change(folder: Path) -> None:
         (folder / "cameras.json").unlink()
-        frames = [{"file_path": f"images/{v:03d}.png", "transform_matrix": np.eye(4).tolist()} for v in range(4)]
+        moved = [np.eye(4) + v * np.outer((1, 0, 0, 0), (0, 0, 0, 1)) for v in range(4)]
+        frames = [{"file_path": f"images/{v:03d}.png", "transform_matrix": moved[v].tolist()} for v in range(4)]
         content = {"w": WIDTH, "h": HEIGHT, "fl_x": 150, "cx": 64, "cy": 48, "frames": frames}
         (folder / "transforms.json").write_text(json.dumps(content | changes))
 
@@ -787,6 +812,61 @@ def test_simulate_says_what_it_needs(
     monkeypatch.setitem(sys.modules, "embreex", None)
     assert main(["simulate", "paper-eval", "--out", str(tmp_path / "out")]) == 2
     assert "pip install 'mvseg[simulate]'" in complaint(capsys)
+
+
+def test_metrics_are_written_in_place_of_a_link_and_stay(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A link must not lead to somebody else's file; and what `eval` writes belongs to the user from then on."""
+    precious, out = tmp_path / "precious", tmp_path / "out" / "plant"
+    precious.write_text("mine")
+    match = ["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]
+    assert main(match) == 0
+    (out / "metrics.json").symlink_to(precious)
+    (out / "notes.txt").write_text("three leaves")
+    assert main(["eval", str(out), "--truth", str(plant / "truth")]) == 0
+    assert precious.read_text() == "mine"
+    metrics = (out / "metrics.json").read_bytes()
+    assert main(match) == 0
+    assert (out / "metrics.json").read_bytes() == metrics
+    assert json.loads(metrics)["ari"] == 1
+    assert (out / "notes.txt").read_text() == "three leaves"
+
+
+@pytest.mark.parametrize(("name", "reason"), [("../secret", "leads out of the folder"), ("a\0", "not the name of")])
+def test_names_in_a_result_do_not_lead_out_of_the_truth(
+    name: str, reason: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    shutil.copy(plant / "truth" / "000.png", plant / "secret.png")
+    path = tmp_path / "out" / "plant" / "instances.json"
+    content = json.loads(path.read_text())
+    content["images"][0]["name"] = name
+    path.write_text(json.dumps(content))
+    capsys.readouterr()
+    assert main(["eval", str(path.parent), "--truth", str(plant / "truth")]) == 2
+    assert reason in complaint(capsys)
+
+
+@pytest.mark.parametrize("name", ["RANK", "WORLD_SIZE", "LOCAL_RANK"])
+def test_an_environment_that_torchrun_did_not_set(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv(name, "abc")
+    folders = [f"--{option}={tmp_path}" for option in ("photos", "labels", "output")]
+    assert main(["train", *folders]) == 2
+    assert complaint(capsys) == f"the environment variable {name} is 'abc', expected a number as torchrun sets it"
+
+
+def test_too_little_memory_is_one_sentence(
+    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fail(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr("mvseg.pipeline.match_regions", fail)
+    assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    assert complaint(capsys).startswith("there is not enough memory")
 
 
 def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytest.CaptureFixture[str]) -> None:

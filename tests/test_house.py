@@ -28,7 +28,7 @@ PACKAGE = ROOT / "mvseg"
 # A room (a folder, or a module of the top level) imports only from the lines above its own, so rooms of one line never
 # import each other. `__init__` stands for `mvseg` itself: below it, nothing imports the package.
 FLOORS = (
-    ("errors", "_version"),
+    ("errors", "sigterm", "_version"),
     ("scene",),
     ("regions",),
     ("partition",),
@@ -180,6 +180,17 @@ def test_files_that_the_documents_name_are_there(page: Path) -> None:
         if not link.startswith("http") and not target.exists():
             absent.append(link or path)
     assert absent == []
+
+
+def test_every_promise_names_tests_that_exist() -> None:
+    lines = (ROOT / "docs" / "reliability.md").read_text(encoding="utf-8").splitlines()
+    rows = [line for line in lines if line.startswith("| ")][1:]  # without the header
+    assert len(rows) > 10
+    named = [re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row) for row in rows]
+    assert [row for row, tests in zip(rows, named, strict=True) if not tests] == []
+    for file, name in [test for tests in named for test in tests]:
+        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
+        assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}, (file, name)
 
 
 def test_text_of_the_benchmarks_page_is_that_of_its_sources() -> None:

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import weakref
+
 import numpy as np
 import pytest
 import torch
@@ -105,3 +107,19 @@ def test_boxes_of_masks_are_torchvisions_but_half_open() -> None:
     assert mask_box(masks[3]) == tuple(boxes[3].tolist())
     assert masks_to_boxes(torch.zeros(1, 4, 5)).tolist() == [[0, 0, 0, 0]]
     assert masks_to_boxes(torch.zeros(0, 4, 5)).shape == (0, 4)
+
+
+def test_label_maps_are_not_kept() -> None:
+    """Memory does not grow with the number of photos: of many maps, the last two are there at most."""
+    seen: list[weakref.ref[np.ndarray]] = []
+
+    def draw(view: int) -> np.ndarray:
+        assert sum(map_() is not None for map_ in seen) <= 1
+        label_map = np.zeros((8, 8), np.uint16)
+        label_map[2:4, view] = 1
+        seen.append(weakref.ref(label_map))
+        return label_map
+
+    regions = regions_from_label_maps(draw(view) for view in range(6))
+    assert regions.num_views == len(regions) == 6
+    assert regions_from_label_maps([]).num_views == 0

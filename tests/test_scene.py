@@ -59,6 +59,9 @@ def test_cameras_are_selected_in_the_order_asked_for() -> None:
         ("R", lambda R: R * torch.tensor([[1.0], [1.0], [-1.0]]).double(), "reflection"),
         ("R", lambda R: 1.01 * R, "not a rotation"),
         ("t", lambda t: t * float("nan"), "not finite"),
+        ("t", lambda t: t + 1e30, r"t holds 1e\+30, expected at most 1e\+12"),
+        ("K", lambda K: torch.tensor([1e300, 1e300, 1], dtype=K.dtype).diag(), r"K holds 1e\+300, expected pixels"),
+        ("K", lambda K: torch.tensor([1e-300, 1e-300, 1], dtype=K.dtype).diag(), "focal length is 1e-300"),
         ("sizes", lambda sizes: 0 * sizes, "image size"),
     ],
 )

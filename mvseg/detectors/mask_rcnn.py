@@ -107,8 +107,14 @@ def build_from_file(arch: str, path: Path) -> tuple[MaskRCNN, Description | None
     if description is not None and description.arch != arch:
         raise InputError(f"{path} holds a {description.arch}, not the {arch} that was asked for")
     classes = state.get("roi_heads.box_predictor.cls_score.bias")
-    if classes is None:
+    if classes is None or classes.ndim != 1:
         raise InputError(f"{path} is not a Mask R-CNN: it has no roi_heads.box_predictor.cls_score.bias")
+    if description is not None and len(description.categories) + 1 != len(classes):
+        message = f"names {len(description.categories)} categories, its head has {len(classes) - 1}"
+        raise InputError(f"{path} {message}: expected as many")
+    broken = next((key for key, value in state.items() if not bool(value.isfinite().all())), None)
+    if broken is not None:
+        raise InputError(f"{path}: {broken} holds a number that is not finite")
     model = build_bare(arch, len(classes))
     is_batch_norm = any(key.endswith("num_batches_tracked") for key in state)
     if not is_batch_norm:

@@ -18,6 +18,8 @@ from torch import Tensor, nn
 
 from mvseg.errors import InputError
 
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384  # pixels that photos are scaled to
+
 
 @dataclass(frozen=True)
 class Description:
@@ -42,7 +44,17 @@ def encode_weights(state: Mapping[str, Tensor], description: Description) -> byt
         "categories": json.dumps(description.categories),
         "image_size": str(description.image_size),
     }
-    return safetensors.torch.save(plain, metadata)
+    return _sort_metadata(safetensors.torch.save(plain, metadata))
+
+
+def _sort_metadata(content: bytes) -> bytes:
+    """The same file with its metadata in order: safetensors writes them in a new order each time."""
+    end = 8 + int.from_bytes(content[:8], "little")
+    header = json.loads(content[8:end])
+    header["__metadata__"] = dict(sorted(header["__metadata__"].items()))
+    text = json.dumps(header, separators=(",", ":"), ensure_ascii=False).encode()
+    text += b" " * (-len(text) % 8)  # tensors start at a multiple of 8
+    return len(text).to_bytes(8, "little") + text + content[end:]
 
 
 def read_weights(path: Path) -> tuple[dict[str, Tensor], Description | None]:
@@ -59,22 +71,37 @@ def read_weights(path: Path) -> tuple[dict[str, Tensor], Description | None]:
         if path.suffix == ".safetensors":
             with safe_open(path, framework="pt") as file:
                 state = {key: file.get_tensor(key) for key in file.keys()}  # noqa: SIM118
-                return state, _read_description(file.metadata() or {})
+                metadata = file.metadata() or {}
+            return state, _read_description(path, metadata)
         content = torch.load(path, map_location="cpu", weights_only=True)
+    except InputError:
+        raise
     except Exception as error:  # a damaged file may raise anything in torch.load
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise InputError(f"{path} cannot be read as weights ({reason})") from error
     if isinstance(content, dict):
-        content = content.get("ema") or content.get("model") or content
+        parts = [content.get(key) for key in ("ema", "model")]
+        content = next((part for part in parts if isinstance(part, dict) and part), content)
     if not isinstance(content, dict) or not all(isinstance(value, Tensor) for value in content.values()):
         raise InputError(f"{path} holds no state dict, expected one, or one under 'ema' or 'model'")
     return content, None
 
 
-def _read_description(metadata: Mapping[str, str]) -> Description | None:
+def _read_description(path: Path, metadata: Mapping[str, str]) -> Description | None:
     if not {"arch", "categories", "image_size"} <= metadata.keys():
         return None
-    return Description(metadata["arch"], tuple(json.loads(metadata["categories"])), int(metadata["image_size"]))
+    try:
+        categories = json.loads(metadata["categories"])
+    except (ValueError, RecursionError):
+        categories = None
+    if not isinstance(categories, list) or not categories or not all(isinstance(name, str) for name in categories):
+        found = metadata["categories"][:40]
+        raise InputError(f"{path}: its metadata say categories '{found}', expected a JSON list of names")
+    size = metadata["image_size"]
+    if not (size.isascii() and size.isdigit() and MIN_IMAGE_SIZE <= int(size[:9]) <= MAX_IMAGE_SIZE):
+        expected = f"pixels from {MIN_IMAGE_SIZE} to {MAX_IMAGE_SIZE}"
+        raise InputError(f"{path}: its metadata say image_size '{size[:40]}', expected {expected}")
+    return Description(metadata["arch"], tuple(categories), int(size))
 
 
 def load_weights(model: nn.Module, state: Mapping[str, Tensor]) -> None:

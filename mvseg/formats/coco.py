@@ -18,7 +18,7 @@ from pydantic import BaseModel, FiniteFloat, NonNegativeInt, RootModel, TypeAdap
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.find_views import base_name, find_views, list_some, warn_of_base_names
-from mvseg.formats.json_file import read_json
+from mvseg.formats.json_file import Int64, Items, read_json
 from mvseg.formats.masks.found_mask import check_categories
 from mvseg.formats.photos import describe_turn
 from mvseg.scene import Scene
@@ -36,7 +36,7 @@ class CocoImage(BaseModel):
 class CocoAnnotation(BaseModel):
     """An annotation as it stands in the file; `decode_segmentation` checks the mask, whoever needs it the category."""
 
-    id: int | str | None = None
+    id: Int64 | str | None = None
     image_id: int | str
     category_id: Any = None
     segmentation: Any = None
@@ -46,8 +46,8 @@ class CocoAnnotation(BaseModel):
 class CocoFile(BaseModel):
     """What every COCO file holds."""
 
-    images: list[CocoImage]
-    annotations: list[CocoAnnotation]
+    images: Items[CocoImage]
+    annotations: Items[CocoAnnotation]
 
 
 class _Category(BaseModel):
@@ -56,10 +56,10 @@ class _Category(BaseModel):
 
 
 class _MaskFile(CocoFile):
-    categories: list[_Category] = []
+    categories: Items[_Category] = []
 
 
-class _Results(RootModel[list[CocoAnnotation]]):
+class _Results(RootModel[Items[CocoAnnotation]]):
     """COCO's results format: annotations alone."""
 
 
@@ -67,11 +67,11 @@ class Rle(BaseModel):
     """A run-length encoded mask as it stands in the file; size is (height, width)."""
 
     size: tuple[int, int]
-    counts: str | list[NonNegativeInt]
+    counts: str | Items[NonNegativeInt]
 
 
 Crowd = Literal["mask", "ignore"]
-_SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(list[list[FiniteFloat]] | Rle)
+_SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(Items[Items[FiniteFloat]] | Rle)
 
 
 def read_coco(

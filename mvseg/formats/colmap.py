@@ -75,11 +75,12 @@ def read_colmap(model: Path, folder: Path) -> Scene:
     check_binary_model(model)
     try:
         reconstruction = pycolmap.Reconstruction(model)
+        images = sorted(reconstruction.images.values(), key=lambda image: image.name)  # which may be no UTF-8
     except (RuntimeError, ValueError, IndexError, OSError, MemoryError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{model}: cannot be read as a COLMAP model ({reason})") from None
     photos = []
-    for image in sorted(reconstruction.images.values(), key=lambda image: image.name):
+    for image in images:
         if image.has_pose:
             photos.append(_photo(model, image, reconstruction.cameras[image.camera_id]))
     scene = build_scene(folder, photos, unit="", source=model)

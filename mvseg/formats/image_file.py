@@ -29,9 +29,9 @@ from mvseg.errors import InputError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 MAX_SIDE = 1 << 20  # pixels
+MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
 ORIENTATION = 0x0112  # EXIF tag
 BITS_PER_SAMPLE = 0x0102  # TIFF tag
-MAX_PIXELS = 1 << 30
 LARGE = 1 << 26  # pixels; Pillow's own limit lies above
 
 PNG_START = b"\x89PNG\r\n\x1a\n"
@@ -47,14 +47,27 @@ READERS: tuple[tuple[bytes, type[ImageFile]], ...] = (
 _pillow_limit = Lock()
 
 
-def read_image(path: Path) -> Image.Image:
+class WrongSize(InputError):
+    """An image of `width` x `height` pixels where another size was expected."""
+
+    def __init__(self, width: int, height: int) -> None:
+        super().__init__(f"it is {width} x {height}")
+        self.width, self.height = width, height
+
+
+def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
     """Decode a JPEG, PNG, TIFF, BMP or WebP file, told apart by its content; the first image of several.
+
+    Args:
+        path: the file.
+        size: width and height that the image must have, in this or the other order; another one is not decoded.
 
     Returns:
         The pixels as the file has them, in one of Pillow's modes.
 
     Raises:
-        InputError: the file cannot be opened, is no such image, is cut short or damaged, or has more than 2^30 pixels.
+        WrongSize: an image of another size.
+        InputError: the file cannot be opened, is no such image, is cut short or damaged, or has more than 2^28 pixels.
             The message is a reason, without the file's name.
     """
     try:
@@ -69,10 +82,13 @@ def read_image(path: Path) -> Image.Image:
     try:
         image = reader(BytesIO(data))
         is_too_large = image.width * image.height > MAX_PIXELS
-        if not is_too_large:
+        is_of_size = size is None or sorted(image.size) == sorted(size)  # a TIFF may be turned when it is decoded
+        if is_of_size and not is_too_large:
             _load(image)
     except Exception as error:  # Pillow raises almost anything on a damaged file
         raise InputError(" ".join(str(error).split()) or type(error).__name__) from None
+    if not is_of_size:
+        raise WrongSize(image.width, image.height)
     if is_too_large:
         raise InputError(f"it is {image.width} x {image.height} pixels, expected at most {MAX_PIXELS} in all")
     return image
@@ -108,7 +124,7 @@ def no_image_message(start: bytes) -> str:
     return "it is not a JPEG, PNG, TIFF, BMP or WebP file"
 
 
-def read_rgb(path: Path) -> np.ndarray:
+def read_rgb(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     """(H, W, 3) uint8: an image in colour, without transparency, the upper 8 of 16 bits.
 
     Files of 16 bits that hold smaller numbers only, as cameras of 10, 12 or 14 bits write them, give the upper 8 of
@@ -117,7 +133,7 @@ def read_rgb(path: Path) -> np.ndarray:
     Raises:
         InputError: see `read_image`; or the pixels are signed, or have 32 bits.
     """
-    image = read_image(path)
+    image = read_image(path, size)
     deep = _read_deep(path, image)
     if deep is not None:
         bits = _bits_of(deep)
@@ -133,10 +149,10 @@ def read_rgb(path: Path) -> np.ndarray:
         raise InputError(str(error)) from None
 
 
-def sensor_bits(path: Path) -> int:
+def sensor_bits(path: Path, size: tuple[int, int] | None = None) -> int:
     """How many bits the numbers of an image use: 8, or 10, 12, 14 or 16 in a file of 16 bits.
 
-    Files of 8 bits are told by their heads; others are decoded.
+    Files of 8 bits are told by their heads; others are decoded. For `size` see `read_image`.
 
     Raises:
         InputError: see `read_image`.
@@ -149,7 +165,7 @@ def sensor_bits(path: Path) -> int:
             is_deep = head.startswith(PNG_START) and head[24:25] == b"\x10"
     if not is_deep:
         return 8
-    deep = _read_deep(path, read_image(path))
+    deep = _read_deep(path, read_image(path, size))
     return 8 if deep is None else _bits_of(deep)
 
 

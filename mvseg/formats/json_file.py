@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Annotated, TypeVar
 
-from pydantic import BaseModel, Field, FiniteFloat, ValidationError
+from pydantic import BaseModel, FailFast, Field, FiniteFloat, ValidationError
 
 from mvseg.errors import InputError
 from mvseg.formats.image_file import MAX_SIDE
@@ -14,6 +14,17 @@ from mvseg.formats.image_file import MAX_SIDE
 Vector3 = tuple[FiniteFloat, FiniteFloat, FiniteFloat]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Pixels = Annotated[int, Field(ge=1, le=MAX_SIDE)]
+Int64 = Annotated[int, Field(ge=-(2**63), lt=2**63)]
+Item = TypeVar("Item")
+
+
+class _FirstFault(FailFast):
+    """The first item that is wrong is enough: pydantic would otherwise describe each of five million."""
+
+    __hash__ = object.__hash__  # unions need one
+
+
+Items = Annotated[list[Item], _FirstFault()]
 Model = TypeVar("Model", bound=BaseModel)
 
 

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from mvseg.errors import InputError
-from mvseg.formats.image_file import read_image, write_png
+from mvseg.formats.image_file import WrongSize, read_image, write_png
 from mvseg.regions import IGNORE_LABEL
 
 VOC_BORDER = 255  # index, in palette PNGs
@@ -24,11 +24,7 @@ def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
     Raises:
         InputError: as `read_labels`, or another size than `width` x `height`.
     """
-    labels = read_labels(path)
-    if labels.shape != (height, width):
-        size = f"{labels.shape[1]} x {labels.shape[0]}"
-        raise InputError(f"{path}: the mask is {size}, its camera says {width} x {height}")
-    return labels
+    return _read(path, (width, height))
 
 
 def read_labels(path: Path) -> np.ndarray:
@@ -38,19 +34,32 @@ def read_labels(path: Path) -> np.ndarray:
         InputError: the file is missing, cannot be decoded, is a JPEG, has colour channels, or does not hold
             unsigned numbers of at most 16 bits.
     """
+    return _read(path, None)
+
+
+def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path}: the mask file is missing")
-    return labels_of(open_labels(path), path)
+    return labels_of(open_labels(path, size), path)
 
 
-def open_labels(path: Path) -> Image.Image:
+def open_labels(path: Path, size: tuple[int, int] | None) -> Image.Image:
     """The decoded image of a label file.
 
+    Args:
+        path: the file.
+        size: width and height that its camera says; an image of another size is not decoded.
+
     Raises:
-        InputError: it cannot be decoded, or is a JPEG.
+        InputError: it cannot be decoded, is a JPEG, or is of another size.
     """
     try:
-        image = read_image(path)
+        image = read_image(path, size)
+        if size is not None and image.size != size:
+            raise WrongSize(image.width, image.height)
+    except WrongSize as error:
+        expected = "" if size is None else f", its camera says {size[0]} x {size[1]}"
+        raise InputError(f"{path}: the mask is {error.width} x {error.height}{expected}") from None
     except InputError as error:
         raise InputError(f"{path}: cannot be read, expected a whole label PNG: {error}") from None
     if image.format == "JPEG":

@@ -18,6 +18,7 @@ from mvseg.errors import InputError
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Pixels
 from mvseg.formats.lens import opencv_lens
+from mvseg.formats.yaml_file import check_yaml_text
 
 MAX_BYTES = 1 << 20
 # Names that tools use, in small letters and without "_".
@@ -133,6 +134,7 @@ def _read_entries(path: Path) -> dict[str, Any]:
             raise InputError(f"{path}: is too large for a calibration")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         text = "\n".join(line for line in lines if not line.startswith("%YAML"))  # "%YAML:1.0" is no YAML
+        check_yaml_text(path, text)
         entries = yaml.load(text, _Loader)
     except InputError:
         raise

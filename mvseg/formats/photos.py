@@ -14,8 +14,10 @@ import torch
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.image_file import (
+    MAX_PIXELS,
     MAX_SIDE,
     PHOTO_SUFFIXES,
+    WrongSize,
     file_name_problem,
     is_turned,
     read_image_size,
@@ -159,6 +161,8 @@ def _problem(photo: Photo, file: str) -> str | None:
         return problem
     if max(photo.width, photo.height) > MAX_SIDE:
         return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_SIDE} pixels a side"
+    if photo.width * photo.height > MAX_PIXELS:
+        return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_PIXELS} pixels in all"
     size = torch.tensor([photo.width, photo.height])
     return camera_problem(torch.as_tensor(photo.K), torch.as_tensor(photo.R), torch.as_tensor(photo.t), size=size)
 
@@ -188,7 +192,9 @@ def check_photos(scene: Scene) -> None:
     if turned:
         message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
         warnings.warn(f"{turned[0]}: {message}", InputWarning, stacklevel=2)
-    few = [(path, bits) for path in paths if (bits := _known_bits(path)) not in (8, 16)]
+    sizes = scene.cameras.sizes.tolist()
+    known = [_known_bits(path, (width, height)) for path, (width, height) in zip(paths, sizes, strict=True)]
+    few = [(path, bits) for path, bits in zip(paths, known, strict=True) if bits not in (8, 16)]
     if few:
         path, bits = few[0]
         message = f"{len(few)} photos of 16 bits hold smaller numbers, this one of {bits} bits: they are brightened"
@@ -200,10 +206,10 @@ def describe_turn(path: Path) -> str:
     return f"EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
 
 
-def _known_bits(path: Path) -> int:
-    """As `sensor_bits`; 8 for a photo that cannot be read, which `read_photo` will name."""
+def _known_bits(path: Path, size: tuple[int, int]) -> int:
+    """As `sensor_bits`; 8 for a photo that cannot be read or has another size, which `read_photo` will name."""
     try:
-        return sensor_bits(path)
+        return sensor_bits(path, size)
     except (InputError, OSError):
         return 8
 
@@ -244,12 +250,15 @@ def read_photo(scene: Scene, view: int) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path}: the image of view {view} is missing")
     try:
-        pixels = read_rgb(path)
+        pixels = read_rgb(path, (width, height))
+        if pixels.shape[:2] != (height, width):
+            raise WrongSize(pixels.shape[1], pixels.shape[0])
+    except WrongSize as error:
+        size = f"{error.width} x {error.height}"
+        turned = " (as it is stored; EXIF turns it for display)" if is_turned(path) else ""
+        message = f"{path}: the image of view {view} is {size}{turned}, its camera says {width} x {height}"
+        raise InputError(message) from None
     except InputError as error:
         message = f"{path}: the image of view {view} cannot be read, expected a whole image file: {error}"
         raise InputError(message) from None
-    if pixels.shape[:2] != (height, width):
-        size = f"{pixels.shape[1]} x {pixels.shape[0]}"
-        turned = " (as it is stored; EXIF turns it for display)" if is_turned(path) else ""
-        raise InputError(f"{path}: the image of view {view} is {size}{turned}, its camera says {width} x {height}")
     return undistort(pixels, scene.views[view].lens, scene.cameras.K[view].cpu().numpy())

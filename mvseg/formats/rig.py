@@ -21,13 +21,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.json_file import Matrix3, Pixels, Vector3, read_json
+from mvseg.formats.json_file import Items, Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.opencv_yaml import calibration_lens, read_calibration
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
 from mvseg.scene import Scene
 
 RIG_FORMAT = "mvseg-rig/1"
+MANY = 10  # unknown keys of one view that are named
 
 
 class RigCamera(BaseModel):
@@ -40,7 +41,7 @@ class RigCamera(BaseModel):
     calibration: str | None = None
     R: Matrix3
     t: Vector3
-    distortion: list[FiniteFloat] | None = None
+    distortion: Items[FiniteFloat] | None = None
 
 
 class _RigView(RigCamera):
@@ -52,7 +53,7 @@ class _Rig(BaseModel):
     format: Literal["mvseg-rig/1"]
     unit: str = ""
     up: Vector3 | None = None
-    views: list[_RigView]
+    views: Items[_RigView]
 
 
 def read_rig(path: Path) -> Scene:
@@ -64,7 +65,7 @@ def read_rig(path: Path) -> Scene:
     """
     rig = read_json(path, _Rig)
     for owner, entry in [("the rig", rig), *((f"view {i}", view) for i, view in enumerate(rig.views))]:
-        for key in entry.model_extra or {}:
+        for key in list(entry.model_extra or {})[:MANY]:
             warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
     photos = []
     for index, view in enumerate(rig.views):

@@ -6,6 +6,8 @@ import warnings
 from collections.abc import Collection
 from pathlib import Path
 
+import numpy as np
+
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
@@ -27,6 +29,7 @@ TRANSFORMS = ("transforms.json", "transforms_train.json")  # Blender's scenes of
 BINARY = 255  # what segmenters write that only tell leaf from background
 
 
+@np.errstate(over="ignore", invalid="ignore")  # absurd numbers become infinite: no camera has such, and it is named
 def load_scene(folder: Path | str) -> Scene:
     """Load the cameras of a scene folder; photos are read later, when they are needed, and may be absent.
 

@@ -16,7 +16,7 @@ import pycolmap
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.json_file import Pixels, read_json
+from mvseg.formats.json_file import Items, Pixels, read_json
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
 from mvseg.scene import ROTATION_TOLERANCE, Scene
@@ -55,7 +55,7 @@ class _Frame(_Intrinsics):
 
 
 class _Transforms(_Intrinsics):
-    frames: list[_Frame]
+    frames: Items[_Frame]
     applied_transform: Rows | None = None
     applied_scale: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 1.0
 

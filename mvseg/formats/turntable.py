@@ -24,9 +24,9 @@ from pydantic import BaseModel, ConfigDict, FiniteFloat
 from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.json_file import Vector3, read_json
+from mvseg.formats.json_file import Items, Vector3, read_json
 from mvseg.formats.photos import build_scene
-from mvseg.formats.rig import RigCamera, photo_of
+from mvseg.formats.rig import MANY, RigCamera, photo_of
 from mvseg.scene import Scene
 
 TURNTABLE_FORMAT = "mvseg-turntable/1"
@@ -51,7 +51,7 @@ class _Turntable(BaseModel):
     unit: str = ""
     axis: _Axis
     cameras: dict[str, RigCamera]
-    views: list[_View]
+    views: Items[_View]
 
 
 def read_turntable(path: Path) -> Scene:
@@ -64,7 +64,7 @@ def read_turntable(path: Path) -> Scene:
     table = read_json(path, _Turntable)
     owners = [("the turntable", table), *((f"camera {name}", each) for name, each in table.cameras.items())]
     for owner, entry in [*owners, *((f"view {index}", view) for index, view in enumerate(table.views))]:
-        for key in entry.model_extra or {}:
+        for key in list(entry.model_extra or {})[:MANY]:
             warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
     if not any(table.axis.direction):
         raise InputError(f"{path}: the direction of the axis is 0, 0, 0, expected a vector along the axis")
@@ -85,6 +85,7 @@ def read_turntable(path: Path) -> Scene:
 
 def turn_about(point: np.ndarray, direction: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
     """A turn about an axis: (3, 3) rotation and (3,) shift, so that X goes to rotation @ X + shift."""
-    axis = direction / np.linalg.norm(direction)
+    axis = direction / np.abs(direction).max()  # first, so that no length overflows
+    axis /= np.linalg.norm(axis)
     turn = Rotation.from_rotvec(axis * np.radians(degrees % 360)).as_matrix()
     return turn, point - turn @ point

@@ -40,19 +40,20 @@ def match_regions(
         that share a camera centre (they are skipped), a scene without regions, and views that do not agree.
 
     Raises:
-        InputError: fewer than two views, regions and cameras of different numbers of views, or a region that reaches
-            beyond the image of its camera.
+        InputError: fewer than two views, regions and cameras of different numbers of views, cameras that are all at
+            one place, or a region that reaches beyond the image of its camera.
     """
     cameras = cameras.to(regions.device)
     check_views(regions, cameras)
+    check_baselines(cameras)
     _check_sizes(regions, cameras)
     _warn_of_gaps(regions, cameras)
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
     method = config.resolved_method
     if method == "nview":
-        matching = match_nview(regions, cameras, affinity)
+        matching = match_nview(regions, cameras, affinity, progress=progress)
         if len(cameras) > 2 and len(regions):
-            _warn_of_disagreement(matching)
+            _warn_of_disagreement(matching, regions)
         return matching
     if method == "one-per-view":
         ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
@@ -109,6 +110,15 @@ def check_views(regions: Regions, cameras: Cameras) -> None:
         raise InputError("matching needs at least two views, got a single view")
 
 
+def check_baselines(cameras: Cameras) -> None:
+    """Raises InputError: the cameras are all at one place, where depth cannot be seen."""
+    if len(cameras) > 1 and bool(is_coincident(cameras).all()):
+        raise InputError(
+            f"all {len(cameras)} cameras are at one place, expected photos from different places: do R and t map world "
+            "points to the camera?"
+        )
+
+
 def _check_sizes(regions: Regions, cameras: Cameras) -> None:
     sizes = cameras.sizes[regions.view_index]
     outside = ((regions.boxes[:, :2] < 0) | (regions.boxes[:, 2:] > sizes)).any(1).nonzero()[:, 0]
@@ -125,12 +135,14 @@ def _check_sizes(regions: Regions, cameras: Cameras) -> None:
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
     if not len(regions):
         warnings.warn("the masks of all views are empty: there are no instances", InputWarning, stacklevel=3)
-    for i, j in torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist():
-        message = f"views {i} and {j} share a camera centre: this pair is skipped"
-        warnings.warn(message, InputWarning, stacklevel=3)
+    pairs = torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist()
+    if pairs:
+        first = "views {} and {} share a camera centre".format(*pairs[0])
+        skipped = "this pair is skipped" if len(pairs) == 1 else f"so do {len(pairs) - 1} more pairs; all are skipped"
+        warnings.warn(f"{first}: {skipped}", InputWarning, stacklevel=3)
 
 
-def _warn_of_disagreement(matching: Matching) -> None:
+def _warn_of_disagreement(matching: Matching, regions: Regions) -> None:
     """Sound poses never did so on 24 development scenes, with true and with degraded masks. Cameras of the next photo
     did so in 9 of 12, cameras of the next but one in 3 of 12: the others agree well enough to pass. The residual alone
     does not tell: it is large where many masks are missing, too."""
@@ -144,4 +156,9 @@ def _warn_of_disagreement(matching: Matching) -> None:
     if matching.method != "nview":
         facts += f"; '{matching.method}' matched them"
     question = "do R and t map world points to the camera, and does each mask belong to its photo?"
+    richest, sparse = int(regions.num_per_view.max()), regions.num_per_view <= regions.num_per_view.max() / 2
+    if int(sparse.sum()) > len(sparse) / 2:  # then rays find nothing whatever the poses are
+        view = int(regions.num_per_view.argmax())
+        counts = f"{int(sparse.sum())} of {len(sparse)} views have at most half of the {richest} masks of view {view}"
+        question = f"{counts}: are masks missing there?"
     warnings.warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}", InputWarning, stacklevel=3)

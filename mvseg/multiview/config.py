@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from mvseg.errors import InputError
 
+MAX_IMAGE_SIZE = 16_384  # pixels, as in a file of weights; this module is imported for --help, and loads no torch
+
 
 @dataclass(frozen=True)
 class DetectConfig:
@@ -28,7 +30,7 @@ class DetectConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.min_score <= 1:
             raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
-        if self.image_size is not None and self.image_size < 32:
-            raise InputError(f"detect.image_size is {self.image_size}, expected at least 32")
+        if self.image_size is not None and not 32 <= self.image_size <= MAX_IMAGE_SIZE:
+            raise InputError(f"detect.image_size is {self.image_size}, expected at least 32, at most {MAX_IMAGE_SIZE}")
         if self.num_iterations < 0:
             raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from types import MappingProxyType
 
 import torch
@@ -26,6 +27,7 @@ def match_proposals(
     cluster_iou: float = 0.3,
     detections_per_view: int = 100,
     match: MatchConfig = MatchConfig(),
+    progress: bool = False,
 ) -> tuple[Tensor, Matching]:
     """Match first, alternate assignment and NMS, then discard unconfirmed boxes (steps 2 to 4 of `MultiViewMaskRCNN`).
 
@@ -36,6 +38,7 @@ def match_proposals(
         cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
         detections_per_view: at most this many are kept in a view, best scores first.
         match: how regions are matched.
+        progress: show progress bars.
 
     Returns:
         (S,) int64 indices of the proposals kept, best score first, and their matching.
@@ -43,15 +46,16 @@ def match_proposals(
     assignment = EpipolarAssignment()
     per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
     keep = _suppress(proposals, per_class, cluster_iou, detections_per_view=detections_per_view)
-    matching, num_instances = _match_classes(proposals.select(keep), cameras, match)
+    matching, num_instances = _match_classes(proposals.select(keep), cameras, match, progress=progress)
     if match.resolved_method != "symnmf":
         num_instances = {}
+    rematch = partial(_match_classes, cameras=cameras, match=match, num_instances=num_instances, progress=progress)
     for _ in range(num_iterations):
         regions = proposals.regions.select(keep)
-        ids, _ = assignment(proposals.regions, regions, matching.instance_ids, cameras=cameras)
+        ids, _ = assignment(proposals.regions, regions, matching.instance_ids, cameras=cameras, progress=progress)
         groups = torch.cat((per_class, ids[:, None]), 1)
         keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
-        matching, _ = _match_classes(proposals.select(keep), cameras, match, num_instances=num_instances)
+        matching, _ = rematch(proposals.select(keep))
     if num_iterations and matching.support is not None:
         stays = confirmed(
             proposals.boxes[keep],
@@ -62,7 +66,7 @@ def match_proposals(
         )
         if not stays.all():
             keep = keep[stays]
-            matching, _ = _match_classes(proposals.select(keep), cameras, match, num_instances=num_instances)
+            matching, _ = rematch(proposals.select(keep))
     return keep, matching
 
 
@@ -82,6 +86,7 @@ def _match_classes(
     match: MatchConfig,
     *,
     num_instances: Mapping[int, int] = MappingProxyType({}),
+    progress: bool = False,
 ) -> tuple[Matching, dict[int, int]]:
     """Match proposals class by class; instances of different classes get different ids.
 
@@ -92,7 +97,7 @@ def _match_classes(
     for label in proposals.classes.unique().tolist():
         members = (proposals.classes == label).nonzero()[:, 0]
         config = replace(match, num_instances=num_instances.get(label) or match.num_instances)
-        parts.append(match_regions(proposals.regions.select(members), cameras, config))
+        parts.append(match_regions(proposals.regions.select(members), cameras, config, progress=progress))
         indices.append(members)
         counts[label] = parts[-1].num_instances
     if not parts:

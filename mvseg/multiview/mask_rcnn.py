@@ -108,13 +108,15 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             views = proposals.regions.view_index[keep]
             return self._collect(detections, sizes, keep=keep, views=views, matching=matching)
 
-    @torch.no_grad()
-    def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> tuple[Proposals, Matching]:
+    def find_regions(
+        self, images: Iterable[Tensor], cameras: Cameras, *, progress: bool = False
+    ) -> tuple[Proposals, Matching]:
         """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time, masks as crops.
 
         Args:
             images: V tensors (3, H, W) in [0, 1] on the detector's device, e.g. from a generator.
             cameras: their V undistorted cameras.
+            progress: show progress bars while the detections are matched.
 
         Returns:
             The D detections that are kept, on the CPU, ordered by view and by falling score, and their matching.
@@ -124,17 +126,31 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         """
         detections, sizes = [], []
         for image in images:
-            detections.append({key: value.cpu() for key, value in self._propose(image).items()})
+            detections.append(self.detect(image))
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
+        return self.match_detections(detections, cameras, progress=progress)
+
+    @torch.no_grad()
+    def detect(self, image: Tensor) -> dict[str, Tensor]:
+        """The excessive set of one image (3, H, W) in [0, 1], on the CPU: what `match_detections` takes."""
+        return {key: value.cpu() for key, value in self._propose(image).items()}
+
+    @torch.no_grad()
+    def match_detections(
+        self, detections: list[dict[str, Tensor]], cameras: Cameras, *, progress: bool = False
+    ) -> tuple[Proposals, Matching]:
+        """The second half of `find_regions`: what is kept of what `detect` gives for V images, and its matching."""
         with torch.autocast("cpu", enabled=False):
-            proposals = gather_proposals(detections, sizes)
-            keep, matching = self._match(proposals, cameras.to("cpu"))
+            proposals = gather_proposals(detections, cameras.sizes.tolist())
+            keep, matching = self._match(proposals, cameras.to("cpu"), progress=progress)
         order = proposals.regions.view_index[keep].argsort(stable=True)
         kept = proposals.select(keep[order])
         return kept, matching.select(order)
 
-    def _match(self, proposals: Proposals, cameras: Cameras) -> tuple[Tensor, Matching]:
+    def _match(
+        self, proposals: Proposals, cameras: Cameras, *, progress: bool = False
+    ) -> tuple[Tensor, Matching]:
         """Indices of the proposals to keep, without those whose mask is empty, and their matching."""
         solid = (proposals.regions.areas > 0).nonzero()[:, 0]
         keep, matching = match_proposals(
@@ -144,6 +160,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             cluster_iou=self.cluster_iou,
             detections_per_view=self.roi_heads.detections_per_img,
             match=self.match,
+            progress=progress,
         )
         return solid[keep], matching
 

@@ -55,7 +55,7 @@ def save_result(
     try:
         with folder_whole(out) as folder:
             _write_images(result, folder, progress, draw_rims=draw_rims)
-            _write_instances(result, folder)
+            _write_instances(result, folder, progress)
             if result.surfaces is not None or result.voxels is not None:
                 _write_shapes(result, folder)
             if result.traits is not None:
@@ -92,7 +92,7 @@ def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bo
     write_png(folder / "contact.png", draw_contact_sheet(tiles, [view.name for view in scene.views]))
 
 
-def _write_instances(result: Result, folder: Path) -> None:
+def _write_instances(result: Result, folder: Path, progress: bool) -> None:
     """instances.json: every region, in the frame of the photo the user took."""
     scene, images = result.scene, []
     for index, view in enumerate(scene.views):
@@ -101,7 +101,7 @@ def _write_instances(result: Result, folder: Path) -> None:
         images.append({"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height})
     others = {mask.region: mask.other for mask in result.matching.merged}
     annotations = []
-    for region in range(len(result.regions)):
+    for region in tqdm(range(len(result.regions)), desc="masks", unit="mask", disable=not progress):
         annotation = _annotate(result, region)
         if region in others:
             annotation["other_instance_id"] = others[region]

@@ -151,15 +151,19 @@ def _draw(
     return painted
 
 
+def shrink_to_tile(overlay: np.ndarray) -> np.ndarray:
+    """An overlay (H, W, 3) as `draw_contact_sheet` shows it, 480 pixels wide; one of that width stays as it is."""
+    height = max(1, round(TILE_WIDTH * overlay.shape[0] / overlay.shape[1]))
+    return np.asarray(cv2.resize(overlay, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA))
+
+
 def draw_contact_sheet(overlays: Sequence[np.ndarray], names: Sequence[str]) -> np.ndarray:
-    """All overlays of a scene on one sheet, row by row, each under its view's name: uint8 RGB."""
+    """All overlays of a scene, or their tiles, on one sheet, row by row, each under its view's name: uint8 RGB."""
     columns = math.ceil(math.sqrt(len(overlays)))
     columns = max(columns, min(len(overlays), 4))
     tiles = []
     for overlay, name in zip(overlays, names, strict=True):
-        height = max(1, round(TILE_WIDTH * overlay.shape[0] / overlay.shape[1]))
-        tile = cv2.resize(overlay, (TILE_WIDTH, height), interpolation=cv2.INTER_AREA)
-        tile = cv2.copyMakeBorder(tile, 26, 4, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
+        tile = cv2.copyMakeBorder(shrink_to_tile(overlay), 26, 4, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
         cv2.putText(tile, name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
         tiles.append(tile)
     tallest = max(tile.shape[0] for tile in tiles)

@@ -11,7 +11,8 @@ from torch import Tensor
 from mvseg.errors import InputError
 from mvseg.evaluation.truth import shown_instance
 from mvseg.formats.coco import Rle, decode_rle
-from mvseg.formats.json_file import Pixels, read_json
+from mvseg.formats.image_file import file_name_problem
+from mvseg.formats.json_file import Int64, Items, Pixels, read_json
 from mvseg.formats.label_png import read_label_png
 
 
@@ -24,13 +25,13 @@ class _Image(BaseModel):
 
 class _Instance(BaseModel):
     image_id: int
-    instance_id: int
+    instance_id: Int64
     segmentation: Rle
 
 
 class _Instances(BaseModel):
-    images: list[_Image]
-    annotations: list[_Instance]
+    images: Items[_Image]
+    annotations: Items[_Instance]
 
 
 def find_result(folder: Path) -> Path:
@@ -68,6 +69,10 @@ def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
     if not truth.is_dir():
         raise InputError(f"{truth}: no such folder of true labels")
     content = read_json(path, _Instances)
+    for image in content.images:
+        problem = file_name_problem(image.name, folder="the folder of true labels")
+        if problem:
+            raise InputError(f"{path}: image {image.name}: {problem}")
     images = {image.id: image for image in content.images}
     labels = {
         number: read_label_png(truth / f"{image.name}.png", image.width, image.height)

@@ -6,6 +6,7 @@ import json
 import multiprocessing
 import os
 import shutil
+import signal
 import threading
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
@@ -19,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.formats.atomic import is_partial, write_text_whole, write_whole
+from mvseg.formats.atomic import is_partial, lock_folder, write_text_whole, write_whole
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.label_png import read_label_png
 from mvseg.scene import Cameras
@@ -123,7 +124,8 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
         num_workers: processes, >= 1.
 
     Raises:
-        InputError: an unknown preset, a number out of range, or a folder with a data set of another preset or seed.
+        InputError: an unknown preset, a number out of range, a folder with a data set of another preset or seed, or one
+            that another process is writing to.
     """
     if isinstance(preset, str):
         if preset not in PRESETS:
@@ -134,8 +136,14 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
     if seed < 0:
         raise InputError(f"the seed is {seed}, expected 0 or more")
     folder = Path(folder)
-    claim_folder(folder, recipe=json.dumps({"preset": asdict(preset), "seed": seed}, indent=1))
-    scenes = list_scenes(preset, seed)
+    folder.mkdir(parents=True, exist_ok=True)
+    with lock_folder(folder):
+        claim_folder(folder, recipe=json.dumps({"preset": asdict(preset), "seed": seed}, indent=1))
+        write_scenes(folder, preset, list_scenes(preset, seed), num_workers=num_workers)
+
+
+def write_scenes(folder: Path, preset: Preset, scenes: list[SceneSpec], *, num_workers: int) -> None:
+    """Write the scenes that are not there yet, and the files that list them all."""
     work = partial(finish_scene, folder, preset)
     results = tqdm(run_all(work, scenes, num_workers), total=len(scenes), unit="scene", desc=str(folder))
     annotated = list(zip(scenes, results, strict=True))
@@ -148,13 +156,13 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
 
 
 def claim_folder(folder: Path, *, recipe: str) -> None:
-    """Make the folder of a data set, or go on with the one that is there, minus what a killed run left unfinished."""
+    """Make an empty folder that of a data set, or go on with the one that it holds, minus what a killed run left
+    unfinished."""
     made_from = folder / "dataset.json"
-    if folder.is_dir() and not made_from.is_file() and not all(is_partial(path) for path in folder.iterdir()):
+    if not made_from.is_file() and not all(is_partial(path) for path in folder.iterdir()):
         raise InputError(f"{folder}: holds files that are not a data set, expected a new or empty folder")
     if made_from.exists() and made_from.read_text(encoding="utf-8") != recipe:
         raise InputError(f"{folder} holds a data set of another preset or seed, expected an empty folder")
-    folder.mkdir(parents=True, exist_ok=True)
     for path in [*folder.glob(".*"), *folder.glob("*/.*")]:
         if is_partial(path) and path.is_dir():
             shutil.rmtree(path)
@@ -173,10 +181,12 @@ def run_all(work: Callable[[Item], Result], items: Iterable[Item], num_workers: 
 
 
 def start_worker() -> None:
-    """Prepare a process of the pool: OpenCV and torch on one thread, and an end as soon as the parent is gone.
+    """Prepare a process of the pool: OpenCV and torch on one thread, an end as soon as the parent is gone, and one
+    without a word when the parent asks for it (pycolmap's handler would print a trace).
 
     A worker that outlives a killed parent would go on with the items in its queue and get in the way of the next run.
     """
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     threading.Thread(target=end_with_parent, daemon=True).start()

@@ -22,7 +22,7 @@ from tqdm import tqdm
 from mvseg.errors import InputError
 from mvseg.formats.coco import CocoAnnotation, CocoFile, decode_segmentation
 from mvseg.formats.image_file import PHOTO_SUFFIXES, file_name_problem, read_rgb
-from mvseg.formats.json_file import read_json
+from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.label_png import read_labels
 from mvseg.formats.labelled_photo import LabelledPhoto, label_photo, mask_photo
 
@@ -117,7 +117,7 @@ class _Category(BaseModel):
 
 
 class _TrainingFile(CocoFile):
-    categories: list[_Category]
+    categories: Items[_Category]
 
 
 def list_coco(photos: Path, labels: Path) -> SampleList:
@@ -232,8 +232,11 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
         except InputError as error:
             return str(error)
 
-    with ThreadPoolExecutor(min(8, os.cpu_count() or 1)) as pool:
+    pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
+    try:
         answers = list(tqdm(pool.map(inspect, samples), "checking samples", len(samples), disable=None, leave=False))
+    finally:
+        pool.shutdown(cancel_futures=True)  # a run that is stopped does not first check the others
     broken = {index: answer for index, answer in enumerate(answers) if isinstance(answer, str)}
     return [answer if isinstance(answer, int) else 0 for answer in answers], broken
 

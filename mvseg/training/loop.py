@@ -19,9 +19,10 @@ from __future__ import annotations
 
 import logging
 import math
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import nullcontext
+from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
 from typing import Any
 
@@ -36,7 +37,7 @@ from mvseg.detectors.mask_rcnn import count_parameters
 from mvseg.detectors.weights_file import Description
 from mvseg.errors import InputError
 from mvseg.evaluation.average_precision import average_precision
-from mvseg.formats.atomic import is_partial, write_text_whole
+from mvseg.formats.atomic import is_partial, lock_folder, write_text_whole
 from mvseg.training.augmentation import Augmentation, AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
@@ -92,9 +93,9 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
             the batch, the run depends on the number of processes.
 
     Raises:
-        InputError: broken samples (unless `skip_broken`), nothing to train on, an output folder with another run, a
-            checkpoint of another config, weights that do not fit, a loss or gradient that is not finite (the message
-            names the photos).
+        InputError: broken samples (unless `skip_broken`), nothing to train on, an output folder with another run, or
+            one that another process is writing to, a checkpoint of another config, weights that do not fit, a loss or
+            gradient that is not finite (the message names the photos).
     """
     with join_processes(config.device) as processes:
         if config.num_chunks % processes.count:
@@ -107,7 +108,10 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
             samples, held_out = processes.ask_first(lambda: find_samples(config))
             state = start_state(config, samples, device=processes.device, model=model)
             run = Run(config=config, processes=processes, samples=samples, held_out=held_out)
-            run_epochs(run, state)
+            with ExitStack() as stack:
+                config.output.mkdir(parents=True, exist_ok=True)
+                processes.ask_first(lambda: stack.enter_context(lock_folder(config.output)))
+                run_epochs(run, state)
 
 
 def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
@@ -268,8 +272,15 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
         num_workers=config.num_workers,
         collate_fn=collate,
         pin_memory=run.processes.device.type == "cuda",
+        worker_init_fn=_end_quietly,
     )
     return iter(loader)
+
+
+def _end_quietly(_: int) -> None:
+    """A worker that is stopped with its parent prints no trace of the connection that breaks. Errors of samples do not
+    pass here: they reach the parent."""
+    sys.excepthook = lambda *_: None
 
 
 def collate(items: list[tuple[Tensor, Target, int]]) -> Chunk:
@@ -295,7 +306,6 @@ def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
 def open_files(run: Run, state: TrainingState) -> Any | None:
     """Write the config, cut the log to the state's step, and open TensorBoard's writer, if it is installed."""
     output = run.config.output
-    output.mkdir(parents=True, exist_ok=True)
     delete_partial(output)
     write_config(output / "config.yaml", config_values(run.config))
     cut_log(output / "log.jsonl", state.step)

@@ -63,8 +63,8 @@ def _wide_row(traits: Traits, leaf: LeafTraits) -> list[str | int]:
             if trait.has_sd:
                 cells.append(format_number(number.sd))
     unit = escape_text(traits.unit or UNKNOWN_UNIT)
-    quality = "; ".join(leaf.reasons) or "good"
-    return [*cells, format_number(leaf.numbers["quality"].value), unit, leaf.method, escape_text(quality)]
+    method, quality = escape_text(leaf.method), escape_text("; ".join(leaf.reasons) or "good")
+    return [*cells, format_number(leaf.numbers["quality"].value), unit, method, quality]
 
 
 def format_number(value: float) -> str:

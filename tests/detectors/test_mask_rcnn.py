@@ -187,6 +187,18 @@ def test_problems(arch: str, num_classes: int, weights: str | None, message: str
         build_detector(arch, num_classes, weights)
 
 
+def test_categories_that_do_not_fit_the_head_are_refused(tmp_path: Path) -> None:
+    """They would get random predictors, and find nonsense."""
+    path, state = tmp_path / "model.safetensors", build_detector("resnet18_fpn", 2).state_dict()
+    path.write_bytes(encode_weights(state, Description("resnet18_fpn", ("leaf", "stem"), 64)))
+    with pytest.raises(InputError, match="names 2 categories, its head has 1"):
+        build_detector("resnet18_fpn", 3, str(path))
+    broken = state | {CLS: torch.tensor([0.0, float("nan")])}
+    path.write_bytes(encode_weights(broken, Description("resnet18_fpn", ("leaf",), 64)))
+    with pytest.raises(InputError, match=f"{CLS} holds a number that is not finite"):
+        build_detector("resnet18_fpn", 2, str(path))
+
+
 CLS = "roi_heads.box_predictor.cls_score.bias"
 
 

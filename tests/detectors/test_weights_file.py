@@ -54,12 +54,32 @@ def test_weights_that_cannot_be_read(tmp_path: Path, name: str) -> None:
         read_weights(tmp_path / name)
 
 
-@pytest.mark.parametrize("change", [{"categories": "leaf"}, {"categories": "3"}, {"image_size": "large"}])
-def test_a_malformed_description(tmp_path: Path, change: dict[str, str]) -> None:
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        *(("categories", value) for value in ("leaf", "3", "null", "[", "[]", '"leaf"', "[[1]]", "[" * 10_000)),
+        *(("image_size", value) for value in ("large", "x", "0", "-5", "31", "1000000", "9" * 5000, "5_12")),
+    ],
+    ids=lambda value: value[:8],
+)
+def test_a_malformed_description(tmp_path: Path, key: str, value: str) -> None:
     metadata = {"arch": "resnet18_fpn", "categories": '["leaf"]', "image_size": "320"}
-    save_file(STATE, tmp_path / "weights.safetensors", metadata | change)
-    with pytest.raises(InputError, match=r"weights\.safetensors cannot be read as weights"):
+    save_file(STATE, tmp_path / "weights.safetensors", metadata | {key: value})
+    with pytest.raises(InputError, match=rf"weights\.safetensors: its metadata say {key} "):
         read_weights(tmp_path / "weights.safetensors")
+
+
+def test_equal_weights_make_equal_files() -> None:
+    """safetensors itself writes the metadata in a new order each time."""
+    files = {encode_weights(STATE, DESCRIPTION) for _ in range(20)}
+    assert len(files) == 1
+
+
+@pytest.mark.parametrize("key", ["ema", "model"])
+def test_a_checkpoint_whose_parts_are_no_state_is_refused(tmp_path: Path, key: str) -> None:
+    torch.save({key: torch.ones(3), "step": 3}, tmp_path / "weights.pt")
+    with pytest.raises(InputError, match=r"weights\.pt holds no state dict"):
+        read_weights(tmp_path / "weights.pt")
 
 
 @pytest.mark.parametrize(

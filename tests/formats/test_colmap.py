@@ -267,3 +267,11 @@ def test_a_model_in_sparse_itself_goes_first(small: Path, tmp_path: Path) -> Non
     shutil.copytree(small / "sparse", folder / "sparse" / "0")
     assert load_scene(folder).source == folder / "sparse"
     assert find_colmap_model(tmp_path) is None
+
+
+def test_a_name_that_is_no_utf_8_is_refused(small: Path, tmp_path: Path) -> None:
+    pycolmap.Reconstruction(small / "sparse").write_text(tmp_path)
+    images = tmp_path / "images.txt"
+    images.write_bytes(images.read_bytes().replace(b".png", b"\xff.png").replace(b".jpg", b"\xff.jpg"))
+    with pytest.raises(InputError, match="cannot be read as a COLMAP model"):
+        read_colmap(tmp_path, tmp_path)

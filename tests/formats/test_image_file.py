@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from io import BytesIO
 from pathlib import Path
 
@@ -13,6 +15,7 @@ from PIL import Image
 from mvseg.errors import InputError
 from mvseg.formats import image_file
 from mvseg.formats.image_file import file_name_problem, read_image, read_image_size, read_rgb, sensor_bits, write_png
+from mvseg.formats.label_png import read_label_png
 
 AS_STORED = cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION
 
@@ -187,3 +190,34 @@ def test_sound_file_names(file: str) -> None:
 @pytest.mark.parametrize("file", ["../a.jpg", "a/../../b.jpg", "/a.jpg", "", ".", "a\0.jpg"])
 def test_file_names_that_lead_out_or_nowhere(file: str) -> None:
     assert file_name_problem(file)
+
+
+@pytest.fixture
+def bomb(tmp_path: Path) -> Path:
+    """A small PNG file that claims 32,000 x 32,000 pixels. (1 MB is enough to hold them all, if they are black.)"""
+    path = tmp_path / "bomb.png"
+    header = struct.pack(">IIBBBBB", 32_000, 32_000, 8, 0, 0, 0, 0)
+    chunks = [(b"IHDR", header), (b"IDAT", zlib.compress(bytes(100_000))), (b"IEND", b"")]
+    checked = [(data, kind + data, zlib.crc32(kind + data)) for kind, data in chunks]
+    parts = [struct.pack(">I", len(data)) + chunk + struct.pack(">I", checksum) for data, chunk, checksum in checked]
+    path.write_bytes(image_file.PNG_START + b"".join(parts))
+    return path
+
+
+def test_a_bomb_is_never_decoded(bomb: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(image: object) -> None:
+        raise AssertionError("decoded")
+
+    monkeypatch.setattr(image_file, "_load", refuse)
+    with pytest.raises(InputError, match="it is 32000 x 32000 pixels, expected at most 268435456"):
+        read_image(bomb)
+    with pytest.raises(image_file.WrongSize, match="it is 32000 x 32000"):
+        read_image(bomb, (640, 480))
+    path = bomb.with_name("deep.png")
+    data = bomb.read_bytes()
+    start = data[12:24] + b"\x10" + data[25:29]  # 16 bits, which are looked at before the photo is read
+    path.write_bytes(data[:12] + start + zlib.crc32(start).to_bytes(4, "big") + data[33:])
+    with pytest.raises(image_file.WrongSize, match="it is 32000 x 32000"):
+        sensor_bits(path, (640, 480))
+    with pytest.raises(InputError, match=r"bomb\.png: the mask is 32000 x 32000, its camera says 640 x 480"):
+        read_label_png(bomb, 640, 480)

@@ -63,6 +63,18 @@ def test_an_axis_anywhere(tmp_path: Path) -> None:
     np.testing.assert_allclose(cameras.project(on_axis)[0], np.stack([cameras.project(on_axis)[0][0]] * 3), atol=1e-9)
 
 
+@pytest.mark.parametrize("length", [1e-300, 1e-3, 1e300])
+def test_the_length_of_the_axis_does_not_matter(length: float, tmp_path: Path) -> None:
+    axis = {"point": [3, -2, 1], "direction": [length, 0, -length]}
+    other = axis | {"direction": [1, 0, -1]}
+    path = tmp_path / "turntable.json"
+    path.write_text(json.dumps(table(0, 40, axis=other)))
+    expected = read_turntable(path).cameras
+    path.write_text(json.dumps(table(0, 40, axis=axis)))
+    torch.testing.assert_close(read_turntable(path).cameras.R, expected.R)
+    torch.testing.assert_close(read_turntable(path).cameras.t, expected.t)
+
+
 def test_four_cameras_and_twelve_angles(tmp_path: Path) -> None:
     """One of them by its calibration file, one with a lens; sizes where they are given."""
     cameras: dict[str, Any] = {}

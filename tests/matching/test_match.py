@@ -1,8 +1,8 @@
 from __future__ import annotations
 
 import dataclasses
-import warnings
 
+import numpy as np
 import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
@@ -160,11 +160,29 @@ def test_two_cameras_that_share_a_centre_are_warned_of() -> None:
     assert adjusted_rand_score(regions.labels, matching.instance_ids) == 1
 
 
-def test_cameras_that_all_share_a_centre_match_nothing() -> None:
-    cameras = cameras_at(torch.tensor([[10.0, 0, 0], [10.0, 0, 0]]))
+@pytest.mark.parametrize("count", [2, 9])
+def test_cameras_that_all_share_a_centre_are_refused(count: int) -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0]] * count))
     regions = regions_from_label_maps(
         render_balls(cameras, torch.tensor([[0.0, 0, 0]]).double(), torch.tensor([0.5]).double())
     )
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
-        assert match_regions(regions, cameras).instance_ids.tolist() == [-1, -1]
+    with pytest.raises(InputError, match=f"all {count} cameras are at one place"):
+        match_regions(regions, cameras)
+
+
+def test_many_pairs_that_share_a_centre_are_one_warning() -> None:
+    cameras = cameras_at(torch.tensor([[10.0, 0, 0]] * 6 + [[0.0, 10, 0]]))
+    nothing = regions_from_label_maps([np.zeros((240, 320), np.int64)] * 7)
+    with pytest.warns(InputWarning) as caught:
+        match_regions(nothing, cameras)
+    about = [str(each.message) for each in caught if "share a camera centre" in str(each.message)]
+    assert about == ["views 0 and 1 share a camera centre: so do 14 more pairs; all are skipped"]
+
+
+@pytest.mark.parametrize("num_views", [2, 4])
+def test_missing_masks_are_not_blamed_on_the_poses(demo_scene: Scene, demo_regions: Regions, num_views: int) -> None:
+    few = demo_regions.select(demo_regions.view_index < num_views)
+    expected = f"{9 - num_views} of 9 views have at most half of the 12 masks of view 0: are masks missing there"
+    with pytest.warns(InputWarning, match=expected) as caught:
+        match_regions(few, demo_scene.cameras)
+    assert not any("do R and t" in str(each.message) for each in caught)

@@ -13,6 +13,7 @@ import pytest
 from pycocotools.coco import COCO
 
 from mvseg.errors import InputError
+from mvseg.formats.atomic import lock_folder
 from mvseg.formats.label_png import read_label_png
 from mvseg.simulation import dataset
 from mvseg.simulation.dataset import EVALUATED_FAMILIES, PRESETS, Preset, list_scenes, plant_index, write_dataset
@@ -161,3 +162,9 @@ def test_wrong_arguments_are_named(tmp_path: Path, changes: dict[str, Any], mess
     with pytest.raises(InputError, match=message):
         write_dataset(**{"preset": TINY, "folder": tmp_path / "none", **changes})
     assert not (tmp_path / "none").exists()
+
+
+def test_two_runs_on_one_folder_do_not_get_in_each_others_way(tmp_path: Path) -> None:
+    with lock_folder(tmp_path), pytest.raises(InputError, match="another run is writing to this folder"):
+        write_dataset(TINY, tmp_path)
+    assert not list(tmp_path.iterdir())

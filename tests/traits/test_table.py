@@ -97,7 +97,9 @@ def test_wide_form(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("text", ["=1+2", "+x", "-x", "@sum", "\t=x", "\r\n =x"])
 def test_no_text_is_a_formula(text: str, tmp_path: Path) -> None:
-    traits = traits_of(plant=text, unit=text)
+    numbers = traits_of().leaves[0].numbers | {"area": missing(text), "length": Measurement(-2.0, 0.5, text)}
+    leaf = LeafTraits(leaf=1, numbers=numbers, method=text, reasons=(text,), rejection=None)  # type: ignore[arg-type]
+    traits = traits_of(plant=text, unit=text, leaves=(leaf,), whole={"number_of_leaves": missing(text)})
     write_long(tmp_path / "long.csv", traits)
     write_wide(tmp_path / "wide.csv", traits)
     for row in read(tmp_path / "long.csv") + read(tmp_path / "wide.csv"):

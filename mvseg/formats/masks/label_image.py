@@ -30,16 +30,13 @@ def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
     """
     if not path.is_file():
         raise InputError(f"{path}: the mask file is missing")
-    image = open_labels(path)
+    image = open_labels(path, (width, height))
     try:
         num_pages = getattr(image, "n_frames", 1)
     except Exception:  # Pillow raises almost anything on a damaged file
         raise InputError(f"{path}: cannot be read, expected a whole image: its list of pages is damaged") from None
     if num_pages > 1:
         raise InputError(f"{path}: holds {num_pages} pages, expected a single label image")
-    if image.size != (width, height):
-        size = f"{image.width} x {image.height}"
-        raise InputError(f"{path}: the mask is {size}, its camera says {width} x {height}")
     if image.mode in ("RGB", "RGBA"):
         return _number_colours(path, image)
     if image.mode in ("I", "F"):

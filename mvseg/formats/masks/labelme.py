@@ -17,7 +17,7 @@ from pydantic import BaseModel, FiniteFloat
 
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
-from mvseg.formats.json_file import read_json
+from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.masks.found_mask import FoundMask
 
 CIRCLE_CORNERS = 64
@@ -25,7 +25,7 @@ CIRCLE_CORNERS = 64
 
 class _Shape(BaseModel):
     label: str
-    points: list[tuple[FiniteFloat, FiniteFloat]]
+    points: Items[tuple[FiniteFloat, FiniteFloat]]
     group_id: int | str | None = None
     shape_type: str | None = "polygon"
     mask: str | None = None
@@ -34,7 +34,7 @@ class _Shape(BaseModel):
 class LabelmeFile(BaseModel):
     """What a labelme file holds."""
 
-    shapes: list[_Shape]
+    shapes: Items[_Shape]
     imageWidth: int | None = None
     imageHeight: int | None = None
 
@@ -61,6 +61,7 @@ def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
     return [FoundMask(number, mask, label) for number, ((label, _), mask) in enumerate(parts.items(), start=1)]
 
 
+@np.errstate(over="ignore", invalid="ignore")  # absurd corners become infinite, which the codec refuses
 def _draw(shape: _Shape, width: int, height: int) -> np.ndarray | None:
     """(height, width) bool; None for a shape without area."""
     kind = shape.shape_type or "polygon"

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-from mvseg.errors import InputError
 from mvseg.formats.label_png import open_labels
 from mvseg.formats.masks.found_mask import FoundMask
 
@@ -22,9 +21,7 @@ def read_mask_images(paths: Sequence[Path], width: int, height: int) -> list[Fou
 
 
 def _read_mask(path: Path, width: int, height: int) -> np.ndarray:
-    image = open_labels(path)
-    if image.size != (width, height):
-        raise InputError(f"{path}: the mask is {image.width} x {image.height}, its camera says {width} x {height}")
+    image = open_labels(path, (width, height))
     if image.mode in ("RGBA", "LA"):
         channels = np.asarray(image)
         return np.asarray(channels[..., :-1].any(2) & (channels[..., -1] > 0))

@@ -14,6 +14,7 @@ import yaml  # type: ignore[import-untyped]
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.masks.found_mask import FoundMask
+from mvseg.formats.yaml_file import check_yaml_text
 
 NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
 MAX_BYTES = 1 << 20  # of a file of names
@@ -82,6 +83,8 @@ def _read_names(path: Path) -> dict[int, str]:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path}: is too large for a file of class names")
         text = path.read_text(encoding="utf-8-sig")
+        if path.suffix == ".yaml":
+            check_yaml_text(path, text)
         names = (yaml.safe_load(text) or {}).get("names", []) if path.suffix == ".yaml" else text.split("\n")
         pairs = names.items() if isinstance(names, dict) else enumerate(names)
         return {int(number): str(name).strip() for number, name in pairs if str(name).strip()}

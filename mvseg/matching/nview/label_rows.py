@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
+from tqdm import tqdm
 
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -89,13 +90,14 @@ class RowTable:
         )
 
 
-def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1) -> RowTable:
+def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1, progress: bool = False) -> RowTable:
     """Sweep the rays of all regions through the label maps of all other views.
 
     Args:
         regions: D regions ordered by view (int64 `view_index` must not decrease).
         cameras: V cameras.
         widen_px: regions grow this far into unlabelled pixels; about the expected reprojection error.
+        progress: show a progress bar over the views.
 
     Returns:
         The table. A row is kept when at least one view shows a region, at most half of the views that the point lies in
@@ -108,7 +110,7 @@ def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1) -> RowTa
     pixels = [torch.zeros(0, dtype=torch.int64)]
     labels = [torch.zeros(0, len(cameras), dtype=maps[0].dtype)]
     inverse = [torch.zeros(0)]
-    for view in range(len(cameras)):
+    for view in tqdm(range(len(cameras)), desc=f"rays, {widen_px} px", unit="view", disable=not progress):
         here = (regions.view_index[region] == view).nonzero()[:, 0]
         for chunk in torch.split(here, CHUNK) if len(here) else ():
             pixel, label, inverse_depth = _join_equal(*sweep.rows(view, xy[chunk]))

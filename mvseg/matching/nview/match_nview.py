@@ -34,7 +34,12 @@ EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean score above which the poses are sound;
 
 
 def match_nview(
-    regions: Regions, cameras: Cameras, affinity: Affinity, *, config: NViewConfig = NViewConfig()
+    regions: Regions,
+    cameras: Cameras,
+    affinity: Affinity,
+    *,
+    config: NViewConfig = NViewConfig(),
+    progress: bool = False,
 ) -> Matching:
     """Match the regions of V >= 2 views by what all views show.
 
@@ -43,6 +48,7 @@ def match_nview(
         cameras: V cameras.
         affinity: the epipolar weights of the regions.
         config: costs, gains and thresholds.
+        progress: show progress bars.
 
     Returns:
         The matching, on the device of the regions. Its method is "one-per-view" where the rows do not explain the
@@ -56,8 +62,10 @@ def match_nview(
     pairwise_ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))[order].cpu().numpy()
     pairwise = renumber(separate_unmatched(pairwise_ids))
 
-    scores, residual_px = fit_poses(ordered, cameras, graph, pairwise=pairwise, config=config)
-    clusters = search(scores, pairwise) if len(cameras) > 2 else pairwise
+    scores, residual_px = fit_poses(
+        ordered, cameras, graph, pairwise=pairwise, config=config, progress=progress
+    )
+    clusters = search(scores, pairwise, progress=progress) if len(cameras) > 2 else pairwise
     method, explained = "nview", scores.explained(clusters)
     if explained < UNEXPLAINED or len(cameras) == 2:
         clusters, method, explained = pairwise, "one-per-view", scores.explained(pairwise)
@@ -77,7 +85,13 @@ def match_nview(
 
 
 def fit_poses(
-    regions: Regions, cameras: Cameras, graph: ViewGraph, *, pairwise: Ints, config: NViewConfig
+    regions: Regions,
+    cameras: Cameras,
+    graph: ViewGraph,
+    *,
+    pairwise: Ints,
+    config: NViewConfig,
+    progress: bool = False,
 ) -> tuple[ClusterScores, int]:
     """The scores of the row table whose label maps are widened by the reprojection error, and that error in pixels.
 
@@ -85,7 +99,8 @@ def fit_poses(
     """
     config, candidates = config.for_views(len(cameras)), []
     for width in WIDENINGS:
-        candidates.append(ClusterScores(row_table(regions, cameras, widen_px=width), graph, config))
+        table = row_table(regions, cameras, widen_px=width, progress=progress)
+        candidates.append(ClusterScores(table, graph, config))
         if candidates[0].explained(pairwise) >= EXPLAINED:
             return candidates[0], width
     explained = np.array([scores.explained(pairwise) for scores in candidates])

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
+from tqdm import tqdm
 
 from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
 from mvseg.matching.nview.config import NViewConfig
@@ -24,7 +25,7 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-def search(scores: ClusterScores, pairwise: Ints) -> Ints:
+def search(scores: ClusterScores, pairwise: Ints, *, progress: bool = False) -> Ints:
     """The best partition that refinement finds from one start, or, with few views, two.
 
     Clusters from the weights alone are kept when they are worth nearly as much: then the masks are sound, and the
@@ -33,13 +34,14 @@ def search(scores: ClusterScores, pairwise: Ints) -> Ints:
     Args:
         scores: of D regions in three views or more.
         pairwise: (D,) int64, clusters from the weights alone, in [0, K).
+        progress: show a progress bar over the views of each sweep.
 
     Returns:
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
     refined = []
     for start in soft_starts(scores.table):
-        refined.append(refine(scores, refine(scores, start), join_pieces=True))
+        refined.append(refine(scores, refine(scores, start, progress=progress), join_pieces=True, progress=progress))
     values = [scores.value(clusters) for clusters in (pairwise, *refined)]
     best = pairwise
     if max(values) - values[0] > (1 - AS_GOOD) * abs(max(values)):
@@ -48,13 +50,14 @@ def search(scores: ClusterScores, pairwise: Ints) -> Ints:
     return join_few(scores, best)
 
 
-def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False) -> Ints:
+def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False, progress: bool = False) -> Ints:
     """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
 
     Args:
         scores: of D regions.
         clusters: (D,) clusters to start from.
         join_pieces: left-over regions may join a cluster that has a region in their view already.
+        progress: show a progress bar over the views of each sweep.
 
     Returns:
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
@@ -64,7 +67,7 @@ def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False) 
     for _ in range(MAX_SWEEPS):
         before, landings = clusters, scores.landings(clusters)
         clusters = before.copy()
-        for view in order.tolist():
+        for view in tqdm(order.tolist(), desc="search", unit="view", leave=False, disable=not progress):
             here = bounds.regions(view)
             if here.start == here.stop:
                 continue

@@ -1,0 +1,43 @@
+"""YAML files of options: what a parser must not be given is one sentence."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from mvseg.errors import InputError
+from mvseg.formats.yaml_file import check_yaml
+
+BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"masks: m # \xff\xfe", "byte 11 is no UTF-8"),
+        (b"match: {seed: " + b"1" * 5000 + b"}", "line 1 holds a number of 5000 digits"),
+        (b"\nmatch: " + b"[" * 20_000, "line 2 is nested more than 32 deep"),
+        (b"match: " + b"{a: " * 2000 + b"1" + b"}" * 2000, "line 1 is nested more than 32 deep"),
+        (BOMB.encode(), r"line 2 has the alias \*a"),
+        (b"\0", "is no YAML file"),
+        (b"match: {a: [3", "is no YAML file"),
+        (b"#" * (1 << 21), "is larger than 1048576 bytes"),
+    ],
+)
+def test_files_that_are_not_parsed(content: bytes, message: str, tmp_path: Path) -> None:
+    path = tmp_path / "run.yaml"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=rf"run\.yaml: {message}"):
+        check_yaml(path)
+
+
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        check_yaml(tmp_path)
+
+
+@pytest.mark.parametrize("text", ["", "masks: masks\nmatch: {num_points: 3, search_range: [2, 5]}\n# Blätter\n"])
+def test_options_are_fine(text: str, tmp_path: Path) -> None:
+    (tmp_path / "run.yaml").write_text(text, encoding="utf-8")
+    check_yaml(tmp_path / "run.yaml")
