@@ -23,7 +23,7 @@ from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
 
 MESH_SHAPE = (64, 17)
-LEAST_CREDIBLE_IOU = 0.6
+LEAST_CREDIBLE_IOU = 0.7
 STEP = 1e-4  # of the coefficients' spread, for differences
 
 
