@@ -6,8 +6,10 @@ layout; without `truth/leaves` there are no figures for hidden leaves. Three que
 1. Average precision of the detector alone, photo by photo (all detections with a class score of 0.05 or more).
 2. The loop, for detections with a score of `--min_score` or more: plain NMS against cluster-aware NMS after 1, 2, 3
    iterations. Mask AP, precision, recall of all leaves, and recall of leaves that are less than half visible (visible
-   pixels against the silhouette that the leaf would have alone).
-3. The ids of the detections: s_match, e_k and ARI over those that find a leaf (see `found_leaves`).
+   pixels against the silhouette that the leaf would have alone). What lies mostly where the truth ignores it counts
+   for nothing.
+3. The ids of the detections: s_match, e_k and ARI over those that find a leaf (see `found_leaves`), pair F1 over all
+   true masks, and MV-PQ, the panoptic quality of whole leaves (see `mvseg.evaluation.panoptic`).
 """
 
 from __future__ import annotations
@@ -32,22 +34,27 @@ from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.average_precision import annotate_truth, average_precision, describe_mask
 from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.evaluation.panoptic import leaf_metrics
+from mvseg.evaluation.truth import shown_instances
+from mvseg.formats.label_png import read_label_png
+from mvseg.formats.lens import undistort
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
-from mvseg.regions import Regions
+from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.data import SampleList, list_samples, read_sample
 from mvseg.training.validation import detect_and_label
 
+MEANS = ("s_match", "e_k", "ari", "all_pair_f1", "mv_pq")  # over the scenes; all else is pooled
 HIDDEN = 0.5  # a leaf is hidden when less than this share of it is visible
 
 
 @dataclass(frozen=True, eq=False)
 class SceneTruth:
-    """The D visible leaves of a scene: their regions, V label maps, and (D,) bool, which of them are hidden."""
+    """The D visible leaves of a scene: their regions, V label maps (65535 = ignore), (D,) bool, which are hidden."""
 
     regions: Regions
     maps: list[np.ndarray]
@@ -97,14 +104,16 @@ def build_model(args: argparse.Namespace, row: str) -> MultiViewMaskRCNN:
     """The model of a row of the table: "plain 0.5" is NMS without clusters, a number is that many iterations."""
     detector = load_detector(args.weights, image_size=args.image_size, min_score=args.min_score)
     if row.startswith("plain"):
-        return MultiViewMaskRCNN(detector, num_iterations=0, cluster_iou=float(row.split()[1]))
-    return MultiViewMaskRCNN(detector, num_iterations=int(row), cluster_iou=0.3)
+        return MultiViewMaskRCNN(detector, num_iterations=0, cluster_iou=float(row.split()[1]), scales=args.scales)
+    return MultiViewMaskRCNN(detector, num_iterations=int(row), cluster_iou=0.3, scales=args.scales)
 
 
 def read_truth(folder: Path, scene: Scene) -> SceneTruth:
     regions = load_masks(scene, folder / "truth")
-    sizes = scene.cameras.sizes.tolist()
-    maps = [regions.label_map(view, regions.labels, size).numpy() for view, size in enumerate(sizes)]
+    maps = []
+    for view, (width, height), K in zip(scene.views, scene.cameras.sizes.tolist(), scene.cameras.K, strict=True):
+        labels = read_label_png(folder / "truth" / f"{view.name}.png", width, height)
+        maps.append(undistort(labels, view.lens, K.numpy()))
     return SceneTruth(regions, maps, torch.from_numpy(visible_share(folder, scene.cameras, regions) < HIDDEN))
 
 
@@ -112,22 +121,26 @@ def count_found(proposals: Proposals, instance_ids: torch.Tensor, truth: SceneTr
     """Numbers of true regions and of detections, and how right the ids of those detections are that find a leaf."""
     credited = credit_masks(proposals.regions, proposals.scores, truth.maps)
     right, found = credited > 0, is_found(truth.regions, proposals.regions, credited)
+    is_ignored = (shown_instances(proposals.regions, truth.maps) == IGNORE_LABEL) & ~right
     ids = matching_metrics(instance_ids[right], credited[right])
+    leaves = leaf_metrics(proposals.regions, instance_ids, truth.maps)
     return {
         "found": int(found.sum()),
         "true": len(found),
         "right": int(right.sum()),
-        "detections": len(right),
+        "detections": len(right) - int(is_ignored.sum()),
         "hidden_found": int((found & truth.is_hidden).sum()),
         "hidden": int(truth.is_hidden.sum()),
         "s_match": ids.s_match,
         "e_k": ids.e_k,
         "ari": ids.ari,
+        "all_pair_f1": leaves.all_pair_f1,
+        "mv_pq": leaves.mv_pq,
     }
 
 
 def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dict[str, float | None]]:
-    """Mask AP, precision, recalls and ids of every row, pooled over the scenes (ids: mean over the scenes)."""
+    """Mask AP, precision and recalls of every row, pooled over the scenes, and the means of `MEANS` over them."""
     rows = ["plain 0.3", "plain 0.5", *[str(n) for n in range(1, args.iterations + 1)]]
     totals: dict[str, Counter[str]] = {row: Counter() for row in rows}
     truths: list[dict[str, Any]] = []
@@ -153,7 +166,7 @@ def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dic
             "precision": total["right"] / max(1, total["detections"]),
             "recall": total["found"] / total["true"],
             "recall_hidden": total["hidden_found"] / max(1, total["hidden"]),
-        } | {name: total[name] / len(folders) for name in ("s_match", "e_k", "ari")}
+        } | {name: total[name] / len(folders) for name in MEANS}
     table["leaves"] = {"visible": total["true"], "less_than_half_visible": total["hidden"]}
     return table
 
@@ -163,6 +176,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, nargs="+", required=True, help="scene folders with truth/")
     parser.add_argument("--weights", default="leaf-slim")
     parser.add_argument("--image_size", type=int, help="longer side of scaled photos (default: as the weights say)")
+    parser.add_argument("--scales", type=float, nargs="+", default=[1.0], help="factors of it, in the loop")
     parser.add_argument("--min_score", type=float, default=DetectConfig.min_score, help="of detections in the loop")
     parser.add_argument("--iterations", type=int, default=3, help="of the loop at most; 0 for average precision alone")
     parser.add_argument("--json", type=Path, help="write the figures here")

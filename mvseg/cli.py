@@ -303,6 +303,8 @@ def _find_masks(scene: Path, masks: Path) -> Path:
 
 def _eval(args: Namespace) -> int:
     from mvseg.evaluation.id_metrics import matching_metrics
+    from mvseg.evaluation.panoptic import leaf_metrics
+    from mvseg.evaluation.truth import shown_instances
     from mvseg.formats.atomic import write_text_whole
     from mvseg.regions import IGNORE_LABEL
     from mvseg.results.read import find_result, read_instances
@@ -310,15 +312,17 @@ def _eval(args: Namespace) -> int:
     result = find_result(args.result)
     if result != args.result:
         print(f"mvseg: {result}: the only result in {args.result}", file=sys.stderr)
-    ids, true = read_instances(result, args.truth)
+    regions, truth = read_instances(result, args.truth)
+    ids, true = regions.labels, shown_instances(regions, truth)
     is_scored = (true != 0) & (true != IGNORE_LABEL)
     metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[is_scored], true[is_scored]))
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
+    metrics |= dataclasses.asdict(leaf_metrics(regions, ids, truth))
     if metrics["no_instance"]:
-        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: they are not scored"
+        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: no part of the scores of the ids"
         print(f"mvseg: warning: {message}", file=sys.stderr)
     for name, value in metrics.items():
-        print(f"{name:15} {value:.4f}" if isinstance(value, float) else f"{name:15} {value}")
+        print(f"{name:18} {value:.4f}" if isinstance(value, float) else f"{name:18} {value}")
     try:
         write_text_whole(result / "metrics.json", json.dumps(metrics, indent=1) + "\n")
     except OSError as error:

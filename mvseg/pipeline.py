@@ -148,7 +148,9 @@ def detect_regions(
     detect = config.detect
     detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = MultiViewMaskRCNN(detector, num_iterations=detect.num_iterations, match=config.match).to(device)
+    model = MultiViewMaskRCNN(
+        detector, num_iterations=detect.num_iterations, scales=detect.scales, match=config.match
+    ).to(device)
     kept = None if keep is None else KeptDetections(keep, _describe_detector(detect, model, device))
     found = []
     for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import combinations
+
 import cv2
 import numpy as np
 import torch
@@ -267,3 +269,66 @@ def consistent_depth_reference(
             if is_inside and abs(depths[j][int(y), int(x)] - depth) <= error * depth:
                 kept[v, u] = depth_here
     return kept
+
+
+def leaf_metrics_reference(
+    masks: list[tuple[int, np.ndarray]], ids: list[int], truth: list[np.ndarray]
+) -> dict[str, float]:
+    """Precision and recall of masks, pair F1 over all true masks and MV-PQ, from sets of pixels.
+
+    Args:
+        masks: view and (H, W) bool mask of each region.
+        ids: of each region, -1 = none.
+        truth: a true label map per view, 0 = nothing, 65535 = ignore.
+    """
+
+    def pixels(view: int, mask: np.ndarray) -> set[tuple[int, int, int]]:
+        return {(view, int(row), int(column)) for row, column in zip(*mask.nonzero(), strict=True)}
+
+    def judge(found: dict, true: dict) -> tuple[dict, list]:
+        """Estimated segment -> (true segment, IoU), and the estimated segments that are false."""
+        right = {}
+        for name, segment in true.items():
+            plain = {key: part - ignored for key, part in found.items()}
+            iou = {key: len(part & segment) / len(part | segment) for key, part in plain.items()}
+            best = max(iou, key=lambda key: iou[key], default=None)
+            if best is not None and iou[best] > 0.5:
+                right[best] = (name, iou[best])
+        mostly_ignored = [key for key, part in found.items() if len(part & ignored) > len(part) / 2]
+        return right, [key for key in found if key not in right and key not in mostly_ignored]
+
+    def divide(part: float, whole: float) -> float:
+        return part / whole if whole else 1.0
+
+    ignored = set().union(*(pixels(view, labels == 65535) for view, labels in enumerate(truth)))
+    true_masks = {
+        (view, label): pixels(view, labels == label)
+        for view, labels in enumerate(truth)
+        for label in set(labels.ravel().tolist()) - {0, 65535}
+    }
+    leaves: dict[int, set] = {}
+    for (_, label), segment in true_masks.items():
+        leaves[label] = leaves.get(label, set()) | segment
+    mask_pixels = {index: pixels(*mask) for index, mask in enumerate(masks)}
+    names = [number if number >= 0 else -1 - index for index, number in enumerate(ids)]
+    instances: dict[int, set] = {}
+    for index, name in enumerate(names):
+        instances[name] = instances.get(name, set()) | mask_pixels[index]
+    right, false = judge(mask_pixels, true_masks)
+    whole, wrong = judge(instances, leaves)
+    pairs = [pair for pair in combinations([*right, *false], 2) if names[pair[0]] == names[pair[1]]]
+    agreeing = [(n, m) for n, m in pairs if n in right and m in right and right[n][0][1] == right[m][0][1]]
+    true_pairs = [pair for pair in combinations(true_masks, 2) if pair[0][1] == pair[1][1]]
+    return {
+        "mask_precision": divide(len(right), len(right) + len(false)),
+        "mask_recall": divide(len(right), len(true_masks)),
+        "all_pair_precision": divide(len(agreeing), len(pairs)),
+        "all_pair_recall": divide(len(agreeing), len(true_pairs)),
+        "all_pair_f1": divide(2 * len(agreeing), len(pairs) + len(true_pairs)),
+        "mv_pq": divide(
+            sum(iou for _, iou in whole.values()), len(whole) + len(wrong) / 2 + (len(leaves) - len(whole)) / 2
+        ),
+        "num_right": len(whole),
+        "num_false": len(wrong),
+        "num_missed": len(leaves) - len(whole),
+    }

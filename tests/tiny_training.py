@@ -101,6 +101,7 @@ def make_config(folder: Path, output: Path, **changes: Any) -> TrainConfig:
         "lr": 2e-2,
         "warmup_steps": 2,
         "ema_decay": 0.9,
+        "precision": "fp32",
         "device": "cpu",
         "num_workers": 0,
         "checkpoint_every": 2,

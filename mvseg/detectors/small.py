@@ -1,9 +1,12 @@
-"""Two Mask R-CNNs for laptops: pyramids of 96 channels, anchors from 16 px on, light heads, a dilated mask head.
+"""Mask R-CNNs for laptops: pyramids of 96 channels, anchors from 16 px on, light heads, a dilated mask head.
 
 The parameter names are torchvision's. That the mask head is dilated cannot be seen in a state dict: build them here.
 """
 
 from __future__ import annotations
+
+from functools import partial
+from typing import Any
 
 import torchvision
 from torch import nn
@@ -14,12 +17,15 @@ from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHe
 from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
 from torchvision.ops import MultiScaleRoIAlign
 
+from mvseg.detectors.efficientnet_lite import LEVELS, LITE_SCALES, PIXEL_MEAN, PIXEL_STD, build_lite
+
 CHANNELS = 96
 BOX_FEATURES = 512
 IMAGE_SIZE = 512
 MASK_DILATIONS = (1, 2, 4, 1)
 # architecture -> torchvision's classifier that its pyramid stands on
 SMALL_BACKBONES = {"resnet18_fpn": "resnet18", "mobilenet_v3_large_fpn": "mobilenet_v3_large"}
+SMALL_ARCHITECTURES = (*SMALL_BACKBONES, *LITE_SCALES)
 
 
 def build_small(arch: str, num_classes: int, backbone_weights: str | None = None) -> MaskRCNN:
@@ -27,10 +33,17 @@ def build_small(arch: str, num_classes: int, backbone_weights: str | None = None
     4 to 64).
 
     Args:
-        arch: a key of `SMALL_BACKBONES`.
+        arch: one of `SMALL_ARCHITECTURES`.
         num_classes: classes with the background.
-        backbone_weights: a name of torchvision's weights for the classifier, to be downloaded; None: random.
+        backbone_weights: a name of torchvision's weights for a classifier of torchvision's, to be downloaded; None:
+            random.
     """
+    if arch in LITE_SCALES:
+        # group norm: the published weights give features with a standard deviation of 3 to 8, too large for the heads
+        norm = partial(nn.GroupNorm, CHANNELS // 16)
+        lite, channels = build_lite(arch)
+        pyramid = BackboneWithFPN(lite, LEVELS, channels, CHANNELS, norm_layer=norm)
+        return add_light_heads(pyramid, num_classes, image_mean=PIXEL_MEAN, image_std=PIXEL_STD)
     classifier = torchvision.models.get_model(SMALL_BACKBONES[arch], weights=backbone_weights)
     if arch == "resnet18_fpn":
         body, levels, channels = classifier, {f"layer{k + 1}": str(k) for k in range(4)}, [64, 128, 256, 512]
@@ -40,8 +53,8 @@ def build_small(arch: str, num_classes: int, backbone_weights: str | None = None
     return add_light_heads(BackboneWithFPN(body, levels, channels, CHANNELS), num_classes)
 
 
-def add_light_heads(backbone: nn.Module, num_classes: int) -> MaskRCNN:
-    """Mask R-CNN with light heads on a pyramid of 96 channels."""
+def add_light_heads(backbone: nn.Module, num_classes: int, **options: Any) -> MaskRCNN:
+    """Mask R-CNN with light heads on a pyramid of 96 channels; `options` go to torchvision's `MaskRCNN`."""
     names = ["0", "1", "2", "3"]
     return MaskRCNN(
         backbone,
@@ -62,6 +75,7 @@ def add_light_heads(backbone: nn.Module, num_classes: int) -> MaskRCNN:
         mask_roi_pool=MultiScaleRoIAlign(names, output_size=14, sampling_ratio=2),
         mask_head=build_mask_head(CHANNELS),
         mask_predictor=MaskRCNNPredictor(CHANNELS, CHANNELS, num_classes),
+        **options,
     )
 
 

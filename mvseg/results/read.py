@@ -1,19 +1,19 @@
-"""Reading a result folder back, with the true ids of its regions."""
+"""Reading a result folder back, with the true labels of its views."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import torch
 from pydantic import BaseModel
-from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.evaluation.truth import shown_instance
 from mvseg.formats.coco import Rle, decode_rle
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Int64, Items, Pixels, read_json
 from mvseg.formats.label_png import read_label_png
+from mvseg.regions import Regions, mask_box, stack_regions
 
 
 class _Image(BaseModel):
@@ -49,16 +49,16 @@ def find_result(folder: Path) -> Path:
     return inside[0] if inside else folder
 
 
-def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
-    """Estimated and true instance ids of the regions of a result.
+def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]]:
+    """The masks and ids of a result, and the true labels of its views.
 
     Args:
         folder: a result folder.
         truth: a folder of label PNGs, one per view, the same number for the same instance in every view.
 
     Returns:
-        (D,) int64 ids as in instances.json (-1 = matched to nothing) and (D,) int64 true labels: 0 for a region that
-        mostly covers no instance, 65535 for one that is mostly ignored.
+        D regions in the frames of the photos, whose `labels` are the ids of instances.json (-1 = matched to nothing),
+        and V true label maps.
 
     Raises:
         InputError: the result or the truth is missing or broken.
@@ -74,19 +74,20 @@ def read_instances(folder: Path, truth: Path) -> tuple[Tensor, Tensor]:
         if problem:
             raise InputError(f"{path}: image {image.name}: {problem}")
     images = {image.id: image for image in content.images}
-    labels = {
-        number: read_label_png(truth / f"{image.name}.png", image.width, image.height)
-        for number, image in images.items()
-    }
-    true = []
+    view_of = {number: view for view, number in enumerate(images)}
+    labels = [read_label_png(truth / f"{image.name}.png", image.width, image.height) for image in images.values()]
+    views, boxes, crops = [], [], []
     for index, annotation in enumerate(content.annotations):
         if annotation.image_id not in images:
             raise InputError(f"{path}: annotations[{index}]: there is no image {annotation.image_id}")
         image = images[annotation.image_id]
         try:
-            mask = decode_rle(annotation.segmentation.counts, image.width, image.height)
+            mask = torch.from_numpy(decode_rle(annotation.segmentation.counts, image.width, image.height))
         except InputError as error:
             raise InputError(f"{path}: annotations[{index}]: {error}") from None
-        true.append(shown_instance(labels[image.id], mask))
+        views.append(view_of[annotation.image_id])
+        boxes.append(mask_box(mask) if mask.any() else (0, 0, 1, 1))
+        x1, y1, x2, y2 = boxes[-1]
+        crops.append(mask[y1:y2, x1:x2].flatten().bool())
     ids = [annotation.instance_id for annotation in content.annotations]
-    return torch.tensor(ids, dtype=torch.int64), torch.tensor(true, dtype=torch.int64)
+    return stack_regions(views, boxes, crops, labels=ids, num_views=len(labels)), labels

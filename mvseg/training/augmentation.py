@@ -39,6 +39,7 @@ class Augmentation:
             window is taken, or the photo is placed at random in an S x S frame of the mean colour.
         color_jitter: strength of brightness, contrast and saturation changes, in [0, 1]; hue gets a tenth of it.
         blur_probability: share of the samples that are blurred (Gaussian, sigma 0.1 to 2 px).
+        light_probability: share of the samples that are lit unevenly, see `light_unevenly`.
     """
 
     image_size: int
@@ -46,6 +47,7 @@ class Augmentation:
     scale_range: tuple[float, float] = (0.6, 1.6)
     color_jitter: float = 0.3
     blur_probability: float = 0.2
+    light_probability: float = 0.0
 
 
 class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
@@ -87,6 +89,8 @@ def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> t
         torch.default_generator.manual_seed(seed)
         photo, layers = orient(photo, labelled.layers, augmentation.orientation)
         photo, layers = rescale(photo, layers, augmentation)
+        if augmentation.light_probability and float(torch.rand(())) < augmentation.light_probability:
+            photo = light_unevenly(photo)
         photo = distort_color(augmentation)(tv_tensors.Image(photo))
     return photo.as_subclass(Tensor).float() / 255, make_target(layers, labelled.classes)
 
@@ -142,6 +146,19 @@ def distort_color(augmentation: Augmentation) -> v2.Transform:
             v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=augmentation.blur_probability),
         ]
     )
+
+
+def light_unevenly(photo: Tensor) -> Tensor:
+    """Put patches of shadow, or of glare up to overexposure, on a photo (3, H, W) uint8; their edges are sharp or soft.
+
+    Detectors that have not seen it break leaves in two where a shadow ends.
+    """
+    cells, sharpness = int(torch.randint(2, 9, ())), 2 ** (6 * float(torch.rand(())))
+    rough = torch.randn(1, 1, cells, cells)
+    field = torch.nn.functional.interpolate(rough, photo.shape[1:], mode="bicubic", align_corners=True)[0]
+    amount = torch.sigmoid(sharpness * (field - 0.5 * torch.randn(())))
+    gain = math.exp(float(torch.rand(())) * 2.2 - 1.3)  # 0.27 to 2.5
+    return (photo.float() * (1 + (gain - 1) * amount)).clamp(0, 255).to(photo.dtype)
 
 
 def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_PX) -> Target:

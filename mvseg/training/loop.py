@@ -51,6 +51,7 @@ from mvseg.training.files import (
     write_metrics,
     write_weights,
 )
+from mvseg.training.precision import choose_bf16
 from mvseg.training.processes import Processes, join_processes
 from mvseg.training.schedule import learning_rate
 from mvseg.training.state import TrainingState, apply_gradients, save_state, start_state
@@ -111,6 +112,8 @@ def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
             with ExitStack() as stack:
                 config.output.mkdir(parents=True, exist_ok=True)
                 processes.ask_first(lambda: stack.enter_context(lock_folder(config.output)))
+                if state.is_bf16 is None:
+                    state.is_bf16 = processes.ask_first(lambda: try_precision(run, state))
                 run_epochs(run, state)
 
 
@@ -221,7 +224,7 @@ def add_gradients(
         torch.manual_seed(mix_seed(config.seed, state.step, number))  # torchvision samples anchors and RoIs at random
         is_last = number == numbers[-1]  # DDP averages the gradients over the processes once, with the last chunk
         with network.no_sync() if isinstance(network, DistributedDataParallel) and not is_last else nullcontext():
-            with torch.autocast(processes.device.type, torch.bfloat16, enabled=uses_bf16(config, processes.device)):
+            with torch.autocast(processes.device.type, torch.bfloat16, enabled=bool(state.is_bf16)):
                 losses = network(photos, targets)
             losses = {name: value.float() for name, value in losses.items()}
             losses["loss"] = torch.stack(list(losses.values())).sum()
@@ -242,15 +245,14 @@ def not_finite(what: str, run: Run, indices: list[int]) -> InputError:
     return InputError(f"{what} is not finite on {names}: look at these photos, or lower lr, or set precision to fp32")
 
 
-def uses_bf16(config: TrainConfig, device: torch.device) -> bool:
-    """Whether the forward pass runs under bfloat16 autocast, see `TrainConfig.precision`."""
-    if config.precision == "auto":
-        return device.type == "cuda" and torch.cuda.is_bf16_supported(including_emulation=False)
-    return config.precision == "bf16"
+def try_precision(run: Run, state: TrainingState) -> bool:
+    """Whether this run is to be in bfloat16, by a forward pass of its own."""
+    samples = augmented_samples(run)
+    photos, targets, _ = collate([samples[0, index % len(samples)] for index in range(run.config.images_per_forward)])
+    return choose_bf16(run.config, state.model, photos, targets)
 
 
-def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
-    """This process's chunks of all steps from `first_step` to the end of the run, read and augmented by workers."""
+def augmented_samples(run: Run) -> AugmentedSamples:
     config = run.config
     augmentation = Augmentation(
         image_size=config.image_size,
@@ -258,7 +260,14 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
         scale_range=config.scale_range,
         color_jitter=config.color_jitter,
         blur_probability=config.blur_probability,
+        light_probability=config.light_probability,
     )
+    return AugmentedSamples(run.samples, augmentation, config.seed)
+
+
+def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
+    """This process's chunks of all steps from `first_step` to the end of the run, read and augmented by workers."""
+    config = run.config
     keys = []
     for epoch in range(first_step // run.steps_per_epoch, config.epochs):
         batches = order_epoch(len(run.samples), config.batch_size, seed=config.seed, epoch=epoch)
@@ -267,7 +276,7 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
                 chunk = batch[number * config.images_per_forward : (number + 1) * config.images_per_forward]
                 keys.append([(epoch, index) for index in chunk])
     loader = DataLoader(
-        AugmentedSamples(run.samples, augmentation, config.seed),
+        augmented_samples(run),
         batch_sampler=keys,
         num_workers=config.num_workers,
         collate_fn=collate,

@@ -6,6 +6,7 @@ import copy
 import logging
 import math
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -14,6 +15,7 @@ from torchvision.models.detection import MaskRCNN
 
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.run import leave_autocast
+from mvseg.detectors.weights_file import load_weights, read_weights
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.training.config import TrainConfig, config_difference, config_values
@@ -34,6 +36,7 @@ class TrainingState:
         step: steps done since the start of the run.
         history: one record per epoch that was trained and evaluated.
         loss_sums: sums of the losses over the steps of the unfinished epoch.
+        is_bf16: whether the forward pass runs under bfloat16 autocast; None until that is decided.
     """
 
     model: MaskRCNN
@@ -42,6 +45,7 @@ class TrainingState:
     step: int = 0
     history: list[dict[str, Any]] = field(default_factory=list)
     loss_sums: dict[str, float] = field(default_factory=dict)
+    is_bf16: bool | None = None
 
     @property
     def result(self) -> MaskRCNN:
@@ -72,9 +76,11 @@ def start_state(
     if model is None:
         weights = config.weights and str(find_weights(config.weights) or config.weights)
         model = build_detector(config.arch, len(samples.categories) + 1, weights)
+        if config.heads:
+            take_heads(model, find_weights(config.heads) or Path(config.heads))
     model.transform.min_size, model.transform.max_size = (config.image_size,), config.image_size
     model.rpn.head.register_forward_hook(leave_autocast)
-    model = model.to(device).train()
+    model = model.to(device=device, memory_format=torch.channels_last).train()  # a third faster on CPUs
     averaged = copy.deepcopy(model).eval() if config.ema_decay else None
     state = TrainingState(model, build_optimizer(config, model), averaged)
     if checkpoint.is_file():
@@ -85,6 +91,21 @@ def start_state(
     elif config.resume:
         logger.info("%s has no checkpoint yet: starting from the beginning", config.output)
     return state
+
+
+def take_heads(model: MaskRCNN, path: Path) -> None:
+    """Load everything but the backbone from another detector's weights.
+
+    Raises:
+        InputError: no such weights, or heads of other shapes.
+    """
+    state, _ = read_weights(path)
+    heads = {name: value.float() for name, value in state.items() if not name.startswith("backbone.")}
+    body = {name: value for name, value in model.state_dict().items() if name.startswith("backbone.")}
+    try:
+        load_weights(model, body | heads)
+    except InputError as error:
+        raise InputError(f"the heads of {path} do not fit: {error}") from error
 
 
 def check_checkpoint(saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
@@ -103,6 +124,7 @@ def restore_state(state: TrainingState, saved: dict[str, Any]) -> None:
     if state.averaged is not None:
         state.averaged.load_state_dict(saved["ema"])
     state.step, state.history, state.loss_sums = saved["step"], saved["history"], saved["loss_sums"]
+    state.is_bf16 = saved["is_bf16"]  # a run keeps its precision, also on another machine
 
 
 def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -> None:
@@ -114,6 +136,7 @@ def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -
         "step": state.step,
         "history": state.history,
         "loss_sums": state.loss_sums,
+        "is_bf16": state.is_bf16,
         "config": config_values(config),
         "samples": [sample.name for sample in samples.samples],
     }
@@ -121,12 +144,22 @@ def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -
 
 
 def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimizer:
-    """AdamW, or SGD with momentum 0.9; biases and norms are not decayed, frozen parameters are left out."""
-    trainable = [parameter for parameter in model.parameters() if parameter.requires_grad]
-    groups = [
-        {"params": [parameter for parameter in trainable if parameter.ndim > 1], "weight_decay": config.weight_decay},
-        {"params": [parameter for parameter in trainable if parameter.ndim <= 1], "weight_decay": 0.0},
-    ]
+    """AdamW, or SGD with momentum 0.9; biases and norms are not decayed, frozen parameters are left out.
+
+    Each group of parameters has a "factor" of the learning rate beside torch's own options.
+    """
+    groups = []
+    for factor in sorted({1.0, config.backbone_lr}):
+        for is_decayed in (True, False):
+            group = [
+                parameter
+                for name, parameter in model.named_parameters()
+                if parameter.requires_grad
+                and (parameter.ndim > 1) == is_decayed
+                and (config.backbone_lr if name.startswith("backbone.body.") else 1.0) == factor
+            ]
+            decay = config.weight_decay if is_decayed else 0.0
+            groups += [{"params": group, "weight_decay": decay, "factor": factor}] if group else []
     if config.optimizer == "adamw":
         return torch.optim.AdamW(groups, lr=config.lr, fused=True)
     return torch.optim.SGD(groups, lr=config.lr, momentum=0.9)
@@ -144,7 +177,7 @@ def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> b
     if not bool(torch.isfinite(norm)):
         return False
     for group in state.optimizer.param_groups:
-        group["lr"] = rate
+        group["lr"] = rate * group["factor"]
     state.optimizer.step()
     if state.averaged is not None:  # torch's AveragedModel would copy the first weights, and rename them
         decay = min(config.ema_decay, (1 + state.step) / (10 + state.step))

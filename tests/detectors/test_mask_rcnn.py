@@ -26,7 +26,7 @@ from mvseg.detectors.mask_rcnn import (
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
 
-SMALL = ["resnet18_fpn", "mobilenet_v3_large_fpn"]
+SMALL = ["resnet18_fpn", "mobilenet_v3_large_fpn", "efficientnet_lite0"]
 Download = Callable[..., dict[str, Tensor]]
 
 

@@ -333,8 +333,8 @@ def read_training_options(folder: Path) -> None:
 
 
 def read_result(folder: Path) -> None:
-    ids, true = read_instances(folder, folder / "truth")
-    assert ids.shape == true.shape
+    regions, truth = read_instances(folder, folder / "truth")
+    assert regions.num_views == len(truth)
 
 
 def readers(folder: Path) -> dict[str, Reader]:

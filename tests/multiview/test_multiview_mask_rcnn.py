@@ -9,6 +9,7 @@ from torchvision.ops import box_iou
 
 from mvseg.detectors.mask_cut import decide_masks
 from mvseg.errors import InputError
+from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.nms import cluster_aware_nms
@@ -285,6 +286,24 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
     assert torch.equal(matching.match_scores, torch.cat([result["match_scores"] for result in results]))
     boxes = proposals.boxes[proposals.boxes > 16]
     assert not torch.equal(boxes, boxes.bfloat16().float())
+
+
+def test_every_photo_is_seen_at_every_scale() -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), scales=(0.5, 1.0)), some_images(), small_cameras()
+    seen: list[int] = []
+    wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0].shape[-1]))
+    proposals, _ = wrapped.find_regions(iter(images), cameras)
+    assert seen[0::2] == [seen[0]] * 3
+    assert seen[1::2] == [2 * seen[0]] * 3
+    results = wrapped(images, cameras=cameras)
+    assert torch.equal(proposals.scores, torch.cat([result["scores"] for result in results]))
+    assert (proposals.scores >= wrapped.roi_heads.score_thresh).all()
+
+
+@pytest.mark.parametrize("scales", [(), (0.0, 1.0), (5.0,), (float("nan"),)])
+def test_scales_have_a_range(scales: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match=r"detect\.scales is \[.*\], expected factors above 0 and up to 4"):
+        DetectConfig(scales=scales)
 
 
 def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:

@@ -18,6 +18,7 @@ import mvseg.results.folder
 from known_leaves import bent_blade, flat_leaf
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
+from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.rig import opencv_lens
@@ -197,7 +198,8 @@ class TestContent:
         assert set(run["seconds"]) == {"load", "match", "reconstruct", "measure"}
 
     def test_eval_reads_it(self, saved: Path, plant: Path) -> None:
-        ids, true = read_instances(saved, plant / "truth")
+        regions, truth = read_instances(saved, plant / "truth")
+        ids, true = regions.labels, shown_instances(regions, truth)
         assert len(ids) == len(true) == 12
         assert len({*zip(ids.tolist(), true.tolist(), strict=True)}) == 3
         assert set(true.tolist()) == {1, 2, 3}

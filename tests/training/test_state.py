@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from mvseg.detectors.mask_rcnn import list_architectures
+from mvseg.detectors.zoo import load_detector
 from mvseg.errors import InputError
 from mvseg.training.config import TrainConfig
 from mvseg.training.data import list_samples
@@ -86,6 +87,32 @@ def test_biases_and_norms_are_not_decayed() -> None:
     groups = build_optimizer(make_config(Path(), Path(), weight_decay=0.3), build_tiny()).param_groups
     decay = {parameter.ndim > 1: group["weight_decay"] for group in groups for parameter in group["params"]}
     assert decay == {True: 0.3, False: 0.0}
+
+
+def test_the_backbone_learns_at_its_own_rate(tmp_path: Path) -> None:
+    photos, labels = write_photos(tmp_path / "data", 2)
+    config = make_config(tmp_path / "data", tmp_path / "out", arch="efficientnet_lite0", backbone_lr=0.25)
+    state = start_state(config, list_samples(photos, labels), device=torch.device("cpu"))
+    for parameter in state.model.parameters():
+        parameter.grad = torch.zeros_like(parameter)
+    assert apply_gradients(config, state, 0.1)
+    name_of = {parameter: name for name, parameter in state.model.named_parameters()}
+    rates = {name_of[parameter]: group["lr"] for group in state.optimizer.param_groups for parameter in group["params"]}
+    assert {rate for name, rate in rates.items() if name.startswith("backbone.body.")} == {0.025}
+    assert {rate for name, rate in rates.items() if not name.startswith("backbone.body.")} == {0.1}
+    assert len(rates) == len(name_of)
+
+
+def test_a_new_backbone_under_heads_that_have_learned(tmp_path: Path) -> None:
+    photos, labels = write_photos(tmp_path / "data", 2)
+    config = make_config(tmp_path / "data", tmp_path / "out", arch="efficientnet_lite0", heads="leaf-slim")
+    state = start_state(config, list_samples(photos, labels), device=torch.device("cpu")).model.state_dict()
+    shipped = load_detector("leaf-slim").state_dict()
+    taken = {name for name, value in shipped.items() if name in state and torch.equal(state[name], value)}
+    assert taken == {name for name in shipped if not name.startswith("backbone.")}
+    other = dataclasses.replace(config, arch="maskrcnn_resnet50_fpn")
+    with pytest.raises(InputError, match=r"the heads of .*leaf-slim.* do not fit: "):
+        start_state(other, list_samples(photos, labels), device=torch.device("cpu"))
 
 
 def test_bfloat16_does_not_collapse_narrow_boxes_far_from_the_origin(tmp_path: Path) -> None:

@@ -1,0 +1,149 @@
+"""Whole leaves, misses and false leaves included, against counting sets of pixels."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError
+from mvseg.evaluation.panoptic import LeafMetrics, leaf_metrics
+from mvseg.regions import Regions, regions_from_label_maps, stack_regions
+from reference import leaf_metrics_reference
+
+SIZE = 12
+IGNORE = 65535
+
+
+def random_truth(rng: np.random.Generator, *, num_views: int = 3, num_leaves: int = 4) -> list[np.ndarray]:
+    """Label maps of rectangles, the later on top, with an ignored one in some."""
+    maps = []
+    for _ in range(num_views):
+        labels = np.zeros((SIZE, SIZE), np.int64)
+        for leaf in [*range(1, num_leaves + 1), *([IGNORE] if rng.random() < 0.7 else [])]:
+            if rng.random() < 0.8:
+                labels[random_window(rng)] = leaf
+        maps.append(labels)
+    return maps
+
+
+def random_window(rng: np.random.Generator) -> tuple[slice, slice]:
+    (top, left), (height, width) = rng.integers(0, SIZE - 5, 2), rng.integers(2, 7, 2)
+    return slice(top, top + height), slice(left, left + width)
+
+
+def random_estimate(
+    rng: np.random.Generator, truth: list[np.ndarray]
+) -> tuple[list[tuple[int, np.ndarray]], list[int]]:
+    """Masks near the true ones and elsewhere, which overlap, and ids that are mostly right; one id may have two masks
+    in a view."""
+    masks, ids = [], []
+    for view, labels in enumerate(truth):
+        for leaf in set(labels.ravel().tolist()) - {0}:
+            mask = np.roll(labels == leaf, rng.integers(0, 2), axis=int(rng.integers(2)))
+            masks.append((view, mask))
+            ids.append(int(rng.choice([leaf % 7, leaf % 7, leaf % 7, 2, -1])))
+        stray = np.zeros((SIZE, SIZE), bool)
+        stray[random_window(rng)] = True
+        masks.append((view, stray))
+        ids.append(int(rng.choice([-1, 1, 9])))
+    return masks, ids
+
+
+def stack(masks: list[tuple[int, np.ndarray]], num_views: int) -> Regions:
+    """Regions whose crops are whole frames."""
+    crops = [torch.from_numpy(mask).flatten() for _, mask in masks]
+    boxes = [(0, 0, mask.shape[1], mask.shape[0]) for _, mask in masks]
+    return stack_regions([view for view, _ in masks], boxes, crops, labels=[0] * len(masks), num_views=num_views)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_it_counts_as_sets_of_pixels_do(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    masks, ids = random_estimate(rng, truth)
+    expected = leaf_metrics_reference(masks, ids, truth)
+    assert asdict(leaf_metrics(stack(masks, 3), torch.tensor(ids), truth)) == pytest.approx(expected)
+
+
+def perfect(truth: list[np.ndarray]) -> tuple[Regions, torch.Tensor]:
+    regions = regions_from_label_maps(truth)
+    return regions, regions.labels
+
+
+def test_the_truth_itself_is_perfect() -> None:
+    truth = random_truth(np.random.default_rng(1))
+    metrics = leaf_metrics(*perfect(truth), truth)
+    shares = [value for name, value in asdict(metrics).items() if not name.startswith("num_")]
+    assert shares == [1.0] * 6
+    assert (metrics.num_right, metrics.num_false, metrics.num_missed) == (4, 0, 0)
+
+
+def test_numbers_of_ids_leaves_and_views_mean_nothing() -> None:
+    rng = np.random.default_rng(5)
+    truth = random_truth(rng)
+    masks, ids = random_estimate(rng, truth)
+    before = leaf_metrics(stack(masks, 3), torch.tensor(ids), truth)
+    renamed = [np.where((labels > 0) & (labels < IGNORE), 500 - labels, labels) for labels in truth]
+    turned = [(2 - view, mask) for view, mask in masks][::-1]
+    other_ids = torch.tensor([number * 3 + 2 if number >= 0 else -1 for number in ids[::-1]])
+    after = leaf_metrics(stack(turned, 3), other_ids, renamed[::-1])
+    assert asdict(after) == pytest.approx(asdict(before))
+
+
+def test_a_leaf_in_two_halves_or_under_two_ids_is_not_right() -> None:
+    truth = [np.repeat([[1, 1, 2, 2]], 4, 0)] * 2
+    regions, _ = perfect(truth)
+    swapped = torch.tensor([1, 2, 2, 1])  # every mask is right, every id is right in one view of two: IoU 1/3
+    metrics = leaf_metrics(regions, swapped, truth)
+    assert (metrics.mask_precision, metrics.mask_recall, metrics.all_pair_f1, metrics.mv_pq) == (1, 1, 0, 0)
+    halves = regions_from_label_maps([np.repeat([[1, 5, 2, 2]], 4, 0)] * 2)
+    assert leaf_metrics(halves, halves.labels, truth).mv_pq == pytest.approx(1 / (1 + 2 / 2 + 1 / 2))
+
+
+def test_misses_and_false_leaves_cost_half_each() -> None:
+    truth = [np.array([[1, 0, 2, 0, 3]])]
+    regions = regions_from_label_maps([np.array([[1, 7, 2, 0, 0]])])
+    metrics = leaf_metrics(regions, torch.tensor([-1, -1, -1]), truth)
+    assert metrics.mv_pq == pytest.approx(2 / (2 + 1 / 2 + 1 / 2))
+    assert (metrics.num_right, metrics.num_false, metrics.num_missed) == (2, 1, 1)
+    assert (metrics.mask_precision, metrics.mask_recall) == (pytest.approx(2 / 3), pytest.approx(2 / 3))
+
+
+def test_ignored_pixels_count_for_nobody() -> None:
+    truth = [np.array([[1, 1, 1, IGNORE, IGNORE, IGNORE, IGNORE, 0]])]
+    outgrown = [np.array([[1, 1, 1, 1, 1, 1, 1, 0]]), np.array([[0, 0, 0, 0, 2, 2, 2, 2]])]
+    masks = [(0, labels > 0) for labels in outgrown]
+    metrics = leaf_metrics(stack(masks, 1), torch.tensor([4, 5]), truth)
+    assert metrics == LeafMetrics(
+        mask_precision=1.0, mask_recall=1.0, all_pair_precision=1.0, all_pair_recall=1.0, all_pair_f1=1.0, mv_pq=1.0,
+        num_right=1, num_false=0, num_missed=0,
+    )  # fmt: skip
+
+
+def test_of_two_masks_of_a_leaf_the_better_one_finds_it() -> None:
+    truth = [np.array([[1, 1, 1, 1, 0]])]
+    masks = [(0, np.array([[True, True, True, False, False]])), (0, np.array([[True, True, True, True, False]]))]
+    metrics = leaf_metrics(stack(masks, 1), torch.tensor([-1, -1]), truth)
+    assert (metrics.mask_precision, metrics.mv_pq) == (0.5, pytest.approx(1 / 1.5))
+
+
+def test_nothing_found_and_nothing_to_find() -> None:
+    nothing, leaf = [np.zeros((2, 3), int)], [np.array([[0, 4, 4]])]
+    none = regions_from_label_maps(nothing)
+    assert leaf_metrics(none, none.labels, nothing).mv_pq == 1
+    missed = leaf_metrics(none, none.labels, leaf)
+    assert (missed.mask_precision, missed.mask_recall, missed.mv_pq, missed.num_missed) == (1, 0, 0, 1)
+    false = leaf_metrics(*perfect(leaf), [np.zeros((1, 3), int)])
+    assert (false.mask_precision, false.mask_recall, false.mv_pq, false.num_false) == (0, 1, 0, 1)
+
+
+def test_other_numbers_of_ids_or_maps() -> None:
+    truth = [np.array([[0, 4, 4]])]
+    regions, ids = perfect(truth)
+    with pytest.raises(InputError, match="0 ids and 1 true label maps, expected 1 and 1"):
+        leaf_metrics(regions, ids[:0], truth)
+    with pytest.raises(InputError, match="1 ids and 2 true label maps"):
+        leaf_metrics(regions, ids, truth * 2)
