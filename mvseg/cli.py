@@ -121,7 +121,7 @@ def build_parser() -> ArgumentParser:
     infer.add_class_arguments(TraitsConfig, "traits")
     infer.add_argument("--scale", type=float | None, help="multiplies the world's lengths, for cameras without a scale")
     infer.add_argument("--unit", type=str | None, help="name of the world's unit, after --scale (default: the scene's)")
-    help_up = "which way is up: X Y Z, or 'rig' to find it from level cameras (default: what the scene says, if at all)"
+    help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers); default: the scene's own"
     infer.add_argument("--up", type=str | list[float] | None, help=help_up)
     help_rims = "draw the rims of the surfaces, as the cameras see them, into overlay/"
     infer.add_argument("--draw_rims", type=bool, default=True, help=help_rims)
@@ -227,9 +227,11 @@ def _read_up(up: str | list[float] | None) -> Up | None:
         return None
     if up == "rig":
         return "rig"
+    if up == "board":
+        return "board"
     words = up.replace(",", " ").split() if isinstance(up, str) else [str(number) for number in up]
     if len(words) != 3 or not all(_is_number(word) for word in words):
-        raise InputError(f"up is '{' '.join(words)}', expected three numbers, as in 0 0 1, or rig")
+        raise InputError(f"up is '{' '.join(words)}', expected three numbers, as in 0 0 1, rig or board")
     x, y, z = (float(word) for word in words)
     return x, y, z
 

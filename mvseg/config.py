@@ -25,7 +25,7 @@ class RunConfig:
         scale: the world's lengths are multiplied by this; None leaves them.
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
-            level; None for that of the scene.
+            level, "board" from ArUco markers that lie flat; None for that of the scene.
         split_merged: cut a mask that seems to cover two instances in two.
         draw_rims: draw the rims of the surfaces into the overlays.
         coco_crowd: what annotations with `iscrowd` are in a COCO file of masks: "mask", one like all others, or
@@ -49,5 +49,5 @@ class RunConfig:
     def __post_init__(self) -> None:
         if self.scale is not None and not 0 < self.scale < math.inf:
             raise InputError(f"scale is {self.scale:g}, expected a positive number")
-        if self.up is not None and self.up != "rig" and not 0 < math.hypot(*self.up) < math.inf:
+        if self.up is not None and not isinstance(self.up, str) and not 0 < math.hypot(*self.up) < math.inf:
             raise InputError(f"up is {self.up}, expected a direction: three finite numbers, not all 0")

@@ -241,7 +241,7 @@ def test_rims_may_be_left_out(plant: Path, tmp_path: Path, monkeypatch: pytest.M
     assert drawn == [False, False, True]
 
 
-@pytest.mark.parametrize("words", [["up"], ["0", "1"], ["0 0 0"], ["0 0 x"], ["nan", "0", "1"]])
+@pytest.mark.parametrize("words", [["up"], ["board"], ["0", "1"], ["0 0 0"], ["0 0 x"], ["nan", "0", "1"]])
 def test_up_that_is_no_direction(
     words: list[str], plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -7,7 +7,7 @@ from typing import Literal
 
 from mvseg.errors import InputError
 
-Up = tuple[float, float, float] | Literal["rig"]  # the direction that points up, or to find it from the cameras
+Up = tuple[float, float, float] | Literal["rig", "board"]  # the direction that points up, or what shows it
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError
 from mvseg.scene import Cameras, Scene
+from mvseg.traits.board import up_of_board
 from mvseg.traits.config import Up
 
 Floats = NDArray[np.float64]
@@ -26,11 +27,16 @@ def find_up(scene: Scene, up: Up | None) -> Scene:
     """The scene with the direction of up that the user says, or else its own.
 
     Raises:
-        InputError: "rig" with cameras that do not tell it, see `up_of_cameras`; a vector without a direction.
+        InputError: "rig" or "board" where these do not tell it, see `up_of_cameras` and `up_of_board`; a vector
+            without a direction.
     """
     if up is None:
         return scene
-    x, y, z = up_of_cameras(scene.cameras).tolist() if up == "rig" else up
+    if up == "board":
+        up = tuple(up_of_board(scene).tolist())
+    elif up == "rig":
+        up = tuple(up_of_cameras(scene.cameras).tolist())
+    x, y, z = up
     return replace(scene, up=(x, y, z))
 
 
