@@ -25,11 +25,11 @@ def write_long(path: Path, traits: Traits) -> None:
 
     In the row of a missing number, `method` is the reason. Leaves without voxels have no rows for these.
     """
-    rows = [_row(traits, "", name, number) for name, number in traits.whole.items()]
+    rows = [_row(traits, name, number, leaf="") for name, number in traits.whole.items()]
     for leaf in traits.leaves:
         for name, number in leaf.numbers.items():
             if number.exists or name not in VOXEL_NAMES:
-                rows.append(_row(traits, leaf.leaf, name, number))
+                rows.append(_row(traits, name, number, leaf=leaf.leaf))
     _write(path, COLUMNS, rows)
 
 
@@ -44,7 +44,7 @@ def write_wide(path: Path, traits: Traits) -> None:
     _write(path, columns, [_wide_row(traits, leaf) for leaf in traits.leaves])
 
 
-def _row(traits: Traits, leaf: int | str, name: str, number: Measurement) -> list[str | int]:
+def _row(traits: Traits, name: str, number: Measurement, *, leaf: int | str) -> list[str | int]:
     definition = DEFINITIONS[name]
     unit = unit_of(definition.kind, traits.unit)
     method, ontology = number.method, definition.ontology

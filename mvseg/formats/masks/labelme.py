@@ -71,7 +71,7 @@ def _draw(shape: _Shape, width: int, height: int) -> np.ndarray | None:
     if kind in ("rectangle", "circle", "mask") and len(points) not in ((2, 4) if kind == "rectangle" else (2,)):
         raise InputError(f"a {kind} of {len(points)} points, expected 2")
     if kind == "mask":
-        return _paste(shape.mask or "", points, width, height)
+        return _paste(shape.mask or "", points, width=width, height=height)
     if kind == "rectangle":
         (x1, y1), (x2, y2) = points.min(0), points.max(0)
         points = np.array([[x1, y1], [x2, y1], [x2, y2], [x1, y2]])
@@ -83,7 +83,7 @@ def _draw(shape: _Shape, width: int, height: int) -> np.ndarray | None:
     return decode_segmentation([points.ravel().tolist()], width, height)
 
 
-def _paste(text: str, points: np.ndarray, width: int, height: int) -> np.ndarray:
+def _paste(text: str, points: np.ndarray, *, width: int, height: int) -> np.ndarray:
     """A mask as a base64 PNG; its first point is the pixel of the top-left corner."""
     try:
         with PngImageFile(BytesIO(base64.b64decode(text, validate=True))) as image:

@@ -173,7 +173,7 @@ def compare_views(masks: MaskStack, photos: LeafPhotos, coefficients: Floats, *,
     num_rows, num_columns = np.clip(np.round(steps), LEAST_POINTS, MOST_POINTS).astype(int).tolist()
     grid = surface_grid(num_rows, num_columns)
     spacing = length / num_rows
-    weight, is_upper = _see(masks, photos, grid, coefficients)
+    weight, is_upper = _see(masks, photos, coefficients, grid=grid)
     return Comparison(
         px_from_world=masks.px_from_world,
         photos=photos,
@@ -204,7 +204,7 @@ def _project(px_from_world: Floats, points: Floats) -> tuple[Floats, Floats]:
     return projection.px[:, :, 0], projection.depth[:, :, 0]
 
 
-def _see(masks: MaskStack, photos: LeafPhotos, grid: SurfaceGrid, coefficients: Floats) -> tuple[Floats, Bools]:
+def _see(masks: MaskStack, photos: LeafPhotos, coefficients: Floats, *, grid: SurfaceGrid) -> tuple[Floats, Bools]:
     """Weight (S, P) of each view at each point of the grid, and does it see the upper side?"""
     points = grid.basis @ coefficients
     px, depth = _project(masks.px_from_world, points)
