@@ -873,7 +873,7 @@ def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytes
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mvseg.cli._run", stop)
+    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", stop)
     assert main(["infer", str(plant)]) == 130
     assert capsys.readouterr().err == "mvseg: interrupted\n"
 

@@ -18,7 +18,7 @@ import yaml
 
 import mvseg
 import mvseg.matching
-from mvseg.cli import build_parser
+from mvseg.cli.command import build_parser
 from mvseg.simulation.demo_plant import write_demo_plant
 from mvseg.training.config import TrainConfig
 
@@ -114,7 +114,7 @@ def test_every_kind_of_forbidden_import_is_seen(line: str, room: str) -> None:
         ("mvseg.formats.__init__", "from . import lens\nfrom .. errors import InputError"),
         ("mvseg.formats.coco", "import models\nfrom mvsegment import x\nimport mvsegment.results"),  # other packages
         ("mvseg.formats.coco", "from mvseg.scene import Scene\nfrom ..regions import Regions\nimport mvseg.demo"),
-        ("mvseg.cli", "import mvseg\nfrom mvseg.pipeline import run_scene\nfrom .batch import run_batch"),
+        ("mvseg.cli.infer", "import mvseg\nfrom mvseg.pipeline import run_scene\nfrom .batch import run_batch"),
         ("mvseg.__init__", "from mvseg.pipeline import run_scene\nfrom ._version import __version__"),
     ],
 )

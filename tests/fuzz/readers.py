@@ -19,7 +19,8 @@ import torch
 from PIL import Image
 from safetensors.torch import save
 
-from mvseg.cli import _build, _parse
+from mvseg.cli.command import _parse
+from mvseg.cli.options import build_options
 from mvseg.detectors.weights_file import read_weights
 from mvseg.errors import InputError
 from mvseg.formats.coco import encode_mask
@@ -319,9 +320,9 @@ def read_options(folder: Path) -> None:
         args = _parse(["infer", "plant", "--config", str(folder / "run.yaml")])["infer"]
     except argparse.ArgumentError as error:
         raise InputError(str(error)) from error
-    _build(DetectConfig, args.detect)
-    _build(MatchConfig, args.match)
-    _build(ReconstructConfig, args.reconstruct)
+    build_options(DetectConfig, args.detect)
+    build_options(MatchConfig, args.match)
+    build_options(ReconstructConfig, args.reconstruct)
 
 
 def read_training_options(folder: Path) -> None:
@@ -329,7 +330,7 @@ def read_training_options(folder: Path) -> None:
         args = _parse(["train", "--config", str(folder / "train.yaml")])["train"]
     except argparse.ArgumentError as error:
         raise InputError(str(error)) from error
-    _build(TrainConfig, args)
+    build_options(TrainConfig, args)
 
 
 def read_result(folder: Path) -> None:

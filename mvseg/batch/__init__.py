@@ -1,0 +1,1 @@
+"""Scenes from their folders to result folders."""

@@ -1,0 +1,55 @@
+"""One scene from its folder to its result folder."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from pathlib import Path
+
+from mvseg.config import RunConfig
+from mvseg.errors import InputError, InputWarning
+from mvseg.multiview.config import DetectConfig
+
+
+def run_one_scene(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet: bool) -> None:
+    """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
+    from mvseg.formats.atomic import sweep_abandoned
+    from mvseg.multiview.kept_detections import delete_kept
+    from mvseg.pipeline import run_scene  # keeps --help and wrong options quick
+    from mvseg.results.earlier import check_out
+    from mvseg.results.folder import save_result
+    from mvseg.results.provenance import describe_run
+
+    sweep_abandoned(out)
+    check_out(out)
+    replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
+    masks = None if masks is None else find_masks(scene, masks)
+    keep = out.resolve().with_name(f"{out.resolve().name}.detections")
+    if masks is None and keep.is_dir():
+        print(f"mvseg: going on from the detections that a run left in {keep}", file=sys.stderr)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        if masks is not None and config.detect != DetectConfig():
+            warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
+        result = run_scene(scene, masks, config, keep=keep, progress=not quiet)
+    # each matching of a detector's loop may repeat a warning
+    messages = list(dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning)))
+    for other in (each for each in caught if not issubclass(each.category, InputWarning)):
+        warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
+    for message in messages:
+        print(f"mvseg: warning: {message}", file=sys.stderr)
+    run = describe_run(result, masks, config, messages=messages)
+    run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
+    save_result(result, out, run, progress=not quiet, draw_rims=config.draw_rims)
+    delete_kept(keep)
+    num_masks, num_views = len(result.regions), len(result.scene.views)
+    masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
+    print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
+
+
+def find_masks(scene: Path, masks: Path) -> Path:
+    """A relative path may start at the scene folder or at the current one, as long as only one of the two exists."""
+    inside = scene / masks
+    if inside.exists() and masks.exists() and not inside.samefile(masks):
+        raise InputError(f"both {inside} and {masks.resolve()} exist, expected --masks with the full path of one")
+    return inside if inside.exists() else masks

@@ -1,0 +1,84 @@
+"""Every verb takes its options from the command line and from YAML (`--config FILE`)."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import warnings
+from collections.abc import Sequence
+
+from jsonargparse import ArgumentParser, Namespace
+
+from mvseg._version import __version__
+from mvseg.cli import eval as evaluate
+from mvseg.cli import infer, match, models, simulate, train
+from mvseg.cli.complain import complain
+from mvseg.cli.options import join_up
+from mvseg.errors import InputError, InputWarning
+from mvseg.sigterm import Terminated, stopped_by_sigterm
+
+INTERRUPTED, TERMINATED = 130, 143
+ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
+VERBS = {"infer": infer, "match": match, "eval": evaluate, "train": train, "simulate": simulate, "models": models}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb.
+
+    Args:
+        argv: arguments after the program's name; None for those of the process.
+
+    Returns:
+        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 130 after Ctrl-C,
+        143 after SIGTERM.
+    """
+    # Let idle threads sleep: on a shared machine, spinning ones slow small tensor operations tenfold. Must be set
+    # before torch is loaded, which the verbs do when they start.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # mvseg reports a broken image itself, once
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("always", InputWarning)
+            args = _parse(join_up(sys.argv[1:] if argv is None else argv))
+            with stopped_by_sigterm():
+                return VERBS[args.verb].run(args[args.verb])
+    except (InputError, argparse.ArgumentError) as error:
+        return complain(error)
+    except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except OSError as error:  # a full disk, a folder that cannot be made
+        return complain(error)
+    except MemoryError as error:
+        return complain(InputError(f"there is not enough memory ({error or 'no more is known'})"))
+    except KeyboardInterrupt:
+        print("mvseg: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except Terminated:
+        print("mvseg: stopped by SIGTERM", file=sys.stderr)
+        return TERMINATED
+
+
+def _parse(arguments: Sequence[str]) -> Namespace:
+    try:
+        args = build_parser().parse_args(list(arguments))
+        for name in ("quiet", "split_merged", "coco_crowd"):
+            if args.verb and name in args[args.verb] and args[args.verb][name] is None:
+                raise InputError(f"{name} is null, expected a value")
+        return args
+    except (UnicodeDecodeError, RecursionError) as error:  # of a file that an option names
+        raise InputError(f"the options cannot be read ({error})") from None
+    except ValueError as error:
+        if isinstance(error, InputError) or "integer string conversion" not in str(error):
+            raise
+        raise InputError("an option is a number of thousands of digits") from None
+
+
+def build_parser() -> ArgumentParser:
+    """The parser of all verbs; its errors are raised, not printed."""
+    parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__)
+    verbs = parser.add_subcommands(dest="verb")
+    for verb in VERBS.values():
+        verb.add(verbs)
+    return parser

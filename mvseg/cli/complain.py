@@ -1,0 +1,16 @@
+"""One sentence on stderr."""
+
+from __future__ import annotations
+
+import sys
+
+from mvseg.errors import InputError
+
+BAD_INPUT = 2
+
+
+def complain(error: Exception) -> int:
+    if isinstance(error, OSError) and error.filename:
+        error = InputError(f"{error.filename}: {error.strerror}")
+    print(f"mvseg: error: {' '.join(str(error).split())}", file=sys.stderr)
+    return BAD_INPUT

@@ -1,0 +1,51 @@
+"""`mvseg eval`: compare the ids of a result with true labels."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+from mvseg.errors import InputError
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser's sub-commands."""
+    parser = ArgumentParser(exit_on_error=False, description="Compare the ids of a result with true labels.")
+    parser.add_argument("result", type=Path, help="result folder, or the --out of mvseg match")
+    parser.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids")
+    verbs.add_subcommand("eval", parser, help="compare a result with true labels")
+
+
+def run(args: Namespace) -> int:
+    """Run the verb; returns the exit code."""
+    from mvseg.evaluation.id_metrics import matching_metrics
+    from mvseg.evaluation.panoptic import leaf_metrics
+    from mvseg.evaluation.truth import shown_instances
+    from mvseg.formats.atomic import write_text_whole
+    from mvseg.regions import IGNORE_LABEL
+    from mvseg.results.read import find_result, read_instances
+
+    result = find_result(args.result)
+    if result != args.result:
+        print(f"mvseg: {result}: the only result in {args.result}", file=sys.stderr)
+    regions, truth = read_instances(result, args.truth)
+    ids, true = regions.labels, shown_instances(regions, truth)
+    is_scored = (true != 0) & (true != IGNORE_LABEL)
+    metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[is_scored], true[is_scored]))
+    metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
+    metrics |= dataclasses.asdict(leaf_metrics(regions, ids, truth))
+    if metrics["no_instance"]:
+        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: no part of the scores of the ids"
+        print(f"mvseg: warning: {message}", file=sys.stderr)
+    for name, value in metrics.items():
+        print(f"{name:18} {value:.4f}" if isinstance(value, float) else f"{name:18} {value}")
+    try:
+        write_text_whole(result / "metrics.json", json.dumps(metrics, indent=1) + "\n")
+    except OSError as error:
+        raise InputError(f"{result}: cannot write metrics.json ({error.strerror})") from None
+    return 0

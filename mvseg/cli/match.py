@@ -1,0 +1,50 @@
+"""`mvseg match`: ids only, of any number of scenes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+from mvseg.batch.one_scene import run_one_scene
+from mvseg.cli.complain import complain
+from mvseg.cli.options import DEFAULT_OUT, add_matching_options, build_options
+from mvseg.config import RunConfig
+from mvseg.errors import InputError
+from mvseg.matching.config import MatchConfig
+from mvseg.reconstruction.config import ReconstructConfig
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser's sub-commands."""
+    parser = ArgumentParser(exit_on_error=False, description="Ids only, of any number of scenes.")
+    parser.add_argument("scenes", nargs="+", type=Path, help="scene folders")
+    add_matching_options(parser, masks=Path("masks"))
+    help_reconstruct = "has no effect; it lets infer and match share their YAML files"
+    parser.add_argument("--reconstruct", type=ReconstructConfig | None, help=help_reconstruct)
+    verbs.add_subcommand("match", parser, help="ids only, of any number of scenes")
+
+
+def run(args: Namespace) -> int:
+    """Run the verb; returns the exit code."""
+    names = [scene.resolve().name for scene in args.scenes]
+    for name in names:
+        if names.count(name) > 1:
+            raise InputError(f"two scenes are called '{name}', expected different names: each names a folder in --out")
+    if args.masks is None:
+        raise InputError("masks is null, expected the masks to match; use mvseg infer to detect them in the photos")
+    code, out = 0, args.out or DEFAULT_OUT
+    config = RunConfig(
+        match=build_options(MatchConfig, args.match, "match."),
+        reconstruct=None,
+        split_merged=args.split_merged,
+        coco_crowd=args.coco_crowd,
+        categories=args.categories,
+    )
+    for scene, name in zip(args.scenes, names, strict=True):
+        try:
+            run_one_scene(scene, args.masks, out / name, config=config, quiet=args.quiet)
+        except InputError as error:  # the other scenes still get their results
+            code = complain(error)
+    return code

@@ -1,0 +1,96 @@
+"""Options that several verbs share, and how they become the configs of the stages."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from jsonargparse import ActionConfigFile, ArgumentParser, Namespace  # type: ignore[attr-defined]  # documented
+
+from mvseg.errors import InputError
+from mvseg.formats.yaml_file import check_yaml
+from mvseg.matching.config import MatchConfig
+from mvseg.multiview.config import DetectConfig
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.training.config import TrainConfig
+from mvseg.traits.config import TraitsConfig, Up
+
+DEFAULT_OUT = Path("results")
+Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig)
+
+
+def build_options(kind: type[Options], args: Namespace | None, prefix: str = "") -> Options:
+    """The options of one stage. "epochs:" without a value is null in YAML, which jsonargparse lets pass everywhere."""
+    fields = dataclasses.fields(kind)
+    if args is None:
+        raise InputError(f"{prefix.rstrip('.')} is null, expected options")
+    for field in fields:
+        if args[field.name] is None and "None" not in str(field.type):
+            raise InputError(f"{prefix}{field.name} is null, expected a value")
+    return kind(**{field.name: args[field.name] for field in fields})
+
+
+class CheckedConfig(ActionConfigFile):
+    """The option --config FILE, whose file is checked before jsonargparse reads it."""
+
+    def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
+        check_yaml(Path(values))
+        super().__call__(parser, cfg, values, option_string)
+
+
+def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
+    parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options")
+    parser.add_argument(
+        "--masks",
+        type=Path | None,
+        default=masks,
+        help="masks (label images, COCO, labelme, YOLO, SAM, NumPy, cellpose; docs/formats.md), in the scene folder or "
+        "anywhere; without it, infer detects leaves",
+    )
+    parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that cover two instances in two")
+    parser.add_argument(
+        "--coco_crowd",
+        type=Literal["mask", "ignore"],
+        default="mask",
+        help="whether COCO annotations with iscrowd are masks like all others, or left out",
+    )
+    parser.add_argument(
+        "--categories", type=str | None, help="names of the categories of masks to take, as leaf,petiole (default: all)"
+    )
+    parser.add_class_arguments(MatchConfig, "match")
+
+
+def join_up(argv: Sequence[str]) -> list[str]:
+    """The three numbers after --up as one argument: a list would swallow the scene folder that may follow."""
+    if "--up" not in argv:
+        return list(argv)
+    start = argv.index("--up") + 1
+    numbers = list(itertools.takewhile(_is_number, argv[start : start + 3]))
+    return [*argv[:start], " ".join(numbers), *argv[start + len(numbers) :]] if numbers else list(argv)
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def read_up(up: str | list[float] | None) -> Up | None:
+    if up is None:
+        return None
+    if up == "rig":
+        return "rig"
+    if up == "board":
+        return "board"
+    words = up.replace(",", " ").split() if isinstance(up, str) else [str(number) for number in up]
+    if len(words) != 3 or not all(_is_number(word) for word in words):
+        raise InputError(f"up is '{' '.join(words)}', expected three numbers, as in 0 0 1, rig or board")
+    x, y, z = (float(word) for word in words)
+    return x, y, z

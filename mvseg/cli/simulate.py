@@ -1,0 +1,30 @@
+"""`mvseg simulate`: render plants with known answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+from mvseg.errors import InputError
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser's sub-commands."""
+    parser = ArgumentParser(exit_on_error=False, description="Render plants with known answers.")
+    parser.add_argument("preset", help="paper-eval (144 scenes of 3 to 20 photos) or train (888 of 9 photos)")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the scenes; finished ones are kept")
+    parser.add_argument("--seed", type=int, default=0, help="for everything that is random")
+    parser.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")
+    verbs.add_subcommand("simulate", parser, help="render plants with known answers")
+
+
+def run(args: Namespace) -> int:
+    """Run the verb; returns the exit code."""
+    try:
+        from mvseg.simulation.dataset import write_dataset
+    except ModuleNotFoundError as error:
+        raise InputError(f"simulate needs {error.name}: pip install 'mvseg[simulate]'") from error
+    write_dataset(args.preset, args.out, seed=args.seed, num_workers=args.num_workers)
+    return 0
