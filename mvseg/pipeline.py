@@ -28,7 +28,9 @@ from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.kept_detections import KeptDetections, read_detections, write_detections
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
+from mvseg.multiview.witnesses import revise_masks
 from mvseg.reconstruction.shapes import reconstruct_shapes
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.results.provenance import hash_files
 from mvseg.results.result import Result
 from mvseg.scene import Scene
@@ -61,7 +63,7 @@ def run_scene(
         InputError: bad input; see the stages.
     """
     seconds: dict[str, float] = {}
-    scores = None
+    scores = from_views = None
     with _timed(seconds, "load"):
         scene = place_scene(load_scene(folder), config)
         check_photos(scene)
@@ -74,13 +76,17 @@ def run_scene(
     if regions is None:
         with _timed(seconds, "detect"):
             detections, matching = detect_regions(scene, config, keep=keep, progress=progress)
-            regions, scores = detections.regions, detections.scores
+        if config.detect.witnesses:
+            with _timed(seconds, "witnesses"):
+                detections, matching, from_views = hear_witnesses(scene, detections, matching, progress=progress)
+        regions, scores = detections.regions, detections.scores
     else:
         with _timed(seconds, "match"):
             matching = match_regions(regions, scene.cameras, config.match, progress=progress)
     if config.split_merged:
         regions, matching, source = split_merged(regions, matching)
         scores = None if scores is None else scores[source]
+        from_views = None if from_views is None else from_views[source]
     kind = "" if found is None else found.kind
     if config.reconstruct is None:
         return Result(
@@ -89,6 +95,7 @@ def run_scene(
             matching=matching,
             seconds=seconds,
             detection_scores=scores,
+            from_other_views=from_views,
             mask_kind=kind,
         )
     with _timed(seconds, "reconstruct"):
@@ -112,6 +119,7 @@ def run_scene(
         traits=traits,
         seconds=seconds,
         detection_scores=scores,
+        from_other_views=from_views,
         mask_kind=kind,
     )
 
@@ -168,10 +176,45 @@ def detect_regions(
     return detections, matching
 
 
+def hear_witnesses(
+    scene: Scene, detections: Proposals, matching: Matching, *, progress: bool = False
+) -> tuple[Proposals, Matching, torch.Tensor]:
+    """Detections as the other views correct them, see `revise_masks`.
+
+    Args:
+        scene: with photos.
+        detections: D detections.
+        matching: of these.
+        progress: show progress bars.
+
+    Returns:
+        D' detections and their matching; (D',) bool, the masks that only the other views show. These have the mean
+        detection score of their instance.
+    """
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
+        surfaces = fit_surfaces(detections.regions, matching.instance_ids, scene.cameras, progress=progress)
+    photos = partial(read_photo, scene)
+    revised = revise_masks(
+        detections.regions, matching, surfaces, cameras=scene.cameras, photos=photos, progress=progress
+    )
+    from_views = revised.source < 0
+    ids = revised.matching.instance_ids
+    scores, classes = detections.scores[revised.source], detections.classes[revised.source]
+    for number in ids[from_views].unique().tolist():
+        of_instance = revised.old_ids[number - 1] == matching.instance_ids
+        scores[from_views & (ids == number)] = detections.scores[of_instance].mean()
+        classes[from_views & (ids == number)] = detections.classes[of_instance].mode()[0]
+    corrected = Proposals(
+        regions=revised.regions, boxes=revised.regions.boxes.float(), scores=scores, classes=classes
+    )
+    return corrected, revised.matching, from_views
+
+
 def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
-    """Everything but the photo that detections depend on. (How often they are matched does not change them.)"""
+    """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
     weights = find_weights(detect.weights) or Path(detect.weights)
-    options = {**asdict(detect), "weights": hash_files(weights), "num_iterations": None}
+    options = {**asdict(detect), "weights": hash_files(weights), "num_iterations": None, "witnesses": None}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "mvseg": __version__}
     return json.dumps(options | {"torch": torch.__version__, "device": device})
 

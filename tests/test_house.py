@@ -38,7 +38,7 @@ FLOORS = (
     ("config",),
     ("training", "results"),
     ("pipeline",),
-    ("batch",),
+    ("batch", "adaptation"),
     ("__init__",),
     ("cli",),
 )

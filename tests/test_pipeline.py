@@ -16,6 +16,7 @@ import pytest
 import torch
 
 import mvseg
+from leafy_scene import write_leafy_scene
 from mvseg import (
     InputError,
     InputWarning,
@@ -28,8 +29,13 @@ from mvseg import (
     match_regions,
     run_scene,
 )
+from mvseg.matching.result import Matching
+from mvseg.multiview.proposals import Proposals
+from mvseg.pipeline import hear_witnesses
 from mvseg.reconstruction.voxels import reconstruct_instances
+from mvseg.results.folder import save_result
 from mvseg.results.provenance import describe_run
+from mvseg.results.result import Result
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)
@@ -169,3 +175,36 @@ def test_surfaces_are_fitted_to_the_photos_when_wanted_and_there(
     assert (with_photos is not None) == is_wanted
     if with_photos is not None:
         assert with_photos(1).shape == (480, 640, 3)
+
+
+def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
+    leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160)
+    missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
+    regions = leafy.regions.select(~missed)
+    count = len(regions)
+    matching = Matching(
+        instance_ids=regions.labels, match_scores=torch.full((count,), 0.9), num_instances=2, method="nview"
+    )
+    scores = torch.linspace(0.4, 0.9, count)
+    found = Proposals(regions=regions, boxes=regions.boxes.float(), scores=scores, classes=regions.labels + 3)
+    corrected, rematched, from_views = hear_witnesses(leafy.scene, found, matching)
+    assert len(corrected.regions) == count + 1
+    (new,) = from_views.nonzero()[:, 0].tolist()
+    assert (int(corrected.regions.view_index[new]), int(rematched.instance_ids[new])) == (2, 1)
+    assert float(corrected.scores[new]) == pytest.approx(float(scores[regions.labels == 1].mean()))
+    assert torch.equal(corrected.classes, rematched.instance_ids + 3)
+    true = leafy.regions.mask(int(missed.nonzero()), 160, 160)
+    shown = corrected.regions.mask(new, 160, 160)
+    assert float((true & shown).sum() / (true | shown).sum()) > 0.9
+    assert torch.equal(corrected.boxes, corrected.regions.boxes.float())
+
+    result = Result(
+        scene=leafy.scene,
+        regions=corrected.regions,
+        matching=rematched,
+        detection_scores=corrected.scores,
+        from_other_views=from_views,
+    )
+    save_result(result, tmp_path / "out", {})
+    written = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
+    assert [entry["from_other_views"] for entry in written] == from_views.tolist()

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg._version import __version__
+from mvseg.cli import adapt, infer, match, models, simulate, train
 from mvseg.cli import eval as evaluate
-from mvseg.cli import infer, match, models, simulate, train
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
 from mvseg.errors import InputError, InputWarning
@@ -20,7 +20,15 @@ from mvseg.sigterm import Terminated, stopped_by_sigterm
 
 INTERRUPTED, TERMINATED = 130, 143
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
-VERBS = {"infer": infer, "match": match, "eval": evaluate, "train": train, "simulate": simulate, "models": models}
+VERBS = {
+    "infer": infer,
+    "match": match,
+    "eval": evaluate,
+    "train": train,
+    "adapt": adapt,
+    "simulate": simulate,
+    "models": models,
+}
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -10,6 +10,7 @@ from typing import Any, Literal, TypeVar
 
 from jsonargparse import ActionConfigFile, ArgumentParser, Namespace  # type: ignore[attr-defined]  # documented
 
+from mvseg.adaptation.config import AdaptConfig
 from mvseg.errors import InputError
 from mvseg.formats.yaml_file import check_yaml
 from mvseg.matching.config import MatchConfig
@@ -19,7 +20,7 @@ from mvseg.training.config import TrainConfig
 from mvseg.traits.config import TraitsConfig, Up
 
 DEFAULT_OUT = Path("results")
-Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig)
+Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, AdaptConfig)
 
 
 def build_options(kind: type[Options], args: Namespace | None, prefix: str = "") -> Options:

@@ -23,6 +23,9 @@ class DetectConfig:
         scales: factors of this size. At several, every photo is looked at once for each, and a mask scores best that
             most of them show; [0.5, 1, 2] takes three to four times as long as [1].
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
+        witnesses: let surfaces that are fitted to the matched masks correct them: the other views show which masks are
+            no leaves or pieces of one, and which leaves were missed (`mvseg.multiview.witnesses`). Finds leaves: not
+            for other things.
     """
 
     weights: str = "leaf-slim"
@@ -30,6 +33,7 @@ class DetectConfig:
     image_size: int | None = None
     scales: tuple[float, ...] = (1.0,)
     num_iterations: int = 1
+    witnesses: bool = True
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_score <= 1:

@@ -119,6 +119,8 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         source: dict[str, Any] = {"source_label": int(result.regions.labels[region])}
     else:
         source = {"score": round(float(result.detection_scores[region]), 4)}
+        if result.from_other_views is not None:
+            source["from_other_views"] = bool(result.from_other_views[region])
     return {
         "image_id": view + 1,
         "instance_id": int(result.matching.instance_ids[region]),

@@ -30,6 +30,8 @@ class Result:
         traits: of the plant and its leaves; None when only ids were asked for.
         seconds: {stage: wall time}.
         detection_scores: (D,) float32, the detector's score of each mask; None when the masks were given.
+        from_other_views: (D,) bool, masks that no detector found: the other views show that a leaf is there; None where
+            masks were given, or the other views were not asked.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
     """
 
@@ -41,4 +43,5 @@ class Result:
     traits: Traits | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     detection_scores: Tensor | None = None
+    from_other_views: Tensor | None = None
     mask_kind: str = ""

@@ -1,0 +1,200 @@
+"""The other views as witnesses: they correct the masks that a detector found.
+
+A surface that is fitted to an instance's masks in all views says where each view must show it. That settles what no
+photo can by itself: which piece of a leaf is the leaf, which mask is none, and which leaf was missed. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from mvseg.matching.result import SURE, Matching, count_sure_views
+from mvseg.multiview.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.visible_leaves import VisibleLeaf, visible_leaves
+from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.scene import Cameras
+
+Photos = Callable[[int], NDArray[np.uint8]]
+Mask = NDArray[np.bool_]
+
+AGREES = 0.5  # IoU of a mask with what its surface shows, from which it stays as it is
+LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for that part to become a mask
+LEAST_PIXELS = 64  # of that part
+LEAST_COLORED = 0.8  # of it, that have the colour of leaves
+SURE_VIEWS = 4  # of an instance whose masks tell that colour
+
+
+@dataclass(frozen=True, eq=False)
+class Revised:
+    """Masks after the other views were heard.
+
+    Attributes:
+        regions: D' masks, at most one for each instance and view.
+        matching: their ids, 1 to K' without gaps, in the order of the old ones.
+        source: (D',) int64, the largest of the regions that a mask was made of; -1 for one that only the other views
+            show.
+        old_ids: (K',) int64, the former id of each instance.
+        counts: of the D masks, how many were "kept" and "dropped"; "shown", how many only the other views show.
+    """
+
+    regions: Regions
+    matching: Matching
+    source: Tensor
+    old_ids: Tensor
+    counts: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """One revised mask: its instance, the old masks in its place, whether it is theirs, and its crop."""
+
+    view: int
+    instance: int
+    members: list[int]
+    is_own: bool
+    box: tuple[int, int, int, int]
+    crop: Tensor
+
+
+def revise_masks(
+    regions: Regions,
+    matching: Matching,
+    surfaces: Mapping[int, LeafSurface],
+    *,
+    cameras: Cameras,
+    photos: Photos,
+    progress: bool = False,
+) -> Revised:
+    """Keep, replace, add and drop masks as the surfaces of their instances say.
+
+    For every instance and view:
+
+    - its masks there stay, as one, when their IoU with the visible part of the surface is at least `AGREES`;
+    - otherwise, and where it has none, that part becomes its mask, as far as it has the colour of leaves
+      (`leaf_color`). It must be `LEAST_VISIBLE` of the surface, and `LEAST_COLORED` of it must have that colour: what a
+      stem or a pot hides, or a wrong surface shows, is no mask;
+    - otherwise it has none.
+
+    Instances without a credible surface go, and those with masks in one view only; so do masks that are matched to
+    nothing. A leaf that only one photo shows is lost with the false ones.
+
+    Args:
+        regions: D masks, as a detector found them.
+        matching: their ids.
+        surfaces: {instance id: surface} fitted to them.
+        cameras: V cameras.
+        photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view.
+        progress: show a progress bar over the views.
+
+    Returns:
+        The masks and their ids, on the CPU. A mask made of several has the best match score of theirs; one that only
+        the other views show has the mean of its instance's.
+    """
+    regions, ids = regions.to("cpu"), matching.instance_ids.cpu()
+    colors = _colors_of_leaves(regions, matching, photos)
+    found: list[_Found] = []
+    for view in tqdm(range(regions.num_views), "witnesses", unit="view", disable=not progress):
+        colored = has_leaf_color(photos(view), colors)
+        for leaf in visible_leaves(surfaces, cameras, view):
+            members = ((regions.view_index == view) & (ids == leaf.instance)).nonzero()[:, 0].tolist()
+            own = _union(regions, members, colored.shape)
+            if _iou(own, leaf.mask) >= AGREES:
+                found.append(_found(view, leaf, members, own, is_own=True))
+            elif _is_leaf(leaf, colored):
+                found.append(_found(view, leaf, members, leaf.mask & colored, is_own=False))
+    found = _seen_twice(found)
+    number = {instance: place for place, instance in enumerate(sorted({each.instance for each in found}), start=1)}
+    revised = stack_regions(
+        [each.view for each in found],
+        [each.box for each in found],
+        [each.crop for each in found],
+        labels=range(1, len(found) + 1),
+        num_views=regions.num_views,
+    )
+    num_kept = sum(len(each.members) for each in found if each.is_own)
+    counts = {"kept": num_kept, "dropped": len(regions) - num_kept, "shown": sum(not each.is_own for each in found)}
+    areas = regions.areas
+    source = [max(each.members, key=lambda n: int(areas[n])) if each.is_own else -1 for each in found]
+    return Revised(
+        regions=revised,
+        matching=_rematch(matching, found, number),
+        source=torch.tensor(source, dtype=torch.int64),
+        old_ids=torch.tensor(list(number), dtype=torch.int64),
+        counts=counts,
+    )
+
+
+def _colors_of_leaves(regions: Regions, matching: Matching, photos: Photos) -> NDArray[np.bool_]:
+    """The colours of masks that are surely matched in `SURE_VIEWS` views, or in all where there are fewer; where there
+    are no such masks, those of all that are matched."""
+    ids, scores = matching.instance_ids.cpu(), matching.match_scores.cpu()
+    views = torch.cat((count_sure_views(matching, regions.view_index), torch.zeros(1, dtype=torch.int64)))
+    is_sure = (ids > 0) & (scores >= SURE) & (views[ids.clamp(min=0) - 1] >= min(SURE_VIEWS, regions.num_views))
+    chosen = is_sure if is_sure.any() else ids > 0
+    counts = ColorCounts.none()
+    for view in range(regions.num_views):
+        photo = photos(view)
+        size = photo.shape[1], photo.shape[0]
+        counts += count_colors(photo, regions.label_map(view, chosen.long(), size).numpy() > 0)
+    return leaf_colors(counts)
+
+
+def _union(regions: Regions, members: list[int], shape: tuple[int, ...]) -> Mask:
+    frame = np.zeros(shape, bool)
+    for index in members:
+        x1, y1, x2, y2 = regions.boxes[index].tolist()
+        frame[y1:y2, x1:x2] |= regions.crop(index).numpy()
+    return frame
+
+
+def _iou(first: Mask, second: Mask) -> float:
+    return float((first & second).sum() / max(int((first | second).sum()), 1))
+
+
+def _is_leaf(leaf: VisibleLeaf, colored: Mask) -> bool:
+    """Whether the photo can show a leaf where the other views say that there is one."""
+    size, num_colored = int(leaf.mask.sum()), int((leaf.mask & colored).sum())
+    return leaf.share >= LEAST_VISIBLE and size >= LEAST_PIXELS and num_colored >= LEAST_COLORED * size
+
+
+def _found(view: int, leaf: VisibleLeaf, members: list[int], mask: Mask, *, is_own: bool) -> _Found:
+    x1, y1, x2, y2 = box = mask_box(torch.from_numpy(mask))
+    crop = torch.from_numpy(mask[y1:y2, x1:x2].copy()).flatten()
+    return _Found(view=view, instance=leaf.instance, members=members, is_own=is_own, box=box, crop=crop)
+
+
+def _seen_twice(found: list[_Found]) -> list[_Found]:
+    """Without the instances that have a mask in one view only."""
+    instances = [each.instance for each in found]
+    return [each for each in found if instances.count(each.instance) > 1]
+
+
+def _rematch(matching: Matching, found: list[_Found], number: Mapping[int, int]) -> Matching:
+    """The matching of the revised masks."""
+    old = matching.match_scores.cpu()
+    scores = [float(old[each.members].max()) if each.is_own else float("nan") for each in found]
+    for place, each in enumerate(found):
+        if not each.is_own:
+            own = [score for score, other in zip(scores, found, strict=True)
+                   if other.is_own and other.instance == each.instance]  # fmt: skip
+            scores[place] = sum(own) / len(own) if own else 0.0
+    revised = Matching(
+        instance_ids=torch.tensor([number[each.instance] for each in found], dtype=torch.int64),
+        match_scores=torch.tensor(scores),
+        num_instances=len(number),
+        method=matching.method,
+        residual_px=matching.residual_px,
+        explained=matching.explained,
+    )
+    if matching.support is None:
+        return revised
+    view_index = torch.tensor([each.view for each in found], dtype=torch.int64)
+    return replace(revised, support=count_sure_views(revised, view_index))

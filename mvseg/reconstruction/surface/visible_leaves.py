@@ -1,0 +1,57 @@
+"""Where a photo must show the surfaces of the instances, and which of them hide others."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleLeaf:
+    """One surface in one view.
+
+    Attributes:
+        instance: its id.
+        mask: (H, W) bool, pixels that it covers and no nearer surface does.
+        share: of all the pixels that it covers.
+    """
+
+    instance: int
+    mask: NDArray[np.bool_]
+    share: float
+
+
+def visible_leaves(surfaces: Mapping[int, LeafSurface], cameras: Cameras, view: int) -> Iterator[VisibleLeaf]:
+    """The credible surfaces that one view shows, the nearest first, one at a time in memory.
+
+    A surface is nearer than another as a whole, by the depth of its middle: where two leaves hide parts of each other
+    one of them is drawn wrong. Stems and pots hide nothing here. What lies behind the camera or beside the photo is
+    left out.
+
+    Args:
+        surfaces: {instance id: surface}.
+        cameras: V cameras.
+        view: index of the view.
+    """
+    camera = cameras[[view]].to("cpu")
+    shown = {instance: surface for instance, surface in surfaces.items() if surface.is_credible}
+    if not shown:
+        return
+    middles = torch.stack([surface.points().reshape(-1, 3).mean(0) for surface in shown.values()])
+    _, depth = camera.project(middles)
+    taken: NDArray[np.bool_] | None = None
+    for index in depth[0].argsort(stable=True).tolist():
+        instance = list(shown)[index]
+        covered = shown[instance].project(camera)[0].numpy()
+        taken = np.zeros_like(covered) if taken is None else taken
+        mask = covered & ~taken
+        if mask.any():
+            yield VisibleLeaf(instance=instance, mask=mask, share=float(mask.sum() / covered.sum()))
+        taken = taken | covered

@@ -1,0 +1,155 @@
+"""What the other views say of masks: two known leaves over another, seen by six cameras, and masks with faults."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import SIZE, as_regions, ring_cameras
+from known_leaves import flat_leaf
+from mvseg.matching.result import Matching
+from mvseg.multiview.witnesses import Revised, revise_masks
+from mvseg.reconstruction.surface.visible_leaves import visible_leaves
+from mvseg.regions import Regions
+
+CAMERAS = ring_cameras(6, elevations_deg=(35, 60, 45))
+LEAVES = {  # the first hides a part of the second from above
+    1: flat_leaf(length=1.6, half_width=0.35, at=(-0.8, -0.3, 0.4)),
+    2: flat_leaf(length=1.6, half_width=0.4, at=(-0.6, 0.2, 0.0)),
+    3: flat_leaf(length=0.8, half_width=0.3, at=(0.4, -0.9, -0.2)),
+}
+GREEN, BROWN = (70, 150, 50), (120, 90, 60)
+
+
+def true_maps() -> list[np.ndarray]:
+    """V label maps of the leaves."""
+    maps = []
+    for view in range(len(CAMERAS)):
+        labels = np.zeros((SIZE, SIZE), np.int64)
+        for leaf in visible_leaves(LEAVES, CAMERAS, view):
+            labels[leaf.mask] = leaf.instance
+        maps.append(labels)
+    return maps
+
+
+TRUE = true_maps()
+
+
+def photo(view: int) -> np.ndarray:
+    """Green where a leaf is, brown elsewhere."""
+    return np.array([BROWN, GREEN], np.uint8)[(TRUE[view] > 0).astype(int)]
+
+
+def match_all(regions: Regions, ids: torch.Tensor) -> Matching:
+    return Matching(
+        instance_ids=ids,
+        match_scores=torch.where(ids > 0, 0.9, 0.0),
+        num_instances=int(ids.max()),
+        method="nview",
+        support=torch.full((int(ids.max()),), 6),
+    )
+
+
+def revise(maps: list[np.ndarray], **changes: object) -> Revised:
+    regions, numbers = as_regions(maps)
+    ids = torch.where(numbers > 100, -1, numbers % 10)  # 11 is a second piece of leaf 1
+    given = {"surfaces": LEAVES, "photos": photo, **changes}
+    return revise_masks(regions, match_all(regions, ids), cameras=CAMERAS, **given)  # type: ignore[arg-type]
+
+
+def label_maps(revised: Revised) -> list[np.ndarray]:
+    ids = revised.matching.instance_ids
+    return [revised.regions.label_map(view, ids, (SIZE, SIZE)).numpy() for view in range(len(CAMERAS))]
+
+
+def test_right_masks_stay_as_they_are() -> None:
+    revised = revise(TRUE)
+    assert all(np.array_equal(*pair) for pair in zip(label_maps(revised), TRUE, strict=True))
+    assert (revised.source >= 0).all()
+    assert revised.old_ids.tolist() == [1, 2, 3]
+    assert revised.counts == {"kept": len(revised.source), "dropped": 0, "shown": 0}
+    assert revised.matching.support is not None
+    assert revised.matching.support.tolist() == [6, 6, 6]
+
+
+def test_a_missed_leaf_is_shown_by_the_others() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    maps[2][maps[2] == 1] = 0
+    revised = revise(maps)
+    shown = label_maps(revised)
+    assert all(np.array_equal(*pair) for pair in zip(shown, TRUE, strict=True))
+    (new,) = (revised.source < 0).nonzero()[:, 0].tolist()
+    assert (int(revised.regions.view_index[new]), int(revised.matching.instance_ids[new])) == (2, 1)
+    assert float(revised.matching.match_scores[new]) == pytest.approx(0.9)
+    assert revised.counts["shown"] == 1
+
+
+def test_pieces_of_a_leaf_are_joined_and_a_piece_alone_is_completed() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    left = np.indices((SIZE, SIZE))[1] < np.median(np.nonzero(TRUE[0] == 1)[1])
+    maps[0][(TRUE[0] == 1) & left] = 11
+    columns = np.nonzero(TRUE[3] == 2)[1]
+    rest = np.indices((SIZE, SIZE))[1] > np.quantile(columns, 0.3)
+    maps[3][(TRUE[3] == 2) & rest] = 0
+    revised = revise(maps)
+    assert all(np.array_equal(*pair) for pair in zip(label_maps(revised), TRUE, strict=True))
+    assert revised.counts == {"kept": sum(len(np.unique(labels)) - 1 for labels in maps) - 1, "dropped": 1, "shown": 1}
+
+
+def test_false_leaves_go() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    maps[1][5:25, 5:25] = 101  # matched to nothing
+    maps[4][TRUE[4] == 3] = 0
+    maps[4][5:25, 5:25] = 3  # the id of leaf 3 at a wrong place
+    revised = revise(maps)
+    assert all(np.array_equal(*pair) for pair in zip(label_maps(revised), TRUE, strict=True))
+    assert revised.counts["dropped"] == 2
+
+
+def test_what_the_photo_cannot_show_is_not_added() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    maps[2][maps[2] == 1] = 0
+
+    def with_pot(view: int) -> np.ndarray:
+        painted = photo(view)
+        painted[TRUE[2] == 1] = BROWN if view == 2 else painted[TRUE[2] == 1]
+        return painted
+
+    revised = revise(maps, photos=with_pot)
+    assert not (label_maps(revised)[2] == 1).any()
+    assert revised.counts["shown"] == 0
+
+
+def test_leaves_without_a_credible_surface_go_and_ids_close_up() -> None:
+    doubtful = LEAVES | {1: replace(LEAVES[1], iou=torch.full((6,), 0.5, dtype=torch.float64))}
+    revised = revise(TRUE, surfaces=doubtful)
+    assert revised.old_ids.tolist() == [2, 3]
+    assert revised.matching.num_instances == 2
+    assert sorted(revised.matching.instance_ids.unique().tolist()) == [1, 2]
+
+
+def test_the_order_of_masks_does_not_matter() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    maps[2][maps[2] == 1] = 0
+    regions, ids = as_regions(maps)
+    order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(2))
+    one, other = (
+        revise_masks(part, match_all(part, numbers), LEAVES, cameras=CAMERAS, photos=photo)
+        for part, numbers in ((regions, ids), (regions.select(order), ids[order]))
+    )
+    assert torch.equal(one.regions.crops, other.regions.crops)
+    assert torch.equal(one.matching.instance_ids, other.matching.instance_ids)
+    is_own = one.source >= 0
+    assert torch.equal(order[other.source[is_own]], one.source[is_own])
+
+
+def test_nothing_found() -> None:
+    regions, ids = as_regions([np.zeros((SIZE, SIZE), np.int64)] * 6)
+    matching = Matching(instance_ids=ids, match_scores=torch.zeros(0), num_instances=0, method="nview")
+    revised = revise_masks(regions, matching, {}, cameras=CAMERAS, photos=photo)
+    assert len(revised.regions) == revised.matching.num_instances == 0
+    assert revised.regions.num_views == 6
+    assert revised.counts == {"kept": 0, "dropped": 0, "shown": 0}
