@@ -2,7 +2,7 @@
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 
-.PHONY: demo test fuzz lint clean
+.PHONY: demo test fuzz lint docs clean
 
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
@@ -19,10 +19,14 @@ lint: $(VENV)/installed
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m mypy
 
+# the site, in build/site; a warning is an error
+docs: $(VENV)/installed
+	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet --config-file .ci/mkdocs.yml
+
 $(VENV)/installed: pyproject.toml
 	python3 -m venv $(VENV)
 	$(PYTHON) -m pip install --quiet --upgrade pip
-	$(PYTHON) -m pip install --quiet --editable '.[test,lint]'
+	$(PYTHON) -m pip install --quiet --editable '.[test,lint,docs]'
 	touch $@
 
 clean:

@@ -14,6 +14,9 @@ from typing import TYPE_CHECKING, Any
 from mvseg._version import __version__
 
 if TYPE_CHECKING:
+    from mvseg.checks.check_scene import Check as Check
+    from mvseg.checks.check_scene import check_scene as check_scene
+    from mvseg.checks.finding import Finding as Finding
     from mvseg.config import RunConfig as RunConfig
     from mvseg.demo import demo_scene as demo_scene
     from mvseg.detectors.zoo import load_detector as load_detector
@@ -81,6 +84,8 @@ _HOME = {
     "multiview.mask_rcnn": ("MultiViewMaskRCNN",),
     "evaluation.id_metrics": ("matching_metrics",),
     "evaluation.shape_distance": ("shape_distance",),
+    "checks.finding": ("Finding",),
+    "checks.check_scene": ("Check", "check_scene"),
     "config": ("RunConfig",),
     "pipeline": ("run_scene",),
 }

@@ -23,6 +23,7 @@ import trimesh
 
 import mvseg
 from mvseg.cli import main
+from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.formats.coco import encode_mask
@@ -295,7 +296,7 @@ def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["--help"], ["{infer,match,eval,", "simulate", "models"]),
+        (["--help"], ["{" + ",".join(VERBS) + "}"]),
         (["--version"], [f"mvseg {mvseg.__version__}"]),
         (["infer", "--help"], ["--masks", "--detect.weights", "--match.method", "--reconstruct.seen_share"]),
         (["match", "--help"], ["scenes [scenes ...]", "--masks", "--match.method"]),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import inspect
+import os
 import re
 import subprocess
 import sys
@@ -34,7 +35,7 @@ FLOORS = (
     ("partition",),
     ("demo",),
     ("formats", "detectors", "matching", "reconstruction"),
-    ("multiview", "traits", "evaluation", "baselines", "simulation"),
+    ("multiview", "traits", "evaluation", "baselines", "simulation", "checks"),
     ("config",),
     ("training", "results"),
     ("pipeline",),
@@ -215,6 +216,13 @@ def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     top = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert top == {"mvseg"}
     assert {"mvseg/demo_plant/cameras.json", "mvseg/py.typed", "mvseg/zoo/leaf-slim/weights.safetensors"} <= set(names)
+    zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
+    code = "from mvseg.cli.options import find_config as find; print(find('fine.yaml'), find('train/rosettes.yaml'))"
+    where = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
+    command = [sys.executable, "-c", code]
+    said = subprocess.run(command, cwd=tmp_path, env=where, check=True, capture_output=True, text=True)
+    home = tmp_path / "installed" / "mvseg" / "configs"
+    assert said.stdout.split() == [str(home / "fine.yaml"), str(home / "train" / "rosettes.yaml")]
 
 
 def test_shipped_scene_is_small() -> None:

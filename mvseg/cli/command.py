@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg._version import __version__
-from mvseg.cli import adapt, infer, match, models, simulate, train
+from mvseg.cli import adapt, check, infer, match, models, simulate, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -21,6 +21,7 @@ from mvseg.sigterm import Terminated, stopped_by_sigterm
 INTERRUPTED, TERMINATED = 130, 143
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
 VERBS = {
+    "check": check,
     "infer": infer,
     "match": match,
     "eval": evaluate,
@@ -38,8 +39,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments after the program's name; None for those of the process.
 
     Returns:
-        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 130 after Ctrl-C,
-        143 after SIGTERM.
+        The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 1 where `check`
+        found an error; 130 after Ctrl-C, 143 after SIGTERM.
     """
     # Let idle threads sleep: on a shared machine, spinning ones slow small tensor operations tenfold. Must be set
     # before torch is loaded, which the verbs do when they start.

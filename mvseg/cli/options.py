@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 from collections.abc import Sequence
+from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal, TypeVar
 
@@ -20,6 +21,8 @@ from mvseg.training.config import TrainConfig
 from mvseg.traits.config import TraitsConfig, Up
 
 DEFAULT_OUT = Path("results")
+# an installed mvseg carries configs/ inside the package, a checkout has it beside the package
+CONFIG_HOMES = (Path(str(files("mvseg") / "configs")), Path(str(files("mvseg"))).parent / "configs")
 Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, AdaptConfig)
 
 
@@ -38,12 +41,29 @@ class CheckedConfig(ActionConfigFile):
     """The option --config FILE, whose file is checked before jsonargparse reads it."""
 
     def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
-        check_yaml(Path(values))
-        super().__call__(parser, cfg, values, option_string)
+        path = find_config(str(values))
+        check_yaml(path)
+        super().__call__(parser, cfg, str(path), option_string)
+
+
+def find_config(name: str) -> Path:
+    """The YAML file that --config names: a path, or else a file that ships, as fine.yaml or train/rosettes.yaml.
+
+    Raises:
+        InputError: there is neither; the message lists those that ship.
+    """
+    if Path(name).exists():
+        return Path(name)
+    for home in CONFIG_HOMES:
+        if (home / name).is_file() and not Path(name).is_absolute() and ".." not in Path(name).parts:
+            return home / name
+    shipped = sorted({path.relative_to(home).as_posix() for home in CONFIG_HOMES for path in home.rglob("*.yaml")})
+    raise InputError(f"{name}: no such file, expected a YAML file of options, or one that ships: {', '.join(shipped)}")
 
 
 def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
-    parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options")
+    help_config = "YAML file with any of these options; fine.yaml and paper.yaml ship"
+    parser.add_argument("--config", action=CheckedConfig, help=help_config)
     parser.add_argument(
         "--masks",
         type=Path | None,

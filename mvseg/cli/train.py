@@ -15,7 +15,8 @@ from mvseg.training.config import TrainConfig
 def add(verbs: Any) -> None:
     """Add the verb to the parser's sub-commands."""
     parser = ArgumentParser(exit_on_error=False, description="Fine-tune a Mask R-CNN; see configs/train/.")
-    parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options")
+    help_config = "YAML file with any of these options; train/rosettes.yaml and train/finetune-coco.yaml ship"
+    parser.add_argument("--config", action=CheckedConfig, help=help_config)
     parser.add_class_arguments(TrainConfig)
     verbs.add_subcommand("train", parser, help="fine-tune a Mask R-CNN")
 

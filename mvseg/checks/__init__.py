@@ -1,0 +1,1 @@
+"""What would go wrong with a scene, found before anything long runs."""

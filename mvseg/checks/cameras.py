@@ -1,0 +1,229 @@
+"""Cameras on their own: do they look at one place, from different sides, and could their lenses exist?"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mvseg.checks.finding import Finding, name_views
+from mvseg.matching.epipolar import is_coincident
+from mvseg.scene import Cameras, Scene
+
+Floats = NDArray[np.float64]
+
+DEPTHS = np.geomspace(0.02, 500, 80)  # of points looked for, in the median distance of two cameras
+GRID = (0.25, 0.5, 0.75)  # of the photo's width and height: the rays along which they are looked for
+MOST_SOURCES, POINTS_AT_ONCE = 32, 4096  # cameras on whose rays points are looked for; bounds the memory
+ALL, MOST = 0.9, 0.6  # share of the cameras that look at one point: with right poses; without doubt about them
+WIDER = 4  # times the angle between the cameras, from which another reading of the poses is the better one
+FIELD_OF_VIEW = (2.0, 140.0)  # degrees, of the photo's diagonal, that lenses without distortion have
+OFF_CENTER = 0.2  # of width and height; a principal point beyond is that of another photo
+SQUARE = 1.2  # quotient of the focal lengths
+FAR = 8.0  # distance of a camera from the middle of the others, in their median distance
+NARROW, WIDE = 2.0, 75.0  # degrees between the rays of neighbouring views: no depth below, no common leaves above
+FLIP = np.diag([1.0, -1.0, -1.0])  # from cameras that look along -z with +y up (OpenGL, Blender)
+
+
+@dataclass(frozen=True, eq=False)
+class Coverage:
+    """A point that as many cameras as possible look at.
+
+    Attributes:
+        point: (3,) world coordinates; where several are seen by as many, the one closest to the photos' middles.
+        sees: (V,) bool, cameras that have it in their image and in front of them.
+        angle: (V,) degrees between the rays of each camera and its neighbour at the point; nan for cameras that do not
+            look at it, or are the only ones.
+    """
+
+    point: Floats
+    sees: NDArray[np.bool_]
+    angle: Floats
+
+
+def find_coverage(cameras: Cameras) -> Coverage:
+    """The point that most of V >= 1 cameras look at, among points on their rays."""
+    centers = cameras.centers
+    apart = torch.linalg.vector_norm(centers[:, None] - centers, dim=2)
+    scale = float(apart[apart > 0].median()) if bool((apart > 0).any()) else 1.0
+    sizes = cameras.sizes.to(centers)
+    grid = torch.tensor([[u, v, 1.0] for u in GRID for v in GRID]).to(centers)
+    px = grid[None] * torch.nn.functional.pad(sizes, (0, 1), value=1.0)[:, None]
+    rays = torch.nn.functional.normalize(px @ cameras.world_from_px.mT, dim=2)
+    depths = torch.from_numpy(DEPTHS * scale).to(centers)
+    some = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_SOURCES)).long()
+    points = (centers[some, None, None] + rays[some, :, None] * depths[:, None]).reshape(-1, 3)
+    looks = [_look(cameras, part) for part in points.split(POINTS_AT_ONCE)]
+    # the most views, and then the middle of the photos
+    best = points[int(torch.cat([sees.sum(0).double() - off.mean(0) / 2 for sees, off in looks]).argmax())]
+    sees = _look(cameras, best[None])[0][:, 0]
+    toward = torch.nn.functional.normalize(best - centers, dim=1)
+    is_other = sees & ~torch.eye(len(cameras), dtype=torch.bool)
+    nearest = torch.where(is_other, toward @ toward.T, -2).amax(1)
+    angle = torch.where(sees & (nearest > -2), torch.rad2deg(nearest.clamp(-1, 1).acos()), torch.nan)
+    return Coverage(point=best.numpy(), sees=sees.numpy(), angle=angle.numpy())
+
+
+def camera_findings(scene: Scene, coverage: Coverage) -> list[Finding]:
+    """What is odd about the cameras of a scene."""
+    names = tuple(view.name for view in scene.views)
+    return [
+        *_place_findings(scene.cameras, coverage, names),
+        *_lens_findings(scene.cameras, names),
+        *_world_findings(scene),
+    ]
+
+
+def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> list[Finding]:
+    if bool(is_coincident(cameras).all()):
+        what = "all cameras are at one place, where depth cannot be seen: do R and t map world points to the camera?"
+        return [Finding(where="cameras", what=what, level="error")]
+    if reading := _other_reading(cameras, coverage):
+        return [Finding(where="cameras", what=reading, level="error")]
+    share = coverage.sees.mean()
+    findings = []
+    unseeing = tuple(np.flatnonzero(~coverage.sees).tolist())
+    if coverage.sees.sum() < 2:
+        what = "no two cameras look at one point: do R and t map world points to the camera?"
+        findings.append(Finding(where="cameras", what=what, level="error"))
+    elif unseeing and share > 0.5:
+        point = f"the point that the other {coverage.sees.sum()} look at"
+        what = f"{name_views(unseeing, names)} look past {point}: check the pose, or leave the photo out"
+        findings.append(Finding(where="cameras", what=what, level="error", views=unseeing))
+    elif unseeing:
+        what = f"no point is seen by more than {coverage.sees.sum()} of {len(names)} cameras: check the poses, unless "
+        findings.append(Finding(where="cameras", what=f"{what}the photos show different plants", level="warning"))
+    findings += _baseline_findings(cameras, coverage, names)
+    centers = cameras.centers.numpy()
+    distance = np.linalg.norm(centers - np.median(centers, 0), axis=1)
+    usual = float(np.median(distance))
+    far = tuple(np.flatnonzero(distance > FAR * usual).tolist()) if len(names) > 3 and usual > 0 else ()
+    if far:
+        times = distance[list(far)].max() / usual
+        what = f"{name_views(far, names)}: {times:.0f} times as far out as the other cameras; is t in another unit?"
+        findings.append(Finding(where="cameras", what=what, level="warning", views=far))
+    return findings
+
+
+def _baseline_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> list[Finding]:
+    findings = []
+    pairs = torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist()
+    if pairs:
+        views = tuple(sorted({view for pair in pairs for view in pair}))
+        what = f"{name_views(views, names)} stand where others stand, and tell no depth with them: move the camera"
+        findings.append(Finding(where="cameras", what=what, level="warning", views=views))
+    spread = _widest_angle(cameras, coverage)
+    if coverage.sees.sum() > 1 and spread < NARROW:
+        what = f"the views differ by {spread:.1f} degrees at most: depth is hardly seen; photograph from more sides"
+        findings.append(Finding(where="cameras", what=what, level="warning"))
+    lonely = tuple(np.flatnonzero(np.nan_to_num(coverage.angle) > WIDE).tolist())
+    if lonely:
+        far_off = coverage.angle[list(lonely)].max()
+        facts = f"the next view is {far_off:.0f} degrees away and shows few of the same leaves"
+        what = f"{name_views(lonely, names)}: {facts}; add photos between"
+        findings.append(Finding(where="cameras", what=what, level="warning", views=lonely))
+    return findings
+
+
+def _lens_findings(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
+    K, sizes = cameras.K.numpy(), cameras.sizes.numpy().astype(float)
+    focal, center = K[:, [0, 1], [0, 1]], K[:, :2, 2]
+    view_deg = field_of_view(cameras)
+    found = (
+        (
+            (view_deg < FIELD_OF_VIEW[0]) | (view_deg > FIELD_OF_VIEW[1]),
+            f"a field of view of {{:.0f}} degrees, expected {FIELD_OF_VIEW[0]:.0f} to {FIELD_OF_VIEW[1]:.0f}: is K in "
+            "pixels, of photos of this size?",
+            view_deg,
+        ),
+        (
+            (np.abs(center / sizes - 0.5) > OFF_CENTER).any(1),
+            "a principal point {:.0%} of the photo's size beside its middle: is K that of photos of another size, or "
+            "before they were cropped?",
+            np.abs(center / sizes - 0.5).max(1),
+        ),
+        (
+            focal.max(1) > SQUARE * focal.min(1),
+            "focal lengths of x and y that differ by a factor of {:.2f}: was the photo scaled in one direction only?",
+            focal.max(1) / focal.min(1),
+        ),
+    )
+    findings = []
+    for is_odd, what, value in found:
+        if is_odd.any():
+            views = tuple(np.flatnonzero(is_odd).tolist())
+            sentence = f"{name_views(views, names)} have {what.format(value[is_odd].max())}"
+            findings.append(Finding(where="cameras", what=sentence, level="warning", views=views))
+    return findings
+
+
+def _world_findings(scene: Scene) -> list[Finding]:
+    findings = []
+    if not scene.unit:
+        what = "the cameras do not say their unit: lengths are in world units, unless --scale and --unit say it"
+        findings.append(Finding(where="cameras", what=what, level="note"))
+    if scene.up is None:
+        what = "the cameras do not say which way is up: heights and angles are not measured, unless --up says it"
+        findings.append(Finding(where="cameras", what=what, level="note"))
+    return findings
+
+
+def field_of_view(cameras: Cameras) -> Floats:
+    """(V,) degrees, along the diagonal of each photo."""
+    half = cameras.sizes.double() / 2 / torch.stack((cameras.K[:, 0, 0], cameras.K[:, 1, 1]), 1)
+    return np.asarray(torch.rad2deg(2 * half.norm(dim=1).atan()).numpy())
+
+
+def _other_reading(cameras: Cameras, coverage: Coverage) -> str | None:
+    """What R and t seem to be instead, as a sentence; None where they seem right.
+
+    Poses that are the wrong way round may still look at one point: cameras around a plant then stand close together and
+    look the same way, each turned about its own axis.
+    """
+    R, t, flip = cameras.R, cameras.t, torch.from_numpy(FLIP)
+    inverse = replace(cameras, R=R.mT, t=cameras.centers)
+    readings = (
+        (inverse, "R and t seem to map camera points to the world: write the inverse, R^T and -R^T t"),
+        (
+            replace(cameras, R=flip @ R, t=t @ flip),
+            "they seem to look along -z, as in OpenGL: negate rows 2 and 3 of R and t",
+        ),
+        (
+            replace(cameras, R=flip @ R.mT, t=cameras.centers @ flip),
+            "R and t seem to map points of OpenGL's cameras to the world, as Blender's do: invert them and negate rows "
+            "2 and 3",
+        ),
+    )
+    given = (int(coverage.sees.sum()), _widest_angle(cameras, coverage))
+    best = (0, 0.0, "")
+    for reading, what in readings:
+        if not bool(is_coincident(reading).all()):
+            found = find_coverage(reading)
+            best = max(best, (int(found.sees.sum()), round(_widest_angle(reading, found), 3), what))
+    num, angle, what = best
+    if num < ALL * len(cameras):
+        return None
+    if given[0] < MOST * len(cameras):
+        return f"the cameras do not look at one place; {what}, and {num} of {len(cameras)} would"
+    if given[1] * WIDER < angle:
+        facts = f"the cameras look from directions that differ by {given[1]:.0f} degrees only"
+        return f"{facts}; {what}, and they differ by {angle:.0f}"
+    return None
+
+
+def _widest_angle(cameras: Cameras, coverage: Coverage) -> float:
+    """Degrees between the most different rays of the cameras that look at the point; 0 if fewer than two do."""
+    toward = coverage.point - cameras.centers.numpy()[coverage.sees]
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True).clip(min=1e-300)
+    return float(np.degrees(np.arccos(np.clip(toward @ toward.T, -1, 1).min()))) if len(toward) > 1 else 0.0
+
+
+def _look(cameras: Cameras, points: Tensor) -> tuple[Tensor, Tensor]:
+    """(V, P) bool, which cameras have which points in their images, and (V, P) how far from the middle; 1 = border."""
+    px, depth = cameras.project(points)
+    off = (px / cameras.sizes[:, None] - 0.5).abs().amax(2) * 2
+    sees = (depth > 0) & (off < 1)
+    return sees, torch.where(sees, off, 1.0)

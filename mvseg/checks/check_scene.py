@@ -1,0 +1,76 @@
+"""All checks of one scene, as a report that the command prints and a page can show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from mvseg.checks.cameras import Coverage, camera_findings, find_coverage
+from mvseg.checks.finding import Finding
+from mvseg.checks.masks import mask_findings
+from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
+from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
+from mvseg.matching.epipolar import is_coincident
+from mvseg.matching.match import check_views
+from mvseg.regions import Regions
+from mvseg.scene import Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What the checks of a scene found.
+
+    Attributes:
+        scene: that was checked.
+        regions: its masks, None without any.
+        findings: in the order cameras, photos, masks, poses; empty for a sound scene that says its unit and up.
+        coverage: what the cameras look at.
+        photos: one entry per view.
+        agreement: of the masks with the poses; None without masks, or if all cameras are at one place.
+    """
+
+    scene: Scene
+    regions: Regions | None
+    findings: tuple[Finding, ...]
+    coverage: Coverage
+    photos: tuple[PhotoFacts, ...]
+    agreement: PoseAgreement | None
+
+    @property
+    def has_errors(self) -> bool:
+        return any(finding.level == "error" for finding in self.findings)
+
+
+def check_scene(scene: Scene, regions: Regions | None = None, *, progress: bool = False) -> Check:
+    """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks.
+
+    Nothing is matched. Photos are decoded, one at a time. Everything runs on the CPU, wherever the inputs are.
+
+    Args:
+        scene: of V views; photos may be absent.
+        regions: its masks.
+        progress: show progress bars.
+
+    Raises:
+        InputError: regions and scene of different numbers of views.
+    """
+    scene = replace(scene, cameras=scene.cameras.to("cpu"))
+    regions = None if regions is None else regions.to("cpu")
+    names = tuple(view.name for view in scene.views)
+    coverage = find_coverage(scene.cameras)
+    photos = read_photo_facts(scene, progress=progress)
+    findings = camera_findings(scene, coverage) + photo_findings(photos, scene, has_masks=regions is not None)
+    agreement = None
+    if regions is not None:
+        check_views(regions, scene.cameras)
+        findings += mask_findings(regions, scene.cameras, names)
+        if not bool(is_coincident(scene.cameras).all()):
+            agreement = pairwise_agreement(regions, scene.cameras, progress=progress)
+            findings += pose_findings(agreement, names)
+    return Check(
+        scene=scene,
+        regions=regions,
+        findings=tuple(findings),
+        coverage=coverage,
+        photos=tuple(photos),
+        agreement=agreement,
+    )

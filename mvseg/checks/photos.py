@@ -1,0 +1,141 @@
+"""Photos against their cameras, and photos that show nothing."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from tqdm import tqdm
+
+from mvseg.checks.finding import Finding, name_views
+from mvseg.errors import InputError
+from mvseg.formats.image_file import is_turned, read_image_size, read_rgb
+from mvseg.scene import Scene
+
+BLANK = 4.0  # grey levels: standard deviation of a photo of nothing
+DARK = 30  # grey level that 99 % of the pixels stay below
+BRIGHT, BURNT = 250, 0.7  # grey level of all channels; share of the pixels from which a photo is overexposed
+STEP = 4  # every fourth row and column is looked at
+
+
+@dataclass(frozen=True)
+class PhotoFacts:
+    """One photo.
+
+    Attributes:
+        size: width and height as stored; None for a photo that is missing or cannot be read.
+        problem: why it cannot be read; "" otherwise, also for a missing one.
+        turned: EXIF asks viewers to turn it.
+        contrast: standard deviation of its grey levels.
+        level: grey level that 99 % of the pixels stay below.
+        burnt: share of its pixels that are white.
+        digest: hash of the file.
+    """
+
+    size: tuple[int, int] | None = None
+    problem: str = ""
+    turned: bool = False
+    contrast: float = 0.0
+    level: float = 0.0
+    burnt: float = 0.0
+    digest: str = ""
+
+
+def read_photo_facts(scene: Scene, *, progress: bool = False) -> list[PhotoFacts]:
+    """One entry per view; each photo is decoded once."""
+    paths = [view.path for view in scene.views]
+    return [_read_facts(path) for path in tqdm(paths, desc="photos", unit="photo", disable=not progress)]
+
+
+def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) -> list[Finding]:
+    """What is wrong with the photos of V views.
+
+    Args:
+        facts: V entries.
+        scene: whose cameras and names they are compared with.
+        has_masks: masks are given, so that all photos may be missing.
+    """
+    names = tuple(view.name for view in scene.views)
+    missing = tuple(view for view, each in enumerate(facts) if each.size is None and not each.problem)
+    if len(missing) == len(facts):
+        if has_masks:
+            what = "there are no photos: traits have no colours, and overlays are black"
+            return [Finding(where="photos", what=what, level="note")]
+        what = f"there are neither photos nor masks: add {scene.views[0].path} and the others, or give --masks"
+        return [Finding(where="photos", what=what, level="error")]
+    findings = []
+    if missing:
+        what = f"{name_views(missing, names)}: no photo, the first is {scene.views[missing[0]].path}; add it, or take "
+        findings.append(Finding(where="photos", what=f"{what}its camera out", level="error", views=missing))
+    for view, each in enumerate(facts):
+        if each.problem:
+            what = f"the photo of {name_views((view,), names)} cannot be read ({each.problem}): export it again"
+            findings.append(Finding(where="photos", what=what, level="error", views=(view,)))
+    return [*findings, *_size_findings(facts, scene, names), *_content_findings(facts, names)]
+
+
+def _size_findings(facts: list[PhotoFacts], scene: Scene, names: tuple[str, ...]) -> list[Finding]:
+    findings = []
+    expected = [tuple(size) for size in scene.cameras.sizes.tolist()]
+    wrong = [view for view, each in enumerate(facts) if each.size is not None and each.size != expected[view]]
+    by_size: dict[tuple[tuple[int, int], tuple[int, ...]], list[int]] = defaultdict(list)
+    for view in wrong:
+        size = facts[view].size
+        assert size is not None
+        by_size[size, expected[view]].append(view)
+    for (size, camera), views in by_size.items():
+        step = "scale K with the photos, or use the photos that the cameras were calibrated on"
+        if size == camera[::-1]:
+            step = "the photos were turned after the calibration; turn them back"
+        what = f"{name_views(tuple(views), names)}: the photo is {size[0]} x {size[1]}, its camera says {camera[0]} x "
+        findings.append(Finding(where="photos", what=f"{what}{camera[1]}: {step}", level="error", views=tuple(views)))
+    turned = tuple(view for view, each in enumerate(facts) if each.turned)
+    if turned:
+        what = f"EXIF turns {name_views(turned, names)} for display: cameras and masks must be of the pixels as stored"
+        findings.append(Finding(where="photos", what=what, level="warning", views=turned))
+    return findings
+
+
+def _content_findings(facts: list[PhotoFacts], names: tuple[str, ...]) -> list[Finding]:
+    findings = []
+    whole = [view for view, each in enumerate(facts) if each.size is not None]
+    blank = tuple(view for view in whole if facts[view].contrast < BLANK)
+    dark = tuple(view for view in whole if view not in blank and facts[view].level < DARK)
+    burnt = tuple(view for view in whole if view not in blank and facts[view].burnt > BURNT)
+    if blank:
+        what = f"the photos of {name_views(blank, names)} show nothing (one colour all over): leave them out"
+        findings.append(Finding(where="photos", what=what, level="error", views=blank))
+    for views, fault in ((dark, "nearly black"), (burnt, "overexposed")):
+        if views:
+            what = f"the photos of {name_views(views, names)} are {fault}: detectors will find few leaves there"
+            findings.append(Finding(where="photos", what=what, level="warning", views=views))
+    same: dict[str, list[int]] = defaultdict(list)
+    for view in whole:
+        same[facts[view].digest].append(view)
+    for twins in same.values():
+        if len(twins) > 1:
+            what = f"{name_views(tuple(twins), names)} are the same photo: check which one belongs to which camera"
+            findings.append(Finding(where="photos", what=what, level="error", views=tuple(twins)))
+    return findings
+
+
+def _read_facts(path: Path) -> PhotoFacts:
+    if not path.is_file():
+        return PhotoFacts()
+    try:
+        size = read_image_size(path)
+        pixels = read_rgb(path)[::STEP, ::STEP]
+    except InputError as error:
+        return PhotoFacts(problem=str(error))
+    grey = pixels.mean(2)
+    return PhotoFacts(
+        size=size,
+        turned=is_turned(path),
+        contrast=float(grey.std()),
+        level=float(np.quantile(grey, 0.99)),
+        burnt=float((pixels.min(2) >= BRIGHT).mean()),
+        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
+    )

@@ -1,0 +1,275 @@
+"""Do the masks of the views agree with the poses? Told by where the masks begin and end, without any matching.
+
+A leaf that two photos show whole touches the same two half-planes of the views' pencil: its mask begins and ends at the
+same angles in both. So with right poses a good part of the masks of a view has a mask in another view that begins and
+ends where it does, to the pixel. With wrong poses only chance makes that so, and how often chance does is measured by
+moving the masks of the other view along the angles. The move at which most masks agree is the error of the epipolar
+lines: it is 0 for right poses. Missing, merged and half-hidden masks cost agreement, but move nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+from tqdm import tqdm
+
+from mvseg.checks.finding import Finding, Level, name_views
+from mvseg.matching.epipolar import Pencil, epipolar_pencil, is_coincident
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+Floats = NDArray[np.float64]
+
+NUM_MOVES = 16  # of a view's masks, to see what chance does
+MOST_PARTNERS = 20  # views that each view is compared with
+WIDEST = 1.5  # radians; a mask that fills more of the pencil holds the epipole and begins and ends nowhere
+UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit of offset: masks of large photos are drawn less exactly
+MOST_OFFSET = 40  # units, tried in both directions
+SHARPNESS = 2.0  # units, of the vote for an offset
+# Of the 96 development scenes (48 plants, true and degraded masks), see `view_is_off`.
+CHANCE, OFF = 0.22, 3.0
+# Chosen on 96 development scenes (48 simulated plants with true and with degraded masks) with eight faults in each: no
+# sound view was off, see docs/check.md.
+CHANCE, OFFSET = 0.22, 1.5  # fitting share, units
+MOST_AGREE = 0.3  # quantile of the offsets over the other views: noise alone puts some of them at 0
+FEW_MASKS = 10  # of two views, in the median: one faulty mask is too large a share of fewer
+FEW_VIEWS = 4  # with fewer, no view is outvoted
+SPECK = 0.002  # share of a mask's pixels
+
+
+@dataclass(frozen=True, eq=False)
+class PoseAgreement:
+    """How the masks of each pair of V views agree; symmetric, nan for pairs that were not compared.
+
+    Attributes:
+        fitting: (V, V) share of the masks of both views whose best partner in the other view fits better than under any
+            move of the other view's masks; by chance it is about 0.06.
+        num_masks: (V, V) int64, masks of both views that were compared.
+        offset: (V, V) units; distance by which the epipolar lines miss, told by the move at which most masks agree.
+        unit_px: pixels per unit of `offset`; the offset is not known more exactly.
+    """
+
+    fitting: Floats
+    num_masks: NDArray[np.int64]
+    offset: Floats
+    unit_px: float
+
+
+@dataclass(frozen=True, eq=False)
+class ViewAgreement:
+    """How each view agrees with those that agree among each other.
+
+    Attributes:
+        fitting: (V,) as in `PoseAgreement`, over all of these; nan for a view that was compared with none.
+        offset_px: (V,) by how much epipolar lines miss in at least 70 % of these, pixels.
+        off: views that agree with none of them.
+        agree: whether most of the views agree; if not, `off` is empty.
+    """
+
+    fitting: Floats
+    offset_px: Floats
+    off: tuple[int, ...]
+    agree: bool
+
+
+@dataclass(frozen=True, eq=False)
+class _Hulls:
+    """The convex hulls of N masks: a mask begins and ends at corners of its hull. (P, 2) pixels, and (P,) whose."""
+
+    corners: Tensor
+    owner: Tensor
+    num: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Spans:
+    """Where N masks begin and end in a pencil: (N, 2) radians, and (N, 2) radians per pixel there."""
+
+    ends: Tensor
+    pitch: Tensor
+
+
+def pairwise_agreement(regions: Regions, cameras: Cameras, *, progress: bool = False) -> PoseAgreement:
+    """How the masks of each pair of views agree with the poses.
+
+    Masks that touch the border are left out: where they would end is not known. With more than 20 other views, each is
+    compared with 20 or more of them.
+
+    Args:
+        regions: D regions in V views.
+        cameras: V >= 2 cameras.
+        progress: show a progress bar over the pairs of views.
+    """
+    num_views = len(cameras)
+    regions, cameras = regions.to("cpu"), cameras.to("cpu")
+    sizes = cameras.sizes[regions.view_index]
+    is_cut = ((regions.boxes[:, :2] <= 0) | (regions.boxes[:, 2:] >= sizes)).any(1)
+    regions = regions.select(~is_cut)
+    hulls = [_hulls(regions, view) for view in range(num_views)]
+    fitting, offset = np.full((2, num_views, num_views), np.nan)
+    num_masks = np.zeros((num_views, num_views), np.int64)
+    unit_px = max(1.0, float(cameras.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL)
+    skip = is_coincident(cameras).tolist()
+    pairs = [(i, j) for i, j in _chosen_pairs(num_views) if hulls[i].num and hulls[j].num and not skip[i][j]]
+    for i, j in tqdm(pairs, desc="poses", unit="pair", disable=not progress):
+        pencil = epipolar_pencil(cameras, i, j)
+        first, second = _spans(pencil, 0, hulls[i]), _spans(pencil, 1, hulls[j])
+        if len(first.ends) and len(second.ends):
+            is_fitting = torch.cat(_beats_chance(first, second))
+            num_masks[i, j] = num_masks[j, i] = len(is_fitting)
+            fitting[i, j] = fitting[j, i] = float(is_fitting.double().mean())
+            offset[i, j] = offset[j, i] = _offset(first, second, unit_px)
+    return PoseAgreement(fitting=fitting, num_masks=num_masks, offset=offset, unit_px=unit_px)
+
+
+def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
+    """Which views agree: the worst one that agrees with none is set apart, again and again, until the others agree.
+
+    A view agrees with none if hardly more of its masks fit than by chance, and the lines miss in most other views. The
+    rest must be more than half of the views, and at least two.
+    """
+    num_views = len(pairs.fitting)
+    kept, off = list(range(num_views)), []
+    while len(kept) > 1:
+        fitting, offset = _against(pairs, kept)
+        is_off = [view for view in kept if fitting[view] < CHANCE and offset[view] >= OFFSET]
+        if not is_off:
+            break
+        worst = min(is_off, key=lambda view: (fitting[view], -offset[view]))
+        kept.remove(worst)
+        off.append(worst)
+    agree = len(kept) > max(1, num_views / 2)
+    fitting, offset = _against(pairs, kept if agree else list(range(num_views)))
+    return ViewAgreement(
+        fitting=fitting, offset_px=offset * pairs.unit_px, off=tuple(sorted(off)) if agree else (), agree=agree
+    )
+
+
+def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]:
+    """Views whose poses and masks contradict the others.
+
+    Args:
+        pairs: of V views.
+        names: of the V views.
+
+    Returns:
+        An error for each view that agrees with none, or one for the whole scene if most do not (warnings where views
+        or masks are few); a warning for lines that miss a little. Nothing where there are no masks to compare.
+    """
+    view = view_agreement(pairs)
+    compared = pairs.num_masks[pairs.num_masks > 0]
+    if not len(compared):
+        return []
+    is_sure = np.median(compared) >= FEW_MASKS and len(names) >= FEW_VIEWS
+    level: Level = "error" if is_sure else "warning"
+    if not view.agree:
+        share, px = np.nanmedian(view.fitting), np.nanmedian(view.offset_px)
+        facts = f"only {share:.0%} of the masks end where others do, epipolar lines miss by {px:.0f} px or more"
+        question = "do R and t map world points to the camera, and does each mask belong to its photo?"
+        what = f"masks and poses of most views disagree ({facts}): {question}"
+        return [Finding(where="poses", what=what, level=level)]
+    findings = []
+    for index in view.off:
+        facts = f"{view.fitting[index]:.0%} of its masks fit, epipolar lines miss by {view.offset_px[index]:.0f} px"
+        what = f"{name_views((index,), names)} agrees with none of the others ({facts} or more): it has the pose or "
+        step = "the masks of another photo, or was moved; mend it or leave it out"
+        findings.append(Finding(where="poses", what=what + step, level=level, views=(index,)))
+    missed = np.flatnonzero(view.offset_px >= OFFSET * pairs.unit_px).tolist() if len(names) >= FEW_VIEWS else []
+    missing = tuple(index for index in missed if index not in view.off)
+    if missing:
+        most = np.nanmax(view.offset_px[list(missing)])
+        step = "refine the poses, as with COLMAP's bundle adjustment"
+        what = f"epipolar lines of {name_views(missing, names)} miss by up to {most:.0f} px: {step}"
+        findings.append(Finding(where="poses", what=what, level="warning", views=missing))
+    return findings
+
+
+def _against(pairs: PoseAgreement, kept: list[int]) -> tuple[Floats, Floats]:
+    """(V,) fitting share and median offset of every view against those that are kept; nan without any."""
+    fitting, offset = np.full((2, len(pairs.fitting)), np.nan)
+    for view in range(len(fitting)):
+        others = [other for other in kept if other != view and pairs.num_masks[view, other]]
+        if others:
+            fitting[view] = np.average(pairs.fitting[view, others], weights=pairs.num_masks[view, others])
+            offset[view] = np.quantile(pairs.offset[view, others], MOST_AGREE)
+    return fitting, offset
+
+
+def _chosen_pairs(num_views: int) -> list[tuple[int, int]]:
+    """Neighbours, far views, and some between. A step of the list reaches one view on either side."""
+    steps = np.linspace(1, num_views - 1, min(num_views - 1, MOST_PARTNERS)).round().astype(int)
+    return [(i, i + step) for step in dict.fromkeys(steps.tolist()) for i in range(num_views - step)]
+
+
+def _hulls(regions: Regions, view: int) -> _Hulls:
+    corners, members = [np.zeros((0, 2))], (regions.view_index == view).nonzero()[:, 0].tolist()
+    for index in members:
+        hull = cv2.convexHull(cv2.findNonZero(without_specks(regions.crop(index).numpy())))
+        corners.append(hull[:, 0] + regions.boxes[index, :2].numpy() + 0.5)
+    owner = np.repeat(np.arange(len(members)), [len(hull) for hull in corners[1:]])
+    return _Hulls(torch.from_numpy(np.concatenate(corners)), torch.from_numpy(owner), len(members))
+
+
+def without_specks(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A mask (H, W) without its specks, the pieces with less than 0.2 % of its pixels: they would be its ends."""
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
+    is_kept = stats[:, cv2.CC_STAT_AREA] >= SPECK * mask.sum()
+    is_kept[0] = False
+    return is_kept[pieces].astype(np.uint8) if is_kept.any() else mask.astype(np.uint8)
+
+
+def _spans(pencil: Pencil, side: int, hulls: _Hulls) -> _Spans:
+    """Begin and end of each mask that does not hold the epipole."""
+    xy, owner, num = hulls.corners, hulls.owner, hulls.num
+    plane = pencil.plane_from_px[side]
+    x, y = (xy @ plane[:, :2].T + plane[:, 2]).unbind(1)
+    angle = torch.atan2(y, x)
+    across = x[:, None] * plane[1, :2] - y[:, None] * plane[0, :2]
+    pitch = across.norm(dim=1) / (x.square() + y.square()).clamp(min=torch.finfo(x.dtype).tiny)
+    ends, at_ends = [], []
+    for sign in (1, -1):
+        start = torch.full((num,), math.inf).double().scatter_reduce(0, owner, sign * angle, "amin")
+        is_there = sign * angle == start[owner]
+        at_ends.append(torch.zeros(num).double().scatter(0, owner[is_there], pitch[is_there]))
+        ends.append(sign * start)
+    spans, pitches = torch.stack(ends, 1), torch.stack(at_ends, 1)
+    is_span = (spans[:, 1] - spans[:, 0] < WIDEST) & (pitches > 0).all(1)
+    return _Spans(spans[is_span], pitches[is_span])
+
+
+def _misses(first: _Spans, second: _Spans, moves: Tensor) -> Tensor:
+    """(S, N, M) pixels: how far the masks of two views are from beginning and ending together, after S moves (S, M) of
+    the second view's masks, radians."""
+    apart = first.ends[:, None] - second.ends
+    px = torch.hypot(first.pitch[:, None], second.pitch)
+    return ((apart - moves[:, None, :, None]) / px).abs().amax(3)
+
+
+def _beats_chance(first: _Spans, second: _Spans) -> tuple[Tensor, Tensor]:
+    """(N,) and (M,) bool: the best partner fits better than under any of the moves, which keep the masks where masks
+    are: they go round within the angles that the second view's masks cover."""
+    middle = second.ends.mean(1)
+    reach = torch.maximum(middle.max() - middle.min(), (second.ends[:, 1] - second.ends[:, 0]).mean())
+    low = (middle.max() + middle.min() - reach) / 2
+    steps = torch.arange(NUM_MOVES + 1).double()[:, None] / (NUM_MOVES + 1)
+    moves = low + (middle - low + steps * reach) % reach.clamp(min=1e-12) - middle
+    moves[0] = 0
+    misses = _misses(first, second, moves)
+    best = misses.amin(2), misses.amin(1)
+    return best[0][0] < best[0][1:].amin(0), best[1][0] < best[1][1:].amin(0)
+
+
+def _offset(first: _Spans, second: _Spans, unit_px: float) -> float:
+    """The move, in units and without sign, at which most masks of two views begin and end together."""
+    units = torch.arange(-MOST_OFFSET, MOST_OFFSET + 1).double()
+    apart = (first.ends[:, None] - second.ends) / torch.hypot(first.pitch[:, None], second.pitch) / unit_px
+    misses = (apart - units[:, None, None, None]).abs().amax(3)
+    votes = sum(torch.exp(-((misses.amin(axis) / SHARPNESS) ** 2)).sum(1) for axis in (1, 2))
+    assert isinstance(votes, Tensor)
+    return float(units[votes == votes.max()].abs().min())

@@ -1,0 +1,178 @@
+"""Cameras on their own: each fault has its sentence, and sound cameras have none."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mvseg.checks.camera_plan import FAULT, INK, POINT, draw_cameras
+from mvseg.checks.cameras import FLIP, camera_findings, field_of_view, find_coverage
+from mvseg.checks.finding import Finding
+from mvseg.scene import Cameras, Scene
+from synthetic import arc_positions, cameras_at, moved
+
+Fault = Callable[[Cameras], Cameras]
+
+
+def findings_of(scene: Scene, cameras: Cameras) -> list[Finding]:
+    scene = replace(scene, cameras=cameras)
+    return camera_findings(scene, find_coverage(cameras))
+
+
+def rotation(axis: list[float], degrees: float) -> Tensor:
+    vector = np.radians(degrees) * np.array(axis) / np.linalg.norm(axis)
+    return torch.from_numpy(cv2.Rodrigues(vector)[0])
+
+
+def turned(cameras: Cameras, view: int, degrees: float) -> Cameras:
+    """One camera turned about its own upright axis."""
+    R, t, turn = cameras.R.clone(), cameras.t.clone(), rotation([0, 1, 0], degrees)
+    R[view], t[view] = turn @ R[view], turn @ t[view]
+    return replace(cameras, R=R, t=t)
+
+
+def edited(cameras: Cameras, view: int, change: Callable[[Tensor, Tensor], None]) -> Cameras:
+    """`change` may write into K and t of one view."""
+    K, t = cameras.K.clone(), cameras.t.clone()
+    change(K[view], t[view])
+    return replace(cameras, K=K, t=t)
+
+
+def inverted(cameras: Cameras) -> Cameras:
+    return replace(cameras, R=cameras.R.mT, t=cameras.centers)
+
+
+def flipped(cameras: Cameras) -> Cameras:
+    flip = torch.from_numpy(FLIP)
+    return replace(cameras, R=flip @ cameras.R, t=cameras.t @ flip)
+
+
+def test_sound_cameras_have_no_finding(demo_scene: Scene) -> None:
+    assert findings_of(demo_scene, demo_scene.cameras) == []
+
+
+@pytest.mark.parametrize("num_views", [4, 5, 12, 30])
+def test_cameras_on_an_arc_have_no_finding(num_views: int, demo_scene: Scene) -> None:
+    scene = replace(demo_scene, views=tuple(replace(demo_scene.views[0], name=str(view)) for view in range(num_views)),
+                    cameras=cameras_at(arc_positions(num_views)))  # fmt: skip
+    assert findings_of(scene, scene.cameras) == []
+
+
+def test_many_cameras_need_little_memory(demo_scene: Scene) -> None:
+    cameras = cameras_at(arc_positions(400))
+    coverage = find_coverage(cameras)
+    assert coverage.sees.all()
+    assert np.linalg.norm(coverage.point) < 1.0
+    assert coverage.angle.max() < 2
+
+
+def test_absurd_numbers_are_borne(demo_scene: Scene) -> None:
+    for factor in (1e-9, 1e9):
+        assert find_coverage(demo_scene.cameras.scale(factor)).sees.all()
+    same = replace(demo_scene.cameras, R=demo_scene.cameras.R[[0] * 6 + [1, 2, 3]],
+                   t=demo_scene.cameras.t[[0] * 6 + [1, 2, 3]])  # fmt: skip
+    found = findings_of(demo_scene, same)
+    assert [each.views for each in found if "stand where others stand" in each.what] == [(0, 1, 2, 3, 4, 5)]
+
+
+def test_another_world_changes_nothing(demo_scene: Scene) -> None:
+    turn = rotation([1, 2, 3], 70)
+    cameras = moved(demo_scene.cameras, 0.013, turn, torch.tensor([5.0, -3.0, 100.0]).double())
+    here, there = find_coverage(demo_scene.cameras), find_coverage(cameras)
+    assert there.sees.all()
+    np.testing.assert_allclose(there.angle, here.angle, atol=0.5)  # points of several rays are equally good
+    expected = 0.013 * turn.numpy() @ here.point + [5, -3, 100]
+    np.testing.assert_allclose(there.point, expected, atol=0.013 * 10)  # mm, of 400 to the cameras
+    assert findings_of(demo_scene, turned(cameras, 3, 60))[0].views == (3,)
+
+
+def test_the_point_is_where_the_plant_is(demo_scene: Scene) -> None:
+    """All cameras of the arc look at the origin: neighbours see it under the angle between their places."""
+    cameras = cameras_at(arc_positions(6))
+    coverage = find_coverage(cameras)
+    assert coverage.sees.all()
+    assert np.linalg.norm(coverage.point) < 1.0  # of 10 to the cameras
+    outwards = cameras.centers.numpy() / 10
+    apart = np.degrees(np.arccos(np.clip(outwards @ outwards.T, -1, 1))) + 360 * np.eye(6)
+    np.testing.assert_allclose(coverage.angle, apart.min(1), atol=4)
+
+
+@pytest.mark.parametrize(
+    ("fault", "level", "views", "words"),
+    [
+        (inverted, "error", (), "map camera points to the world: write the inverse"),
+        (flipped, "error", (), "negate rows 2 and 3 of R and t, and 9 of 9 would"),
+        (lambda cameras: inverted(flipped(cameras)), "error", (), "as Blender's do: invert them"),
+        (lambda cameras: turned(cameras, 4, 70), "error", (4,), "view 4 (004) look past the point"),
+        (lambda cameras: replace(cameras, R=cameras.R[[0] * 9], t=cameras.t[[0] * 9]), "error", (), "all cameras"),
+        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(1000)), "warning", (2,), "is t in another unit"),
+        (lambda cameras: edited(cameras, 5, lambda K, t: K[:2].mul_(2)), "warning", (5,), "is K that of photos of"),
+        (lambda cameras: edited(cameras, 5, lambda K, t: K[0, 0].mul_(1.5)), "warning", (5,), "a factor of 1.50"),
+    ],
+)  # fmt: skip
+def test_each_fault_has_its_sentence(
+    fault: Fault, level: str, views: tuple[int, ...], words: str, demo_scene: Scene
+) -> None:
+    found = findings_of(demo_scene, fault(demo_scene.cameras))
+    assert (level, views) in [(each.level, each.views) for each in found if words in each.what], found
+
+
+def test_a_field_of_view_that_no_lens_has(demo_scene: Scene) -> None:
+    K = demo_scene.cameras.K.clone()
+    K[1, [0, 1], [0, 1]] = 50.0  # millimetres, taken for pixels
+    cameras = replace(demo_scene.cameras, K=K)
+    np.testing.assert_allclose(field_of_view(cameras)[1], np.degrees(2 * np.arctan(400 / 50)))  # photos of 640 x 480
+    (found,) = findings_of(demo_scene, cameras)
+    assert found.views == (1,)
+    assert "is K in pixels" in found.what
+
+
+def test_views_from_one_side_only(demo_scene: Scene) -> None:
+    cameras = cameras_at(arc_positions(9, span=1.0)[[0, 2, 4, 6, 8, 0, 2, 4, 6]])
+    found = findings_of(demo_scene, cameras)
+    assert any("depth is hardly seen" in each.what for each in found)
+    (same,) = [each for each in found if "stand where others stand" in each.what]
+    assert same.views == (0, 1, 2, 3, 5, 6, 7, 8)
+
+
+def test_views_too_far_apart(demo_scene: Scene) -> None:
+    scene = replace(demo_scene, views=demo_scene.views[:2], cameras=demo_scene.cameras[[0, 4]])
+    (found,) = camera_findings(scene, find_coverage(scene.cameras))
+    assert (found.level, found.views) == ("warning", (0, 1))
+    assert "add photos between" in found.what
+
+
+def test_cameras_that_look_nowhere_together(demo_scene: Scene) -> None:
+    R, t = (part.clone() for part in (demo_scene.cameras.R, demo_scene.cameras.t))
+    for view in range(9):  # one at a place, all looking outwards along different axes
+        R[view] = rotation([0, 0, 1], 40.0 * view) @ demo_scene.cameras.R[0]
+        R[view] = R[view] @ rotation([0, 1, 0], 40.0 * view)
+        t[view] = -R[view] @ (torch.eye(3).double()[view % 3] * 0.01 * view)
+    found = findings_of(demo_scene, replace(demo_scene.cameras, R=R, t=t))
+    assert "error" in {each.level for each in found} or any("no point is seen by more" in each.what for each in found)
+
+
+def test_what_is_not_known_is_a_note(demo_scene: Scene) -> None:
+    found = findings_of(replace(demo_scene, unit="", up=None), demo_scene.cameras)
+    assert [(each.level, each.what.split(":")[0]) for each in found] == [
+        ("note", "the cameras do not say their unit"),
+        ("note", "the cameras do not say which way is up"),
+    ]
+
+
+def test_the_plan_shows_every_camera(demo_scene: Scene) -> None:
+    def count(picture: np.ndarray, color: tuple[int, int, int]) -> int:
+        return cv2.connectedComponents((picture == color).all(2).astype(np.uint8))[0] - 1
+
+    picture = draw_cameras(demo_scene, find_coverage(demo_scene.cameras))
+    assert (count(picture, POINT), count(picture, FAULT)) == (1, 0)
+    assert count(picture, INK) >= 9
+    cameras = turned(demo_scene.cameras, 3, 70)
+    faulty = draw_cameras(replace(demo_scene, cameras=cameras, up=None), find_coverage(cameras), off=(5,))
+    assert count(faulty, FAULT) >= 2

@@ -1,0 +1,89 @@
+"""Photos: each fault has its sentence, and sound photos have none."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvseg.checks.finding import Finding
+from mvseg.checks.photos import photo_findings, read_photo_facts
+from mvseg.formats.scene_folder import load_scene
+from scene_folders import HEIGHT, WIDTH, cut_file, edit_rig, write_image, write_scene
+
+Fault = Callable[[Path], object]
+
+
+def findings_of(folder: Path, *, has_masks: bool = False) -> list[Finding]:
+    scene = load_scene(folder)
+    return photo_findings(read_photo_facts(scene), scene, has_masks=has_masks)
+
+
+def photo(folder: Path, view: int) -> Path:
+    return folder / "images" / f"{view:03d}.png"
+
+
+def fill(folder: Path, view: int, color: int) -> None:
+    write_image(photo(folder, view), np.full((HEIGHT, WIDTH, 3), color, np.uint8))
+
+
+def lay_down(folder: Path, view: int) -> None:
+    write_image(photo(folder, view), cv2.imread(str(photo(folder, view))).transpose(1, 0, 2))
+
+
+def dim(folder: Path, view: int) -> None:
+    image = cv2.imread(str(photo(folder, view)))
+    write_image(photo(folder, view), image // 10 + np.arange(WIDTH, dtype=np.uint8)[None, :, None] // 8)
+
+
+def overexpose(folder: Path, view: int) -> None:
+    image = cv2.imread(str(photo(folder, view)))
+    image[:, : WIDTH * 4 // 5] = 255
+    write_image(photo(folder, view), image)
+
+
+def turn_by_exif(folder: Path, view: int) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    jpeg = folder / "images" / "turned.jpg"
+    Image.open(photo(folder, view)).save(jpeg, exif=exif)
+    edit_rig(folder, view, file="images/turned.jpg")
+
+
+def test_sound_photos_have_no_finding(tmp_path: Path) -> None:
+    assert findings_of(write_scene(tmp_path / "plant")) == []
+
+
+@pytest.mark.parametrize(
+    ("fault", "level", "views", "words"),
+    [
+        (lambda f: write_image(photo(f, 2), np.zeros((48, 64, 3), np.uint8)), "error", (2,), "scale K with the photos"),
+        (lambda f: lay_down(f, 1), "error", (1,), "turn them back"),
+        (lambda f: photo(f, 3).unlink(), "error", (3,), "no photo, the first is"),
+        (lambda f: cut_file(photo(f, 0), 0.5), "error", (0,), "cannot be read"),
+        (lambda f: fill(f, 1, 128), "error", (1,), "show nothing"),
+        (lambda f: [fill(f, view, 0) for view in (0, 1)], "error", (0, 1), "show nothing"),
+        (lambda f: dim(f, 2), "warning", (2,), "nearly black"),
+        (lambda f: overexpose(f, 2), "warning", (2,), "overexposed"),
+        (lambda f: turn_by_exif(f, 1), "warning", (1,), "EXIF turns view 1"),
+        (lambda f: shutil.copy(photo(f, 0), photo(f, 3)), "error", (0, 3), "are the same photo"),
+    ],
+)  # fmt: skip
+def test_each_fault_has_its_sentence(
+    fault: Fault, level: str, views: tuple[int, ...], words: str, tmp_path: Path
+) -> None:
+    folder = write_scene(tmp_path / "plant")
+    fault(folder)
+    found = [each for each in findings_of(folder) if words in each.what]
+    assert [(each.level, each.views) for each in found] == [(level, views)]
+
+
+def test_without_photos_masks_will_do(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant", images=False)
+    assert [each.level for each in findings_of(folder, has_masks=True)] == ["note"]
+    assert [each.level for each in findings_of(folder)] == ["error"]

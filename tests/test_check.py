@@ -1,0 +1,114 @@
+"""`mvseg check`: what a user sees, and the exit code."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import warnings
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mvseg.checks.check_scene import check_scene
+from mvseg.cli import main
+from mvseg.demo import demo_scene as demo_folder
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.regions import Regions
+from mvseg.scene import Scene
+from scene_folders import write_image, write_scene
+
+
+@pytest.fixture
+def plant(tmp_path: Path) -> Path:
+    """A copy of the shipped scene, for tests that break it."""
+    return Path(shutil.copytree(demo_folder(), tmp_path / "plant"))
+
+
+def test_a_good_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(demo_folder()), "--masks", "masks", "--quiet", "--out", str(tmp_path / "out")]) == 0
+    said = capsys.readouterr().out
+    assert "9 cameras, unit mm, up 0.00 0.00 1.00" in said
+    assert "9 of 9 look at one point; 9 photos; 108 masks" in said
+    assert said.endswith("\nnothing would go wrong\n")
+    content = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert content["findings"] == []
+    assert [view["masks"] for view in content["views"]] == [12] * 9
+    assert [view["miss_px"] for view in content["views"]] == [0] * 9
+    assert cv2.imread(str(tmp_path / "out" / "cameras.png")).shape == (900, 900, 3)
+
+
+def test_a_fault_is_an_exit_code_of_1(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = json.loads((plant / "cameras.json").read_text())
+    first, second = rig["views"][2], rig["views"][5]
+    for key in ("R", "t"):
+        first[key], second[key] = second[key], first[key]
+    (plant / "cameras.json").write_text(json.dumps(rig))
+    assert main(["check", str(plant), "--masks", "masks", "--quiet", "--out", str(tmp_path / "out")]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert [line[:35] for line in lines[-2:]] == [f"error    poses    view {view} (00{view}) agre" for view in (2, 5)]
+    content = json.loads((tmp_path / "out" / "check.json").read_text())
+    assert [finding["views"] for finding in content["findings"]] == [[2], [5]]
+    assert (cv2.imread(str(tmp_path / "out" / "cameras.png")) == (39, 48, 215)).all(2).any()  # red, as OpenCV has it
+
+
+def test_a_warning_is_none(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_image(plant / "masks" / "004.png", np.zeros((480, 640), np.uint16))
+    assert main(["check", str(plant), "--masks", "masks", "--quiet"]) == 0
+    assert "warning  masks    there are no masks in view 4 (004)" in capsys.readouterr().out
+
+
+def test_what_readers_warn_of_is_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    folder = write_scene(tmp_path / "plant")
+    for path in (folder / "masks").iterdir():
+        write_image(path, np.where(cv2.imread(str(path), -1) > 0, 255, 0).astype(np.uint8))
+    assert main(["check", str(folder), "--masks", "masks", "--quiet"]) == 0
+    captured = capsys.readouterr()
+    assert "holds 0 and 255 only" in captured.out
+    assert captured.err == ""
+
+
+def test_masks_that_cannot_be_read_come_after_what_can(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_image(plant / "masks" / "004.png", np.zeros((48, 64), np.uint16))
+    shutil.rmtree(plant / "images")
+    assert main(["check", str(plant), "--masks", "masks", "--quiet"]) == 2
+    captured = capsys.readouterr()
+    assert "9 of 9 look at one point; 0 photos" in captured.out
+    assert "neither photos nor masks" not in captured.out
+    assert "nothing would go wrong" not in captured.out
+    assert captured.err.startswith("mvseg: error: ")
+    assert "64 x 48" in captured.err
+
+
+def test_no_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(tmp_path / "nothing"), "--quiet"]) == 2
+    assert capsys.readouterr().err == f"mvseg: error: {tmp_path / 'nothing'}: no such scene folder\n"
+
+
+def test_from_python(demo_scene: Scene, demo_regions: Regions) -> None:
+    check = check_scene(demo_scene, demo_regions)
+    assert check.findings == ()
+    assert not check.has_errors
+    assert check_scene(demo_scene).agreement is None
+    few = Scene(name="few", views=demo_scene.views[:5], cameras=demo_scene.cameras[:5])
+    with pytest.raises(InputError, match="regions of 9 views with 5 cameras"):
+        check_scene(few, demo_regions)
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize(
+    ("plant", "masks"),
+    [("basil-0729", "masks"), ("maize-plant1", "silhouettes"), ("fern-llff", None)]
+)
+def test_real_plants_have_no_error(plant: str, masks: str | None, shared_data: Path) -> None:
+    scene = load_scene(shared_data / plant)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        regions = None if masks is None else load_masks(scene, shared_data / plant / masks)
+    check = check_scene(scene, regions)
+    assert not check.has_errors
+    warned = [finding.what.split(" have ")[-1] for finding in check.findings if finding.level == "warning"]
+    expected = ["stray pixels far from the rest of them: remove the small pieces"] if plant == "maize-plant1" else []
+    assert warned == expected

@@ -1,0 +1,170 @@
+"""The documents: commands and notebooks run, the site is built from files alone, and nothing public is left out."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import pytest
+
+import mvseg
+import mvseg.matching
+from mvseg.cli import main
+from mvseg.cli.options import find_config
+from mvseg.errors import InputError
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
+# what a browser fetches by itself
+LOADED = re.compile(r"<(?:script|img|iframe|source)\b[^>]*\bsrc=\"?([^\s\">]+)|<link\b[^>]*>|url\(([^)]+)\)")
+
+
+@pytest.fixture
+def pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The hooks of the site."""
+    pytest.importorskip("mkdocs")
+    pytest.importorskip("nbconvert")
+    monkeypatch.syspath_prepend(str(ROOT / ".ci"))
+    return import_module("mkdocs_pages")
+
+
+def test_the_guides_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of them, as they stand, one after the other; on five of the nine photos, which is quicker."""
+    blocks = re.findall(r"```\n(.*?)```", (DOCS / "guide.md").read_text(encoding="utf-8"), re.DOTALL)
+    lines = [line for block in blocks for line in block.strip().splitlines()]
+    assert len(lines) == 6
+    monkeypatch.chdir(tmp_path)
+    for line in lines:
+        words = shlex.split(line, comments=True)
+        if words[0] == "python":
+            subprocess.run([sys.executable, *words[1:]], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
+            rig = json.loads(Path("plant/cameras.json").read_text())
+            Path("plant/cameras.json").write_text(json.dumps(rig | {"views": rig["views"][::2]}))
+        else:
+            assert words[0] == "mvseg"
+            assert main(words[1:]) == 0, line
+    assert (tmp_path / "results" / "plant" / "traits_wide.csv").is_file()
+    assert json.loads((tmp_path / "ids" / "plant" / "metrics.json").read_text())["ari"] == 1
+
+
+def commands_of(page: Path) -> list[list[str]]:
+    """Commands `mvseg ...` in the code blocks of a page."""
+    blocks = re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    lines = [line for block in blocks for line in block.strip().splitlines()]
+    return [words[1:] for line in lines if (words := shlex.split(line, comments=True)) and words[0] == "mvseg"]
+
+
+@pytest.mark.parametrize("name", ["check", "own-masks", "own-cameras", "fine-tune"])
+def test_other_commands_are_understood(name: str) -> None:
+    from mvseg.cli.command import build_parser
+
+    commands = commands_of(DOCS / f"{name}.md")
+    assert commands
+    for words in commands:
+        build_parser().parse_args(words)
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_notebooks_run_and_print_what_they_show(path: Path, tmp_path: Path) -> None:
+    nbformat = pytest.importorskip("nbformat")
+    pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    runner = tmp_path / "run.py"  # a process of its own: Jupyter's event loop leaves warnings behind
+    runner.write_text(
+        "import nbclient, nbformat, sys\n"
+        "book = nbformat.read(sys.argv[1], 4)\n"
+        "nbclient.NotebookClient(book, timeout=600, kernel_name='python3').execute()\n"
+        "nbformat.write(book, sys.argv[2])\n"
+    )
+    command = [sys.executable, str(runner), str(path), str(tmp_path / "run.ipynb")]
+    subprocess.run(command, check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": str(ROOT)}, capture_output=True)
+    shown, printed = (_text_outputs(nbformat.read(each, 4)) for each in (path, tmp_path / "run.ipynb"))
+    assert any(shown)
+    assert printed == shown
+
+
+def _text_outputs(book: Any) -> list[str]:
+    cells = [cell for cell in book.cells if cell.cell_type == "code"]
+    return ["".join(output.get("text", "") for output in cell.outputs) for cell in cells]
+
+
+def test_every_public_name_is_on_the_page() -> None:
+    listed = re.findall(r"^::: mvseg\.(\w+)$", (DOCS / "api.md").read_text(encoding="utf-8"), re.MULTILINE)
+    assert sorted(listed) == sorted(set(mvseg.__all__) - {"__version__"})
+    assert set(mvseg.matching.__all__) <= set(listed)
+
+
+def test_pages_that_nobody_listed_are_shown(pages: ModuleType) -> None:
+    nav = pages.order_pages(["guide.md", "index.md", "harvest.md", "api.md"])
+    assert nav == [{"Start": ["index.md", "guide.md"]}, {"Bring your own": ["harvest.md"]}, {"Python": ["api.md"]}]
+    missing = {page for wanted in pages.ORDER.values() for page in wanted} - {"index.md"}
+    missing -= {path.relative_to(DOCS).with_suffix(".md").as_posix() for path in DOCS.rglob("*.*")}
+    assert missing <= {"results.md", "pose.md", "batch.md", "performance.md"}
+
+
+def test_the_first_page_links_into_the_site(pages: ModuleType) -> None:
+    links = re.findall(r"\]\(([^)#]+)", pages.first_page())
+    assert "demo.jpg" in links
+    assert "matching.md" in links
+    inside = [link for link in links if not link.startswith("http")]
+    assert [link for link in inside if not (DOCS / link).is_file()] == []
+    outside = [link.removeprefix(pages.SOURCE) for link in links if link.startswith(pages.SOURCE)]
+    assert [link for link in outside if not (ROOT / link).exists()] == []
+
+
+def test_the_site_is_built_and_loads_nothing_from_elsewhere(pages: ModuleType, tmp_path: Path) -> None:
+    command = ["build", "--strict", "--quiet", "--config-file", str(ROOT / ".ci" / "mkdocs.yml"), "--site-dir"]
+    where = {**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"}
+    site = tmp_path / "site"
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", *command, str(site)], env=where, check=False, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    built = {path.relative_to(site).as_posix() for path in site.rglob("*.html")}
+    assert {"index.html", "guide/index.html", "api/index.html", "notebooks/own_arrays/index.html"} <= built
+    loaded = set()
+    for path in [*site.rglob("*.html"), *site.rglob("*.css")]:
+        for found in LOADED.finditer(path.read_text(encoding="utf-8")):
+            if found[0].startswith("<link") and "stylesheet" not in found[0] and "preload" not in found[0]:
+                continue
+            loaded.add(found[1] or found[2] or found[0])
+    assert len(loaded) > 5
+    assert [each for each in loaded if "//" in each and "http://www.w3.org" not in each] == []
+    assert "match_regions" in (site / "api" / "index.html").read_text(encoding="utf-8")
+
+
+def test_the_image_is_made_of_files_that_are_there() -> None:
+    lines = (ROOT / ".ci" / "Dockerfile").read_text(encoding="utf-8").splitlines()
+    copied = {source for line in lines if line.startswith("COPY ") for source in line.split()[1:-1]}
+    assert {path for path in copied if not (ROOT / path).exists()} == set()
+    allowed = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
+    assert {path.removeprefix("./") for path in copied} == {line[1:] for line in allowed if line.startswith("!")}
+    assert {"pyproject.toml", "README.md", "LICENSE", "mvseg", "models", "configs"} == copied
+
+
+def test_shipped_configs_have_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert find_config("fine.yaml") == ROOT / "configs" / "fine.yaml"
+    assert find_config("train/rosettes.yaml") == ROOT / "configs" / "train" / "rosettes.yaml"
+    shutil.copy(ROOT / "configs" / "paper.yaml", "fine.yaml")
+    assert find_config("fine.yaml") == Path("fine.yaml")  # one's own come first
+    for name in ("absent.yaml", "../pyproject.toml", "/absent.yaml"):
+        with pytest.raises(InputError, match=r"no such file.*fine\.yaml, paper\.yaml, train/finetune-coco\.yaml"):
+            find_config(name)
+
+
+def test_a_shipped_config_is_taken_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from mvseg.cli.command import build_parser
+
+    monkeypatch.chdir(tmp_path)
+    assert build_parser().parse_args(["infer", "--config", "fine.yaml"]).infer.reconstruct.seen_share == 0.9
