@@ -28,6 +28,7 @@ class RunConfig:
             level, "board" from ArUco markers that lie flat; None for that of the scene.
         split_merged: cut a mask that seems to cover two instances in two.
         draw_rims: draw the rims of the surfaces into the overlays.
+        report: write report.html, the result as one page.
         coco_crowd: what annotations with `iscrowd` are in a COCO file of masks: "mask", one like all others, or
             "ignore", left out.
         categories: names of the categories whose masks are taken, with commas between them ("leaf,petiole"), where the
@@ -43,6 +44,7 @@ class RunConfig:
     up: Up | None = None
     split_merged: bool = False
     draw_rims: bool = True
+    report: bool = True
     coco_crowd: Literal["mask", "ignore"] = "mask"
     categories: str | None = None
 

@@ -77,7 +77,7 @@ def test_demo_finds_every_leaf(demo: Path) -> None:
         *(f"labels/{name}" for name in views),
         *(f"overlay/{name}" for name in views),
         *(f"leaves/leaf_{leaf:03d}.ply" for leaf in range(1, 13)),
-        *("contact.png", "instances.json", "run.json", "scene.glb", "traits.csv", "traits_wide.csv"),
+        *("contact.png", "instances.json", "report.html", "run.json", "scene.glb", "traits.csv", "traits_wide.csv"),
     }
     leaf_of_label: dict[int, set[int]] = {}
     for name in views:
@@ -204,6 +204,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "unit": None,
         "up": None,
         "draw_rims": True,
+        "report": True,
     }
     assert run["mvseg"] == mvseg.__version__
     assert run["mask_kind"] == "label images"
@@ -240,6 +241,15 @@ def test_rims_may_be_left_out(plant: Path, tmp_path: Path, monkeypatch: pytest.M
         out = ["--out", str(tmp_path / "out"), "--quiet", *COARSE]
         assert main(["infer", *words, *out, "--masks", "masks", str(plant)]) == 0
     assert drawn == [False, False, True]
+
+
+@pytest.mark.parametrize("verb", ["infer", "match"])
+def test_the_page_may_be_left_out(verb: str, plant: Path, tmp_path: Path) -> None:
+    coarse = COARSE if verb == "infer" else []
+    for name, words in (("with", []), ("without", ["--report", "false"])):
+        out = ["--out", str(tmp_path / name), "--quiet", *coarse, "--masks", "masks"]
+        assert main([verb, *words, *out, str(plant)]) == 0
+    assert [len(list((tmp_path / name).rglob("report.html"))) for name in ("with", "without")] == [1, 0]
 
 
 @pytest.mark.parametrize("words", [["up"], ["board"], ["0", "1"], ["0 0 0"], ["0 0 x"], ["nan", "0", "1"]])

@@ -223,6 +223,8 @@ def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     said = subprocess.run(command, cwd=tmp_path, env=where, check=True, capture_output=True, text=True)
     home = tmp_path / "installed" / "mvseg" / "configs"
     assert said.stdout.split() == [str(home / "fine.yaml"), str(home / "train" / "rosettes.yaml")]
+    assets = (PACKAGE / "results" / "report" / "assets").rglob("*")
+    assert {file.relative_to(ROOT).as_posix() for file in assets if file.is_file()} <= set(names)
 
 
 def test_shipped_scene_is_small() -> None:

@@ -135,7 +135,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert (run["scene"], run["warnings"]) == ("plant", ["odd"])
-        ran = {"masks", "match", "split_merged", "coco_crowd", "categories"}  # the stages that ran
+        ran = {"masks", "match", "split_merged", "coco_crowd", "categories", "report"}  # the stages that ran
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"

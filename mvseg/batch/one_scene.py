@@ -40,7 +40,7 @@ def run_one_scene(scene: Path, masks: Path | None, out: Path, *, config: RunConf
         print(f"mvseg: warning: {message}", file=sys.stderr)
     run = describe_run(result, masks, config, messages=messages)
     run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
-    save_result(result, out, run, progress=not quiet, draw_rims=config.draw_rims)
+    save_result(result, out, run, progress=not quiet, draw_rims=config.draw_rims, report=config.report)
     delete_kept(keep)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"

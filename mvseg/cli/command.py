@@ -72,7 +72,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _parse(arguments: Sequence[str]) -> Namespace:
     try:
         args = build_parser().parse_args(list(arguments))
-        for name in ("quiet", "split_merged", "coco_crowd"):
+        for name in ("quiet", "report", "split_merged", "coco_crowd"):
             if args.verb and name in args[args.verb] and args[args.verb][name] is None:
                 raise InputError(f"{name} is null, expected a value")
         return args

@@ -55,6 +55,7 @@ def run(args: Namespace) -> int:
         up=read_up(args.up),
         split_merged=args.split_merged,
         draw_rims=args.draw_rims,
+        report=args.report,
         coco_crowd=args.coco_crowd,
         categories=args.categories,
     )

@@ -39,6 +39,7 @@ def run(args: Namespace) -> int:
         match=build_options(MatchConfig, args.match, "match."),
         reconstruct=None,
         split_merged=args.split_merged,
+        report=args.report,
         coco_crowd=args.coco_crowd,
         categories=args.categories,
     )

@@ -73,6 +73,7 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
     )
     parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    parser.add_argument("--report", type=bool, default=True, help="write report.html, the result as one page")
     parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that cover two instances in two")
     parser.add_argument(
         "--coco_crowd",

@@ -257,3 +257,10 @@ def write_png(path: Path, image: np.ndarray) -> None:
     pixels = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_RGB2BGR)
     _, encoded = cv2.imencode(".png", pixels)
     path.write_bytes(encoded.tobytes())
+
+
+def encode_jpeg(image: np.ndarray, *, quality: int) -> bytes:
+    """The bytes of a JPEG file of (H, W, 3) uint8 RGB; `quality` from 1 to 95."""
+    buffer = BytesIO()
+    Image.fromarray(image).save(buffer, "JPEG", quality=quality, optimize=True)
+    return buffer.getvalue()

@@ -13,9 +13,22 @@ from numpy.typing import NDArray
 ROOT = "plant"  # the node above all others in a GLB
 
 
-def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int]) -> None:
-    """Write one mesh as binary PLY with normals, in world coordinates, every vertex in the RGB colour (0 to 255)."""
-    path.write_bytes(trimesh.exchange.ply.export_ply(_colored(mesh, color), vertex_normal=True))
+def simplify_mesh(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
+    """A closed mesh with at most so many triangles, by quadric decimation; one that has no more is returned as it is.
+
+    The rim of an open mesh may suffer.
+    """
+    return mesh if len(mesh.faces) <= max_faces else mesh.simplify_quadric_decimation(face_count=max_faces)
+
+
+def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int], *, instance_id: int) -> None:
+    """Write one mesh as binary PLY with normals, in world coordinates.
+
+    Every vertex has the RGB colour (0 to 255), and the id as its property `instance_id`.
+    """
+    colored = _colored(mesh, color)
+    colored.vertex_attributes["instance_id"] = np.full(len(mesh.vertices), instance_id, np.int32)
+    path.write_bytes(trimesh.exchange.ply.export_ply(colored, vertex_normal=True))
 
 
 def write_glb(
@@ -34,7 +47,7 @@ def write_glb(
     Args:
         path: the file.
         meshes: {name: mesh}.
-        colors: {name: RGB, 0 to 255}.
+        colors: {name: RGB, 0 to 255}, of sRGB as in pictures; the file has them linear, as glTF wants them.
         matrix: (4, 4) gltf_from_world, of the node above all others; glTF is in metres, +y is up. None: the identity.
         about: what that node says in its `extras`.
         extras: {name: what its node says in its `extras`}.
@@ -44,13 +57,34 @@ def write_glb(
     scene.graph.update(frame_from=scene.graph.base_frame, frame_to=ROOT, matrix=root, metadata=dict(about or {}))
     for name, mesh in meshes.items():
         material = trimesh.visual.material.PBRMaterial(
-            name=name, baseColorFactor=[*colors[name], 255], metallicFactor=0.0, roughnessFactor=0.8, doubleSided=True
+            name=name,
+            baseColorFactor=[*_linear(colors[name]), 255],
+            metallicFactor=0.0,
+            roughnessFactor=0.8,
+            doubleSided=True,
         )
         visual = trimesh.visual.TextureVisuals(material=material)
-        painted = trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False)
+        normals = _unit_normals(mesh)
+        painted = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_normals=normals, visual=visual, process=False)
         said = dict((extras or {}).get(name, {}))
         scene.add_geometry(painted, node_name=name, geom_name=name, parent_node_name=ROOT, metadata=said)
     path.write_bytes(trimesh.exchange.gltf.export_glb(scene, include_normals=True))
+
+
+def _unit_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+    """(P, 3) normals of the vertices; those of a place without any (two sides that touch) point along +z, since glTF
+    allows no others than unit vectors."""
+    normals = np.array(mesh.vertex_normals)
+    has_none = np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-3
+    normals[has_none] = (0, 0, 1)
+    return normals
+
+
+def _linear(color: tuple[int, int, int]) -> list[int]:
+    """The share of light that a colour of sRGB means, 0 to 255 (trimesh keeps no fractions)."""
+    share = np.array(color) / 255
+    light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
+    return [round(float(255 * value)) for value in light]
 
 
 def _colored(mesh: trimesh.Trimesh, color: tuple[int, int, int]) -> trimesh.Trimesh:

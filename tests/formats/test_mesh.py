@@ -11,7 +11,7 @@ import torch
 import trimesh
 
 from known_leaves import bent_blade
-from mvseg.formats.mesh import write_glb, write_ply
+from mvseg.formats.mesh import simplify_mesh, write_glb, write_ply
 from mvseg.reconstruction.voxels import VoxelGrid
 
 RED, BLUE = (250, 10, 20), (0, 30, 240)
@@ -26,7 +26,7 @@ def ball() -> trimesh.Trimesh:
 
 
 def test_ply_keeps_shape_place_and_colour(ball: trimesh.Trimesh, tmp_path: Path) -> None:
-    write_ply(tmp_path / "leaf.ply", ball, RED)
+    write_ply(tmp_path / "leaf.ply", ball, RED, instance_id=12)
     assert (tmp_path / "leaf.ply").read_bytes().startswith(b"ply\nformat binary_little_endian")
     back = trimesh.load_mesh(tmp_path / "leaf.ply")
     assert back.is_watertight
@@ -35,6 +35,7 @@ def test_ply_keeps_shape_place_and_colour(ball: trimesh.Trimesh, tmp_path: Path)
     np.testing.assert_allclose(back.bounds, [[95, -25, -2], [105, -15, 8]], atol=0.3)
     np.testing.assert_allclose(back.bounds, ball.bounds, rtol=1e-6)
     assert (back.visual.vertex_colors == [*RED, 255]).all()
+    assert (back.metadata["_ply_raw"]["vertex"]["data"]["instance_id"] == 12).all()
 
 
 def test_glb_has_a_node_per_mesh(ball: trimesh.Trimesh, tmp_path: Path) -> None:
@@ -51,12 +52,13 @@ def test_glb_has_a_node_per_mesh(ball: trimesh.Trimesh, tmp_path: Path) -> None:
         np.testing.assert_allclose(back.bounds, meshes[name].bounds, rtol=1e-6)
         assert back.is_watertight
         material = back.visual.material
-        assert material.baseColorFactor.tolist() == [*color, 255]
+        light = [int(255 * (value / 255) ** 2.2) for value in color]  # of sRGB, nearly
+        np.testing.assert_allclose(material.baseColorFactor, [*light, 255], atol=2)
         assert (material.doubleSided, material.metallicFactor) == (True, 0)
 
 
 def test_the_mesh_itself_stays_uncoloured(ball: trimesh.Trimesh, tmp_path: Path) -> None:
-    write_ply(tmp_path / "leaf.ply", ball, RED)
+    write_ply(tmp_path / "leaf.ply", ball, RED, instance_id=1)
     assert not ball.visual.defined
 
 
@@ -84,7 +86,7 @@ def test_glb_places_the_world_and_says_what_was_measured(ball: trimesh.Trimesh, 
 
 def test_an_open_surface_stays_open_and_has_its_normals(tmp_path: Path) -> None:
     leaf = bent_blade()
-    write_ply(tmp_path / "leaf.ply", leaf.mesh(), RED)
+    write_ply(tmp_path / "leaf.ply", leaf.mesh(), RED, instance_id=1)
     write_glb(tmp_path / "scene.glb", {"leaf_001": leaf.mesh()}, {"leaf_001": RED})
     assert b"property float nx" in (tmp_path / "leaf.ply").read_bytes()
     (shown,) = trimesh.load_scene(tmp_path / "scene.glb").geometry.values()
@@ -93,6 +95,22 @@ def test_an_open_surface_stays_open_and_has_its_normals(tmp_path: Path) -> None:
         assert back.area == pytest.approx(leaf.area, rel=1e-5)
         np.testing.assert_allclose(np.linalg.norm(back.vertex_normals, axis=1), 1, atol=1e-4)
         assert (back.vertex_normals @ leaf.mesh().face_normals.mean(0) > 0).all()
+
+
+def test_a_simpler_mesh_has_the_shape(ball: trimesh.Trimesh) -> None:
+    simple = simplify_mesh(ball, 200)
+    assert 150 < len(simple.faces) <= 200 < len(ball.faces)
+    assert simple.volume == pytest.approx(ball.volume, rel=0.04)
+    np.testing.assert_allclose(np.linalg.norm(simple.vertex_normals, axis=1), 1, atol=1e-6)
+    assert simplify_mesh(ball, len(ball.faces)) is ball
+
+
+def test_all_normals_in_a_glb_are_unit_vectors(tmp_path: Path) -> None:
+    """Two sides that touch have none of their own, which is an error in glTF."""
+    sides = trimesh.Trimesh(np.eye(3), [[0, 1, 2], [0, 2, 1]], process=False)
+    write_glb(tmp_path / "scene.glb", {"leaf_001": sides}, {"leaf_001": RED})
+    (shown,) = trimesh.load_scene(tmp_path / "scene.glb", process=False).geometry.values()
+    np.testing.assert_allclose(np.linalg.norm(shown.vertex_normals, axis=1), 1, atol=1e-6)
 
 
 def test_glb_without_meshes_is_a_valid_file(tmp_path: Path) -> None:

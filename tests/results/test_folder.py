@@ -56,6 +56,7 @@ IDS_FILES = {
     *(f"overlay/{view:03d}.png" for view in range(4)),
     "contact.png",
     "instances.json",
+    "report.html",
     "run.json",
 }
 SHAPE_FILES = {
@@ -152,7 +153,8 @@ class TestContent:
         for index, entry in enumerate(content["annotations"]):
             view = entry["image_id"] - 1
             labels = read_label_png(saved / "labels" / f"{view:03d}.png", WIDTH, HEIGHT)
-            assert entry["instance_id"] == result.matching.instance_ids[index]
+            assert entry["instance_id"] == entry["track_id"] == result.matching.instance_ids[index]
+            assert entry["attributes"] == {"instance_id": entry["instance_id"], "track_id": entry["instance_id"]}
             assert (labels == entry["instance_id"]).sum() == entry["area"]
             assert 0 < entry["match_score"] <= 1
             assert entry["source_label"] == result.regions.labels[index]
@@ -197,6 +199,15 @@ class TestContent:
         assert run["counts"] == {"regions": 12, "instances": 3}
         assert set(run["seconds"]) == {"load", "match", "reconstruct", "measure"}
 
+    def test_every_file_and_field_is_described(self, saved: Path) -> None:
+        described = (Path(__file__).parents[2] / "docs" / "results.md").read_text(encoding="utf-8")
+        content = json.loads((saved / "instances.json").read_text())
+        rows = (saved / "traits.csv").read_text().splitlines()
+        names = {*content["annotations"][0], *content["images"][0], *rows[0].split(","), "other_instance_id", "score"}
+        names |= json.loads((saved / "run.json").read_text()).keys() - {"config"}
+        names |= {path.name for path in saved.iterdir() if path.is_file()}
+        assert [name for name in sorted(names) if f"`{name}`" not in described] == []
+
     def test_eval_reads_it(self, saved: Path, plant: Path) -> None:
         regions, truth = read_instances(saved, plant / "truth")
         ids, true = regions.labels, shown_instances(regions, truth)
@@ -210,6 +221,22 @@ class TestVariants:
         save_result(ids_only(result), tmp_path / "out", {})
         assert files_below(tmp_path / "out") == IDS_FILES
 
+    def test_without_a_report(self, result: Result, tmp_path: Path) -> None:
+        save_result(ids_only(result), tmp_path / "out", {}, report=False)
+        assert files_below(tmp_path / "out") == IDS_FILES - {"report.html"}
+
+    def test_leaves_have_few_triangles_in_the_scene_and_all_in_their_files(
+        self, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(mvseg.results.folder, "MAX_FACES", 300)
+        save_result(result, tmp_path / "out", {})
+        shown = trimesh.load_scene(tmp_path / "out" / "scene.glb")
+        for leaf in (1, 2, 3):
+            full = trimesh.load_mesh(tmp_path / "out" / "leaves" / f"leaf_{leaf:03d}.ply")
+            small = shown.geometry[f"leaf_{leaf:03d}"]
+            assert len(small.faces) <= 300 < len(full.faces)
+            assert small.volume == pytest.approx(full.volume, rel=0.05)
+
     def test_unmatched_regions(self, result: Result, tmp_path: Path) -> None:
         ids = result.matching.instance_ids.clone()
         ids[ids == 2] = -1
@@ -218,6 +245,9 @@ class TestVariants:
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         assert [entry["instance_id"] for entry in annotations].count(-1) == 4
         assert {entry["instance_id"] for entry in annotations} == {-1, 1, 3}
+        assert {entry.get("track_id") for entry in annotations} == {None, 1, 3}
+        unmatched = [entry["attributes"] for entry in annotations if "track_id" not in entry]
+        assert unmatched == [{"instance_id": -1}] * 4
         paths = (tmp_path / "out" / "labels").iterdir()
         numbers_per_view = [np.unique(read_label_png(path, WIDTH, HEIGHT)) for path in paths]
         assert [numbers.tolist() for numbers in numbers_per_view] == [[0, 1, 3]] * 4
@@ -322,12 +352,12 @@ class TestBrokenPhotos:
 
 
 WRITERS = [
-    "write_label_png", "draw_overlay", "draw_tile", "write_png", "draw_contact_sheet", "write_coco", "write_ply",
-    "write_glb", "write_long", "write_wide",
+    "write_label_png", "draw_overlay", "draw_tile", "draw_picture", "write_png", "draw_contact_sheet", "write_coco",
+    "write_ply", "write_glb", "write_long", "write_wide", "write_report",
 ]  # fmt: skip
 
 
-SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_tile", "write_png", "write_ply")
+SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_tile", "draw_picture", "write_png", "write_ply")
 
 
 class TestWholeOrNotAtAll:

@@ -166,15 +166,15 @@ class LeafSurface:
         mean = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]).sum(0)
         return torch.from_numpy(mean / max(float(np.linalg.norm(mean)), 1e-300))
 
-    def mesh(self) -> trimesh.Trimesh:
-        """Open mesh whose first vertex is the base and whose last one is the tip; empty without a surface.
+    def mesh(self, num_rows: int = MESH_SHAPE[0], num_columns: int = MESH_SHAPE[1]) -> trimesh.Trimesh:
+        """Open mesh of `points`, whose first vertex is the base and whose last one is the tip; empty without a surface.
 
         Its normals point to the side that most cameras of the fit saw.
         """
         if not self.exists:
             return trimesh.Trimesh()
-        vertices = grid_vertices(self.points().numpy())
-        return trimesh.Trimesh(vertices, grid_triangles(*MESH_SHAPE), process=False)
+        vertices = grid_vertices(self.points(num_rows, num_columns).numpy())
+        return trimesh.Trimesh(vertices, grid_triangles(num_rows, num_columns), process=False)
 
     def project(self, cameras: Cameras) -> list[Tensor]:
         """V masks (H, W) bool: the pixels that the surface covers half or more of, as if nothing hid it.

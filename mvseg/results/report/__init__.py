@@ -1,0 +1,1 @@
+"""`report.html`: the result as one page that opens offline."""

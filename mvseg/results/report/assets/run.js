@@ -1,0 +1,30 @@
+// The head of the page, and what is known of the run: warnings, versions, options.
+
+function buildRun(data) {
+  const { run } = data;
+  const warnings = run.warnings ?? [];
+  document.getElementById("plant").textContent = data.plant;
+  const leaves = count(data.leaves.length, "leaf", "leaves");
+  document.getElementById("summary").textContent =
+    `${leaves}, ${count(data.views.length, "photo")}, ${count(data.numMasks, "mask")}; lengths in ${data.unit}`;
+  const link = document.getElementById("warnings-link");
+  link.textContent = count(warnings.length, "warning");
+  link.hidden = warnings.length === 0;
+
+  const list = warnings.length
+    ? element("ul", {}, ...warnings.map((text) => element("li", {}, text)))
+    : element("p", { class: "note" }, "There were none.");
+  const facts = [
+    ["mvseg", run.mvseg], ["Python", run.python], ["PyTorch", run.torch],
+    ["masks", run.mask_kind ?? "found by a detector"], ["matched by", run.matched_by],
+    ["residual", run.residual_px == null ? null : `${run.residual_px} px`],
+    ["seconds", Object.entries(run.seconds ?? {}).map(([stage, wall]) => `${stage} ${wall}`).join(", ")],
+    ...Object.entries(run.inputs ?? {}).map(([path, hash]) => [path, `SHA-256 ${hash}`]),
+  ].filter(([, value]) => value !== null && value !== undefined && value !== "");
+  const terms = facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]);
+  document.getElementById("run").append(
+    element("div", { id: "warnings" }, element("h2", {}, "Warnings"), list),
+    element("div", {}, element("h2", {}, "Run"), element("dl", {}, ...terms)),
+    element("details", {}, element("summary", {}, "Options"), element("pre", {}, run.config)),
+  );
+}

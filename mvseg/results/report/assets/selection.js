@@ -1,0 +1,73 @@
+"use strict";
+
+// Which leaf is selected, and which one the pointer is on. Every part of the page listens; none knows of another.
+const selection = {
+  selected: null,
+  hovered: null,
+  listeners: [],
+
+  listen(listener) {
+    this.listeners.push(listener);
+  },
+
+  select(leaf) {
+    if (leaf === this.selected) return;
+    this.selected = leaf;
+    this.tell();
+  },
+
+  hover(leaf) {
+    if (leaf === this.hovered) return;
+    this.hovered = leaf;
+    this.tell();
+  },
+
+  tell() {
+    for (const listener of this.listeners) listener(this.selected, this.hovered);
+  },
+
+  // Classes of an element that stands for a leaf.
+  mark(element, leaf) {
+    element.classList.toggle("selected", leaf === this.selected);
+    element.classList.toggle("hovered", leaf === this.hovered);
+  },
+};
+
+// A view that another part of the page points at, by its index.
+const shownView = {
+  listeners: [],
+  listen(listener) {
+    this.listeners.push(listener);
+  },
+  show(view) {
+    for (const listener of this.listeners) listener(view);
+  },
+};
+
+const SVG = "http://www.w3.org/2000/svg";
+
+// An element with attributes and children. Text becomes a text node: it is never read as HTML.
+function element(name, attributes = {}, ...children) {
+  return fill(document.createElement(name), attributes, children);
+}
+
+function drawing(name, attributes = {}, ...children) {
+  return fill(document.createElementNS(SVG, name), attributes, children);
+}
+
+function fill(node, attributes, children) {
+  for (const [key, value] of Object.entries(attributes)) {
+    if (value !== null && value !== undefined) node.setAttribute(key, value);
+  }
+  node.append(...children.filter((child) => child !== null));
+  return node;
+}
+
+// The address of a JPEG in base64; the page holds each picture once, whatever shows it.
+function addressOf(base64) {
+  return URL.createObjectURL(new Blob([bytesOf(base64)], { type: "image/jpeg" }));
+}
+
+function bytesOf(base64) {
+  return Uint8Array.from(atob(base64), (letter) => letter.charCodeAt(0));
+}

@@ -1,0 +1,121 @@
+// What stands in the 3D view: leaves, cameras, the grid, and a photo behind the leaves.
+
+function makeLeaf(leaf, { points, faces }) {
+  const positions = Float32Array.from(new Int16Array(bytesOf(points).buffer), (step) => step / 32767);
+  const geometry = new THREE.BufferGeometry();
+  geometry.setAttribute("position", new THREE.BufferAttribute(positions, 3));
+  geometry.setIndex(new THREE.BufferAttribute(new Uint16Array(bytesOf(faces).buffer), 1));
+  geometry.computeVertexNormals();
+  const color = new THREE.Color(leaf.color);
+  const material = new THREE.MeshLambertMaterial({ color, emissive: color, side: THREE.DoubleSide, transparent: true });
+  material.emissiveIntensity = 0;
+  const mesh = new THREE.Mesh(geometry, material);
+  mesh.userData.leaf = leaf.id;
+  return { id: leaf.id, mesh, middle: middleOf(positions) };
+}
+
+// The vertex nearest to the mean of all: a number there lies on the leaf, however it is bent.
+function middleOf(positions) {
+  const points = [];
+  for (let at = 0; at < positions.length; at += 3) points.push(new THREE.Vector3().fromArray(positions, at));
+  const mean = points.reduce((sum, point) => sum.add(point), new THREE.Vector3()).divideScalar(points.length);
+  return points.reduce((best, point) => (point.distanceTo(mean) < best.distanceTo(mean) ? point : best));
+}
+
+// A camera is a pyramid with its photo as the base; the more cameras there are, the smaller.
+function makeCamera(entry, { masks }, { view, share, texture }) {
+  const [center, up, ahead] = [entry.center, entry.up, entry.ahead].map((numbers) => new THREE.Vector3(...numbers));
+  const rays = entry.corners.map((corner) => new THREE.Vector3(...corner));
+  const depth = center.length() * clamp(share, 0.07, 0.2);
+  const corners = rays.map((ray) => center.clone().addScaledVector(ray, depth));
+  const lines = corners.flatMap((corner, n) => [center, corner, corner, corners[(n + 1) % 4]]);
+  const frame = new THREE.LineSegments(
+    new THREE.BufferGeometry().setFromPoints(lines),
+    new THREE.LineBasicMaterial({ color: 0x7a8a7d, transparent: true }));
+  const photo = new THREE.Mesh(
+    makeSheet(corners), new THREE.MeshBasicMaterial({ map: texture, side: THREE.DoubleSide, transparent: true }));
+  photo.userData.view = view;
+  const fade = (isFaded) => {
+    for (const { material } of [photo, frame]) material.opacity = isFaded ? 0.2 : 1;
+  };
+  const shows = new Set(masks.map((mask) => mask.leaf));
+  return { group: new THREE.Group().add(frame, photo), photo, center, up, ahead, rays, shows, fade };
+}
+
+// A picture from its corners: top left, top right, bottom right, bottom left.
+function makeSheet(corners) {
+  const sheet = new THREE.BufferGeometry().setFromPoints(corners);
+  sheet.setAttribute("uv", new THREE.BufferAttribute(new Float32Array([0, 1, 1, 1, 1, 0, 0, 0]), 2));
+  sheet.setIndex([0, 2, 1, 0, 3, 2]);
+  return sheet;
+}
+
+function loadTexture(address, draw) {
+  const texture = new THREE.TextureLoader().load(address, draw);
+  texture.colorSpace = THREE.SRGBColorSpace;
+  return texture;
+}
+
+function makeGrid(space) {
+  const step = space.grid / space.radius;
+  const half = Math.ceil(1 / step) * step;
+  const lines = [];
+  for (let at = -half; at <= half + step / 2; at += step) {
+    lines.push([at, -half], [at, half], [-half, at], [half, at]);
+  }
+  const points = lines.map(([x, z]) => new THREE.Vector3(x, space.ground, z));
+  const material = new THREE.LineBasicMaterial({ color: 0x8a988c, transparent: true, opacity: 0.35 });
+  return new THREE.LineSegments(new THREE.BufferGeometry().setFromPoints(points), material);
+}
+
+function makeSky() {
+  return new THREE.HemisphereLight(0xffffff, 0x909890, 1.9);
+}
+
+// Moves with the viewer.
+function makeLamp() {
+  const lamp = new THREE.DirectionalLight(0xffffff, 1.6);
+  lamp.position.set(0.4, 0.8, 1);
+  return lamp;
+}
+
+function makeBackdrop() {
+  const backdrop = new THREE.Mesh(new THREE.BufferGeometry(), new THREE.MeshBasicMaterial({ side: THREE.DoubleSide }));
+  backdrop.visible = false;
+  return backdrop;
+}
+
+function setTexture({ material }, texture) {
+  material.map?.dispose();
+  material.map = texture;
+  material.needsUpdate = true;
+}
+
+// Rays to the corners of a part of a photo, from those to the corners of the photo.
+function cropOf(rays, [x1, y1, x2, y2]) {
+  const across = rays[1].clone().sub(rays[0]);
+  const down = rays[3].clone().sub(rays[0]);
+  return [[x1, y1], [x2, y1], [x2, y2], [x1, y2]].map(([x, y]) =>
+    rays[0].clone().addScaledVector(across, x).addScaledVector(down, y));
+}
+
+// Hang a picture behind the plant, where the camera saw it; returns its corners.
+function hangBackdrop(backdrop, center, rays) {
+  const depth = (center.length() + 1.5) * 1.02;
+  const corners = rays.map((ray) => ray.clone().multiplyScalar(depth).add(center));
+  backdrop.geometry.dispose();
+  backdrop.geometry = makeSheet(corners);
+  return corners;
+}
+
+// Let the picture with these corners, which is parallel to the screen, fill the view, without turning the camera.
+function aimAt(camera, corners) {
+  const [low, high] = [corners[3], corners[1]].map((corner) => camera.worldToLocal(corner.clone()));
+  const scale = camera.near / -low.z;
+  const half = (Math.max(high.y - low.y, (high.x - low.x) / camera.aspect) / 2) * scale;
+  const [x, y] = [((low.x + high.x) / 2) * scale, ((low.y + high.y) / 2) * scale];
+  const wide = half * camera.aspect;
+  camera.fov = (2 * Math.atan(half / camera.near) * 180) / Math.PI; // for when the viewer turns away
+  camera.projectionMatrix.makePerspective(x - wide, x + wide, y + half, y - half, camera.near, camera.far);
+  camera.projectionMatrixInverse.copy(camera.projectionMatrix).invert();
+}

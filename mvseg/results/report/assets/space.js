@@ -1,0 +1,221 @@
+// The 3D view: leaves, cameras with their photos, a grid on the ground. It is drawn when something changes only.
+
+const FIELD = 35; // degrees
+const FADED = 0.16; // opacity of leaves that are not selected
+const OVER_PHOTO = 0.55; // of all leaves, before a photo
+
+class Space {
+  constructor(data, addresses, renderer) {
+    this.data = data;
+    this.addresses = addresses;
+    this.renderer = renderer;
+    this.canvas = renderer.domElement;
+    this.shown = null; // the view whose photo is behind the leaves
+    this.isPending = false;
+    this.camera = new THREE.PerspectiveCamera(FIELD, 1, 0.01, 1000);
+    this.controls = new THREE.OrbitControls(this.camera, this.canvas);
+    const withShape = data.leaves.filter((leaf) => leaf.id in data.space.leaves);
+    this.leaves = withShape.map((leaf) => makeLeaf(leaf, data.space.leaves[leaf.id]));
+    const share = 2 / data.views.length;
+    const textures = addresses.thumbnails.map((address) => loadTexture(address, () => this.draw()));
+    this.cameras = data.space.cameras.map((entry, view) =>
+      makeCamera(entry, data.views[view], { view, share, texture: textures[view] }));
+    this.ground = makeGrid(data.space);
+    this.backdrop = makeBackdrop();
+    this.scene = new THREE.Scene().add(
+      makeSky(), this.camera.add(makeLamp()), this.ground, this.backdrop,
+      ...this.leaves.map((leaf) => leaf.mesh), ...this.cameras.map((one) => one.group));
+    this.labels = makeLabels(this.leaves);
+  }
+
+  listen() {
+    this.controls.addEventListener("change", () => {
+      if (this.shown !== null) this.leavePhoto();
+      this.draw();
+    });
+    new ResizeObserver(() => this.resize()).observe(this.canvas);
+    selection.listen(() => this.mark());
+    listenToPointer(this);
+    const on = (name, event, change) => document.getElementById(name).addEventListener(event, change);
+    on("show-cameras", "change", () => this.showBackdrop(this.shown));
+    on("show-numbers", "change", (event) => {
+      document.getElementById("space-labels").hidden = !event.target.checked;
+    });
+    on("look-plant", "click", () => this.lookAround(this.plant()));
+    on("look-all", "click", () => this.lookAround(this.everything()));
+    this.resize();
+    this.lookAround(this.leaves.length ? this.plant() : this.everything());
+  }
+
+  draw() {
+    if (this.isPending) return;
+    this.isPending = true;
+    requestAnimationFrame(() => {
+      this.isPending = false;
+      this.drawNow();
+      this.canvas.dataset.frames = Number(this.canvas.dataset.frames ?? 0) + 1;
+    });
+  }
+
+  drawNow() {
+    this.renderer.render(this.scene, this.camera);
+    for (const { leaf, text } of this.labels) {
+      const { x, y, isAhead } = this.positionOf(leaf.id);
+      text.style.visibility = isAhead ? "visible" : "hidden";
+      text.style.transform = `translate(${x.toFixed(1)}px, ${y.toFixed(1)}px) translate(-50%, -50%)`;
+    }
+  }
+
+  resize() {
+    const { clientWidth, clientHeight } = this.canvas;
+    if (clientWidth === 0 || clientHeight === 0) return;
+    this.renderer.setSize(clientWidth, clientHeight, false);
+    this.camera.aspect = clientWidth / clientHeight;
+    if (this.shown !== null) this.lookThrough(this.shown);
+    else this.camera.updateProjectionMatrix();
+    this.draw();
+  }
+
+  // Where the middle of a leaf is seen, in pixels of the canvas.
+  positionOf(id) {
+    const leaf = this.leaves.find((one) => one.id === id);
+    const { x, y, z } = leaf.middle.clone().project(this.camera);
+    return { x: ((x + 1) / 2) * this.canvas.clientWidth, y: ((1 - y) / 2) * this.canvas.clientHeight, isAhead: z < 1 };
+  }
+
+  litLeaves() {
+    return this.leaves.filter((leaf) => leaf.mesh.material.emissiveIntensity > 0).map((leaf) => leaf.id);
+  }
+
+  // Leaves that are not selected fade; over a photo all let it shine through.
+  mark() {
+    const { selected, hovered } = selection;
+    for (const leaf of this.leaves) {
+      const isLit = leaf.id === selected || leaf.id === hovered;
+      const material = leaf.mesh.material;
+      material.opacity = selected !== null && !isLit ? FADED : this.shown !== null ? OVER_PHOTO : 1;
+      material.depthWrite = material.opacity === 1;
+      material.emissiveIntensity = isLit ? 0.45 : 0;
+    }
+    for (const { text, leaf } of this.labels) {
+      const isLit = leaf.id === selected || leaf.id === hovered;
+      text.classList.toggle("lit", isLit);
+      text.classList.toggle("faded", selected !== null && !isLit);
+    }
+    for (const one of this.cameras) one.fade(selected !== null && !one.shows.has(selected));
+    this.draw();
+  }
+
+  plant() {
+    return new THREE.Sphere(new THREE.Vector3(), 1.05);
+  }
+
+  everything() {
+    const plant = new THREE.Box3().setFromCenterAndSize(new THREE.Vector3(), new THREE.Vector3(1, 1, 1));
+    const centers = this.cameras.map((one) => one.center);
+    return plant.union(new THREE.Box3().setFromPoints(centers)).getBoundingSphere(new THREE.Sphere());
+  }
+
+  // From the front, slightly above; far enough to see all of a ball.
+  lookAround({ center, radius }) {
+    const field = FIELD * Math.min(1, this.camera.aspect);
+    const distance = radius / Math.sin((field / 2) * (Math.PI / 180));
+    this.camera.fov = FIELD;
+    this.camera.position.set(0.5, 0.5, 1).setLength(distance).add(center);
+    this.controls.target.copy(center);
+    this.controls.update();
+    this.leavePhoto();
+  }
+
+  // From where a photo was taken, with the photo behind the leaves; until the viewer turns away.
+  lookThrough(view) {
+    const { camera } = this;
+    const { center, up, ahead, rays } = this.cameras[view];
+    const corners = hangBackdrop(this.backdrop, center, cropOf(rays, this.data.views[view].box));
+    if (view !== this.shown) setTexture(this.backdrop, loadTexture(this.addresses.pictures[view], () => this.draw()));
+    camera.position.copy(center);
+    camera.up.copy(up);
+    camera.lookAt(ahead.clone().add(center));
+    camera.up.set(0, 1, 0); // the controls know no other, and turn the view upright when they are used
+    camera.updateMatrixWorld();
+    aimAt(camera, corners);
+    this.controls.target.copy(center).addScaledVector(ahead, center.length());
+    this.showBackdrop(view);
+  }
+
+  leavePhoto() {
+    this.camera.updateProjectionMatrix();
+    this.showBackdrop(null);
+  }
+
+  showBackdrop(view) {
+    this.shown = view;
+    this.backdrop.visible = view !== null;
+    this.ground.visible = view === null;
+    const areCamerasOn = document.getElementById("show-cameras").checked;
+    for (const one of this.cameras) one.group.visible = view === null && areCamerasOn;
+    const note = document.getElementById("space-note");
+    note.textContent = view === null ? describeSpace(this.data)
+      : `From the camera of photo ${this.data.views[view].name}, with the photo behind the leaves.`;
+    this.mark();
+  }
+}
+
+function buildSpace(data, addresses) {
+  try {
+    const canvas = document.getElementById("canvas");
+    const renderer = new THREE.WebGLRenderer({ canvas, antialias: true, alpha: true });
+    renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
+    const space = new Space(data, addresses, renderer);
+    space.listen();
+    return space;
+  } catch (error) {
+    document.getElementById("space-note").textContent = `This browser shows nothing in 3D (${error.message}).`;
+    return null;
+  }
+}
+
+function describeSpace(data) {
+  const squares = `Squares on the ground: ${Number(data.space.grid.toPrecision(6))} ${data.unit}.`;
+  const up = data.space.isUpKnown ? "" : " Which way is up is not known; most photos have their upper side up.";
+  const hasLeaves = Object.keys(data.space.leaves).length > 0;
+  return (hasLeaves ? "" : "Cameras only: there are no shapes in 3D. ") + squares + up;
+}
+
+function makeLabels(leaves) {
+  return leaves.map((leaf) => {
+    const text = element("span", {}, String(leaf.id));
+    document.getElementById("space-labels").append(text);
+    return { leaf, text };
+  });
+}
+
+// What the pointer is on: a leaf, or the photo of a camera.
+function listenToPointer({ canvas, camera, leaves, cameras }) {
+  const caster = new THREE.Raycaster();
+  const meshes = [...leaves.map((leaf) => leaf.mesh), ...cameras.map((one) => one.photo)];
+  let pressed = null;
+
+  function find(event) {
+    const { left, top, width, height } = canvas.getBoundingClientRect();
+    const at = new THREE.Vector2(((event.clientX - left) / width) * 2 - 1, 1 - ((event.clientY - top) / height) * 2);
+    caster.setFromCamera(at, camera);
+    const seen = meshes.filter((mesh) => mesh.parent.visible);
+    return caster.intersectObjects(seen, false)[0]?.object.userData ?? {};
+  }
+
+  canvas.addEventListener("pointermove", (event) => {
+    if (event.buttons) return;
+    const { leaf, view } = find(event);
+    canvas.classList.toggle("on-leaf", leaf !== undefined || view !== undefined);
+    selection.hover(leaf ?? null);
+  });
+  canvas.addEventListener("pointerleave", () => selection.hover(null));
+  canvas.addEventListener("pointerdown", (event) => { pressed = [event.clientX, event.clientY]; });
+  canvas.addEventListener("pointerup", (event) => {
+    if (pressed === null || Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > 5) return;
+    const { leaf, view } = find(event);
+    if (view !== undefined) shownView.show(view);
+    else selection.select(leaf ?? null);
+  });
+}

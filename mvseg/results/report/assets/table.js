@@ -1,0 +1,127 @@
+// The table of leaves. A click on a header sorts; missing numbers are last either way.
+
+function buildTable(data) {
+  const columns = listColumns(data);
+  const table = document.getElementById("table");
+  const [head, body] = [table.tHead, table.tBodies[0]];
+  const rows = data.leaves.map((leaf) => makeRow(leaf, columns));
+  body.append(...rows.map((row) => row.element));
+  const order = { column: 0, isDescending: false };
+  const headers = columns.map((column, index) => makeHeader(column, () => sort(index)));
+  head.append(element("tr", {}, ...headers));
+  headers[0].setAttribute("aria-sort", "ascending");
+  const masks = data.views.flatMap((view) => view.masks);
+  const unmatched = data.numMasks - masks.filter((mask) => mask.leaf > 0).length;
+  document.getElementById("table-caption").textContent = describeTable(data, unmatched);
+
+  function sort(index) {
+    order.isDescending = order.column === index && !order.isDescending;
+    order.column = index;
+    const sign = order.isDescending ? -1 : 1;
+    rows.sort((a, b) => compare(a.keys[index], b.keys[index], sign) || a.leaf - b.leaf);
+    body.append(...rows.map((row) => row.element));
+    headers.forEach((header, at) => {
+      if (at === index) header.setAttribute("aria-sort", order.isDescending ? "descending" : "ascending");
+      else header.removeAttribute("aria-sort");
+    });
+  }
+
+  const leafOf = (event) => Number(event.target.closest("tr")?.dataset.leaf) || null;
+  body.addEventListener("pointerover", (event) => selection.hover(leafOf(event)));
+  body.addEventListener("pointerleave", () => selection.hover(null));
+  body.addEventListener("click", (event) => selection.select(leafOf(event)));
+  body.addEventListener("focusin", (event) => selection.hover(leafOf(event)));
+  body.addEventListener("focusout", () => selection.hover(null));
+  body.addEventListener("keydown", (event) => {
+    const step = { ArrowDown: 1, ArrowUp: -1 }[event.key];
+    const at = rows.findIndex((row) => row.element.contains(document.activeElement));
+    const next = rows[at + step];
+    if (step === undefined || next === undefined) return;
+    event.preventDefault();
+    next.element.querySelector("button").focus();
+    selection.select(next.leaf);
+  });
+  selection.listen((selected) => {
+    for (const row of rows) {
+      selection.mark(row.element, row.leaf);
+      row.element.setAttribute("aria-selected", row.leaf === selected);
+    }
+    const row = rows.find((one) => one.leaf === selected);
+    if (row) scrollInside(document.getElementById("table-frame"), row.element, head.offsetHeight);
+  });
+}
+
+// Only the table moves, never the page.
+function scrollInside(frame, row, above) {
+  if (row.offsetTop - above < frame.scrollTop) frame.scrollTop = row.offsetTop - above;
+  const below = row.offsetTop + row.offsetHeight - frame.clientHeight;
+  if (below > frame.scrollTop) frame.scrollTop = below;
+}
+
+function compare(a, b, sign) {
+  if (a === null || b === null) return (a === null) - (b === null);
+  return sign * (typeof a === "string" ? a.localeCompare(b) : a - b);
+}
+
+// Each column: name, unit, meaning, and for a leaf its text and what it is sorted by.
+function listColumns(data) {
+  const masks = data.views.flatMap((view) => view.masks);
+  const mean = (leaf) => {
+    const scores = masks.filter((mask) => mask.leaf === leaf.id).map((mask) => mask.match_score);
+    return scores.length ? scores.reduce((sum, score) => sum + score, 0) / scores.length : null;
+  };
+  const numViews = (leaf) => data.views.filter((view) => showsLeaf(view, leaf.id)).length;
+  const traits = data.traits.filter((trait) => trait.isColumn).map((trait) => ({
+    name: nameOf(trait),
+    unit: trait.unit,
+    meaning: trait.meaning,
+    cell: (leaf) => numberCell(leaf.traits[trait.name]),
+    key: (leaf) => leaf.traits[trait.name]?.value ?? null,
+  }));
+  const plain = (name, meaning, key, write = String) => ({
+    name, unit: "", meaning, key, cell: (one) => element("td", {}, key(one) === null ? "\u2013" : write(key(one))),
+  });
+  const leaf = { ...plain("leaf", "number of the leaf, in all files", (one) => one.id), cell: leafCell };
+  const score = plain("match", "mean match score of the leaf's masks, 1 is best", mean, (value) => value.toFixed(2));
+  if (data.traits.length === 0) return [leaf, plain("views", "photos with a mask of the leaf", numViews), score];
+  const shape = plain("shape", "what was measured", (one) => one.shape);
+  const doubts = (one) => one.doubts.join("; ");
+  const quality = {
+    ...plain("doubts", "reasons to doubt the numbers", (one) => doubts(one) || null),
+    cell: (one) => element("td", { class: "text" }, doubts(one)),
+    kind: "text",
+  };
+  return [leaf, ...traits, score, shape, quality];
+}
+
+function leafCell(leaf) {
+  const swatch = element("span", { class: "swatch", style: `background:${leaf.color}` });
+  const name = { type: "button", "aria-label": `leaf ${leaf.id}` };
+  return element("td", {}, element("button", name, swatch, ` ${leaf.id}`));
+}
+
+function numberCell(number) {
+  if (number?.value === undefined) return element("td", { title: number?.why }, "\u2013");
+  const text = formatNumber(number.value, number.sd);
+  const sd = text.sd === null ? null : element("span", { class: "sd" }, ` \u00b1 ${text.sd}`);
+  return element("td", { title: number.on }, text.value, sd);
+}
+
+function makeRow(leaf, columns) {
+  const row = element("tr", { "data-leaf": leaf.id }, ...columns.map((column) => column.cell(leaf)));
+  row.classList.toggle("doubtful", (leaf.doubts ?? []).length > 0);
+  return { leaf: leaf.id, element: row, keys: columns.map((column) => column.key(leaf)) };
+}
+
+function makeHeader(column, sort) {
+  const button = element("button", { type: "button", title: column.meaning }, column.name);
+  button.addEventListener("click", sort);
+  const unit = column.unit ? element("small", {}, column.unit) : null;
+  return element("th", { scope: "col", class: column.kind ?? null }, button, unit);
+}
+
+function describeTable(data, unmatched) {
+  const others = unmatched ? ` ${count(unmatched, "mask")} matched to no leaf.` : "";
+  const sd = data.traits.length ? " Numbers are given \u00b1 one standard deviation." : "";
+  return `Click a header to sort.${sd}${others}`;
+}
