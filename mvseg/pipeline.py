@@ -25,7 +25,7 @@ from mvseg.matching.match import check_baselines, match_regions
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.multiview.config import DetectConfig
-from mvseg.multiview.kept_detections import KeptDetections, read_detections, write_detections
+from mvseg.multiview.kept_detections import KeptDetections, delete_kept, read_detections, write_detections
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
 from mvseg.multiview.witnesses import revise_masks
@@ -52,8 +52,9 @@ def run_scene(
         folder: the scene, see `load_scene`.
         masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
         config: the options of all stages.
-        keep: folder for the detections of each photo, made when it is needed: a run that was cut off goes on from them.
-            `delete_kept` deletes them once the result is safe.
+        keep: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
+            from them, and one with other options of later stages uses them again. What it holds of other photos or
+            options is deleted; `delete_kept` deletes the rest.
         progress: show progress bars.
 
     Returns:
@@ -75,7 +76,7 @@ def run_scene(
         raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them")
     if regions is None:
         with _timed(seconds, "detect"):
-            detections, matching = detect_regions(scene, config, keep=keep, progress=progress)
+            detections, matching = detect_regions(scene, config, keep=keep, prune=True, progress=progress)
         if config.detect.witnesses:
             with _timed(seconds, "witnesses"):
                 detections, matching, from_views = hear_witnesses(scene, detections, matching, progress=progress)
@@ -143,12 +144,17 @@ def place_scene(scene: Scene, config: RunConfig) -> Scene:
 
 
 def detect_regions(
-    scene: Scene, config: RunConfig = RunConfig(), *, keep: Path | None = None, progress: bool = False
+    scene: Scene,
+    config: RunConfig = RunConfig(),
+    *,
+    keep: Path | None = None,
+    prune: bool = False,
+    progress: bool = False,
 ) -> tuple[Proposals, Matching]:
     """Find and match the instances in the photos of a scene, see `MultiViewMaskRCNN.find_regions`.
 
     Runs on the first GPU, if there is one. Torch's thread count and random generators are left alone. One photo at a
-    time is in memory. For `keep` see `run_scene`.
+    time is in memory. For `keep` see `run_scene`; `prune` deletes what it holds of other photos and options.
 
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
@@ -160,7 +166,7 @@ def detect_regions(
         detector, num_iterations=detect.num_iterations, scales=detect.scales, match=config.match
     ).to(device)
     kept = None if keep is None else KeptDetections(keep, _describe_detector(detect, model, device))
-    found = []
+    found, names = [], set()
     for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress):
         path = kept.path(scene, view) if kept is not None and scene.views[view].path.is_file() else None
         shown = None if path is None else read_detections(path)
@@ -168,7 +174,11 @@ def detect_regions(
             shown = model.detect(torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1).float() / 255)
             if path is not None:
                 write_detections(path, shown)
+        if path is not None:
+            names.add(path.name)
         found.append(shown)
+    if keep is not None and prune:
+        delete_kept(keep, but=names)
     detections, matching = model.match_detections(found, scene.cameras, progress=progress)
     if not len(detections.regions):
         message = f"the detector finds nothing that scores {detect.min_score:g} or more"

@@ -1,7 +1,10 @@
-"""SIGTERM as an exception, so that what is half written is cleared away, as after Ctrl-C."""
+"""How processes end: SIGTERM as an exception, so that what is half written is cleared away, as after Ctrl-C; and
+workers, which end with the process that started them."""
 
 from __future__ import annotations
 
+import multiprocessing
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -38,6 +41,14 @@ def stopped_by_sigterm() -> Iterator[None]:
     finally:
         sys.unraisablehook = earlier_hook
         signal.signal(signal.SIGTERM, signal.SIG_DFL if earlier is None else earlier)
+
+
+def end_with_parent() -> None:
+    """Wait until the parent process is gone, then end this one at once; for a thread of a `multiprocessing` process."""
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)
 
 
 def _terminate(*_: object) -> None:

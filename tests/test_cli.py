@@ -309,6 +309,7 @@ def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
         (["--help"], ["{" + ",".join(VERBS) + "}"]),
         (["--version"], [f"mvseg {mvseg.__version__}"]),
         (["infer", "--help"], ["--masks", "--detect.weights", "--match.method", "--reconstruct.seen_share"]),
+        (["batch", "--help"], ["--resume", "--num_workers", "--scheduler", "--detect.weights", "--scale", "--up"]),
         (["match", "--help"], ["scenes [scenes ...]", "--masks", "--match.method"]),
         (["train", "--help"], ["--photos", "--labels", "--resume"]),
     ],

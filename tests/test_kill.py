@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 
+from mvseg.batch import run_batch
+from mvseg.cli import main
 from mvseg.detectors.weights_file import read_weights
 from mvseg.results.provenance import hash_files
 from mvseg.results.read import read_instances
@@ -136,6 +138,48 @@ def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: 
         assert [path.name for path in out.iterdir()] == ["plant"]
         counts = json.loads((place / "run.json").read_text())["counts"]
         assert len(read_instances(place, plant / "truth")[0]) == counts["regions"]
+
+
+def test_a_batch_goes_on_where_it_was_killed(
+    runs: Runs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each result is old or new, and in the end all tables are those of a batch that was never disturbed."""
+    names, out, earlier = ("aloe", "basil", "mint"), tmp_path / "out", tmp_path / "earlier"
+    plants = [write_scene(tmp_path / "plants" / name, 2 + number % 2) for number, name in enumerate(names)]
+    run = ["batch", str(plants[0].parent), "--masks", "masks", "--out", str(out), "--quiet", "--num_workers", "2"]
+    run += ["--resume", "true", "--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
+    monkeypatch.setattr(run_batch, "run_locally", work_here)
+    monkeypatch.chdir(tmp_path)  # where no masks/ lies
+    assert main([*run, "--match.seed", "7", "--unit", "cm", "--scale", "0.1"]) == 0
+    shutil.copytree(out, earlier)
+    seconds = runs(run)["seconds"]
+    old, new = ({name: read_result(of / name) for name in names} for of in (earlier, out))
+    tables = {path.name: path.read_bytes() for path in (out / "tables").glob("traits*")}
+    assert len(tables) in (2, 4)  # without and with pyarrow
+    assert all(old[name] != new[name] for name in names)
+    for number, (signal, delay) in enumerate(moments("batch", seconds)):
+        shutil.rmtree(out)
+        if number % 3:
+            shutil.copytree(earlier, out)
+        runs(run, signal, delay)
+        for name in names:
+            if number % 3 or (out / name).exists():
+                assert read_result(out / name) in (old[name], new[name])
+        if number % 3 or (out / "tables").exists():
+            read_result(out / "tables")
+        if signal == SIGTERM and out.exists():
+            assert {path.name for path in out.iterdir()} <= {*names, "tables", "_batch"}
+        runs(run)
+        assert {path.name for path in out.iterdir()} == {*names, "tables", "_batch"}
+        assert {name: read_result(out / name) for name in names} == new
+        read_result(out / "tables")
+        assert {name: (out / "tables" / name).read_bytes() for name in tables} == tables
+
+
+def work_here(work: Any, items: Any, *, num_workers: int, started: Any) -> Iterator[tuple[int, Any]]:
+    """Without processes that take seconds to start."""
+    for key, item in items.items():
+        yield key, work(item)
 
 
 @pytest.mark.parametrize("num_workers", [2] if KILLS < 5 else [0, 2])

@@ -1,1 +1,1 @@
-"""Scenes from their folders to result folders."""
+"""Scenes from their folders to result folders: one, or a night's plants."""

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg._version import __version__
-from mvseg.cli import adapt, check, infer, match, models, simulate, train
+from mvseg.cli import adapt, batch, check, infer, match, models, simulate, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -23,6 +23,7 @@ ABOUT = "The same instance, with the same id, in every calibrated view and in 3D
 VERBS = {
     "check": check,
     "infer": infer,
+    "batch": batch,
     "match": match,
     "eval": evaluate,
     "train": train,
@@ -40,7 +41,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 1 where `check`
-        found an error; 130 after Ctrl-C, 143 after SIGTERM.
+        found an error; 3 when scenes of a batch have failed; 130 after Ctrl-C, 143 after SIGTERM.
     """
     # Let idle threads sleep: on a shared machine, spinning ones slow small tensor operations tenfold. Must be set
     # before torch is loaded, which the verbs do when they start.
@@ -60,7 +61,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except OSError as error:  # a full disk, a folder that cannot be made
         return complain(error)
     except MemoryError as error:
-        return complain(InputError(f"there is not enough memory ({error or 'no more is known'})"))
+        return complain(InputError(f"there is not enough memory ({str(error) or 'no more is known'})"))
     except KeyboardInterrupt:
         print("mvseg: interrupted", file=sys.stderr)
         return INTERRUPTED

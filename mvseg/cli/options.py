@@ -12,6 +12,7 @@ from typing import Any, Literal, TypeVar
 from jsonargparse import ActionConfigFile, ArgumentParser, Namespace  # type: ignore[attr-defined]  # documented
 
 from mvseg.adaptation.config import AdaptConfig
+from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.formats.yaml_file import check_yaml
 from mvseg.matching.config import MatchConfig
@@ -85,6 +86,40 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
         "--categories", type=str | None, help="names of the categories of masks to take, as leaf,petiole (default: all)"
     )
     parser.add_class_arguments(MatchConfig, "match")
+
+
+def add_run_options(parser: ArgumentParser) -> None:
+    """The options of a whole run, from photos or masks to traits; `build_run` reads them."""
+    add_matching_options(parser, masks=None)
+    parser.add_class_arguments(DetectConfig, "detect")
+    parser.add_class_arguments(ReconstructConfig, "reconstruct")
+    parser.add_class_arguments(TraitsConfig, "traits")
+    help_scale = "multiplies the world's lengths, for cameras without a scale"
+    parser.add_argument("--scale", type=float | None, help=help_scale)
+    help_unit = "name of the world's unit, after --scale (default: the scene's)"
+    parser.add_argument("--unit", type=str | None, help=help_unit)
+    help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers); default: the scene's own"
+    parser.add_argument("--up", type=str | list[float] | None, help=help_up)
+    help_rims = "draw the rims of the surfaces, as the cameras see them, into overlay/"
+    parser.add_argument("--draw_rims", type=bool, default=True, help=help_rims)
+
+
+def build_run(args: Namespace) -> RunConfig:
+    """The options that `add_run_options` added."""
+    return RunConfig(
+        detect=build_options(DetectConfig, args.detect, "detect."),
+        match=build_options(MatchConfig, args.match, "match."),
+        reconstruct=build_options(ReconstructConfig, args.reconstruct, "reconstruct."),
+        traits=build_options(TraitsConfig, args.traits, "traits."),
+        scale=args.scale,
+        unit=args.unit,
+        up=read_up(args.up),
+        split_merged=args.split_merged,
+        draw_rims=args.draw_rims,
+        report=args.report,
+        coco_crowd=args.coco_crowd,
+        categories=args.categories,
+    )
 
 
 def join_up(argv: Sequence[str]) -> list[str]:

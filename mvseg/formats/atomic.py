@@ -94,20 +94,26 @@ def sweep_abandoned(place: Path) -> None:
 
 
 @contextmanager
-def lock_folder(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Keep other runs out of a folder in which files are added one by one; the lock ends with the process.
 
+    Args:
+        folder: must exist.
+        wait: wait until no other process works in it.
+
     Raises:
-        InputError: another process works in it.
+        InputError: another process works in it, and `wait` is not set.
     """
     if sys.platform == "win32":
         yield
         return
     handle = os.open(folder, os.O_RDONLY)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except BaseException as error:
         os.close(handle)
+        if not isinstance(error, OSError):  # a signal, while it waits
+            raise
         if error.errno not in (errno.EAGAIN, errno.EACCES):  # a disk without locks
             yield
             return

@@ -1,8 +1,9 @@
 """Detections kept while a scene is worked on, so that a run that was cut off goes on from them.
 
-One .safetensors file per photo, in a folder beside the result, which is deleted when the result is there. Its name is a
-hash of everything that the detections depend on: the photo, its camera, the weights and the options. A changed photo or
-option gets another name, so that detections are used again only where they would be the same.
+One .safetensors file per photo, in a folder that `mvseg infer` deletes when the result is there, and that `mvseg batch`
+keeps for the next batch. Its name is a hash of everything that the detections depend on: the photo, its camera, the
+weights and the options. A changed photo or option gets another name, so that detections are used again only where they
+would be the same.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -62,11 +64,13 @@ def read_detections(path: Path) -> dict[str, Tensor] | None:
     return detections if detections.keys() == FIELDS else None
 
 
-def delete_kept(folder: Path) -> None:
-    """Delete the kept detections, and the folder unless somebody has put something else into it."""
+def delete_kept(folder: Path, *, but: Collection[str] = ()) -> None:
+    """Delete the kept detections but those of the given names, and the folder if nothing else is in it."""
     if not folder.is_dir():
         return
     for path in [*folder.iterdir()]:
+        if path.name in but:
+            continue
         is_half = is_partial(path) and KEPT_NAME.match(path.name[1:]) is not None
         if KEPT_NAME.fullmatch(path.name) or is_half:
             path.unlink(missing_ok=True)

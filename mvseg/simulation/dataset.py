@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import multiprocessing
-import os
 import shutil
 import signal
 import threading
@@ -24,6 +23,7 @@ from mvseg.formats.atomic import is_partial, lock_folder, write_text_whole, writ
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.label_png import read_label_png
 from mvseg.scene import Cameras
+from mvseg.sigterm import end_with_parent
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.scene_writer import write_scene, write_table
@@ -190,14 +190,6 @@ def start_worker() -> None:
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     threading.Thread(target=end_with_parent, daemon=True).start()
-
-
-def end_with_parent() -> None:
-    """Wait until the parent process is gone, then end this one at once."""
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def finish_scene(dataset: Path, preset: Preset, scene: SceneSpec) -> list[Photo]:

@@ -30,18 +30,22 @@ def write_long(path: Path, traits: Traits) -> None:
         for name, number in leaf.numbers.items():
             if number.exists or name not in VOXEL_NAMES:
                 rows.append(_row(traits, name, number, leaf=leaf.leaf))
-    _write(path, COLUMNS, rows)
+    write_csv(path, COLUMNS, rows)
 
 
 def write_wide(path: Path, traits: Traits) -> None:
     """One row per leaf: each trait, beside it its standard deviation, and in the end the unit of lengths, the method
     and the quality: "good", or the reasons to doubt the numbers."""
+    write_csv(path, wide_columns(), [_wide_row(traits, leaf) for leaf in traits.leaves])
+
+
+def wide_columns() -> list[str]:
+    """The columns of `write_wide`."""
     columns = ["leaf"]
     for trait in LEAF_TRAITS:
         if trait.name != "quality":
             columns += [trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name]
-    columns += ["iou", "unit", "method", "quality"]
-    _write(path, columns, [_wide_row(traits, leaf) for leaf in traits.leaves])
+    return [*columns, "iou", "unit", "method", "quality"]
 
 
 def _row(traits: Traits, name: str, number: Measurement, *, leaf: int | str) -> list[str | int]:
@@ -78,6 +82,7 @@ def escape_text(text: str) -> str:
     return f"'{text}" if text.startswith(FORMULA_STARTS) else text
 
 
-def _write(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str | int]]) -> None:
+def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str | int]]) -> None:
+    """Columns, then rows, as UTF-8."""
     with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([columns, *rows])

@@ -101,3 +101,7 @@ def test_a_run_that_was_cut_off_goes_on_from_its_detections(
     assert torch.equal(resumed_ids.instance_ids, ids.instance_ids)
     detect_regions(scene, RunConfig(detect=DetectConfig(min_score=0.06)), keep=keep)
     assert len(ran) == 3 + 2 + 4
+    assert len(list(keep.iterdir())) == 4 + 4  # scenes may share a folder
+    detect_regions(scene, config, keep=keep, prune=True)
+    assert len(ran) == 3 + 2 + 4
+    assert len(list(keep.iterdir())) == 4

@@ -1,0 +1,25 @@
+"""Where a batch keeps what: OUT/NAME holds the result of a scene, and two folders beside them are the batch's own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+STATE, TABLES = "_batch", "tables"
+RESERVED = {STATE, TABLES}
+
+
+def scene_state(out: Path, name: str) -> Path:
+    """The folder of a scene's status and its kept detections; locked while a process works on the scene."""
+    return out / STATE / name
+
+
+def scene_detections(out: Path, name: str) -> Path:
+    return scene_state(out, name) / "detections"
+
+
+def scene_result(out: Path, name: str) -> Path:
+    return out / name
+
+
+def tables_folder(out: Path) -> Path:
+    return out / TABLES

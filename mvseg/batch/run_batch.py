@@ -1,0 +1,180 @@
+"""A night's plants: scene after scene, on this machine or on a cluster; what is done stays done."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import closing, contextmanager, suppress
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from mvseg._version import __version__
+from mvseg.batch.dask_workers import connect, run_on_dask
+from mvseg.batch.local_workers import run_locally
+from mvseg.batch.lost import Lost
+from mvseg.batch.places import STATE, scene_result, scene_state, tables_folder
+from mvseg.batch.progress import Progress
+from mvseg.batch.scene_list import BatchScene, list_scenes
+from mvseg.batch.status import Status, write_status
+from mvseg.batch.tables import write_tables
+from mvseg.batch.work import Finished, work_on_scene
+from mvseg.config import RunConfig
+from mvseg.detectors.zoo import find_weights
+from mvseg.errors import InputError
+from mvseg.formats.atomic import is_partial, lock_folder, sweep_abandoned
+from mvseg.results.earlier import check_out
+
+Started = Callable[[int], object]
+Engine = Callable[[dict[int, BatchScene], int | None, Started], Generator[tuple[int, Any], None, None]]
+
+
+@dataclass(frozen=True)
+class BatchCounts:
+    """What became of the scenes: `kept` are those that were done before; `warned` of those that are done."""
+
+    done: int
+    kept: int
+    failed: int
+    warned: int
+
+
+def run_batch(
+    source: Path,
+    out: Path,
+    config: RunConfig = RunConfig(),
+    *,
+    masks: Path | None = None,
+    resume: bool = False,
+    num_workers: int = 1,
+    scheduler: str | None = None,
+    quiet: bool = False,
+) -> BatchCounts:
+    """From scene folders to result folders `out/NAME` and the tables in `out/tables`. A failure is told on stderr.
+
+    Args:
+        source: a table or a folder of scenes, see `list_scenes`.
+        out: folder of the results; made when missing.
+        config: the options of all scenes.
+        masks: in each scene folder, or beside them; None: a detector finds them.
+        resume: go on with the batch that `out` holds: scenes that are done with the same inputs and options are kept.
+        num_workers: processes, >= 1, where no scheduler is given.
+        scheduler: of a Dask cluster, see `connect`.
+        quiet: no progress bar.
+
+    Raises:
+        InputError: bad input, before any scene is begun: the table, `out`, the scheduler.
+        OSError: the tables cannot be written.
+    """
+    if num_workers < 1:
+        raise InputError(f"{num_workers} workers asked for, expected at least 1")
+    scenes = list_scenes(source, out, masks)
+    if any(scene.masks is None for scene in scenes):
+        config = _find_weights(config)
+    place = out.resolve()
+    with _engine(partial(work_on_scene, place, config), num_workers, scheduler) as engine:
+        _claim(out, resume=resume)
+        with lock_folder(place):
+            check_out(tables_folder(place))
+            if any(is_partial(path) for path in place.iterdir()):  # a run was killed
+                for scene in scenes:
+                    sweep_abandoned(scene_result(place, scene.name))
+            finished = _work_on_all(scenes, engine, place, quiet=quiet)
+            rows = [(scene, finished[index].status) for index, scene in enumerate(scenes)]
+            run = {"mvseg": __version__, "source": str(source), "masks": masks and str(masks)}
+            has_parquet = write_tables(
+                tables_folder(place), place, rows, run={**run, "config": asdict(config)}
+            )
+    if not has_parquet:
+        print("mvseg: there are no Parquet tables without pyarrow: pip install 'mvseg[batch]'", file=sys.stderr)
+    done = [status for _, status in rows if status.state == "done"]
+    return BatchCounts(
+        done=len(done),
+        kept=sum(each.is_kept for each in finished.values()),
+        failed=len(rows) - len(done),
+        warned=sum(bool(status.warnings) for status in done),
+    )
+
+
+def _find_weights(config: RunConfig) -> RunConfig:
+    """The same options with the absolute path of weights that do not ship: workers may run elsewhere.
+
+    Raises:
+        InputError: there are no such weights.
+    """
+    weights = config.detect.weights
+    if find_weights(weights) is not None:
+        return config
+    if not Path(weights).is_file():
+        raise InputError(f"'{weights}' is neither a shipped detector (mvseg models) nor a file of weights")
+    return replace(config, detect=replace(config.detect, weights=str(Path(weights).absolute())))
+
+
+def _claim(out: Path, *, resume: bool) -> None:
+    """Make `out` the folder of a batch.
+
+    Raises:
+        InputError: it holds something else, or a batch that is not to be resumed.
+    """
+    if out.exists() and not out.is_dir():
+        raise InputError(f"{out}: is a file, expected a folder for the results")
+    if (out / STATE).is_dir():
+        if not resume:
+            raise InputError(f"{out}: holds an earlier batch, expected --resume true or another --out")
+    elif out.is_dir() and not all(is_partial(path) for path in out.iterdir()):
+        raise InputError(f"{out}: holds files that are not a batch, expected a new or empty folder")
+    (out / STATE).mkdir(parents=True, exist_ok=True)
+
+
+@contextmanager
+def _engine(work: Callable[[BatchScene], Finished], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
+    """What does `work` on many scenes, side by side or one after the other."""
+    if scheduler is None:
+        yield lambda scenes, at_once, started: run_locally(
+            work, scenes, num_workers=at_once or num_workers, started=started
+        )
+        return
+    with connect(scheduler) as client:
+        yield lambda scenes, at_once, started: run_on_dask(
+            work, scenes, client=client, at_once=at_once, started=started
+        )
+
+
+def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path, *, quiet: bool) -> dict[int, Finished]:
+    """All scenes, side by side; those whose worker died once more, one after the other, when memory is free again."""
+    finished: dict[int, Finished] = {}
+    progress = Progress([scene.name for scene in scenes], quiet=quiet)
+    with closing(progress):
+        for at_once in (None, 1):
+            left = {index: scene for index, scene in enumerate(scenes) if index not in finished}
+            if not left:
+                break
+            try:
+                with closing(engine(left, at_once, progress.start)) as answers:
+                    for index, answer in answers:
+                        if isinstance(answer, Lost) and at_once is None:
+                            progress.say(f"{scenes[index].name}: the process {answer.reason}; it gets one more try")
+                            progress.stop(index, is_finished=False)
+                            continue
+                        finished[index] = _give_up(scenes[index], answer, out) if isinstance(answer, Lost) else answer
+                        status = finished[index].status
+                        if status.state == "failed":
+                            progress.say(f"{scenes[index].name}: {status.sentence}")
+                        progress.stop(index, is_finished=True)
+            finally:
+                for index in progress.running:  # workers that had to be killed cleared nothing away
+                    sweep_abandoned(scene_result(out, scenes[index].name))
+    return finished
+
+
+def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:
+    """The status of a scene whose worker died twice."""
+    sentence = f"the process that worked on this scene {lost.reason}, twice"
+    folder = scene_state(out, scene.name)
+    status = Status(state="failed", scene=str(scene.folder), sentence=sentence)
+    with suppress(OSError):  # the tables tell it, too
+        folder.mkdir(parents=True, exist_ok=True)
+        write_status(folder, status)
+    sweep_abandoned(scene_result(out, scene.name))
+    return Finished(status)

@@ -1,0 +1,167 @@
+"""The scenes of a batch: the rows of a table, or the sub-folders of a folder."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from mvseg.batch.places import RESERVED
+from mvseg.errors import InputError
+
+OWN_COLUMNS = ("scene", "name", "masks")
+MAX_BYTES = 1 << 26
+
+
+@dataclass(frozen=True)
+class BatchScene:
+    """One scene of a batch.
+
+    Attributes:
+        name: of its result folder; unique in the batch, also where capitals do not count.
+        folder: the scene folder, absolute; it need not exist.
+        masks: the path that the table gives, or that of `--masks`; None: a detector finds them.
+        beside: where a relative path of masks may start, besides the scene folder; absolute.
+        carried: what the table says of it, {column: text}: `plant`, `time`, then the table's other columns.
+    """
+
+    name: str
+    folder: Path
+    masks: Path | None
+    beside: Path
+    carried: dict[str, str]
+
+
+def list_scenes(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene, ...]:
+    """The scenes of a batch, in the order of the table, or of the names of the folders.
+
+    Args:
+        source: a CSV table with a column `scene`, the path of a scene folder that starts at the table's own folder, and
+            perhaps `name`, `masks`, `plant`, `time` and others; or a folder with one scene in each sub-folder. Hidden
+            sub-folders, and `out`, are none.
+        out: folder of the results.
+        masks: of the scenes for which the table names none.
+
+    Raises:
+        InputError: there is nothing of that name, the table is broken, there are no scenes, or two of one name.
+    """
+    if source.is_dir():
+        scenes = _list_folders(source, out, masks)
+    elif source.is_file():
+        scenes = _read_table(source, masks)
+    else:
+        raise InputError(f"{source}: no such file or folder, expected a CSV table of scenes or a folder of scenes")
+    first_of: dict[str, BatchScene] = {}
+    for scene in scenes:
+        if scene.name.casefold() in RESERVED:
+            raise InputError(f"{source}: a scene is called '{scene.name}', the name of a folder of the batch's own")
+        other = first_of.setdefault(scene.name.casefold(), scene)
+        if other is not scene:
+            message = f"{other.folder} and {scene.folder} are both called '{scene.name}'"
+            raise InputError(f"{source}: {message}, expected different names (column name): each names a folder")
+    return scenes
+
+
+def _list_folders(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene, ...]:
+    if (source / "cameras.json").is_file():
+        raise InputError(f"{source}: is itself a scene, expected a folder of scenes; use mvseg infer for one scene")
+    folders = [path for path in sorted(source.iterdir()) if path.is_dir() and not path.name.startswith(".")]
+    folders = [path for path in folders if path.resolve() != out.resolve()]
+    if not folders:
+        raise InputError(f"{source}: has no sub-folders, expected a scene in each, or a CSV table of scenes")
+    return tuple(
+        BatchScene(
+            name=path.name,
+            folder=path.absolute(),
+            masks=masks,
+            beside=Path.cwd(),
+            carried={"plant": path.name, "time": ""},
+        )
+        for path in folders
+    )
+
+
+def _read_table(source: Path, masks: Path | None) -> tuple[BatchScene, ...]:
+    columns, rows = _read_rows(source)
+    extra = [column for column in columns if column not in (*OWN_COLUMNS, "plant", "time")]
+    taken = sorted(set(extra) & _columns_of_results())
+    if taken:
+        raise InputError(f"{source}: the column '{taken[0]}' is one of the results' own, expected another name")
+    scenes = []
+    for line, cells in rows:
+        row = dict(zip(columns, cells, strict=True))
+        if not row["scene"]:
+            raise InputError(f"{source}: line {line} names no scene, expected the path of its folder")
+        name = row.get("name") or _name_of(row["scene"])
+        if name in ("", ".", "..") or name.startswith(".") or "/" in name or "\\" in name or "\0" in name:
+            raise InputError(f"{source}: line {line}: '{name}' cannot name a folder of results")
+        carried = {"plant": row.get("plant") or name, "time": row.get("time", "")}
+        scenes.append(
+            BatchScene(
+                name=name,
+                folder=source.parent.absolute() / row["scene"],
+                masks=Path(row["masks"]) if row.get("masks") else masks,
+                beside=source.parent.absolute() if row.get("masks") else Path.cwd(),
+                carried=carried | {column: row[column] for column in extra},
+            )
+        )
+    return tuple(scenes)
+
+
+def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
+    """Columns, and the rows that are not empty, with the numbers of their lines; cells are stripped."""
+    try:
+        with source.open("rb") as file:
+            data = file.read(MAX_BYTES + 1)
+        text = data.decode("utf-8-sig")  # Windows editors put a mark in front
+    except OSError as error:
+        raise InputError(f"{source}: cannot be read ({error.strerror})") from None
+    except UnicodeDecodeError as error:
+        raise InputError(f"{source}: byte {error.start} is no UTF-8, expected a CSV table") from None
+    if len(data) > MAX_BYTES:
+        raise InputError(f"{source}: is larger than {MAX_BYTES} bytes, expected a table with one row per scene")
+    header = text.partition("\n")[0]
+    delimiter = ";" if ";" in header and "," not in header else ","  # spreadsheets of half of Europe
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
+    rows: list[tuple[int, list[str]]] = []
+    try:
+        for cells in reader:
+            if any(cell.strip() for cell in cells):
+                rows.append((reader.line_num, [cell.strip() for cell in cells]))
+    except csv.Error as error:
+        raise InputError(f"{source}: line {reader.line_num} is no CSV ({error})") from None
+    if not rows:
+        raise InputError(f"{source}: is empty, expected a table with a column 'scene'")
+    (_, columns), *rows = rows
+    _check_columns(source, columns)
+    if not rows:
+        raise InputError(f"{source}: names no scenes, expected one row per scene")
+    for line, cells in rows:
+        if len(cells) != len(columns):
+            raise InputError(f"{source}: line {line} has {len(cells)} cells, expected {len(columns)}")
+    return columns, rows
+
+
+def _check_columns(source: Path, columns: Sequence[str]) -> None:
+    if "scene" not in columns:
+        shown = ", ".join(columns)[:200]
+        raise InputError(f"{source}: has no column 'scene', found {shown}; expected the paths of scene folders there")
+    for column in columns:
+        if not column:
+            raise InputError(f"{source}: a column has no name")
+        if list(columns).count(column) > 1:
+            raise InputError(f"{source}: two columns are called '{column}', expected different names")
+
+
+def _columns_of_results() -> set[str]:
+    from mvseg.batch.tables import SUMMARY_COLUMNS
+    from mvseg.traits.table import COLUMNS, wide_columns
+
+    return {*COLUMNS, *wide_columns(), *SUMMARY_COLUMNS, "sentence"} - {"plant"}
+
+
+def _name_of(path: str) -> str:
+    """The parts of a path in one name: "day-1/basil" is "day-1_basil"."""
+    return "_".join(part for part in path.replace("\\", "/").split("/") if part not in ("", ".", ".."))

@@ -1,0 +1,130 @@
+"""What a worker does with one scene of a batch: nothing if its result is there, else the result; a failure is a
+sentence in the scene's status."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+import traceback
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import torch
+
+from mvseg.batch.one_scene import find_masks, save_scene, solve_scene
+from mvseg.batch.places import scene_detections, scene_result, scene_state
+from mvseg.batch.scene_key import scene_key
+from mvseg.batch.scene_list import BatchScene
+from mvseg.batch.status import FileHash, Status, read_status, write_status
+from mvseg.config import RunConfig
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.atomic import lock_folder, sweep_abandoned
+from mvseg.formats.scene_folder import load_scene
+from mvseg.results.earlier import RUN_FILE, check_out
+from mvseg.results.provenance import hash_files
+
+_one_at_a_time = threading.Lock()  # Dask's workers may have threads; warnings are caught for the whole process
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A scene that is done or has failed; `is_kept`: it had been done before with the same inputs and options."""
+
+    status: Status
+    is_kept: bool = False
+
+
+def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
+    """Work on one scene, on one thread, while no other process does.
+
+    Args:
+        out: folder of the results, absolute.
+        config: the options.
+        scene: the scene.
+
+    Raises:
+        OSError: the scene's status cannot be written.
+    """
+    torch.set_num_threads(1)
+    cv2.setNumThreads(1)
+    keep = scene_detections(out, scene.name)
+    folder, started = scene_state(out, scene.name), time.monotonic()
+    folder.mkdir(parents=True, exist_ok=True)
+    with _one_at_a_time, lock_folder(folder, wait=True):
+        earlier = read_status(folder)
+        try:
+            masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
+            key, inputs = _key_of(scene, masks, config, earlier)
+            if earlier is not None and earlier.key == key and _is_done(earlier, scene_result(out, scene.name)):
+                return Finished(earlier, is_kept=True)
+            write_status(folder, Status(state="running", scene=str(scene.folder), key=key, inputs=inputs))
+            status = _finish(scene, masks, scene_result(out, scene.name), config=config, keep=keep)
+        except Exception as error:  # whatever it is, the other scenes go on
+            status, key, inputs = _describe_failure(error, scene), "", {}
+        seconds = round(time.monotonic() - started, 3)
+        told = {"key": key, "inputs": inputs, "seconds": seconds, "peak_mb": _peak_mb()}
+        status = status.model_copy(update=told)
+        write_status(folder, status)
+    return Finished(status)
+
+
+def _key_of(
+    scene: BatchScene, masks: Path | None, config: RunConfig, earlier: Status | None
+) -> tuple[str, dict[str, FileHash]]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # the run itself gives them
+        loaded = load_scene(scene.folder)
+    return scene_key(loaded, masks, config, known={} if earlier is None else earlier.inputs)
+
+
+def _is_done(status: Status, result: Path) -> bool:
+    """Whether the result that a status tells of is there."""
+    run = result / RUN_FILE
+    if status.state != "done" or not run.is_file() or hash_files(run) != status.result:
+        return False
+    return all((result / name).is_file() for name in json.loads(run.read_bytes())["files"])
+
+
+def _finish(scene: BatchScene, masks: Path | None, out: Path, *, config: RunConfig, keep: Path) -> Status:
+    sweep_abandoned(out)
+    check_out(out)
+    result, messages = solve_scene(scene.folder, masks, config, keep=keep, progress=False)
+    save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages, progress=False)
+    return Status(
+        state="done",
+        scene=str(scene.folder),
+        result=hash_files(out / RUN_FILE),
+        instances=result.matching.num_instances,
+        masks=len(result.regions),
+        views=len(result.scene.views),
+        warnings=messages,
+    )
+
+
+def _describe_failure(error: Exception, scene: BatchScene) -> Status:
+    """The sentence of a failure; bad input needs no trace."""
+    trace = ""
+    if isinstance(error, InputError):
+        sentence = str(error)
+    elif isinstance(error, MemoryError):
+        sentence = f"there is not enough memory ({str(error) or 'no more is known'})"
+    elif isinstance(error, OSError):
+        sentence = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    else:
+        trace = "".join(traceback.format_exception(error))
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{Path(last.filename).name}, line {last.lineno}"
+        sentence = f"unexpected {type(error).__name__} in {place}: {error}"
+    return Status(state="failed", scene=str(scene.folder), sentence=" ".join(sentence.split()), trace=trace)
+
+
+def _peak_mb() -> float | None:
+    """The most memory that this process has held. (Linux's `ru_maxrss` starts with what its parent held.)"""
+    try:
+        lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
+        return round(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1e3, 1)  # kB
+    except (OSError, ValueError, StopIteration):
+        return None

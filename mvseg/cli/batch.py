@@ -1,0 +1,58 @@
+"""`mvseg batch`: many scenes, one after another or side by side, and their traits in one table."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+from mvseg.cli.options import DEFAULT_OUT, add_run_options, build_run
+from mvseg.errors import InputError
+
+SOME_FAILED = 3
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser's sub-commands."""
+    about = "Many scenes, one after another or side by side, and their traits in one table; see docs/batch.md."
+    parser = ArgumentParser(exit_on_error=False, description=about)
+    help_scenes = "CSV table (columns scene, and if you like name, masks, plant, time, ...), or folder of scene folders"
+    parser.add_argument("scenes", type=Path, help=help_scenes)
+    add_run_options(parser)
+    help_resume = "go on with the batch in --out: what is done with the same inputs and options is kept"
+    parser.add_argument("--resume", type=bool, default=False, help=help_resume)
+    help_workers = "scenes worked on at once, each in a process of its own on one thread (default: 1)"
+    parser.add_argument("--num_workers", type=int | None, help=help_workers)
+    help_scheduler = "work on a Dask cluster instead: the scheduler's address, or its file"
+    parser.add_argument("--scheduler", type=str | None, help=help_scheduler)
+    verbs.add_subcommand("batch", parser, help="many scenes, one table of traits")
+
+
+def run(args: Namespace) -> int:
+    """Run the verb; returns the exit code."""
+    from mvseg.batch.run_batch import run_batch  # keeps --help and wrong options quick
+
+    if args.scheduler is not None and args.num_workers is not None:
+        raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
+    out = args.out or DEFAULT_OUT / args.scenes.resolve().stem
+    counts = run_batch(
+        args.scenes,
+        out,
+        build_run(args),
+        masks=args.masks,
+        resume=args.resume,
+        num_workers=1 if args.num_workers is None else args.num_workers,
+        scheduler=args.scheduler,
+        quiet=args.quiet,
+    )
+    total, tables = counts.done + counts.failed, out / "tables"
+    if counts.warned:
+        some = f"{counts.warned} of {counts.done} scenes have warnings"
+        print(f"mvseg: warning: {some}, see {tables / 'summary.csv'}", file=sys.stderr)
+    if counts.failed:
+        print(f"mvseg: {counts.failed} of {total} scenes failed, see {tables / 'failures.csv'}", file=sys.stderr)
+    kept = f" ({counts.kept} of them before)" if counts.kept else ""
+    print(f"{out}: {counts.done} of {total} scenes are done{kept}")
+    return SOME_FAILED if counts.failed else 0

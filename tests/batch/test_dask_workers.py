@@ -1,0 +1,102 @@
+"""A Dask cluster of processes on this machine, and what becomes of an item whose worker dies."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from batch_work import describe_process, do_as_told
+from mvseg.batch.dask_workers import connect, run_on_dask
+from mvseg.batch.lost import Lost
+from mvseg.errors import InputError
+
+distributed = pytest.importorskip("distributed")
+dask = pytest.importorskip("dask")
+pytestmark = pytest.mark.filterwarnings("ignore::ResourceWarning")
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    settings = {
+        "distributed.scheduler.allowed-failures": 0,
+        "temporary-directory": str(tmp_path_factory.mktemp("dask")),
+        "distributed.logging.distributed": "critical",
+    }
+    with (
+        dask.config.set(settings),
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+    ):
+        yield cluster
+
+
+def test_a_worker_that_dies_loses_what_it_had_and_the_rest_goes_on(cluster: Any, tmp_path: Path) -> None:
+    begun: list[int] = []
+    words = ["a", "kill", "b", "raise", "c", "d"]
+    file = tmp_path / "scheduler.json"
+    file.write_text(json.dumps({"address": cluster.scheduler_address}))
+    with connect(str(file)) as client:
+        items = dict(enumerate(words))
+        answers = dict(run_on_dask(do_as_told, items, client=client, at_once=1, started=begun.append))
+    assert sorted(answers) == list(range(6))
+    assert [answers[key][0] for key in (0, 2, 4, 5)] == ["A", "B", "C", "D"]
+    assert isinstance(answers[1], Lost)
+    assert answers[1].reason.startswith("died with its worker, most likely because memory ran out")
+    assert answers[3] == Lost("stopped with ValueError: it is broken")
+    assert begun == [0, 1, 2, 3, 4, 5]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="looks into /proc")
+def test_workers_end_on_sigterm_as_dask_has_it(cluster: Any) -> None:
+    """Loading pycolmap would set a handler that prints a C++ trace, and may hang."""
+    with connect(cluster.scheduler_address) as client:
+        cluster.wait_for_workers(2, timeout=120)
+        before = client.run(describe_process)
+        list(run_on_dask(do_as_told, {0: "a"}, client=client, at_once=None, started=int))
+        after = client.run(describe_process)
+    assert len(after) == 2
+    assert {is_loaded for is_loaded, _ in after.values()} == {True}
+    assert {is_handled for _, is_handled in after.values()} == {is_handled for _, is_handled in before.values()}
+
+
+def test_items_are_given_to_all_workers_at_once_and_taken_back(cluster: Any, tmp_path: Path) -> None:
+    with connect(cluster.scheduler_address) as client:
+        answers = dict(run_on_dask(do_as_told, dict(enumerate("abcdef")), client=client, at_once=None, started=int))
+        assert [answers[key][0] for key in range(6)] == list("ABCDEF")
+        items = dict(enumerate(["a", *(f"kill-once:{tmp_path / str(number)}" for number in range(20))]))
+        with closing(run_on_dask(do_as_told, items, client=client, at_once=1, started=int)) as some:
+            assert next(some)[0] == 0
+    assert len(list(tmp_path.iterdir())) <= 1
+
+
+@pytest.mark.parametrize(
+    ("scheduler", "message"),
+    [
+        ("nowhere.json", "nowhere.json: cannot be read"),
+        ("broken.json", "broken.json: is no scheduler file of Dask"),
+        ("list.json", "list.json: is no scheduler file of Dask"),
+        ("tcp://127.0.0.1:9", "no Dask scheduler answers at tcp://127.0.0.1:9"),
+        ("127.0.0.1:9", "no Dask scheduler answers at 127.0.0.1:9"),
+    ],
+)
+def test_a_scheduler_that_is_not_there(
+    scheduler: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mvseg.batch.dask_workers.TIMEOUT", 0.5)
+    monkeypatch.chdir(tmp_path)
+    Path("broken.json").write_text("{")
+    Path("list.json").write_text("[]")
+    with pytest.raises(InputError) as error:
+        connect(scheduler)
+    assert str(error.value).startswith(message)
+
+
+def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"^--scheduler needs distributed: pip install 'mvseg\[batch\]'$"):
+        connect("tcp://127.0.0.1:9")

@@ -1,0 +1,75 @@
+"""Processes that work through a list, and what becomes of an item whose process dies."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from batch_work import Unpicklable, do_as_told
+from mvseg.batch.local_workers import run_locally
+from mvseg.batch.lost import Lost
+from mvseg.errors import InputError
+
+
+def run(items: list[str], num_workers: int) -> tuple[dict[int, Any], list[int]]:
+    """The answers, and the keys in the order in which workers took them."""
+    begun: list[int] = []
+    numbered = dict(enumerate(items))
+    answers = run_locally(do_as_told, numbered, num_workers=num_workers, started=begun.append)
+    found = list(answers)
+    assert len(found) == len({key for key, _ in found})
+    return dict(found), begun
+
+
+def test_every_item_has_its_answer_and_workers_are_used_again() -> None:
+    environment = dict(os.environ)
+    answers, begun = run(["a", "b", "c", "threads", "d"], 2)
+    assert [answers[key][0] for key in range(5)] == ["A", "B", "C", "1", "D"]
+    assert len({process for _, process in answers.values()} - {os.getpid()}) <= 2
+    assert begun == [0, 1, 2, 3, 4]
+    assert dict(os.environ) == environment
+
+
+def test_a_process_that_dies_loses_its_own_item_only() -> None:
+    answers, _ = run(["kill", "a", "exit", "b", "raise", "c"], 2)
+    assert [answers[key][0] for key in (1, 3, 5)] == ["A", "B", "C"]
+    assert answers[0] == Lost("was killed (SIGKILL), as systems do when memory runs out")
+    assert answers[2] == Lost("ended with exit code 7")
+    assert answers[4] == Lost("stopped with ValueError: it is broken")
+
+
+def test_the_last_item_may_kill_its_process() -> None:
+    answers, _ = run(["a", "kill"], 1)
+    assert (answers[0][0], type(answers[1])) == ("A", Lost)
+
+
+def test_nothing_to_do() -> None:
+    assert run([], 2) == ({}, [])
+
+
+def test_workers_that_cannot_start_are_an_error() -> None:
+    work = partial(do_as_told, Unpicklable())  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=r"^no worker can be started: the process ended with exit code 5$"):
+        list(run_locally(work, {0: "a", 1: "b"}, num_workers=2, started=int))
+
+
+def test_workers_clear_up_when_the_caller_has_enough(tmp_path: Path) -> None:
+    items = {0: f"wait:{tmp_path}", 1: "a"}
+    with closing(run_locally(do_as_told, items, num_workers=2, started=int)) as answers:
+        assert next(answers)[1][0] == "A"  # type: ignore[index]
+        while not (tmp_path / "begun").exists() or not (tmp_path / "begun").read_text():
+            time.sleep(0.01)
+        process = int((tmp_path / "begun").read_text())
+        os.kill(process, signal.SIGINT)  # a terminal sends Ctrl-C to all; the parent alone decides
+        time.sleep(0.1)
+        assert not (tmp_path / "cleared").exists()
+    assert (tmp_path / "cleared").exists()
+    with pytest.raises(ProcessLookupError):
+        os.kill(process, 0)

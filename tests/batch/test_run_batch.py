@@ -1,0 +1,338 @@
+"""A night's plants: what is done, kept, refused and told."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mvseg.batch import run_batch as batch
+from mvseg.batch.lost import Lost
+from mvseg.batch.places import scene_state
+from mvseg.batch.run_batch import BatchCounts, run_batch
+from mvseg.batch.status import read_status
+from mvseg.cli import main
+from mvseg.cli.command import build_parser
+from mvseg.cli.options import build_run
+from mvseg.config import RunConfig
+from mvseg.errors import InputError
+from mvseg.formats.atomic import lock_folder
+from mvseg.multiview.config import DetectConfig
+from mvseg.results.read import read_instances
+from scene_folders import write_scene
+
+COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
+
+
+@pytest.fixture
+def plants(tmp_path: Path) -> Path:
+    """Two scenes, and one whose cameras are broken."""
+    for name, num_views in (("basil", 3), ("mint", 2)):
+        write_scene(tmp_path / "plants" / name, num_views)
+    write_scene(tmp_path / "plants" / "cactus", 2)
+    (tmp_path / "plants" / "cactus" / "cameras.json").write_text("{")
+    return tmp_path / "plants"
+
+
+@pytest.fixture
+def here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work in this process: others take seconds to start."""
+
+    def run(
+        work: Callable[[Any], Any], items: Mapping[int, Any], *, num_workers: int, started: Callable[[int], object]
+    ) -> Iterator[tuple[int, Any]]:
+        assert num_workers >= 1
+        for key, item in items.items():
+            started(key)
+            yield key, work(item)
+
+    monkeypatch.setattr(batch, "run_locally", run)
+
+
+def arguments(scenes: Path, out: Path, *more: str) -> list[str]:
+    return ["batch", str(scenes), "--masks", "masks", "--out", str(out), *COARSE, *more]
+
+
+def read_table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_a_broken_scene_does_not_stop_the_others(
+    plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With real workers."""
+    out = tmp_path / "out"
+    assert main(arguments(plants, out, "--num_workers", "2")) == 3
+    said = capsys.readouterr()
+    assert said.out == f"{out}: 2 of 3 scenes are done\n"
+    reason = f"{plants / 'cactus' / 'cameras.json'}: not a whole JSON file"
+    assert f"\rmvseg: cactus: {reason}" in said.err
+    assert "batch: 100%" in said.err
+    assert ", basil" in said.err
+    assert f"mvseg: 1 of 3 scenes failed, see {out / 'tables' / 'failures.csv'}\n" in said.err
+    assert sorted(path.name for path in out.iterdir()) == ["_batch", "basil", "mint", "tables"]
+    (failure,) = read_table(out / "tables" / "failures.csv")
+    assert (failure["scene"], failure["folder"]) == ("cactus", str(plants / "cactus"))
+    assert failure["sentence"].startswith(reason)
+    assert len(read_instances(out / "basil", plants / "basil" / "truth")[0]) == 9
+    environment = read_status(scene_state(out, "basil"))
+    assert environment is not None
+    assert environment.peak_mb is None or environment.peak_mb > 50
+
+
+def test_the_tables_of_a_batch(here: None, plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    table, out = tmp_path / "night.csv", tmp_path / "out"
+    table.write_text(
+        "scene,plant,time,pot\nplants/basil,=b1,-2,red\nplants/mint,m1,day 3,@2\nplants/nowhere,n1,,\n"
+    )
+    assert main(arguments(table, out, "--quiet", "--unit", "cm")) == 3
+    said = capsys.readouterr().err.splitlines()
+    assert f"mvseg: nowhere: {tmp_path / 'plants' / 'nowhere'}: no such scene folder" in " ".join(said).replace(
+        "plants_nowhere", "nowhere"
+    )
+    assert f"mvseg: warning: 2 of 2 scenes have warnings, see {out / 'tables' / 'summary.csv'}" in said
+    single = read_table(out / "plants_basil" / "traits.csv")
+    joined = read_table(out / "tables" / "traits.csv")
+    assert list(joined[0])[:5] == ["scene", "plant", "time", "pot", "leaf"]
+    basil = [row for row in joined if row["scene"] == "plants_basil"]
+    assert {(row["plant"], row["time"], row["pot"]) for row in basil} == {("'=b1", "-2", "red")}
+    assert {(row["plant"], row["pot"]) for row in joined if row not in basil} == {("m1", "'@2")}
+    own = ["leaf", "trait", "value", "sd", "unit", "method", "ontology"]
+    assert [[row[name] for name in own] for row in basil] == [[row[name] for name in own] for row in single]
+    wide = read_table(out / "tables" / "traits_wide.csv")
+    assert [(row["scene"], row["leaf"]) for row in wide] == [
+        (scene, str(leaf)) for scene in ("plants_basil", "plants_mint") for leaf in (1, 2, 3)
+    ]
+    summary = read_table(out / "tables" / "summary.csv")
+    columns = ("scene", "plant", "state", "instances", "masks", "views", "warnings", "warning_text")
+    warning = "the cameras are in mm: unit cm without a scale only renames it"
+    assert [[row[name] for name in columns] for row in summary] == [
+        ["plants_basil", "'=b1", "done", "3", "9", "3", "1", warning],
+        ["plants_mint", "m1", "done", "3", "6", "2", "1", warning],
+        ["plants_nowhere", "n1", "failed", "0", "0", "0", "0", ""],
+    ]
+    run = json.loads((out / "tables" / "run.json").read_text())
+    assert run["counts"] == {"scenes": 3, "done": 2, "failed": 1}
+    assert run["config"]["unit"] == "cm"
+    assert run["files"].keys() == {path.name for path in (out / "tables").iterdir()} - {"run.json"}
+
+
+def test_the_same_tables_as_parquet(here: None, plants: Path, tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet")
+    (tmp_path / "night.csv").write_text("scene,plant,time\nplants/basil,007,1\nplants/mint,,\n")
+    main(arguments(tmp_path / "night.csv", tmp_path / "out", "--quiet"))
+    for name in ("traits", "traits_wide"):
+        rows = read_table(tmp_path / "out" / "tables" / f"{name}.csv")
+        table = parquet.read_table(tmp_path / "out" / "tables" / f"{name}.parquet")
+        assert table.column_names == list(rows[0])
+        found = table.to_pylist()
+        assert len(found) == len(rows) > 3
+        for row, cells in zip(rows, found, strict=True):
+            for column, text in row.items():
+                cell = cells[column]
+                if cell is None:
+                    assert text == ""
+                else:
+                    assert cell == (float(text) if isinstance(cell, float) else type(cell)(text))
+        assert found[0]["plant"] == "007"
+        assert {type(cells["leaf"]) for cells in found} <= {int, type(None)}
+        numbers = {"value", "sd"} if name == "traits" else {"area", "area_sd", "volume", "iou", "num_views"}
+        assert all(isinstance(cells[column], float | None) for cells in found for column in numbers)
+
+
+def test_without_pyarrow_there_are_csv_tables_and_a_sentence(
+    here: None, plants: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    main(arguments(plants, tmp_path / "out", "--quiet"))
+    assert "no Parquet tables without pyarrow: pip install 'mvseg[batch]'" in capsys.readouterr().err
+    assert not list((tmp_path / "out" / "tables").glob("*.parquet"))
+    assert (tmp_path / "out" / "tables" / "traits.csv").is_file()
+
+
+def test_a_batch_is_resumed(here: None, plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "out"
+    assert main(arguments(plants, out, "--quiet")) == 3
+    tables = {path.name: path.read_bytes() for path in (out / "tables").glob("*.csv")}
+    (out / "tables" / "notes.txt").write_text("a good night")
+    capsys.readouterr()
+    assert main(arguments(plants, out, "--quiet")) == 2
+    message = f"mvseg: error: {out}: holds an earlier batch, expected --resume true or another --out\n"
+    assert capsys.readouterr().err == message
+    assert main(arguments(plants, out, "--quiet", "--resume", "true")) == 3
+    assert capsys.readouterr().out == f"{out}: 2 of 3 scenes are done (2 of them before)\n"
+    again = {path.name: path.read_bytes() for path in (out / "tables").glob("*.csv")}
+    assert {name: again[name] for name in again if name != "summary.csv"} == {
+        name: tables[name] for name in tables if name != "summary.csv"
+    }
+    (plants / "cactus" / "cameras.json").write_bytes((plants / "mint" / "cameras.json").read_bytes())
+    assert main(arguments(plants, out, "--quiet", "--resume", "true")) == 0
+    assert capsys.readouterr().out == f"{out}: 3 of 3 scenes are done (2 of them before)\n"
+    assert read_table(out / "tables" / "failures.csv") == []
+    assert (out / "tables" / "notes.txt").read_text() == "a good night"
+    assert main(arguments(plants, out, "--quiet", "--resume", "true", "--match.seed", "5")) == 0
+    assert capsys.readouterr().out == f"{out}: 3 of 3 scenes are done\n"
+
+
+def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
+    plants: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rounds = []
+
+    def run(work: Any, items: Any, *, num_workers: int, started: Any) -> Iterator[tuple[int, Any]]:
+        rounds.append((num_workers, [item.name for item in items.values()]))
+        for key, item in items.items():
+            started(key)
+            dies = item.name == "basil" or (item.name == "mint" and num_workers > 1)
+            yield key, Lost("was killed") if dies else work(item)
+
+    monkeypatch.setattr(batch, "run_locally", run)
+    assert main(arguments(plants, tmp_path / "out", "--quiet", "--num_workers", "3")) == 3
+    assert rounds == [(3, ["basil", "cactus", "mint"]), (1, ["basil", "mint"])]
+    said = capsys.readouterr().err
+    assert "mvseg: mint: the process was killed; it gets one more try\n" in said
+    sentence = "the process that worked on this scene was killed, twice"
+    assert f"mvseg: basil: {sentence}\n" in said
+    failures = {row["scene"]: row["sentence"] for row in read_table(tmp_path / "out" / "tables" / "failures.csv")}
+    assert failures["basil"] == sentence
+    assert failures.keys() == {"basil", "cactus"}
+    status = read_status(scene_state(tmp_path / "out", "basil"))
+    assert status is not None
+    assert (status.state, status.sentence) == ("failed", sentence)
+
+
+def test_a_worker_that_is_killed_for_good(plants: Path, tmp_path: Path) -> None:
+    """Real processes: whichever has the first scene is killed, twice."""
+    if not Path("/proc/self/status").exists():
+        pytest.skip("looks for the workers in /proc")
+    out, killed = tmp_path / "out", []
+
+    def kill() -> None:
+        state = scene_state(out.resolve(), "basil")
+        while len(killed) < 2 and not stop.wait(0.002):
+            status = read_status(state)
+            if status is None or status.state != "running":
+                continue
+            for children in Path("/proc/self/task").glob("*/children"):
+                with suppress(OSError):  # threads and processes come and go
+                    for process in map(int, children.read_text().split()):
+                        if b"spawn_main" in Path(f"/proc/{process}/cmdline").read_bytes():
+                            os.kill(process, signal.SIGKILL)
+                            killed.append(process)
+            (state / "status.json").unlink(missing_ok=True)
+
+    stop = threading.Event()
+    thread = threading.Thread(target=kill)
+    thread.start()
+    try:
+        (plants / "cactus").rename(tmp_path / "cactus")
+        counts = run_batch(plants, out, masks=Path("masks"), quiet=True)
+    finally:
+        stop.set()
+        thread.join()
+    assert counts == BatchCounts(done=1, kept=0, failed=1, warned=0)
+    (failure,) = read_table(out / "tables" / "failures.csv")
+    assert failure["sentence"] == (
+        "the process that worked on this scene was killed (SIGKILL), as systems do when memory runs out, twice"
+    )
+    assert sorted(path.name for path in out.iterdir()) == ["_batch", "mint", "tables"]
+
+
+def test_scenes_on_a_dask_cluster(plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    distributed = pytest.importorskip("distributed")
+    dask = pytest.importorskip("dask")
+    folder = str(tmp_path / "dask")
+    with (
+        dask.config.set({"temporary-directory": folder}),
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster,
+    ):
+        address = cluster.scheduler_address
+        assert main(arguments(plants, tmp_path / "out", "--quiet", "--scheduler", address)) == 3
+    assert capsys.readouterr().out == f"{tmp_path / 'out'}: 2 of 3 scenes are done\n"
+    assert len(read_table(tmp_path / "out" / "tables" / "traits_wide.csv")) == 6
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--num_workers", "0"], "0 workers asked for, expected at least 1"),
+        (["--num_workers", "2", "--scheduler", "x"], "--num_workers has no effect with --scheduler"),
+        (["--scheduler", "nowhere.json"], "nowhere.json: cannot be read"),
+        (["--match.num_points", "0"], "num_points is 0"),
+        (["--masks", "null", "--detect.weights", "no.safetensors"], "'no.safetensors' is neither a shipped detector"),
+    ],
+)
+def test_bad_options(
+    more: list[str], message: str, plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(arguments(plants, tmp_path / "out", *more)) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_options_are_those_of_infer(tmp_path: Path) -> None:
+    (tmp_path / "run.yaml").write_text("match: {seed: 4}\nunit: cm\ncategories: leaf\n")
+    words = ["--config", str(tmp_path / "run.yaml"), "--detect.min_score", "0.4", "--reconstruct.shape", "voxels"]
+    words += ["--traits.leaves_only", "false", "--scale", "2", "--up", "0 0 1", "--draw_rims", "false"]
+    words += ["--split_merged", "true", "--coco_crowd", "ignore", "--report", "false"]
+    infer, both = (build_run(build_parser().parse_args([verb, "x", *words])[verb]) for verb in ("infer", "batch"))
+    assert infer == both
+    assert (both.match.seed, both.unit, both.scale, both.up) == (4, "cm", 2, (0, 0, 1))
+    names, usual = [field.name for field in fields(RunConfig)], RunConfig()
+    assert [name for name in names if getattr(both, name) == getattr(usual, name)] == []
+
+
+def test_weights_are_found_from_wherever_a_worker_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("mine.safetensors").touch()
+    found = batch._find_weights(RunConfig(detect=DetectConfig(weights="mine.safetensors")))
+    assert found.detect.weights == str(tmp_path / "mine.safetensors")
+    assert batch._find_weights(RunConfig()) == RunConfig()
+
+
+def test_an_out_that_is_no_batch_is_left_alone(plants: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "thesis.txt").touch()
+    with pytest.raises(InputError, match="holds files that are not a batch, expected a new or empty folder"):
+        run_batch(plants, out, resume=True)
+    with pytest.raises(InputError, match="is a file, expected a folder for the results"):
+        run_batch(plants, out / "thesis.txt")
+    assert [path.name for path in out.iterdir()] == ["thesis.txt"]
+
+
+def test_tables_that_were_changed_by_hand_are_left_alone(here: None, plants: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    main(arguments(plants, out, "--quiet"))
+    (out / "tables" / "traits.csv").write_text("scene,corrected\n")
+    with pytest.raises(InputError, match=r"traits\.csv: was changed after mvseg wrote it, move it away"):
+        run_batch(plants, out, masks=Path("masks"), resume=True)
+
+
+def test_two_batches_on_one_folder(plants: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    (out / "_batch").mkdir(parents=True)
+    with (
+        lock_folder(out),
+        pytest.raises(InputError, match="another run is writing to this folder, expected one at a time"),
+    ):
+        run_batch(plants, out, resume=True)
+
+
+def test_the_folder_of_scenes_may_hold_the_results(here: None, plants: Path) -> None:
+    (plants / "cactus" / "cameras.json").unlink()
+    out = plants / "results"
+    assert main(arguments(plants, out, "--quiet")) == 3
+    assert main(arguments(plants, out, "--quiet", "--resume", "true")) == 3
+    assert [row["scene"] for row in read_table(out / "tables" / "summary.csv")] == ["basil", "cactus", "mint"]

@@ -1,0 +1,46 @@
+"""Work for the workers of a batch that goes wrong as it is told; light, because each worker imports it."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from pathlib import Path
+
+
+class Unpicklable:
+    """Ends the process that unpickles it."""
+
+    def __reduce__(self) -> tuple[object, tuple[int]]:
+        return os._exit, (5,)
+
+
+def do_as_told(item: str, *_: object) -> tuple[str, int]:
+    """The word in capitals and the number of the process; "verb:argument" does something else before."""
+    verb, _, argument = item.partition(":")
+    if verb == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif verb == "kill-once" and not Path(argument).exists():
+        Path(argument).touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    elif verb == "exit":
+        os._exit(7)
+    elif verb == "raise":
+        raise ValueError("it is\nbroken")
+    elif verb == "wait":
+        try:
+            Path(argument, "begun").write_text(str(os.getpid()))
+            time.sleep(60)
+        finally:
+            Path(argument, "cleared").touch()
+    elif verb == "threads":
+        return os.environ["OMP_NUM_THREADS"], os.getpid()
+    return verb.upper(), os.getpid()
+
+
+def describe_process() -> tuple[bool, bool]:
+    """Whether pycolmap is loaded, and whether anybody handles SIGTERM, C++ included (Linux only)."""
+    lines = Path("/proc/self/status").read_text().splitlines()
+    caught = next(int(line.split()[1], 16) for line in lines if line.startswith("SigCgt:"))
+    return "pycolmap" in sys.modules, bool(caught >> (signal.SIGTERM - 1) & 1)
