@@ -35,7 +35,7 @@ FLOORS = (
     ("partition",),
     ("demo",),
     ("formats", "detectors", "matching", "reconstruction"),
-    ("multiview", "traits", "evaluation", "baselines", "simulation", "checks"),
+    ("multiview", "traits", "evaluation", "baselines", "simulation", "checks", "poses"),
     ("config",),
     ("training", "results"),
     ("pipeline",),

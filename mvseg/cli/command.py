@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg._version import __version__
-from mvseg.cli import adapt, batch, check, infer, match, models, simulate, train
+from mvseg.cli import adapt, batch, check, infer, match, models, pose, simulate, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -21,6 +21,7 @@ from mvseg.sigterm import Terminated, stopped_by_sigterm
 INTERRUPTED, TERMINATED = 130, 143
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
 VERBS = {
+    "pose": pose,
     "check": check,
     "infer": infer,
     "batch": batch,

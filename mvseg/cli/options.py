@@ -17,6 +17,7 @@ from mvseg.errors import InputError
 from mvseg.formats.yaml_file import check_yaml
 from mvseg.matching.config import MatchConfig
 from mvseg.multiview.config import DetectConfig
+from mvseg.poses.config import PoseConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.training.config import TrainConfig
 from mvseg.traits.config import TraitsConfig, Up
@@ -24,7 +25,9 @@ from mvseg.traits.config import TraitsConfig, Up
 DEFAULT_OUT = Path("results")
 # an installed mvseg carries configs/ inside the package, a checkout has it beside the package
 CONFIG_HOMES = (Path(str(files("mvseg") / "configs")), Path(str(files("mvseg"))).parent / "configs")
-Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, AdaptConfig)
+Options = TypeVar(
+    "Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, AdaptConfig, PoseConfig
+)
 
 
 def build_options(kind: type[Options], args: Namespace | None, prefix: str = "") -> Options:

@@ -25,6 +25,19 @@ def opencv_lens(K: np.ndarray, distortion: list[float], *, width: int, height: i
     return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
 
 
+def opencv_distortion(lens: pycolmap.Camera) -> list[float] | None:
+    """OpenCV's coefficients of a lens, as a rig file holds them; None of a lens that OpenCV does not have.
+
+    An empty list stands for a pinhole.
+    """
+    numbers = [float(number) for number in lens.params]
+    if lens.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
+        return []
+    if lens.model_name in ("SIMPLE_RADIAL", "RADIAL"):
+        return [*numbers[3:], 0.0, 0.0, 0.0, 0.0][:5]
+    return numbers[4:] if lens.model_name in ("OPENCV", "FULL_OPENCV") else None
+
+
 def photo_from_pinhole(lens: pycolmap.Camera, K: np.ndarray, xy: np.ndarray) -> np.ndarray:
     """Where undistorted pixel positions lie in the photo: (P, 2) -> (P, 2) float64, pixel centres at half integers."""
     rays = np.linalg.solve(K, np.concatenate([xy, np.ones((len(xy), 1))], 1).T).T

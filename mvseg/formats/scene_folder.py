@@ -67,7 +67,7 @@ def _describe(folder: Path) -> str:
     photos = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in (*PHOTO_SUFFIXES, ".heic", ".heif")]
     if photos:
         first = photos[0].relative_to(folder).as_posix()
-        return f"found {len(photos)} photos ({first}, ...): COLMAP estimates their cameras, put its model into sparse/"
+        return f"found {len(photos)} photos ({first}, ...): mvseg pose {folder} --out SCENE estimates their cameras"
     names = sorted(path.name for path in folder.iterdir())
     return f"found {list_some(names)}"
 

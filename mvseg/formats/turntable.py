@@ -15,9 +15,11 @@ who looks. Where the cameras go round a plant that stands still, the angles have
 from __future__ import annotations
 
 import dataclasses
+import json
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
@@ -81,6 +83,44 @@ def read_turntable(path: Path) -> Scene:
         turn, shift = turn_about(np.array(table.axis.point), np.array(table.axis.direction), view.angle)
         photos.append(dataclasses.replace(photo, R=photo.R @ turn, t=photo.R @ shift + photo.t))
     return build_scene(path.parent, photos, unit=table.unit, source=path)
+
+
+def read_turntable_angles(path: Path) -> tuple[dict[str, Any], list[float], str]:
+    """The camera (as in a rig file), the angles of its views in order, and the unit of a turntable whose axis is the
+    world's z axis: what `write_turntable` takes.
+
+    Raises:
+        InputError: the file cannot be read, has several cameras or another axis, or its camera has no K and size.
+    """
+    table = read_json(path, _Turntable)
+    axis, cameras = table.axis, list(table.cameras.values())
+    if len(cameras) != 1 or (*axis.point, *axis.direction) != (0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
+        raise InputError(f"{path}: expected one camera and the axis 0 0 1 at 0 0 0, as mvseg pose writes it")
+    camera = cameras[0].model_dump(exclude_none=True)
+    if not {"K", "width", "height"} <= camera.keys():
+        raise InputError(f"{path}: the camera has no K, width and height, expected a file of mvseg pose --turntable")
+    return camera, [view.angle for view in table.views], table.unit
+
+
+def write_turntable(
+    path: Path, camera: dict[str, Any], views: Sequence[tuple[str, float]], *, unit: str
+) -> None:
+    """Write the file of one camera beside a table whose axis is the world's z axis.
+
+    Args:
+        path: where; its folder must exist.
+        camera: width, height, K, R, t and distortion, as in a rig file.
+        views: file and angle in degrees of each photo.
+        unit: of t.
+    """
+    content = {
+        "format": TURNTABLE_FORMAT,
+        "unit": unit,
+        "axis": {"point": [0, 0, 0], "direction": [0, 0, 1]},
+        "cameras": {"camera": camera},
+        "views": [{"file": file, "camera": "camera", "angle": angle} for file, angle in views],
+    }
+    path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def turn_about(point: np.ndarray, direction: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:

@@ -17,8 +17,8 @@ from mvseg.results.provenance import hash_files
 RUN_FILE = "run.json"
 
 
-def check_out(out: Path) -> None:
-    """Check that a result can be written to `out`.
+def check_out(out: Path, run_file: str = RUN_FILE) -> None:
+    """Check that a result can be written to `out`. `run_file` lists the files of an earlier one.
 
     Raises:
         InputError: `out` is a file, lies where nothing can be written, or is a folder that is neither empty nor an
@@ -29,7 +29,7 @@ def check_out(out: Path) -> None:
         if not os.access(resolved, os.R_OK):
             raise InputError(f"{out}: cannot be read, expected a new or empty folder, or an earlier result")
         if any(resolved.iterdir()):
-            _check_unchanged(out, _read_listed(out))
+            _check_unchanged(out, _read_listed(out, run_file))
     elif out.exists() or any(parent.is_file() for parent in resolved.parents):
         raise InputError(f"{out}: the output folder is not writable (a file is in the way)")
     nearest = next((parent for parent in resolved.parents if parent.exists()), resolved)
@@ -37,12 +37,12 @@ def check_out(out: Path) -> None:
         raise InputError(f"{out}: the output folder is not writable (no permission to write in {nearest})")
 
 
-def list_files(folder: Path) -> dict[str, str]:
+def list_files(folder: Path, run_file: str = RUN_FILE) -> dict[str, str]:
     """{path in the folder: SHA-256} of all files but run.json itself; what run.json says of them."""
-    return {name: hash_files(folder / name) for name in _names_below(folder) if name != RUN_FILE}
+    return {name: hash_files(folder / name) for name in _names_below(folder) if name != run_file}
 
 
-def keep_user_files(out: Path, folder: Path) -> None:
+def keep_user_files(out: Path, folder: Path, run_file: str = RUN_FILE) -> None:
     """Copy what the user put into the earlier result at `out` into the new one in `folder`.
 
     Raises:
@@ -50,7 +50,7 @@ def keep_user_files(out: Path, folder: Path) -> None:
     """
     if not out.is_dir() or not any(out.iterdir()):
         return
-    for name in sorted(_names_below(out) - _read_listed(out).keys() - {RUN_FILE}):
+    for name in sorted(_names_below(out) - _read_listed(out, run_file).keys() - {run_file}):
         if os.path.lexists(folder / name):
             message = "was not written by mvseg, but the new result has a file of this name: move it away"
             raise InputError(f"{out / name}: {message}")
@@ -63,10 +63,10 @@ def _names_below(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in paths if path.is_symlink() or not path.is_dir()}
 
 
-def _read_listed(out: Path) -> dict[str, str]:
+def _read_listed(out: Path, run_file: str) -> dict[str, str]:
     """The files that the run.json of an earlier result lists, with their SHA-256."""
     try:
-        files = json.loads((out / RUN_FILE).read_text(encoding="utf-8"))["files"]
+        files = json.loads((out / run_file).read_text(encoding="utf-8"))["files"]
         return {str(name): str(sha256) for name, sha256 in files.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # no run.json, or another program's
         message = "holds files that are not an earlier result, expected a new or empty folder"

@@ -8,7 +8,14 @@ import pycolmap
 import pytest
 from scipy import ndimage
 
-from mvseg.formats.lens import distort, opencv_lens, photo_from_pinhole, pinhole_from_photo, undistort
+from mvseg.formats.lens import (
+    distort,
+    opencv_distortion,
+    opencv_lens,
+    photo_from_pinhole,
+    pinhole_from_photo,
+    undistort,
+)
 
 WIDTH, HEIGHT = 160, 120
 K = np.array([[150.0, 0, 81.3], [0, 155.0, 58.2], [0, 0, 1]])
@@ -173,3 +180,29 @@ def test_lenses_in_turn_do_not_disturb_each_other() -> None:
     for name, values in COEFFICIENTS.items():
         np.testing.assert_array_equal(undistort(labels, lens_of(values), K), first[name])
     assert (first["barrel"] != first["pincushion"]).any()
+
+
+@pytest.mark.parametrize(
+    ("model", "params"),
+    [
+        ("SIMPLE_PINHOLE", [150, 80, 60]),
+        ("PINHOLE", [150, 155, 80, 60]),
+        ("SIMPLE_RADIAL", [150, 80, 60, -0.1]),
+        ("RADIAL", [150, 80, 60, -0.1, 0.02]),
+        ("OPENCV", [150, 155, 80, 60, -0.1, 0.02, 0.001, -0.002]),
+        ("FULL_OPENCV", [150, 155, 80, 60, -0.1, 0.02, 0.001, -0.002, 0.01, 0.02, 0.003, 0.001]),
+    ],
+)
+def test_lenses_of_colmap_are_opencvs(model: str, params: list[float]) -> None:
+    lens = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params)
+    coefficients = opencv_distortion(lens)
+    assert coefficients is not None
+    same = opencv_lens(lens.calibration_matrix(), coefficients, width=WIDTH, height=HEIGHT)
+    rays = np.random.default_rng(0).uniform(-0.4, 0.4, (20, 2))
+    rays = np.column_stack([rays, np.ones(20)])
+    np.testing.assert_allclose(same.img_from_cam(rays), lens.img_from_cam(rays), atol=1e-9)
+
+
+def test_a_fisheye_is_none_of_opencvs() -> None:
+    lens = pycolmap.Camera(model="OPENCV_FISHEYE", width=WIDTH, height=HEIGHT, params=[150, 155, 80, 60, *FISHEYE])
+    assert opencv_distortion(lens) is None

@@ -1,0 +1,90 @@
+"""`mvseg pose`: from photos alone to a scene folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+from mvseg.cli.options import CheckedConfig, build_options, read_up
+from mvseg.errors import InputError
+from mvseg.formats.board import BoardConfig
+from mvseg.poses.config import Known, PoseConfig
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser's sub-commands."""
+    about = "Estimate the cameras of photos: a scene folder for mvseg infer, from photos alone."
+    parser = ArgumentParser(exit_on_error=False, description=about)
+    parser.add_argument("photos", type=Path, help="folder of photos, or of folders of photos, one per camera")
+    parser.add_argument("--out", type=Path, required=True, help="the scene folder")
+    parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options")
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    parser.add_class_arguments(PoseConfig)
+    help_board = "scale and axes from a printed ChArUco board: --board.columns, --board.rows, --board.square, ..."
+    parser.add_argument("--board", type=BoardConfig | None, help=help_board)
+    help_marker = "scale from printed ArUco or AprilTag markers with sides (of the black squares) of this length"
+    parser.add_argument("--marker", type=float | None, help=help_marker)
+    help_distance = "scale from how far apart two photos (by name), or two markers (as marker:7), are: A B LENGTH"
+    parser.add_argument("--distance", nargs=3, type=str, metavar=("A", "B", "LENGTH"), help=help_distance)
+    help_positions = "scale and axes from where the camera stood: CSV with photo,x,y,z, or JSON"
+    parser.add_argument("--positions", type=Path | None, help=help_positions)
+    parser.add_argument("--unit", type=str | None, help="name of the unit of these lengths (mm, m, ...)")
+    help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers)"
+    parser.add_argument("--up", type=str | list[float] | None, help=help_up)
+    help_turntable = (
+        "photos from a turntable, by one camera that stands still: 'board' calibrates it from photos of --board on the "
+        "table; a turntable.json made so gives the cameras of a plant that was photographed at the same angles"
+    )
+    parser.add_argument("--turntable", type=str | None, help=help_turntable)
+    verbs.add_subcommand("pose", parser, help="a scene folder from photos alone")
+
+
+def run(args: Namespace) -> int:
+    """Run the verb; returns the exit code."""
+    known = Known(
+        board=args.board if args.board is None else BoardConfig(**vars(args.board)),
+        marker=args.marker,
+        distance=_read_distance(args.distance),
+        positions=args.positions,
+        unit=args.unit or "",
+    )
+    config = build_options(PoseConfig, args)
+    if args.turntable is not None:
+        _run_turntable(args, known, config)
+        return 0
+    from mvseg.batch.pose_photos import pose_photos  # keeps --help and wrong options quick
+
+    pose_photos(args.photos, args.out, config=config, known=known, up=read_up(args.up), quiet=args.quiet)
+    return 0
+
+
+def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
+    from mvseg.batch.pose_turntable import pose_board_photos, pose_turntable_photos
+
+    is_board = args.turntable == "board"
+    used = ("marker", "distance", "positions") if is_board else ("board", "marker", "distance", "positions", "unit")
+    useless = [name for name in used if getattr(known, name)] + (["up"] if args.up is not None else [])
+    if config != PoseConfig():
+        useless.append("the options of structure from motion")
+    if useless:
+        raise InputError(f"{', '.join(useless)}: of no use with --turntable {args.turntable}, expected none of them")
+    if not is_board:
+        pose_turntable_photos(args.photos, args.out, turntable=Path(args.turntable), quiet=args.quiet)
+    elif known.board is None:
+        raise InputError("--turntable board needs the board: --board.columns, .rows, .square and .marker")
+    else:
+        pose_board_photos(args.photos, args.out, board=known.board, unit=known.unit, quiet=args.quiet)
+
+
+def _read_distance(words: list[str] | None) -> tuple[str, str, float] | None:
+    if words is None:
+        return None
+    if len(words) != 3:
+        raise InputError(f"distance has {len(words)} words, expected two photos or markers, and a length")
+    first, second, length = words
+    try:
+        return first, second, float(length)
+    except ValueError:
+        raise InputError(f"distance: '{length}' is no length, expected --distance A B LENGTH") from None

@@ -1,0 +1,67 @@
+"""A printed ChArUco board, as users describe it. Without torch: options are read before it is loaded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.errors import InputError
+
+Floats = NDArray[np.float64]
+
+# Prints of markers, by OpenCV's names; the one with the most markers in the photos is taken.
+Family = Literal["4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36H11"]
+FAMILIES: tuple[Family, ...] = get_args(Family)
+MAX_SQUARES = 200
+
+
+@dataclass(frozen=True)
+class BoardConfig:
+    """A printed ChArUco board; its world has the origin in a corner, x and y in the board, z out of it, towards you.
+
+    Attributes:
+        columns: squares in a row.
+        rows: squares in a column.
+        square: side of a square.
+        marker: side of a marker, in the unit of `square`.
+        family: OpenCV's name of the markers; a board of DICT_5X5_100 has family 5X5_1000, which begins with the same.
+        legacy: the pattern of boards from before OpenCV 4.6 (they differ if `rows` is even).
+    """
+
+    columns: int
+    rows: int
+    square: float
+    marker: float
+    family: Family = "5X5_1000"
+    legacy: bool = False
+
+    def __post_init__(self) -> None:
+        if not (2 <= self.columns <= MAX_SQUARES and 2 <= self.rows <= MAX_SQUARES):
+            raise InputError(f"the board has {self.columns} x {self.rows} squares, expected 2 x 2 to {MAX_SQUARES}")
+        if not 0 < self.marker < self.square < np.inf:
+            lengths = f"the markers have {self.marker:g}, the squares {self.square:g}"
+            raise InputError(f"{lengths}: expected 0 < marker < square")
+
+    def corners(self) -> Floats:
+        """(P, 3) inner corners of the squares, by OpenCV's numbers, in the unit of `square`."""
+        return _from_opencv(np.array(self.opencv().getChessboardCorners(), float), self)
+
+    def opencv(self) -> cv2.aruco.CharucoBoard:
+        dictionary = cv2.aruco.getPredefinedDictionary(opencv_dictionary(self.family))
+        board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
+        board.setLegacyPattern(self.legacy)
+        return board
+
+
+def _from_opencv(points: Floats, board: BoardConfig) -> Floats:
+    """OpenCV's y runs down the board and its z into it: turned about x, with the origin at the bottom left."""
+    return points * [1, -1, -1] + [0, board.rows * board.square, 0]
+
+
+def opencv_dictionary(family: Family) -> int:
+    """OpenCV's number of a family."""
+    return int(getattr(cv2.aruco, f"DICT_{family}"))

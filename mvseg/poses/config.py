@@ -1,0 +1,78 @@
+"""Options of `mvseg pose`: of structure from motion, and what is known of the world."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from mvseg.errors import InputError
+from mvseg.formats.board import BoardConfig
+from mvseg.poses.pairs import Pairs
+
+# Lenses that a rig file can hold.
+CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"]
+LEAST_SHARE = 0.6  # of the photos must register, unless min_registered says otherwise
+LEAST = 3  # photos
+
+
+@dataclass(frozen=True)
+class PoseConfig:
+    """How the cameras of photos are estimated.
+
+    Attributes:
+        pairs: which photos are compared: all pairs (exhaustive), or neighbours in the order of their names and a few
+            further away, the last being neighbours of the first (sequential). By default all pairs of up to 40 photos,
+            neighbours of more.
+        image_size: photos whose longer side has more pixels are scaled down to it for finding features.
+        camera_model: COLMAP's name of the lens.
+        shared_camera: true: one camera took all photos, with one zoom; false: every photo has a camera of its own. By
+            default photos of one folder, size and (EXIF) focal length share one.
+        calibration: file of OpenCV or ROS with the camera matrix and distortion of all photos, which then are not
+            estimated.
+        min_registered: number of photos that must register; by default 60 %, and at least 3.
+    """
+
+    pairs: Pairs | None = None
+    image_size: int = 2000
+    camera_model: CameraModel = "SIMPLE_RADIAL"
+    shared_camera: bool | None = None
+    calibration: Path | None = None
+    min_registered: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.image_size < 64:
+            raise InputError(f"image_size is {self.image_size}, expected 64 or more")
+        if self.min_registered is not None and self.min_registered < LEAST:
+            raise InputError(f"min_registered is {self.min_registered}, expected {LEAST} or more")
+        if self.calibration is not None and self.shared_camera is False:
+            raise InputError("shared_camera is false beside a calibration, expected one of them")
+
+
+@dataclass(frozen=True)
+class Known:
+    """What is known of the world; at most one of the first four.
+
+    Attributes:
+        board: a printed ChArUco board, in which the world then has its axes.
+        marker: side of the printed markers (their black squares).
+        distance: two photos, or markers as marker:7, and how far apart they are.
+        positions: file of the camera positions, see `formats/positions.py`.
+        unit: name of the unit of these lengths.
+    """
+
+    board: BoardConfig | None = None
+    marker: float | None = None
+    distance: tuple[str, str, float] | None = None
+    positions: Path | None = None
+    unit: str = ""
+
+    def __post_init__(self) -> None:
+        given = [name for name in ("board", "marker", "distance", "positions") if getattr(self, name) is not None]
+        if len(given) > 1:
+            raise InputError(f"{' and '.join(given)} both give a scale, expected one of them")
+        lengths = {"marker": self.marker, "distance": self.distance and self.distance[2]}
+        for name, length in lengths.items():
+            if length is not None and not 0 < length < math.inf:
+                raise InputError(f"{name} is {length:g} long, expected a positive number")

@@ -1,0 +1,222 @@
+"""Scale and axes of a scene whose cameras know neither: from markers, a known distance, or known positions."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.board import BoardConfig
+from mvseg.formats.find_views import find_views, list_some
+from mvseg.formats.markers import Corner, find_board, find_scene_markers
+from mvseg.formats.photos import read_photo
+from mvseg.formats.positions import read_positions
+from mvseg.poses.alignment import Similarity, align, is_one_line, scale_by, spreads
+from mvseg.poses.config import Known
+from mvseg.reconstruction.triangulate import triangulate_points
+from mvseg.scene import Scene
+
+Floats = NDArray[np.float64]
+
+MARKER = "marker:"  # in front of a marker's number, where a photo's name could stand
+SPREAD = 0.05  # of the sides of markers, above which their size is doubtful
+MISFIT = 0.05  # residual of positions over their spread, above which they hardly fit
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """How a scene gets into its known world.
+
+    Attributes:
+        similarity: world_from_scene.
+        unit: of the world.
+        source: where the scale comes from, as text; "" if nowhere.
+        residual: root mean square misfit, in units of the world; None if nothing tells.
+        num_used: lengths or positions that were used.
+        left_out: names of photos whose positions contradict the others.
+        up: direction that points up in the world, where the source says so (a board that lies flat).
+    """
+
+    similarity: Similarity
+    unit: str
+    source: str = ""
+    residual: float | None = None
+    num_used: int = 0
+    left_out: tuple[str, ...] = ()
+    up: tuple[float, float, float] | None = None
+
+    def describe(self) -> str:
+        """One line: where the scale comes from, and how well it fits."""
+        if not self.source:
+            return "no scale: lengths are in arbitrary units (--marker, --distance or --positions give one)"
+        fit = "" if self.residual is None else f", residual {self.residual:.3g} {self.unit or 'units'}"
+        wrong = f", {len(self.left_out)} left out ({list_some(self.left_out)})" if self.left_out else ""
+        return f"scale from {self.source}{fit}{wrong}"
+
+
+def place(scene: Scene, known: Known, *, progress: bool = False) -> Placement:
+    """The similarity that brings a scene into the known world.
+
+    Warns (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line.
+
+    Args:
+        scene: cameras up to a similarity, with photos.
+        known: see `Known`; without a length the scene stays as it is.
+        progress: show a progress bar.
+
+    Raises:
+        InputError: the markers or photos named are not seen, the positions do not fit the photos or are mirrored.
+    """
+    if known.board is not None:
+        return _by_board(scene, known.board, known.unit, progress=progress)
+    if known.marker is not None:
+        return _by_markers(scene, known.marker, known.unit, progress=progress)
+    if known.distance is not None:
+        return _by_distance(scene, known.distance, known.unit, progress=progress)
+    if known.positions is not None:
+        return _by_positions(scene, known.positions, known.unit)
+    return Placement(similarity=scale_by(1.0), unit=known.unit)
+
+
+def _by_board(scene: Scene, board: BoardConfig, unit: str, *, progress: bool) -> Placement:
+    seen: dict[int, list[tuple[int, Floats]]] = {}
+    for view in tqdm(range(len(scene.views)), desc="board", unit="photo", disable=not progress):
+        photo = np.asarray(cv2.cvtColor(read_photo(scene, view), cv2.COLOR_RGB2GRAY), np.uint8)
+        for number, px in zip(*find_board(photo, board), strict=True):
+            seen.setdefault(int(number), []).append((view, px))
+    points = triangulate_points(scene.cameras, seen)
+    try:
+        alignment = align(np.array(list(points.values())).reshape(-1, 3), board.corners()[list(points)])
+    except InputError as error:
+        message = f"{len(points)} corners of the board are seen in two photos or more"
+        raise InputError(f"{message}: {error} (is it {board.columns} x {board.rows} of {board.family}?)") from None
+    return Placement(
+        similarity=alignment.similarity,
+        unit=unit,
+        source=f"{int(alignment.is_inlier.sum())} corners of the board",
+        residual=alignment.rms,
+        num_used=int(alignment.is_inlier.sum()),
+        up=(0.0, 0.0, 1.0),
+    )
+
+
+def _by_markers(scene: Scene, side: float, unit: str, *, progress: bool) -> Placement:
+    """All corners of all markers are fitted at once: each marker is a square of its own pose, of one common scale."""
+    sides = marker_sides(_marker_corners(scene, progress=progress))
+    if not len(sides):
+        raise InputError("no whole marker is seen in two photos, expected ArUco or AprilTag markers of --marker's size")
+    middle = float(np.median(sides))
+    odd = int((np.abs(sides / middle - 1) > SPREAD).sum())
+    if odd:
+        message = f"{odd} of {len(sides)} markers differ in size by more than {SPREAD:.0%}: expected prints of one size"
+        warnings.warn(message, InputWarning, stacklevel=3)
+    residual = float(np.sqrt(((sides / middle - 1) ** 2).mean())) * side
+    return Placement(
+        similarity=scale_by(side / middle),
+        unit=unit,
+        source=f"{len(sides)} markers of {side:g} {unit}".rstrip(),
+        residual=residual if len(sides) > 1 else None,
+        num_used=len(sides),
+    )
+
+
+def marker_sides(corners: dict[Corner, Floats]) -> Floats:
+    """(M,) sides of the markers of which all four corners are known: the square with the least squared distances."""
+    whole = sorted({marker for marker, _ in corners if all((marker, corner) in corners for corner in range(4))})
+    quads = np.array([[corners[marker, corner] for corner in range(4)] for marker in whole]).reshape(-1, 4, 3)
+    square = np.array([[-1, 1, 0], [1, 1, 0], [1, -1, 0], [-1, -1, 0]]) / 2
+    # Umeyama's scale: the singular values of the cross-covariance over the variance of the unit square
+    from_center = quads - quads.mean(1, keepdims=True)
+    return np.linalg.svd(from_center.swapaxes(1, 2) @ square, compute_uv=False).sum(1) / (square**2).sum()
+
+
+def _marker_corners(scene: Scene, *, progress: bool) -> dict[Corner, Floats]:
+    """The corners of the family of markers that has the most of them in space."""
+    found = find_scene_markers(scene, progress=progress)
+    return max((triangulate_points(scene.cameras, seen) for seen in found.values()), key=len)
+
+
+def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str, *, progress: bool) -> Placement:
+    names, length = distance[:2], distance[2]
+    corners = _marker_corners(scene, progress=progress) if any(name.startswith(MARKER) for name in names) else {}
+    first, second = (_point(scene, name, corners) for name in names)
+    apart = float(np.linalg.norm(first - second))
+    if apart <= 1e-9 * float(spreads(scene.cameras.centers.cpu().numpy())[0]):
+        raise InputError(f"{names[0]} and {names[1]} are at one place, expected two that are {length:g} apart")
+    return Placement(
+        similarity=scale_by(length / apart),
+        unit=unit,
+        source=f"the distance from {names[0]} to {names[1]}, {length:g} {unit}".rstrip(),
+        num_used=1,
+    )
+
+
+def _point(scene: Scene, name: str, corners: dict[Corner, Floats]) -> Floats:
+    """The centre of a marker or of a photo's camera."""
+    if not name.startswith(MARKER):
+        (view,) = find_views([name], scene, source=Path("--distance"))
+        if view is None:
+            raise InputError(f"--distance: {name} is no registered photo and no marker, which is called as {MARKER}7")
+        return np.asarray(scene.cameras.centers[view].cpu().numpy())
+    number = name.removeprefix(MARKER)
+    keys = [(int(number), corner) for corner in range(4)] if number.isdecimal() else []
+    quad = [corners[key] for key in keys if key in corners]
+    if len(quad) < 4:
+        seen = list_some([f"{MARKER}{marker}" for marker in sorted({marker for marker, _ in corners})])
+        raise InputError(f"--distance: {name} is not seen whole in two photos, found {seen}")
+    return np.mean(quad, axis=0)
+
+
+def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
+    positions = read_positions(path)
+    views = find_views(positions.names, scene, source=path)
+    used = [index for index, view in enumerate(views) if view is not None]
+    if len(used) < 2:
+        found = f"{len(used)} of its photos are registered ({list_some(positions.names)})"
+        raise InputError(f"{path}: {found}, expected three or more")
+    unit = unit or positions.unit
+    centers = scene.cameras.centers.cpu().numpy()[[view for view in views if view is not None]]
+    target = positions.xyz[used]
+    if is_one_line(target):
+        return _by_positions_on_a_line(centers, target, path=path, unit=unit)
+    try:
+        alignment = align(centers, target)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from None
+    wrong = [positions.names[used[index]] for index in np.flatnonzero(~alignment.is_inlier)]
+    if alignment.rms > MISFIT * spreads(target)[0]:
+        share = alignment.rms / spreads(target)[0]
+        message = f"the positions hardly fit the photos (residual {share:.0%} of their spread): do the names belong?"
+        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
+    return Placement(
+        similarity=alignment.similarity,
+        unit=unit,
+        source=f"{int(alignment.is_inlier.sum())} positions of {path.name}",
+        residual=alignment.rms,
+        num_used=int(alignment.is_inlier.sum()),
+        left_out=tuple(wrong),
+    )
+
+
+def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit: str) -> Placement:
+    """The scale alone: the median ratio of distances, those of far pairs counting."""
+    far = float(np.linalg.norm(target - target.mean(0), axis=1).max())
+    pairs = [(i, j) for i, j in combinations(range(len(target)), 2) if np.linalg.norm(target[i] - target[j]) > far / 2]
+    ratios = [np.linalg.norm(target[i] - target[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
+    if not ratios:
+        raise InputError(f"{path}: all positions are at one place, expected where the camera stood")
+    message = "the positions lie on one line, which gives a scale but no axes: they stay the scene's own"
+    warnings.warn(f"{path}: {message}", InputWarning, stacklevel=5)
+    return Placement(
+        similarity=scale_by(float(np.median(ratios))),
+        unit=unit,
+        source=f"{len(target)} positions on one line of {path.name}",
+        num_used=len(target),
+    )

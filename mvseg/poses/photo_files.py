@@ -1,0 +1,176 @@
+"""The photos of a folder, checked and copied upright into a scene."""
+
+from __future__ import annotations
+
+import re
+import shutil
+from collections import defaultdict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from PIL import Image, ImageOps
+from tqdm import tqdm
+
+from mvseg.errors import InputError
+from mvseg.formats.image_file import PHOTO_SUFFIXES, is_turned, read_image, read_rgb, sensor_bits, write_png
+
+FOCAL_LENGTH, FOCAL_LENGTH_35MM, CAMERA_MODEL, EXIF_BLOCK = 0x920A, 0xA405, 0x0110, 0x8769  # EXIF tags
+QUALITY = 95  # of a JPEG that is written anew, upright
+
+
+@dataclass(frozen=True)
+class PhotoFile:
+    """A photo in a scene's `images/`.
+
+    Attributes:
+        name: path below `images/`, "/" between folders.
+        width: pixels.
+        height: pixels.
+        optics: what EXIF says of camera model and focal length; "" where it says nothing.
+        is_turned: it was turned upright, as EXIF asks.
+    """
+
+    name: str
+    width: int
+    height: int
+    optics: str = ""
+    is_turned: bool = False
+
+    @property
+    def folder(self) -> str:
+        return self.name.rpartition("/")[0]
+
+
+def list_photos(folder: Path) -> tuple[Path, list[str]]:
+    """The photos of a folder: those in it; or else those in its `images/`; or else those in all its folders, each of
+    which stands for a camera.
+
+    Returns:
+        The folder (or its `images/`), and the paths of the photos relative to it, in the order in which people number
+        them.
+
+    Raises:
+        InputError: there is no such folder, it holds fewer than three photos or HEIC files, or two photos differ in
+            their suffix only.
+    """
+    if not folder.is_dir():
+        problem = "is a file" if folder.exists() else "no such folder"
+        raise InputError(f"{folder}: {problem}, expected a folder of photos")
+    files = _files_in(folder)
+    if not _are_photos(files) and _are_photos(_files_in(folder / "images")):
+        folder, files = folder / "images", _files_in(folder / "images")
+    if not _are_photos(files):
+        folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
+        files += [path for each in folders for path in _files_in(each)]
+    phone = [path.name for path in files if path.suffix.lower() in (".heic", ".heif")]
+    if phone:
+        raise InputError(f"{folder}: {phone[0]} is a HEIC file ({len(phone)} in all), expected JPEG: convert them")
+    photos = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+    if len(photos) < 3:
+        raise InputError(f"{folder}: found {len(photos)} photos (JPEG, PNG, TIFF, BMP, WebP), expected at least three")
+    first_with: dict[str, str] = {}
+    for name in photos:
+        other = first_with.setdefault(name.rpartition(".")[0].lower(), name)
+        if other != name:
+            raise InputError(f"{folder}: {other} and {name} differ in their suffix only, expected one of them")
+    return folder, sorted(photos, key=natural_order)
+
+
+def _files_in(folder: Path) -> list[Path]:
+    paths = sorted(folder.iterdir()) if folder.is_dir() else []
+    return [path for path in paths if path.is_file() and not path.name.startswith(".")]
+
+
+def _are_photos(files: Sequence[Path]) -> bool:
+    return any(path.suffix.lower() in (*PHOTO_SUFFIXES, ".heic", ".heif") for path in files)
+
+
+def natural_order(name: str) -> list[tuple[int, int | str]]:
+    """A key for sorting names as people count: 2.jpg before 10.jpg."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
+
+
+def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: bool = False) -> list[PhotoFile]:
+    """Copy photos into a scene's `images/`, as they are where that is possible.
+
+    Photos that EXIF turns are written anew, upright; so are WebP files and those of 10, 12 or 14 bits in 16, which
+    COLMAP cannot read, as PNG of 8 bits.
+
+    Args:
+        folder: of the photos.
+        names: their paths in it.
+        images: made here.
+        progress: show a progress bar.
+
+    Raises:
+        InputError: a photo is broken or cut short; it is named.
+        OSError: a photo cannot be copied.
+    """
+    photos = []
+    for name in tqdm(names, desc="photos", unit="photo", disable=not progress):
+        path = images / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        try:
+            photos.append(_copy(folder / name, path, images))
+        except InputError as error:
+            message = f"the photo cannot be read, expected a whole image file: {error}"
+            raise InputError(f"{folder / name}: {message}") from None
+    return photos
+
+
+def _copy(source: Path, path: Path, images: Path) -> PhotoFile:
+    turned = is_turned(source)
+    image = read_image(source)  # decoded: a file that is cut short is found now
+    optics = _describe_optics(image)
+    if turned:
+        exif = image.getexif()
+        image = ImageOps.exif_transpose(image)
+        exif[0x0112] = 1
+        image.convert("RGB").save(path, format="JPEG", quality=QUALITY, subsampling=0, exif=exif)
+    elif path.suffix.lower() == ".webp" or sensor_bits(source) not in (8, 16):
+        path = path.with_suffix(".png")
+        write_png(path, read_rgb(source))
+    else:
+        shutil.copyfile(source, path)
+    name = path.relative_to(images).as_posix()
+    return PhotoFile(name=name, width=image.width, height=image.height, optics=optics, is_turned=turned)
+
+
+def _describe_optics(image: Image.Image) -> str:
+    try:
+        exif = image.getexif()
+        block = exif.get_ifd(EXIF_BLOCK)
+        known = [exif.get(CAMERA_MODEL), block.get(FOCAL_LENGTH), block.get(FOCAL_LENGTH_35MM)]
+    except Exception:  # a damaged EXIF block says nothing
+        return ""
+    return " ".join(str(each).strip("\0 ") for each in known if each)
+
+
+def group_by_camera(photos: Sequence[PhotoFile], *, shared: bool | None = None) -> list[list[PhotoFile]]:
+    """Photos that share one camera: focal length and distortion.
+
+    Args:
+        photos: in any order, which stays within a group.
+        shared: True: one camera took all; False: each photo has its own; None: photos of one folder, size and (EXIF)
+            focal length share one.
+
+    Raises:
+        InputError: photos of different sizes shall share one camera.
+    """
+    groups: dict[object, list[PhotoFile]] = defaultdict(list)
+    for photo in photos:
+        key = (photo.folder, photo.width, photo.height, photo.optics)
+        groups["all" if shared else photo.name if shared is False else key].append(photo)
+    for group in groups.values():
+        first, other = group[0], next((each for each in group if _size(each) != _size(group[0])), None)
+        if other is not None:
+            sizes = f"{first.name} has {first.width} x {first.height} pixels, "
+            sizes += f"{other.name} {other.width} x {other.height}"
+            raise InputError(f"{sizes}: they cannot share one camera, expected --shared_camera false or none")
+    return list(groups.values())
+
+
+def _size(photo: PhotoFile) -> tuple[int, int]:
+    return photo.width, photo.height

@@ -1,0 +1,55 @@
+"""Points in space from their pixels in several views."""
+
+from __future__ import annotations
+
+from collections.abc import Hashable, Mapping, Sequence
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.scene import Cameras
+
+Floats = NDArray[np.float64]
+Key = TypeVar("Key", bound=Hashable)
+
+MOST_ERROR = 0.003  # reprojection error in widths of the photo; more is a mistake, or something that moved
+LEAST_ANGLE = np.radians(1.0)  # between two rays of a point
+
+
+def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, Floats]]]) -> dict[Key, Floats]:
+    """Points that two views or more agree on.
+
+    Args:
+        cameras: V cameras.
+        seen: {point: (view, (2,) pixels) wherever it is seen}, at most once in a view.
+
+    Returns:
+        {point: (3,) world coordinates}; points seen in a single view, or not within `MOST_ERROR` in each, are left out,
+        and so are those whose rays are all nearly parallel.
+    """
+    K, R, t = (getattr(cameras, name).cpu().numpy().astype(float) for name in ("K", "R", "t"))
+    centers, sizes = cameras.centers.cpu().numpy(), cameras.sizes.cpu().numpy()
+    px_from_world = K @ np.concatenate([R, t[:, :, None]], 2)
+    points: dict[Key, Floats] = {}
+    for key, places in seen.items():
+        views = [view for view, _ in places]
+        if len(set(views)) < 2 or len(set(views)) < len(views):
+            continue
+        px = np.stack([place for _, place in places])
+        point = triangulate(px_from_world[views], px)
+        image = px_from_world[views] @ np.append(point, 1.0)
+        error = np.linalg.norm(image[:, :2] / image[:, 2:] - px, axis=1)
+        rays = point - centers[views]
+        rays /= np.linalg.norm(rays, axis=1, keepdims=True)
+        is_steady = bool((rays @ rays.T).min() < np.cos(LEAST_ANGLE))
+        if is_steady and (error < MOST_ERROR * sizes[views, 0]).all():
+            points[key] = point
+    return points
+
+
+def triangulate(px_from_world: Floats, px: Floats) -> Floats:
+    """(3,) point of S views with matrices (S, 3, 4) and pixels (S, 2): linear least squares."""
+    rows = px[:, :, None] * px_from_world[:, 2:] - px_from_world[:, :2]
+    rows = (rows / np.linalg.norm(rows[..., :3], axis=-1, keepdims=True)).reshape(-1, 4)
+    return np.asarray(np.linalg.lstsq(rows[:, :3], -rows[:, 3], rcond=None)[0], dtype=float)

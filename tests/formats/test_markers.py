@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from mvseg.errors import InputError
+from mvseg.formats.board import BoardConfig
+from mvseg.formats.markers import find_board, find_markers
+from room_scene import BOARD, BOARD_AT, draw_room, room_cameras
+
+
+def grey_room(view: int) -> tuple[np.ndarray, object]:
+    cameras = room_cameras(width=720, height=540, focal=760)[[view]]
+    return cv2.cvtColor(draw_room(cameras)[0], cv2.COLOR_RGB2GRAY), cameras
+
+
+@pytest.mark.parametrize("view", [0, 3])
+def test_corners_of_a_board_lie_where_the_camera_sees_them(view: int) -> None:
+    photo, cameras = grey_room(view)
+    numbers, px = find_board(photo, BOARD)
+    assert len(numbers) == 12
+    true, _ = cameras.project(torch.from_numpy(BOARD.corners()[numbers] + BOARD_AT))
+    assert np.abs(px - true[0].numpy()).max() < 0.3
+    assert abs(np.mean(px - true[0].numpy())) < 0.05  # no half pixel
+
+
+def test_sides_of_markers_have_no_bias() -> None:
+    photo, cameras = grey_room(3)
+    found = find_markers(photo, BOARD.family)
+    assert len(found) == 10
+    layout, misses = BOARD.opencv(), []
+    height = BOARD.rows * BOARD.square
+    for points, number in zip(layout.getObjPoints(), layout.getIds().ravel(), strict=True):
+        world = np.asarray(points, float) * [1, -1, 0] + [0, height, 0] + BOARD_AT
+        true, _ = cameras.project(torch.from_numpy(world))
+        sides, true_sides = (
+            np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1).mean() for quad in (found[int(number)], true[0].numpy())
+        )
+        assert sides == pytest.approx(true_sides, rel=0.015)
+        misses.append(found[int(number)] - true[0].numpy())
+    assert np.abs(misses).max() < 0.5
+    assert np.abs(np.mean(misses, axis=(0, 1))).max() < 0.1  # no half pixel
+
+
+def test_a_marker_that_is_there_twice_says_nothing() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_1000)
+    photo = np.full((120, 300), 255, np.uint8)
+    for number, left in ((3, 20), (3, 110), (5, 200)):
+        photo[20:100, left : left + 80] = cv2.aruco.generateImageMarker(dictionary, number, 80)
+    found = find_markers(photo, "4X4_1000")
+    assert list(found) == [5]
+    np.testing.assert_allclose(found[5], [[200, 20], [280, 20], [280, 100], [200, 100]], atol=0.3)  # edges of pixels
+
+
+def test_nothing_to_see() -> None:
+    numbers, px = find_board(np.full((80, 80), 128, np.uint8), BOARD)
+    assert (numbers.shape, px.shape) == ((0,), (0, 2))
+    assert find_markers(np.full((80, 80), 128, np.uint8), "5X5_1000") == {}
+
+
+def test_the_boards_world_is_right_handed() -> None:
+    """x and y lie in the board, as one reads it, z comes out of it."""
+    corners = BOARD.corners()
+    assert corners.min(0).tolist() == [40, 40, 0]
+    assert corners.max(0).tolist() == [160, 120, 0]
+    assert corners[0].tolist() == [40, 120, 0]  # OpenCV counts from the top left
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [({"columns": 1}, "1 x 4 squares"), ({"marker": 40.0}, "markers have 40, the squares 40"), ({"square": 0}, "0")],
+)
+def test_boards_that_cannot_be(changes, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        replace(BOARD, **changes)
+    assert BoardConfig(columns=5, rows=4, square=40.0, marker=30.0) == BOARD

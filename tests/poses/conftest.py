@@ -1,0 +1,40 @@
+"""One run of structure from motion that the tests of this room share: it takes seconds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from mvseg.formats.board import Family
+from mvseg.formats.markers import Seen, find_scene_markers
+from mvseg.poses.config import PoseConfig
+from mvseg.poses.mapping import Structure, find_structure
+from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
+from mvseg.poses.scene_files import IMAGES, write_structure
+from mvseg.scene import Cameras, Scene
+from room_scene import room_cameras, write_room
+
+
+@dataclass(frozen=True)
+class MappedRoom:
+    """Photos of the room, their true cameras (mm, z up), and what structure from motion made of them."""
+
+    folder: Path
+    truth: Cameras
+    files: list[PhotoFile]
+    structure: Structure
+    scene: Scene
+    markers: dict[Family, Seen]
+
+
+@pytest.fixture(scope="session")
+def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
+    folder = tmp_path_factory.mktemp("room")
+    truth = room_cameras()
+    source, names = list_photos(write_room(folder / "my photos", truth))
+    files = copy_photos(source, names, folder / IMAGES)
+    structure = find_structure(folder / IMAGES, files, config=PoseConfig(), work=folder)
+    scene = write_structure(structure, folder)
+    return MappedRoom(folder, truth, files, structure, scene, find_scene_markers(scene))

@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pycolmap
+import pytest
+
+from mvseg.poses.cancellable import run_cancellable
+from mvseg.sigterm import Terminated, stopped_by_sigterm
+
+
+def test_answers_and_errors_pass() -> None:
+    assert run_cancellable(lambda token: 3) == 3
+    with pytest.raises(ZeroDivisionError):
+        run_cancellable(lambda token: 1 / 0)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="SIGTERM of POSIX systems")
+@pytest.mark.parametrize("delay", [0.0, 0.15])
+@pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, Terminated), (signal.SIGINT, KeyboardInterrupt)])
+def test_a_signal_cancels_the_call_and_waits_for_its_end(
+    number: int, error: type[BaseException], delay: float
+) -> None:
+    ended = []
+
+    def call(token: pycolmap.CancellationToken) -> None:
+        time.sleep(delay)
+        os.kill(os.getpid(), number)
+        while not token.is_cancelled:
+            time.sleep(0.01)
+        time.sleep(0.1)
+        ended.append(True)
+
+    with pytest.raises(error), stopped_by_sigterm():
+        run_cancellable(call)
+    assert ended == [True]
+    assert pycolmap.logging.minloglevel == 0

@@ -1,0 +1,156 @@
+"""Scale and axes of the rendered room, of which everything is known: the board's squares are 40 mm, its markers 30."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.poses import known_world
+from mvseg.poses.alignment import fit_similarity
+from mvseg.poses.config import Known
+from mvseg.poses.known_world import marker_sides, place
+from room_scene import BOARD, BOARD_AT
+
+NAMES = [f"{view}.png" for view in range(7)]
+
+
+@pytest.fixture(autouse=True)
+def known_markers(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    """To find them takes a second, of which one is enough."""
+    monkeypatch.setattr(known_world, "find_scene_markers", lambda scene, progress: room.markers)
+
+
+def write_positions(path: Path, centers: np.ndarray, names=NAMES) -> Path:
+    rows = [",".join([name, *map(str, xyz)]) for name, xyz in zip(names, centers, strict=False)]
+    path.write_text("\n".join(["photo,x,y,z", *rows]) + "\n")
+    return path
+
+
+def true_scale(room) -> float:
+    return fit_similarity(room.scene.cameras.centers.numpy(), room.truth.centers.numpy()).scale
+
+
+def test_a_board_gives_scale_and_axes(room) -> None:
+    placement = place(room.scene, Known(board=BOARD, unit="mm"))
+    assert placement.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
+    centers = placement.similarity.apply(room.scene.cameras.centers.numpy()) + BOARD_AT
+    assert np.abs(centers - room.truth.centers.numpy()).max() < 8  # mm at 600 mm: the photos are small
+    assert (placement.up, placement.unit) == ((0.0, 0.0, 1.0), "mm")
+    assert placement.num_used >= 10  # of 12
+    assert placement.residual < 0.5
+    assert f"scale from {placement.num_used} corners of the board, residual 0." in placement.describe()
+
+
+def test_markers_of_a_known_size_give_the_scale(room) -> None:
+    placement = place(room.scene, Known(marker=BOARD.marker, unit="mm"))
+    assert placement.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
+    assert placement.num_used >= 8
+
+
+def test_the_distance_of_two_markers_or_photos_gives_the_scale(room) -> None:
+    markers = place(room.scene, Known(distance=("marker:0", "marker:1", 2 * BOARD.square)))  # in one row
+    assert markers.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
+    centers = room.truth.centers.numpy()
+    apart = float(np.linalg.norm(centers[0] - centers[6]))
+    photos = place(room.scene, Known(distance=("0.png", "6", apart)))
+    assert photos.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
+
+
+def test_positions_that_were_left_out_are_predicted(room, tmp_path: Path) -> None:
+    centers = room.truth.centers.numpy()
+    some = [0, 2, 3, 5, 6]
+    path = write_positions(tmp_path / "log.csv", centers[some], [NAMES[view] for view in some])
+    placement = place(room.scene, Known(positions=path, unit="mm"))
+    found = placement.similarity.apply(room.scene.cameras.centers.numpy())
+    assert np.abs(found - centers)[[1, 4]].max() < 2  # mm
+    assert placement.num_used == 5
+    assert placement.left_out == ()
+
+
+def test_a_wrong_position_is_left_out_and_named(room, tmp_path: Path) -> None:
+    centers = room.truth.centers.numpy().copy()
+    centers[4] += 200
+    placement = place(room.scene, Known(positions=write_positions(tmp_path / "log.csv", centers)))
+    assert placement.left_out == ("4.png",)
+    assert placement.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
+
+
+def test_positions_of_other_photos_are_warned_of(room, tmp_path: Path) -> None:
+    path = write_positions(tmp_path / "log.csv", np.random.default_rng(1).normal(size=(7, 3)))
+    with pytest.warns(InputWarning, match="the positions hardly fit the photos"):
+        place(room.scene, Known(positions=path))
+
+
+def test_positions_on_a_line_give_the_scale_only(room, tmp_path: Path) -> None:
+    line = np.outer(np.arange(7), [10.0, 0, 0])
+    centers = room.scene.cameras.centers.new_tensor(line / 5)
+    cameras = replace(room.scene.cameras, t=-(room.scene.cameras.R @ centers[:, :, None])[:, :, 0])
+    path = write_positions(tmp_path / "log.csv", line)
+    with pytest.warns(InputWarning, match="on one line, which gives a scale but no axes"):
+        placement = place(replace(room.scene, cameras=cameras), Known(positions=path))
+    assert placement.similarity.scale == pytest.approx(5)
+    np.testing.assert_array_equal(placement.similarity.R, np.eye(3))
+
+
+def test_left_handed_positions_are_refused(room, tmp_path: Path) -> None:
+    path = write_positions(tmp_path / "log.csv", room.truth.centers.numpy() * [1, -1, 1])
+    with pytest.raises(InputError, match="fit as in a mirror only"):
+        place(room.scene, Known(positions=path))
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ({"distance": ("0.png", "nowhere.png", 3.0)}, "nowhere.png is no registered photo"),
+        ({"distance": ("marker:0", "marker:99", 3.0)}, "marker:99 is not seen whole in two photos, found marker:0"),
+        ({"distance": ("marker:x", "marker:0", 3.0)}, "marker:x is not seen whole"),
+        ({"distance": ("1.png", "1.png", 3.0)}, "are at one place"),
+        ({"board": replace(BOARD, family="4X4_1000")}, r"0 corners of the board.*is it 5 x 4 of 4X4_1000"),
+    ],
+)
+def test_what_is_not_in_the_photos_is_named(room, known, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        place(room.scene, Known(**known))
+
+
+def test_positions_of_nothing(room, tmp_path: Path) -> None:
+    path = write_positions(tmp_path / "log.csv", np.eye(3), ["a.png", "b.png", "c.png"])
+    with pytest.raises(InputError, match=r"0 of its photos are registered \(a.png, b.png, c.png\)"):
+        place(room.scene, Known(positions=path))
+
+
+@pytest.mark.parametrize(
+    ("known", "message"),
+    [
+        ({"marker": 3.0, "distance": ("a", "b", 2.0)}, "marker and distance both give a scale"),
+        ({"marker": 0.0}, "marker is 0 long"),
+        ({"distance": ("a", "b", -1.0)}, "distance is -1 long"),
+    ],
+)
+def test_contradictions(known, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        Known(**known)
+
+
+def test_nothing_known_leaves_the_scene_as_it_is(room) -> None:
+    placement = place(room.scene, Known())
+    np.testing.assert_array_equal(placement.similarity.matrix, np.eye(4)[:3])
+    assert "arbitrary units" in placement.describe()
+
+
+def test_sides_of_squares_anywhere() -> None:
+    """Turned, moved and noisy squares; a marker without its fourth corner says nothing."""
+    rng = np.random.default_rng(0)
+    square = np.array([[0, 1, 0], [1, 1, 0], [1, 0, 0], [0, 0, 0.0]])
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    corners = {(7, corner): 30 * square[corner] @ turn + 100 for corner in range(4)}
+    corners |= {(9, corner): 50 * square[corner] + 0.01 * rng.normal(size=3) for corner in range(4)}
+    corners |= {(11, corner): square[corner] for corner in range(3)}
+    np.testing.assert_allclose(marker_sides(corners), [30, 50], rtol=1e-3)
+    assert len(marker_sides({})) == 0
+
+

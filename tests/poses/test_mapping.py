@@ -1,0 +1,111 @@
+"""Structure from motion of a rendered room, whose cameras are known."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+import pytest
+
+from mvseg.errors import InputError
+from mvseg.formats.image_file import write_png
+from mvseg.formats.opencv_yaml import Calibration
+from mvseg.formats.photos import read_photo
+from mvseg.formats.rig import read_rig
+from mvseg.poses.alignment import Similarity, fit_similarity
+from mvseg.poses.config import PoseConfig
+from mvseg.poses.mapping import find_structure
+from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
+from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
+from room_scene import FOCAL, HEIGHT, WIDTH
+
+
+def test_all_photos_register_where_they_were_taken(room) -> None:
+    structure, truth = room.structure, room.truth
+    assert structure.registered == tuple(photo.name for photo in room.files)
+    assert (structure.left_out, structure.plain, structure.other_models) == ((), (), ())
+    assert structure.residual_px < 0.5
+    centers, true_centers = room.scene.cameras.centers.numpy(), truth.centers.numpy()
+    similarity = fit_similarity(centers, true_centers)
+    assert np.abs(similarity.apply(centers) - true_centers).max() < 2  # mm, at 600 mm
+    assert room.scene.cameras.K[0, 0, 0] == pytest.approx(FOCAL, rel=0.01)
+    turned = room.scene.cameras.R.numpy() @ similarity.R.T
+    angles = np.degrees(np.linalg.norm(turned - truth.R.numpy(), axis=(1, 2)) / np.sqrt(2))
+    assert angles.max() < 0.3
+
+
+def test_photos_may_have_spaces_in_their_names_and_one_shares_a_camera(room) -> None:
+    assert len(room.structure.model.cameras) == 1
+    assert not list(room.folder.glob("colmap-*"))  # the database is gone
+
+
+def test_a_moved_world_shows_the_same_photos(room, tmp_path: Path) -> None:
+    """Rig file and COLMAP model say the same; points keep their pixels."""
+    folder = shutil.copytree(room.folder, tmp_path / "scene")
+    similarity = Similarity(scale=3.0, R=np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]]), t=np.array([5.0, 6, 7]))
+    structure = replace(room.structure, model=pycolmap.Reconstruction(room.folder / "sparse" / "0"))
+    points = np.array([point.xyz for point in structure.model.points3D.values()])
+    before, _ = write_structure(structure, folder).cameras.project(room.scene.cameras.centers.new_tensor(points))
+    scene = replace(move_structure(structure, similarity, folder), unit="mm", up=(0.0, 0.0, 1.0))
+    moved = scene.cameras.centers.new_tensor(similarity.apply(points))
+    after, depths = scene.cameras.project(moved)
+    np.testing.assert_allclose(after.numpy(), before.numpy(), atol=1e-6)
+    assert (depths > 0).all()
+    write_cameras(scene, folder)
+    rig = read_rig(folder / "cameras.json")
+    assert (rig.unit, rig.up) == ("mm", (0.0, 0.0, 1.0))
+    assert [view.name for view in rig.views] == [view.name for view in scene.views]
+    np.testing.assert_allclose(rig.cameras.project(moved)[0].numpy(), after.numpy(), atol=1e-9)
+    assert np.abs(read_photo(rig, 0).astype(int) - read_photo(scene, 0)).max() <= 1  # the same lens
+
+
+def test_a_calibrated_camera_stays_and_a_photo_without_texture_is_left_out(room, tmp_path: Path) -> None:
+    source, names = list_photos(room.folder / IMAGES)
+    files = copy_photos(source, names[:4], tmp_path)
+    write_png(tmp_path / "grey.png", np.full((HEIGHT, WIDTH, 3), 120, np.uint8))
+    files.insert(2, PhotoFile("grey.png", WIDTH, HEIGHT))
+    K = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL + 1, HEIGHT / 2], [0, 0, 1]])
+    calibration = Calibration(K=K, distortion=(), is_fisheye=False, width=None, height=None)
+    structure = find_structure(tmp_path, files, config=PoseConfig(), calibration=calibration)
+    assert structure.left_out == structure.plain == ("grey.png",)
+    assert structure.registered == tuple(names[:4])
+    (camera,) = structure.model.cameras.values()
+    np.testing.assert_array_equal(camera.calibration_matrix(), K)
+
+
+def test_too_few_photos_are_one_sentence(tmp_path: Path) -> None:
+    files = []
+    for name in ("a.png", "b.png", "c.png"):
+        write_png(tmp_path / name, np.full((64, 80, 3), 120, np.uint8))
+        files.append(PhotoFile(name, 80, 64))
+    message = r"^0 of 3 photos could be registered, expected at least 3; 3 have hardly any texture, .* a.png\. Next"
+    with pytest.raises(InputError, match=message):
+        find_structure(tmp_path, files, config=PoseConfig())
+    with pytest.raises(InputError, match=r"^0 of 3 .*--min_registered asks for 4"):
+        find_structure(tmp_path, files, config=PoseConfig(min_registered=4))
+
+
+def test_a_calibration_of_other_photos_is_refused(tmp_path: Path) -> None:
+    files = [PhotoFile("a.png", 80, 64)]
+    calibration = Calibration(K=np.eye(3), distortion=(), is_fisheye=False, width=64, height=80)
+    with pytest.raises(InputError, match=r"a.png: the calibration is of 64 x 80 pixels, the photo has 80 x 64"):
+        find_structure(tmp_path, files, config=PoseConfig(), calibration=calibration)
+    fisheye = replace(calibration, distortion=(0.1, 0, 0, 0), is_fisheye=True, width=80, height=64)
+    with pytest.raises(InputError, match="is of a fisheye"):
+        find_structure(tmp_path, files, config=PoseConfig(), calibration=fisheye)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"image_size": 10}, "image_size is 10"),
+        ({"min_registered": 1}, "min_registered is 1"),
+        ({"calibration": Path("c.yaml"), "shared_camera": False}, "beside a calibration"),
+    ],
+)
+def test_options_out_of_range(options, message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        PoseConfig(**options)

@@ -1,0 +1,113 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PIL import Image
+
+from mvseg.errors import InputError
+from mvseg.formats.image_file import read_rgb
+from mvseg.poses.photo_files import PhotoFile, copy_photos, group_by_camera, list_photos, natural_order
+
+RAMP = np.linspace(0, 255, 60 * 40).reshape(40, 60).astype(np.uint8)
+
+
+def save(folder: Path, *names: str) -> Path:
+    for name in names:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        assert cv2.imwrite(str(folder / name), RAMP)
+    return folder
+
+
+def save_jpeg(path: Path, orientation: int = 1, **tags: float) -> Path:
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    exif[0x0110] = "Phone 7"
+    exif.get_ifd(0x8769)[0x920A] = tags.get("focal", 4.0)
+    Image.fromarray(RAMP).convert("RGB").save(path, format="JPEG", exif=exif, quality=95)
+    return path
+
+
+def test_photos_are_listed_as_people_count(tmp_path: Path) -> None:
+    save(tmp_path, "10.JPG", "9.jpg", "img1.png", ".hidden.png")
+    (tmp_path / "notes.txt").write_text("")
+    assert list_photos(tmp_path) == (tmp_path, ["9.jpg", "10.JPG", "img1.png"])
+    assert sorted(["b10", "b9", "a2b", "a2", "a10"], key=natural_order) == ["a2", "a2b", "a10", "b9", "b10"]
+
+
+def test_photos_lie_in_images_or_in_a_folder_per_camera(tmp_path: Path) -> None:
+    save(tmp_path / "scene", "images/0.png", "images/1.png", "images/2.png", "masks/0.png")
+    assert list_photos(tmp_path / "scene") == (tmp_path / "scene" / "images", ["0.png", "1.png", "2.png"])
+    save(tmp_path / "rig", "top/0.png", "top/1.png", "side/0.png", "side/1.png")
+    assert list_photos(tmp_path / "rig") == (tmp_path / "rig", ["side/0.png", "side/1.png", "top/0.png", "top/1.png"])
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (("0.png", "1.png"), "found 2 photos"),
+        ((), "found 0 photos"),
+        (("0.png", "1.png", "2.png", "2.jpg"), "2.jpg and 2.png differ in their suffix only"),
+    ],
+)
+def test_photos_that_cannot_be_used(tmp_path: Path, names: tuple[str, ...], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        list_photos(save(tmp_path, *names))
+
+
+def test_heic_and_missing_folders_are_named(tmp_path: Path) -> None:
+    (tmp_path / "IMG_1.HEIC").write_bytes(b"")
+    with pytest.raises(InputError, match=r"IMG_1.HEIC is a HEIC file \(1 in all\), expected JPEG"):
+        list_photos(tmp_path)
+    with pytest.raises(InputError, match="no such folder"):
+        list_photos(tmp_path / "nowhere")
+    with pytest.raises(InputError, match="is a file, expected a folder"):
+        list_photos(tmp_path / "IMG_1.HEIC")
+
+
+@pytest.mark.parametrize("orientation", range(1, 9))
+def test_photos_are_copied_upright(tmp_path: Path, orientation: int) -> None:
+    path = save_jpeg(tmp_path / "a.jpg", orientation)
+    (photo,) = copy_photos(tmp_path, ["a.jpg"], tmp_path / "images")
+    copy = read_rgb(tmp_path / "images" / "a.jpg")
+    shown = cv2.imread(str(path), cv2.IMREAD_COLOR_RGB)  # turned as EXIF says
+    assert copy.shape == shown.shape
+    assert np.abs(copy.astype(int) - shown).max() <= 8
+    assert (photo.width, photo.height) == copy.shape[1::-1]
+    assert photo.is_turned == (orientation != 1)
+    assert ((tmp_path / "images" / "a.jpg").read_bytes() == path.read_bytes()) == (orientation == 1)
+    with Image.open(tmp_path / "images" / "a.jpg") as image:
+        exif = image.getexif()
+    assert (exif[0x0112], exif.get_ifd(0x8769)[0x920A]) == (1, 4.0)  # the focal length stays
+
+
+def test_what_colmap_cannot_read_becomes_png(tmp_path: Path) -> None:
+    save(tmp_path, "a.webp")
+    cv2.imwrite(str(tmp_path / "b.png"), RAMP.astype(np.uint16) * 4)  # 10 bits in 16
+    found = copy_photos(tmp_path, ["a.webp", "b.png"], tmp_path / "images")
+    assert [photo.name for photo in found] == ["a.png", "b.png"]
+    for photo in found:
+        assert cv2.imread(str(tmp_path / "images" / photo.name), cv2.IMREAD_UNCHANGED).dtype == np.uint8
+        np.testing.assert_allclose(read_rgb(tmp_path / "images" / photo.name)[..., 0], RAMP, atol=3)
+
+
+def test_a_broken_photo_is_named(tmp_path: Path) -> None:
+    save(tmp_path, "a.png")
+    (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-20])
+    with pytest.raises(InputError, match=r"a.png: the photo cannot be read.*cut short"):
+        copy_photos(tmp_path, ["a.png"], tmp_path / "images")
+
+
+def test_photos_of_one_folder_size_and_focal_length_share_a_camera(tmp_path: Path) -> None:
+    for name, focal in (("a.jpg", 4.0), ("b.jpg", 4.0), ("c.jpg", 7.0)):
+        save_jpeg(tmp_path / name, focal=focal)
+    a, b, c = copy_photos(tmp_path, ["a.jpg", "b.jpg", "c.jpg"], tmp_path / "images")
+    small, other = PhotoFile("d.jpg", 30, 20, a.optics), PhotoFile("top/e.jpg", a.width, a.height, a.optics)
+    photos = [a, b, c, small, other]
+    assert group_by_camera(photos) == [[a, b], [c], [small], [other]]
+    assert group_by_camera(photos, shared=False) == [[photo] for photo in photos]
+    assert group_by_camera([a, b, c, other], shared=True) == [[a, b, c, other]]
+    with pytest.raises(InputError, match=r"a.jpg has 60 x 40 pixels, d.jpg 30 x 20: they cannot share one camera"):
+        group_by_camera(photos, shared=True)

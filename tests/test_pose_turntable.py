@@ -1,0 +1,109 @@
+"""`mvseg pose --turntable`: the table calibrated from a rendered board, and then used for other photos."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.cli import main
+from mvseg.formats.image_file import write_png
+from mvseg.formats.markers import find_board
+from mvseg.formats.photos import read_photo
+from mvseg.formats.scene_folder import load_scene
+from mvseg.reconstruction.triangulate import triangulate_points
+from room_scene import BOARD
+from turntable_board import ANGLES, HEIGHT, WIDTH, draw_board
+
+OPTIONS = ["--board.columns", "5", "--board.rows", "4", "--board.square", "40", "--board.marker", "30", "--quiet"]
+
+
+def write_photos(folder: Path, photos: list[np.ndarray]) -> Path:
+    folder.mkdir()
+    for index, photo in enumerate(photos):
+        write_png(folder / f"{index}.png", np.repeat(photo[..., None], 3, 2))
+    return folder
+
+
+def test_a_table_is_calibrated_once_and_serves_other_photos(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    empty = np.full((HEIGHT, WIDTH), 90, np.uint8)
+    photos = write_photos(tmp_path / "photos", [*(draw_board(angle) for angle in ANGLES), empty])
+    table = tmp_path / "table"
+    command = ["pose", str(photos), "--out", str(table), "--turntable", "board", "--unit", "mm", *OPTIONS]
+    assert main(command) == 0
+    scene = load_scene(table)
+    assert scene.unit == "mm"
+    assert [view.name for view in scene.views] == [str(view) for view in range(len(ANGLES))]  # not the empty one
+    # The board stands on the table: its corners are triangulated as large as they were printed.
+    seen: dict[int, list] = {}
+    for view in range(len(scene.views)):
+        for number, px in zip(*find_board(read_photo(scene, view)[..., 0].copy(), BOARD), strict=True):
+            seen.setdefault(int(number), []).append((view, px))
+    points = triangulate_points(scene.cameras, seen)
+    found, printed = np.array(list(points.values())), BOARD.corners()[list(points)]
+    assert len(points) == 12
+    np.testing.assert_allclose(torch.pdist(torch.tensor(found)), torch.pdist(torch.tensor(printed)), atol=0.3)  # mm
+
+    shutil.rmtree(photos)
+    write_photos(photos, [draw_board(angle) for angle in ANGLES])
+    plant = tmp_path / "plant"
+    again = ["pose", str(photos), "--out", str(plant), "--turntable", str(table / "turntable.json")]
+    assert main([*again, "--quiet"]) == 0
+    same = load_scene(plant)
+    torch.testing.assert_close(same.cameras.t, scene.cameras.t)
+    assert (same.unit, len(same.views)) == ("mm", len(ANGLES))
+    assert main([*again, "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+    assert json.loads((table / "pose.json").read_text())["registered"] == [f"{view}.png" for view in range(len(ANGLES))]
+
+    (photos / "7.png").unlink()
+    assert main(again) == 2
+    assert "8 views for 7 photos, expected one per photo" in capsys.readouterr().err
+    write_png(photos / "7.png", np.zeros((20, 30, 3), np.uint8))
+    assert main([*again, "--quiet"]) == 2
+    assert "7.png has 30 x 20 pixels, the turntable's camera 640 x 480" in capsys.readouterr().err
+    assert len(load_scene(plant).views) == 8  # the earlier scene is still there
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "plant", "table"]
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--turntable", "board"], "needs the board"),
+        (["--turntable", "board", "--marker", "30"], "marker: of no use with --turntable board"),
+        (["--turntable", "t.json", "--unit", "mm", "--up", "rig"], "unit, up: of no use with --turntable t.json"),
+        (["--turntable", "board", *OPTIONS, "--image_size", "800"], "the options of structure from motion: of no use"),
+        (["--turntable", "nowhere.json"], "nowhere.json: cannot be read"),
+    ],
+)
+def test_wrong_options(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    photos = write_photos(tmp_path / "photos", [np.zeros((20, 30), np.uint8)] * 4)
+    assert main(["pose", str(photos), "--out", str(tmp_path / "out"), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["photos"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"axis": {"point": [1, 0, 0], "direction": [0, 0, 1]}}, "the axis 0 0 1 at 0 0 0"),
+        ({"cameras": {"camera": {"calibration": "c.yaml", "R": np.eye(3).tolist(), "t": [0, 0, 1]}}}, "has no K"),
+    ],
+)
+def test_turntables_of_others(tmp_path: Path, capsys: pytest.CaptureFixture[str], change, message: str) -> None:
+    photos = write_photos(tmp_path / "photos", [np.zeros((20, 30), np.uint8)] * 3)
+    camera = {"width": 30, "height": 20, "K": np.eye(3).tolist(), "R": np.eye(3).tolist(), "t": [0, 0, 1]}
+    content = {"format": "mvseg-turntable/1", "axis": {"point": [0, 0, 0], "direction": [0, 0, 1]},
+               "cameras": {"camera": camera}, "views": []}  # fmt: skip
+    (tmp_path / "turntable.json").write_text(json.dumps(content | change))
+    options = ["--turntable", str(tmp_path / "turntable.json")]
+    assert main(["pose", str(photos), "--out", str(tmp_path / "out"), *options]) == 2
+    assert message in capsys.readouterr().err

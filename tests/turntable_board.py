@@ -1,0 +1,38 @@
+"""Photos of a board that turns on a table in front of a known camera: exact, by warping one plane."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from room_scene import BOARD, PX_PER_MM, board_picture
+
+WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
+K = np.array([[FOCAL, 0, 325.0], [0, FOCAL, 236.0], [0, 0, 1]])
+ANGLES = np.array([0.0, 35, 70, 110, 150, 200, 250, 300])
+ELEVATION, DISTANCE = np.radians(50), 420.0
+# The camera looks at the origin of the table from above; z is the axis, upwards.
+R = np.array([
+    [1.0, 0, 0],
+    [0, -np.sin(ELEVATION), -np.cos(ELEVATION)],
+    [0, np.cos(ELEVATION), -np.sin(ELEVATION)],
+])  # fmt: skip
+T = np.array([0.0, 0, DISTANCE])
+# The board lies off the axis, tilted by some degrees.
+BOARD_TURN = Rotation.from_euler("xyz", [6, -4, 20], degrees=True)
+BOARD_SHIFT = BOARD_TURN.apply([-90.0, -70, 0]) + [12, -7, 0]
+
+
+def draw_board(angle: float, *, shift: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
+    """(H, W) uint8: the board after the table has turned by `angle` degrees; `shift` of the table, mm."""
+    picture = cv2.copyMakeBorder(board_picture(BOARD), 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=255)
+    board_from_picture = np.diag([1 / PX_PER_MM, -1 / PX_PER_MM, 1.0])
+    board_from_picture[:2, 2] = [-10, BOARD.rows * BOARD.square + 10]
+    turn = Rotation.from_euler("z", angle, degrees=True)
+    axes = (turn * BOARD_TURN).as_matrix()
+    plane = np.column_stack([R @ axes[:, :2], R @ (turn.apply(BOARD_SHIFT) + shift) + T])
+    half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
+    larger = half @ np.diag([3.0, 3, 1]) @ K @ plane @ board_from_picture @ np.linalg.inv(half)
+    photo = cv2.warpPerspective(picture, larger, (3 * WIDTH, 3 * HEIGHT), flags=cv2.INTER_LINEAR, borderValue=90)
+    return np.asarray(cv2.resize(photo, (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA), np.uint8)
