@@ -1,29 +1,82 @@
-"""Are match scores probabilities? `python benchmarks/confidence.py --cache ~/mvseg-cells [--split test]`
+"""Are match scores probabilities, and are wrong poses noticed? `python benchmarks/confidence.py --cache ~/mvseg-cells`
 
-Scores of the N-view matcher against the share of regions whose id is right, on the scenes of `label_maps` (true and
-degraded masks). The id of a region is right when its cluster is the largest one of its leaf, and its leaf is the most
-frequent one of its cluster.
+The scenes are those of `label_maps` with at most `--most_masks` true masks; true and degraded masks, and those that the
+shipped detector finds. Each is matched with exact poses and with `--draws` of the faults of `camera_faults`, drawn at
+random. The id of a region is right when its cluster is the largest one of its leaf, and its leaf is the most frequent
+one of its cluster; detections that show no leaf do not count.
+
+1. Scores against the share of regions whose id is right: the expected calibration error is the mean difference over ten
+   equal bins, weighted by the number of regions.
+2. How many scenes are warned of: poses spoil the ids of a scene when its ARI is below 0.8, and more than 0.1 below that
+   with exact poses; the ids are sound when they are right with an ARI of 0.8 or more.
+
+`--fit` prints the coefficients of `match_scores.py` as fitted on these scenes; it is for the split "dev". Look at
+"test" once, at the end.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+import warnings
+from collections import defaultdict
+from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
+from scipy.optimize import minimize
+from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps
+from benchmarks.camera_faults import FAULTS, faulty_cameras
+from benchmarks.label_maps import add_scene_options, chosen_scenes, load_detected, load_maps
+from mvseg.errors import InputWarning
+from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import region_affinity
-from mvseg.matching.nview.match_nview import match_nview
+from mvseg.matching.match import match_regions
+from mvseg.matching.nview.match_nview import find_clusters
+from mvseg.matching.nview.match_scores import collect_evidence, scene_features
+from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
+from mvseg.partition import drop_singletons, renumber, separate_unmatched
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
 from mvseg.simulation.dataset import SceneSpec, run_all
 
+KINDS = ("true", "degraded", "detected")
 EDGES = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.01)
+NUM_BINS = 10  # of the calibration error
+SPOILT, LOSS = 0.8, 0.1  # ARI below which, and loss of ARI from which, poses spoil the ids
+
+
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """One scene with one kind of masks and one fault.
+
+    Attributes:
+        kind, fault: which.
+        num_views: V.
+        ari: over the regions that show a leaf.
+        is_warned: whether `match_regions` says that the views hardly agree.
+        scores: (N,) of the matched regions that show a leaf.
+        is_right: (N,) bool.
+        features: (N, 4), see `scene_features`; None where they were not asked for.
+    """
+
+    kind: str
+    fault: str
+    num_views: int
+    ari: float
+    is_warned: bool
+    scores: NDArray[np.floating]
+    is_right: NDArray[np.bool_]
+    features: NDArray[np.floating] | None
 
 
 def has_right_id(ids: np.ndarray, truth: np.ndarray) -> np.ndarray:
@@ -33,35 +86,142 @@ def has_right_id(ids: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return (ids >= 0) & (counts.argmax(1)[ids] == truth) & (counts.argmax(0)[truth] == ids)
 
 
-def score_scene(spec: SceneSpec, *, cache: Path) -> np.ndarray:
-    """(D, 3): number of views, score, and whether the id is right, of the matched regions of one scene."""
+def run_scene(spec: SceneSpec, *, cache: Path, num_draws: int, is_fit: bool) -> list[Outcome]:
+    """All kinds of masks of one scene, each with exact poses first."""
     torch.set_num_threads(1)
-    scene = load_maps(spec, cache)
-    rows = []
-    for kind in KINDS:
-        regions, truth = scene.masks(kind)
-        matching = match_nview(regions, scene.cameras, region_affinity(regions, scene.cameras))
-        ids = matching.instance_ids.numpy()
-        num_views = np.full(len(ids), spec.num_views)
-        right = has_right_id(ids, truth.numpy())
-        rows.append(np.stack((num_views, matching.match_scores.numpy(), right), 1)[ids >= 0])
-    return np.concatenate(rows)
+    scene, outcomes = load_maps(spec, cache), []
+    for number, kind in enumerate(KINDS):
+        if kind == "detected":
+            regions = load_detected(spec, cache)
+            truth = shown_instances(regions, scene.true)
+        else:
+            regions, truth = scene.masks(kind)
+        rng = np.random.default_rng([spec.seed, spec.num_views, number])
+        drawn = [FAULTS[index] for index in rng.choice(len(FAULTS), num_draws, replace=False)]
+        for fault in ("exact", *drawn):
+            cameras = faulty_cameras(scene.cameras, fault, rng)
+            outcomes.append(judge(regions, truth, cameras, kind=kind, fault=fault, is_fit=is_fit))
+    return outcomes
+
+
+def judge(
+    regions: Regions, truth: Tensor, cameras: Cameras, *, kind: str, fault: str, is_fit: bool
+) -> Outcome:
+    """Match; `truth` (D,) is the leaf that each region shows, 0 = none."""
+    found = None
+    if is_fit:
+        ids, found = clusters_and_features(regions, cameras)
+        scores, is_warned = np.zeros(len(ids)), False
+    else:
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            matching = match_regions(regions, cameras)
+        ids, scores = matching.instance_ids, matching.match_scores.numpy()
+        is_warned = any("hardly agree" in str(each.message) for each in caught)
+    shows = truth > 0
+    counts = ((ids > 0) & shows).numpy()
+    return Outcome(
+        kind=kind,
+        fault=fault,
+        num_views=len(cameras),
+        ari=matching_metrics(ids[shows], truth[shows]).ari,
+        is_warned=is_warned,
+        scores=scores[counts],
+        is_right=has_right_id(ids.numpy(), truth.numpy())[counts],
+        features=None if found is None else found[counts],
+    )
+
+
+def clusters_and_features(regions: Regions, cameras: Cameras) -> tuple[Tensor, NDArray[np.floating]]:
+    """(D,) int64 ids, -1 for regions alone, and (D, 4) `scene_features`; the regions are ordered by view."""
+    affinity = region_affinity(regions, cameras)
+    weights, views = affinity.to_dense().double().numpy(), regions.view_index.numpy()
+    alone = separate_unmatched(one_per_view_clusters(affinity, regions.view_index, len(cameras)).numpy())
+    pairwise_clusters = renumber(alone)
+    graph = ViewGraph(weights, views, len(cameras))
+    found = find_clusters(regions, cameras, graph, pairwise=pairwise_clusters)
+    evidence = collect_evidence(found.scores, found.clusters, pairwise_clusters)
+    clusters = drop_singletons(found.clusters)
+    return torch.from_numpy(np.where(clusters < 0, -1, clusters + 1)), scene_features(evidence)
+
+
+def fit(outcomes: list[Outcome]) -> NDArray[np.float64]:
+    """(5,) the intercept and coefficients of largest likelihood, every region alike."""
+    X = np.concatenate([each.features for each in outcomes if each.features is not None])
+    X = np.concatenate((np.ones((len(X), 1)), X), 1)
+    sign = 2 * np.concatenate([each.is_right for each in outcomes]) - 1.0
+
+    def loss(w: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
+        margin = sign * (X @ w)
+        return np.logaddexp(0, -margin).mean(), -(sign / (1 + np.exp(margin))) @ X / len(X)
+
+    w: NDArray[np.float64] = minimize(loss, np.zeros(X.shape[1]), jac=True, method="BFGS").x
+    return w
+
+
+def calibration_error(scores: NDArray[np.floating], is_right: NDArray[np.bool_]) -> float:
+    """Mean |score - share that is right| over ten equal bins, weighted by their regions."""
+    bins = np.minimum((scores * NUM_BINS).astype(int), NUM_BINS - 1)
+    counts = np.bincount(bins, minlength=NUM_BINS)
+    gaps = np.bincount(bins, scores - is_right, NUM_BINS)
+    return float(np.abs(gaps).sum() / max(counts.sum(), 1))
+
+
+def print_scores(outcomes: list[Outcome]) -> None:
+    scores, right = (np.concatenate([getattr(each, name) for each in outcomes]) for name in ("scores", "is_right"))
+    print(f"{'score':>14}{'mean score':>12}{'right':>8}{'regions':>9}")
+    for low, high in pairwise(EDGES):
+        inside = (scores >= low) & (scores < high)
+        if inside.any():
+            name = f"{low:.2f} - {min(high, 1):.2f}"
+            print(f"{name:>14}{scores[inside].mean():12.3f}{right[inside].mean():8.3f}{inside.sum():9}")
+
+
+def print_groups(outcomes: list[Outcome]) -> None:
+    """One row per group of scenes: how well scores are calibrated, and how many are warned of."""
+    groups: dict[str, list[Outcome]] = defaultdict(list)
+    base, with_exact = {}, 0.0
+    for each in outcomes:  # of each scene, exact poses come first
+        is_exact = each.fault == "exact"
+        base[id(each)] = with_exact = each.ari if is_exact else with_exact
+        poses = "exact" if is_exact else "wrong poses"
+        for name in {"all", poses, f"{poses}, {each.kind}", each.fault, f"{each.num_views} views"}:
+            groups[name].append(each)
+    header = ("regions", "right", "score", "error", "ARI", "scenes", "spoilt", "warned", "sound", "warned")
+    print(f"{'':22}" + "".join(f"{name:>8}" for name in header))
+    for name in sorted(groups):
+        rows = groups[name]
+        scores, right = (np.concatenate([getattr(each, what) for each in rows]) for what in ("scores", "is_right"))
+        is_spoilt = [each.ari < SPOILT and base[id(each)] - each.ari > LOSS for each in rows]
+        is_sound = [each.ari >= SPOILT for each in rows]
+        figures = (right.mean(), scores.mean(), calibration_error(scores, right), mean(each.ari for each in rows))
+        counts = (len(rows), sum(is_spoilt), warned(rows, is_spoilt), sum(is_sound), warned(rows, is_sound))
+        print(f"{name:22}{len(right):8}" + "".join(f"{x:8.3f}" for x in figures) + "".join(f"{n:8}" for n in counts))
+
+
+def warned(outcomes: list[Outcome], chosen: list[bool]) -> int:
+    return sum(each.is_warned for each, is_chosen in zip(outcomes, chosen, strict=True) if is_chosen)
+
+
+def mean(values: Iterable[float]) -> float:
+    return float(np.mean(list(values)))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     add_scene_options(parser)
+    parser.add_argument("--most_masks", type=int, default=100, help="scenes of at most this many leaves times views")
+    parser.add_argument("--draws", type=int, default=4, help="faults of the cameras per scene and kind of masks")
+    parser.add_argument("--fit", action="store_true", help="print coefficients")
     args = parser.parse_args()
-    rows = np.concatenate(list(run_all(partial(score_scene, cache=args.cache), chosen_scenes(args), args.workers)))
-    print(f"{'views':>6}{'score':>14}{'mean score':>12}{'right':>8}{'regions':>9}")
-    for views in (0, *sorted(args.views)):
-        of_views = rows[(rows[:, 0] == views) | (views == 0)]
-        for low, high in pairwise(EDGES):
-            bin_rows = of_views[(of_views[:, 1] >= low) & (of_views[:, 1] < high)]
-            if len(bin_rows):
-                name = f"{low:.2f} - {min(high, 1):.2f}"
-                score, right = bin_rows[:, 1:].mean(0)
-                print(f"{views or 'all':>6}{name:>14}{score:12.3f}{right:8.3f}{len(bin_rows):9}")
+    work = partial(run_scene, cache=args.cache, num_draws=args.draws, is_fit=args.fit)
+    specs = [spec for spec in chosen_scenes(args) if spec.num_leaves * spec.num_views <= args.most_masks]
+    outcomes = [each for of_scene in run_all(work, specs, args.workers) for each in of_scene]
+    if args.fit:
+        print("SCENE_COEFFICIENTS =", tuple(np.round(fit(outcomes), 3).tolist()))
+        return
+    print_scores(outcomes)
+    print_groups(outcomes)
 
 
 if __name__ == "__main__":

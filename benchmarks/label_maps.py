@@ -15,9 +15,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.atomic import write_whole
 from mvseg.formats.image_file import read_rgb
+from mvseg.multiview.config import DetectConfig
+from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index, scene_cameras
@@ -100,6 +103,25 @@ def load_photos(spec: SceneSpec, cache: Path) -> np.ndarray:
     with np.load(path) as saved:
         loaded: np.ndarray = saved["photos"]
         return loaded
+
+
+def load_detected(spec: SceneSpec, cache: Path) -> Regions:
+    """What the shipped detector finds in a scene with exact poses, loop included; detected when not in the cache."""
+    path = cache / "detected" / f"{spec.folder.replace('/', '_')}_{spec.seed}.npz"
+    names = ("view_index", "boxes", "crops", "labels")
+    if not path.exists():
+        photos = [torch.from_numpy(photo).permute(2, 0, 1).float() / 255 for photo in load_photos(spec, cache)]
+        model = MultiViewMaskRCNN(load_detector("leaf-slim", min_score=DetectConfig.min_score))
+        found = model.find_regions(photos, load_maps(spec, cache).cameras)[0].regions
+        path.parent.mkdir(parents=True, exist_ok=True)
+
+        def save(partial: Path) -> None:
+            with partial.open("wb") as file:
+                np.savez_compressed(file, **{name: getattr(found, name).numpy() for name in names})
+
+        write_whole(path, save)
+    with np.load(path) as saved:
+        return Regions(**{name: torch.from_numpy(saved[name]) for name in names}, num_views=spec.num_views)
 
 
 def visible_ids(plant: Plant, cameras: Cameras) -> np.ndarray:

@@ -171,7 +171,8 @@ def detect_regions(
         path = kept.path(scene, view) if kept is not None and scene.views[view].path.is_file() else None
         shown = None if path is None else read_detections(path)
         if shown is None:
-            shown = model.detect(torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1).float() / 255)
+            photo = torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1)
+            shown = model.detect(photo.float().div_(255))
             if path is not None:
                 write_detections(path, shown)
         if path is not None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import copy
 from collections import OrderedDict
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import torch
@@ -55,7 +56,9 @@ def run_heads(
         heads.detections_per_img = detections_per_img
     if score_thresh is not None:
         heads.score_thresh = score_thresh
-    resized, _ = (transform or model.transform)([photo])
+    frame = copy.copy(transform or model.transform)
+    frame.normalize = partial(normalize, frame)
+    resized, _ = frame([photo])
     features = model.backbone(resized.tensors)
     if isinstance(features, Tensor):
         features = {"0": features}
@@ -67,6 +70,15 @@ def run_heads(
     height, width = resized.image_sizes[0]
     floats = {key: detections[key].float() for key in ("boxes", "scores", "masks")}
     return decide_masks(detections | floats) | {"frame": torch.tensor([width, height])}
+
+
+def normalize(transform: GeneralizedRCNNTransform, photo: Tensor) -> Tensor:
+    """torchvision's own, with one copy of the photo (3, H, W) instead of two: 290 MB less at 24 megapixels."""
+    mean, sd = (
+        torch.as_tensor(x, dtype=photo.dtype, device=photo.device)
+        for x in (transform.image_mean, transform.image_std)
+    )
+    return (photo - mean[:, None, None]).div_(sd[:, None, None])
 
 
 def detect(model: GeneralizedRCNN, photo: Tensor) -> tuple[dict[str, Tensor], Iterator[Tensor]]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, Literal
 
@@ -76,8 +76,10 @@ _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(Items[Items[Fi
 
 def read_coco(
     path: Path, scene: Scene, *, crowd: Crowd = "mask", categories: Collection[str] = ()
-) -> list[list[tuple[int, np.ndarray]]]:
+) -> list[Iterator[tuple[int, np.ndarray]]]:
     """The masks of a COCO file, view by view, as they stand there (in the frame of the photo).
+
+    A mask is decoded when it is asked for: hundreds of them, of large photos, do not fit into memory together.
 
     Images are found by file name, see `find_views`; those that are not in the scene are left out. A list of results
     (annotations alone) is read, too: there the `image_id` is the name of a photo, or the number that it consists of.
@@ -92,18 +94,18 @@ def read_coco(
         categories: names of the categories that are taken; all, if empty. A category without a name goes by its id.
 
     Returns:
-        V lists of (number, (height, width) bool mask); a view without annotations has an empty list. The numbers are
-        the annotation ids or, where an id is missing or no integer, the places in the file, from 1.
+        V iterators over (number, (height, width) bool mask); that of a view without annotations is empty. The numbers
+        are the annotation ids or, where an id is missing or no integer, the places in the file, from 1.
 
     Raises:
         InputError: the file is broken, none of its images is in the scene, an entry fits several views or has another
-            size than its camera, a segmentation cannot be decoded, or a category is not there.
+            size than its camera, or a category is not there. From the iterators: a segmentation cannot be decoded.
     """
     coco = _read_file(path, scene)
     view_of = _find_images(path, coco, scene)
     names = {str(category.id): category.name for category in coco.categories}
     has_ids = all(isinstance(annotation.id, int) for annotation in coco.annotations)
-    masks: list[list[tuple[int, np.ndarray]]] = [[] for _ in scene.views]
+    chosen: list[list[tuple[int, CocoAnnotation]]] = [[] for _ in scene.views]
     counts: Counter[str] = Counter()
     num_crowds = num_boxes = 0
     for place, annotation in enumerate(coco.annotations, start=1):
@@ -118,9 +120,7 @@ def read_coco(
         counts[category] += 1
         if (crowd == "ignore" and annotation.iscrowd) or (categories and category not in categories):
             continue
-        width, height = scene.cameras.sizes[view].tolist()
-        number = annotation.id if has_ids and isinstance(annotation.id, int) else place
-        masks[view].append((number, _decode(path, annotation, (width, height), place=place)))
+        chosen[view].append((place, annotation))
     if num_crowds:
         what = "taken as masks (--coco_crowd ignore leaves them out)" if crowd == "mask" else "left out"
         warnings.warn(f"{path}: {num_crowds} annotations with iscrowd are {what}", InputWarning, stacklevel=4)
@@ -128,7 +128,11 @@ def read_coco(
         message = f"{num_boxes} annotations have no mask (a box at most) and are left out"
         warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
     check_categories(counts, categories, known=names.values(), source=path)
-    return masks
+    sizes = scene.cameras.sizes.tolist()
+    return [
+        _decode_all(path, of_view, (width, height), has_ids=has_ids)
+        for of_view, (width, height) in zip(chosen, sizes, strict=True)
+    ]
 
 
 def _read_file(path: Path, scene: Scene) -> _MaskFile:
@@ -188,12 +192,17 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     return {str(image.id): view for image, view in zip(coco.images, views, strict=True)}
 
 
-def _decode(path: Path, annotation: CocoAnnotation, size: tuple[int, int], *, place: int) -> np.ndarray:
-    try:
-        return decode_segmentation(annotation.segmentation, *size)
-    except InputError as error:
-        name = place if annotation.id is None else annotation.id
-        raise InputError(f"{path}: annotation {name}: {error}") from None
+def _decode_all(
+    path: Path, annotations: list[tuple[int, CocoAnnotation]], size: tuple[int, int], *, has_ids: bool
+) -> Iterator[tuple[int, np.ndarray]]:
+    """The masks of annotations, each with its place in the file; `size` is the width and height of their image."""
+    for place, annotation in annotations:
+        try:
+            mask = decode_segmentation(annotation.segmentation, *size)
+        except InputError as error:
+            name = place if annotation.id is None else annotation.id
+            raise InputError(f"{path}: annotation {name}: {error}") from None
+        yield annotation.id if has_ids and isinstance(annotation.id, int) else place, mask
 
 
 def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarray:

@@ -15,6 +15,8 @@ import cv2
 import numpy as np
 import pycolmap
 
+CHUNK = 1 << 20  # pixels at a time: all of a photo of 24 megapixels would take 3 GB
+
 Mapping = Callable[[pycolmap.Camera, np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -82,11 +84,15 @@ def _positions(
     width, height = size
     lens = pycolmap.Camera(model=model, width=width, height=height, params=list(params))
     matrix = np.array(K).reshape(3, 3)
-    rows, columns = np.indices((height, width))
-    centers = np.stack((columns.ravel(), rows.ravel()), 1) + 0.5
     inverse = pinhole_from_photo if mapping is photo_from_pinhole else photo_from_pinhole
-    xy = mapping(lens, matrix, centers)
-    returned = inverse(lens, matrix, np.where(np.isfinite(xy), xy, -1e6))
-    is_shown = np.abs(returned - centers).max(1, keepdims=True) < 0.5  # pixels; False for what is not finite
-    positions = np.where(is_shown, np.clip(xy - 0.5, -1e4, 1e5), -1e4)
-    return positions.T.astype(np.float32, order="C").reshape(2, height, width)
+    positions = np.empty((2, height, width), np.float32)
+    num_rows = max(1, CHUNK // width)
+    for top in range(0, height, num_rows):
+        rows, columns = np.mgrid[top : min(top + num_rows, height), :width] + 0.5
+        centers = np.stack((columns.ravel(), rows.ravel()), 1)
+        xy = mapping(lens, matrix, centers)
+        returned = inverse(lens, matrix, np.where(np.isfinite(xy), xy, -1e6))
+        is_shown = np.abs(returned - centers).max(1, keepdims=True) < 0.5  # pixels; False for what is not finite
+        part = np.where(is_shown, np.clip(xy - 0.5, -1e4, 1e5), -1e4)
+        positions[:, top : top + num_rows] = part.T.reshape(2, -1, width)
+    return positions

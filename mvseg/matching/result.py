@@ -49,6 +49,7 @@ class Matching:
         residual_px: reprojection error of the matched regions, in pixels; None where it was not estimated.
         explained: mean score of the matched regions in their clusters; 1 = every pixel is seen in all other views. None
             where it was not estimated.
+        view_explained: (V,) float32, the same of each view's matched regions; NaN for a view without any.
     """
 
     instance_ids: Tensor
@@ -59,14 +60,16 @@ class Matching:
     merged: tuple[MergedMask, ...] = ()
     residual_px: int | None = None
     explained: float | None = None
+    view_explained: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.instance_ids)
 
     def to(self, device: torch.device | str) -> Matching:
         support = None if self.support is None else self.support.to(device)
+        views = None if self.view_explained is None else self.view_explained.to(device)
         ids, scores = self.instance_ids.to(device), self.match_scores.to(device)
-        return replace(self, instance_ids=ids, match_scores=scores, support=support)
+        return replace(self, instance_ids=ids, match_scores=scores, support=support, view_explained=views)
 
     def select(self, index: Tensor) -> Matching:
         """The regions at an int64 index, in that order. All instances stay, even those without regions."""
@@ -119,8 +122,8 @@ class Matching:
         """The regions and instances of one or more matchings, one after another.
 
         No instance is shared by two parts: the ids of each part follow those of the parts before it. The method is that
-        of the first part. Support, residual (the largest) and explained share (the mean over the matched regions) are
-        None when a part has none.
+        of the first part. Support, residual (the largest) and explained share (the mean over the matched regions; of
+        each view, over the parts) are None when a part has none.
         """
         ids, merged = [], []
         num_regions = num_instances = 0
@@ -135,6 +138,7 @@ class Matching:
         residuals = [part.residual_px for part in parts if part.residual_px is not None]
         weights = [int((part.instance_ids > 0).sum()) for part in parts]
         shares = [part.explained * n for part, n in zip(parts, weights, strict=True) if part.explained is not None]
+        views = [part.view_explained for part in parts if part.view_explained is not None]
         return Matching(
             instance_ids=torch.cat(ids),
             match_scores=torch.cat([part.match_scores for part in parts]),
@@ -144,6 +148,7 @@ class Matching:
             merged=tuple(merged),
             residual_px=max(residuals) if len(residuals) == len(parts) else None,
             explained=sum(shares) / max(sum(weights), 1) if len(shares) == len(parts) else None,
+            view_explained=torch.stack(views).nanmean(0) if len(views) == len(parts) else None,
         )
 
 

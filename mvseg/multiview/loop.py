@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from types import MappingProxyType
 
 import torch
@@ -41,32 +41,42 @@ def match_proposals(
         progress: show progress bars.
 
     Returns:
-        (S,) int64 indices of the proposals kept, best score first, and their matching.
+        (S,) int64 indices of the proposals kept, best score first, and their matching. Warns of what `match_regions`
+        says of it; what that said of earlier rounds is forgotten.
     """
     assignment = EpipolarAssignment()
     per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
-    keep = _suppress(proposals, per_class, cluster_iou, detections_per_view=detections_per_view)
-    matching, num_instances = _match_classes(proposals.select(keep), cameras, match, progress=progress)
-    if match.resolved_method != "symnmf":
-        num_instances = {}
-    rematch = partial(_match_classes, cameras=cameras, match=match, num_instances=num_instances, progress=progress)
-    for _ in range(num_iterations):
-        regions = proposals.regions.select(keep)
-        ids, _ = assignment(proposals.regions, regions, matching.instance_ids, cameras=cameras, progress=progress)
-        groups = torch.cat((per_class, ids[:, None]), 1)
-        keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
-        matching, _ = rematch(proposals.select(keep))
-    if num_iterations and matching.support is not None:
-        stays = confirmed(
-            proposals.boxes[keep],
-            per_class[keep],
-            matching.instance_ids,
-            match_scores=matching.match_scores,
-            iou_threshold=cluster_iou,
-        )
-        if not stays.all():
-            keep = keep[stays]
-            matching, _ = rematch(proposals.select(keep))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        keep = _suppress(proposals, per_class, cluster_iou, detections_per_view=detections_per_view)
+        matching, num_instances = _match_classes(proposals.select(keep), cameras, match, progress=progress)
+        if match.resolved_method != "symnmf":
+            num_instances = {}
+
+        def rematch(kept: Tensor) -> Matching:
+            caught.clear()
+            chosen = proposals.select(kept)
+            return _match_classes(chosen, cameras, match, num_instances=num_instances, progress=progress)[0]
+
+        for _ in range(num_iterations):
+            regions = proposals.regions.select(keep)
+            ids, _ = assignment(proposals.regions, regions, matching.instance_ids, cameras=cameras, progress=progress)
+            groups = torch.cat((per_class, ids[:, None]), 1)
+            keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
+            matching = rematch(keep)
+        if num_iterations and matching.support is not None:
+            stays = confirmed(
+                proposals.boxes[keep],
+                per_class[keep],
+                matching.instance_ids,
+                match_scores=matching.match_scores,
+                iou_threshold=cluster_iou,
+            )
+            if not stays.all():
+                keep = keep[stays]
+                matching = rematch(keep)
+    for each in caught:
+        warnings.warn(each.message, stacklevel=2)
     return keep, matching
 
 

@@ -6,9 +6,10 @@ import pytest
 import torch
 from torch import Tensor
 from torchvision.models.detection.roi_heads import paste_masks_in_image
+from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from mvseg.detectors.mask_cut import decide_masks
-from mvseg.detectors.run import detect, run_heads
+from mvseg.detectors.run import detect, normalize, run_heads
 from mvseg.evaluation.average_precision import annotate_detections
 from tiny_training import build_tiny
 
@@ -91,3 +92,11 @@ def test_a_detector_that_finds_nothing(model: torch.nn.Module, photo: Tensor) ->
     found, masks = detect(model, photo)
     assert found["boxes"].shape == (0, 4)
     assert annotate_detections(found, masks, 0) == []
+
+
+def test_photos_are_normalized_as_torchvision_does(model: torch.nn.Module, photo: Tensor) -> None:
+    before = photo.clone()
+    assert torch.equal(normalize(model.transform, photo), model.transform.normalize(photo))
+    run_heads(model, photo)
+    assert torch.equal(photo, before)
+    assert model.transform.normalize.__func__ is GeneralizedRCNNTransform.normalize

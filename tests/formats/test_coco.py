@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ from pycocotools.coco import COCO
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.coco import decode_rle, encode_mask, read_coco, write_coco
+from mvseg.formats.masks.view_regions import stack_views
 from mvseg.scene import Cameras, Scene, View
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in pycocotools
@@ -62,8 +65,12 @@ def write(folder: Path, annotations: list[dict[str, Any]], files: tuple[str, ...
     return path
 
 
+def read_all(path: Path, scene: Scene, **options: Any) -> list[list[tuple[int, np.ndarray]]]:
+    return [list(view) for view in read_coco(path, scene, **options)]
+
+
 def read_one(folder: Path, scene: Scene, segmentation: Any) -> np.ndarray:
-    ((_, mask),), _ = read_coco(write(folder, [{"segmentation": segmentation}]), scene)
+    ((_, mask),), _ = read_all(write(folder, [{"segmentation": segmentation}]), scene)
     return mask
 
 
@@ -104,7 +111,7 @@ def test_annotations_go_to_their_views(scene: Scene, tmp_path: Path) -> None:
         {"segmentation": rles[2], "image_id": 11},
         {"segmentation": rles[3], "image_id": 12},
     ]
-    first, second = read_coco(write(tmp_path, annotations, ("a.jpg", "b.jpg", "elsewhere.jpg")), scene)
+    first, second = read_all(write(tmp_path, annotations, ("a.jpg", "b.jpg", "elsewhere.jpg")), scene)
     assert [number for number, _ in first] == [2]
     assert [number for number, _ in second] == [1, 3]
     np.testing.assert_array_equal(second[0][1], random_mask(0))
@@ -115,13 +122,13 @@ def test_crowds_are_masks_unless_told_otherwise(scene: Scene, tmp_path: Path) ->
     annotations = [{"segmentation": encode_mask(random_mask(seed)), "iscrowd": seed % 2} for seed in range(3)]
     path = write(tmp_path, annotations)
     with pytest.warns(InputWarning, match="1 annotations with iscrowd are taken as masks"):
-        assert [number for number, _ in read_coco(path, scene)[0]] == [1, 2, 3]
+        assert [number for number, _ in read_all(path, scene)[0]] == [1, 2, 3]
     with pytest.warns(InputWarning, match="1 annotations with iscrowd are left out"):
-        assert [number for number, _ in read_coco(path, scene, crowd="ignore")[0]] == [1, 3]
+        assert [number for number, _ in read_all(path, scene, crowd="ignore")[0]] == [1, 3]
 
 
 def test_a_view_without_annotations_is_empty(scene: Scene, tmp_path: Path) -> None:
-    assert read_coco(write(tmp_path, []), scene) == [[], []]
+    assert read_all(write(tmp_path, []), scene) == [[], []]
 
 
 @pytest.mark.parametrize(
@@ -129,16 +136,36 @@ def test_a_view_without_annotations_is_empty(scene: Scene, tmp_path: Path) -> No
 )
 def test_images_are_found_by_name(form: str, scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": [POLYGON]}], (form.format("a"), form.format("b")))
-    assert [len(view) for view in read_coco(path, scene)] == [1, 0]
+    assert [len(view) for view in read_all(path, scene)] == [1, 0]
 
 
 def test_views_in_subfolders(tmp_path: Path) -> None:
     scene = make_scene("images/left/1.jpg", "images/right/1.jpg")
     path = write(tmp_path, [{"segmentation": [POLYGON], "image_id": 11}], ("left/1.jpg", "right/1.jpg"))
-    assert [len(view) for view in read_coco(path, scene)] == [0, 1]
+    assert [len(view) for view in read_all(path, scene)] == [0, 1]
     path = write(tmp_path, [], ("1.jpg", "right/1.jpg"))
     with pytest.raises(InputError, match=r"image 1.jpg could be view 0 \(left/1\) or 1 \(right/1\), expected its path"):
-        read_coco(path, scene)
+        read_all(path, scene)
+
+
+def test_masks_of_many_photos_are_never_in_memory_together(tmp_path: Path) -> None:
+    scene = make_scene(*[f"images/{view}.jpg" for view in range(8)])
+    side, per_view = 1000, 6
+    scene = Scene("plant", scene.views, replace(scene.cameras, sizes=torch.tensor([[side, side]] * len(scene.views))))
+    mask = np.zeros((side, side), bool)
+    mask[400:450, 300:350] = True
+    images = [{"id": view, "file_name": f"{view}.jpg", "width": side, "height": side} for view in range(8)]
+    rle = encode_mask(mask)
+    annotations = [{"image_id": view, "segmentation": rle} for view in range(8) for _ in range(per_view)]
+    path = tmp_path / "masks.json"
+    path.write_text(json.dumps({"images": images, "annotations": annotations}))
+    tracemalloc.start()
+    regions = stack_views(read_coco(path, scene), scene, source=path)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert regions.num_per_view.tolist() == [per_view] * 8
+    assert regions.areas.tolist() == [2500] * 8 * per_view
+    assert peak < per_view * side**2  # bytes: less than the masks of one photo
 
 
 BAD: list[tuple[Any, str]] = [
@@ -164,7 +191,7 @@ BAD: list[tuple[Any, str]] = [
 def test_broken_masks_are_named(segmentation: Any, message: str, scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": [POLYGON]}, {"segmentation": segmentation}])
     with pytest.raises(InputError, match=rf"masks.json: annotation 2: .*{message}"):
-        read_coco(path, scene)
+        read_all(path, scene)
 
 
 @pytest.mark.parametrize(
@@ -183,13 +210,13 @@ def test_masks_of_another_form_are_named(segmentation: Any, scene: Scene, tmp_pa
     path = write(tmp_path, [{"segmentation": [POLYGON]}, {"segmentation": segmentation}])
     message = r"masks.json: annotation 2: its segmentation is neither polygons of finite numbers nor run lengths"
     with pytest.raises(InputError, match=message):
-        read_coco(path, scene)
+        read_all(path, scene)
 
 
 def test_views_that_the_file_does_not_list_are_empty_and_named(scene: Scene, tmp_path: Path) -> None:
     message = r"1 views have no entry among the images and no masks, the first is view 1 \(b\); the file holds a.jpg, c"
     with pytest.warns(InputWarning, match=message):
-        masks = read_coco(write(tmp_path, [{"segmentation": [POLYGON]}], ("a.jpg", "c.jpg")), scene)
+        masks = read_all(write(tmp_path, [{"segmentation": [POLYGON]}], ("a.jpg", "c.jpg")), scene)
     assert [len(view) for view in masks] == [1, 0]
 
 
@@ -197,50 +224,50 @@ def test_a_file_of_other_photos_says_what_it_holds(scene: Scene, tmp_path: Path)
     files = ("c.jpg", "d.jpg", "e.jpg", "f.jpg", "g.jpg")
     message = r"none of its images is a photo of the scene, expected a.jpg, b.jpg, found c.jpg, d.jpg, e.jpg and 2 more"
     with pytest.raises(InputError, match=message):
-        read_coco(write(tmp_path, [], files), scene)
+        read_all(write(tmp_path, [], files), scene)
 
 
 @pytest.mark.parametrize("form", ["lm/day1/{}.jpg", "{}_jpg.rf.0a1b2c.jpg", "D:\\x\\{}.JPG", "{}.PNG", "/x/{}"])
 def test_names_of_other_machines_fit_by_their_base_name(form: str, scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": [POLYGON]}], (form.format("a"), form.format("b")))
     if form == "{}.PNG":  # the suffix alone says nothing
-        assert [len(view) for view in read_coco(path, scene)] == [1, 0]
+        assert [len(view) for view in read_all(path, scene)] == [1, 0]
         return
     with pytest.warns(InputWarning, match="2 names fit a photo by the base name only, the first is .* for a$"):
-        assert [len(view) for view in read_coco(path, scene)] == [1, 0]
+        assert [len(view) for view in read_all(path, scene)] == [1, 0]
 
 
 def test_base_names_that_are_not_unique(scene: Scene, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"both x/a.jpg and y/a.jpg could be view 0 \(a\), expected the path"):
-        read_coco(write(tmp_path, [], ("x/a.jpg", "y/a.jpg", "b.jpg")), scene)
+        read_all(write(tmp_path, [], ("x/a.jpg", "y/a.jpg", "b.jpg")), scene)
     path = write(tmp_path, [{"segmentation": [POLYGON]}], ("a.jpg", "y/a.jpg", "b.jpg"))
-    assert [len(view) for view in read_coco(path, scene)] == [1, 0]  # what fits better is enough
+    assert [len(view) for view in read_all(path, scene)] == [1, 0]  # what fits better is enough
 
 
 def test_boxes_without_masks_are_counted(scene: Scene, tmp_path: Path) -> None:
     box = {"bbox": [1, 2, 3, 4]}
     annotations = [box, {"segmentation": [POLYGON]}, box | {"segmentation": []}, box | {"segmentation": [[]]}]
     with pytest.warns(InputWarning, match=r"3 annotations have no mask \(a box at most\) and are left out"):
-        assert [number for number, _ in read_coco(write(tmp_path, annotations), scene)[0]] == [2]
+        assert [number for number, _ in read_all(write(tmp_path, annotations), scene)[0]] == [2]
 
 
 def test_ids_may_be_text_or_missing(scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": [POLYGON], "id": "x"}, {"segmentation": [OTHER]}])
-    assert [number for number, _ in read_coco(path, scene)[0]] == [1, 2]
+    assert [number for number, _ in read_all(path, scene)[0]] == [1, 2]
     content = json.loads(path.read_text())
     content["images"][0]["id"] = "10"  # and its annotations say 10
     for annotation in content["annotations"]:
         del annotation["id"]
     path.write_text(json.dumps(content))
-    assert [number for number, _ in read_coco(path, scene)[0]] == [1, 2]
+    assert [number for number, _ in read_all(path, scene)[0]] == [1, 2]
     content["annotations"][1]["segmentation"] = [[1.0]]
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match="annotation 2: its segmentation is not"):
-        read_coco(path, scene)
+        read_all(path, scene)
     content["images"][1]["id"] = 10
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match="2 images have 1 ids, expected one each"):
-        read_coco(path, scene)
+        read_all(path, scene)
 
 
 def test_lists_of_results(tmp_path: Path) -> None:
@@ -252,11 +279,11 @@ def test_lists_of_results(tmp_path: Path) -> None:
             for image, rle in zip(ids, rles, strict=True)
         ]
         (tmp_path / "results.json").write_text(json.dumps(results))
-        first, second = read_coco(tmp_path / "results.json", scene)
+        first, second = read_all(tmp_path / "results.json", scene)
         assert [number for number, _ in [*first, *second]] == [2, 1]
         np.testing.assert_array_equal(second[0][1], random_mask(0))
     with pytest.raises(InputError, match=r"none of its images .*, expected a.jpg, b.jpg, found 017.jpg, 000.jpg"):
-        read_coco(tmp_path / "results.json", make_scene("images/a.jpg", "images/b.jpg"))
+        read_all(tmp_path / "results.json", make_scene("images/a.jpg", "images/b.jpg"))
 
 
 def test_categories_are_selected_or_named(scene: Scene, tmp_path: Path) -> None:
@@ -265,18 +292,18 @@ def test_categories_are_selected_or_named(scene: Scene, tmp_path: Path) -> None:
     content["categories"] = [{"id": 1, "name": "leaf"}, {"id": 2, "name": "pot"}, {"id": 3, "name": "stem"}]
     path.write_text(json.dumps(content))
     with pytest.warns(InputWarning, match=r"masks of 3 categories are taken alike \(2 leaf, 1 pot, 1 9\); --"):
-        assert len(read_coco(path, scene)[0]) == 4
+        assert len(read_all(path, scene)[0]) == 4
     for wanted, numbers in ((["leaf"], [1, 3]), (["pot", "9"], [2, 4]), (["stem"], [])):
-        assert [number for number, _ in read_coco(path, scene, categories=wanted)[0]] == numbers
+        assert [number for number, _ in read_all(path, scene, categories=wanted)[0]] == numbers
     with pytest.raises(InputError, match=r"there is no category 'leaves', expected of these: leaf, pot, stem, 9"):
-        read_coco(path, scene, categories=["leaves"])
+        read_all(path, scene, categories=["leaves"])
 
 
 def test_other_image_size(scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [])
     path.write_text(path.read_text().replace(f'"width": {WIDTH}', '"width": 61'))
     with pytest.raises(InputError, match=r"masks.json: image a.jpg is 61 x 40, its camera says 60 x 40"):
-        read_coco(path, scene)
+        read_all(path, scene)
 
 
 @pytest.mark.parametrize("length", [0, 1, 100, 200])
@@ -284,7 +311,7 @@ def test_cut_short(length: int, scene: Scene, tmp_path: Path) -> None:
     path = write(tmp_path, [{"segmentation": [POLYGON]}])
     path.write_text(path.read_text()[:length])
     with pytest.raises(InputError, match=r"masks.json: not a whole JSON file"):
-        read_coco(path, scene)
+        read_all(path, scene)
 
 
 def test_written_file_reads_back_here_and_in_pycocotools(
@@ -299,7 +326,7 @@ def test_written_file_reads_back_here_and_in_pycocotools(
         for number, mask in enumerate(masks)
     ]
     write_coco(tmp_path / "out.json", images, annotations)
-    first, second = read_coco(tmp_path / "out.json", scene)
+    first, second = read_all(tmp_path / "out.json", scene)
     np.testing.assert_array_equal([mask for _, mask in first], [masks[0], masks[2]])
     np.testing.assert_array_equal(second[0][1], masks[1])
     coco = COCO(tmp_path / "out.json")
@@ -319,5 +346,5 @@ def test_annotations_of_no_image_are_counted(scene: Scene, tmp_path: Path) -> No
     segmentation = uncompressed(random_mask(0))
     path = write(tmp_path, [{"segmentation": segmentation}, {"segmentation": segmentation, "image_id": 99}])
     with pytest.warns(InputWarning, match="1 annotations are of no image in the file, the first is annotation 2"):
-        masks = read_coco(path, scene)
+        masks = read_all(path, scene)
     assert [len(view) for view in masks] == [1, 0]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import cv2
 import numpy as np
 import pycolmap
@@ -9,6 +11,7 @@ import pytest
 from scipy import ndimage
 
 from mvseg.formats.lens import (
+    _positions,
     distort,
     opencv_distortion,
     opencv_lens,
@@ -206,3 +209,21 @@ def test_lenses_of_colmap_are_opencvs(model: str, params: list[float]) -> None:
 def test_a_fisheye_is_none_of_opencvs() -> None:
     lens = pycolmap.Camera(model="OPENCV_FISHEYE", width=WIDTH, height=HEIGHT, params=[150, 155, 80, 60, *FISHEYE])
     assert opencv_distortion(lens) is None
+
+
+def test_positions_are_computed_part_by_part(monkeypatch: pytest.MonkeyPatch, coefficients: list[float]) -> None:
+    """Whole rows at a time; the last part may have fewer."""
+    K_large = K * [[8], [8], [1]]
+    lens = opencv_lens(K_large, coefficients, width=8 * WIDTH, height=8 * HEIGHT)
+    labels = np.arange(64 * WIDTH * HEIGHT).reshape(8 * HEIGHT, -1) % 60_000
+    _positions.cache_clear()
+    whole = undistort(labels.astype(np.uint16), lens, K_large)
+    for chunk in (1, 7 * 8 * WIDTH + 5):
+        monkeypatch.setattr("mvseg.formats.lens.CHUNK", chunk)
+        _positions.cache_clear()
+        tracemalloc.start()
+        np.testing.assert_array_equal(undistort(labels.astype(np.uint16), lens, K_large), whole)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 4 * 8 * labels.size  # bytes: the positions take 8 of each pixel
+    _positions.cache_clear()

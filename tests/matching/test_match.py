@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from sklearn.metrics import adjusted_rand_score
 from mvseg.errors import InputError, InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match import match_regions
+from mvseg.matching.match import match_regions, odd_views
 from mvseg.matching.split import split_merged
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
@@ -134,12 +135,49 @@ def test_views_that_agree_on_nothing_are_warned_of() -> None:
         assert match_regions(scene.regions, cameras).method == "one-per-view"
 
 
-def test_cameras_of_the_previous_photo_are_warned_of(demo_scene: Scene, demo_regions: Regions) -> None:
-    """nview finds clusters all the same, and with high scores."""
-    order = [8, 0, 1, 2, 3, 4, 5, 6, 7]
-    cameras = demo_scene.cameras[order]
-    with pytest.warns(InputWarning, match=r"explain 32% of the masks at a reprojection error of 8 pixels or more\)"):
-        assert match_regions(demo_regions, cameras).method == "nview"
+@pytest.mark.parametrize(
+    ("shift", "facts"),
+    [
+        (1, "5.% of the ids are expected to be right, .*, at a reprojection error of 8 pixels or more; 'one-per-view'"),
+        (-1, "3.% of the ids are expected to be right, rays explain 32% of the masks, at a reprojection error of 8"),
+        (2, "rays explain 59% of the masks, least in views 7, 8"),
+    ],
+)
+def test_cameras_of_other_photos_are_warned_of(
+    shift: int, facts: str, demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
+) -> None:
+    """Of the next, the previous, and the next but one: there all but two photos agree with each other."""
+    order = [(view + shift) % 9 for view in range(9)]
+    cameras = dataclasses.replace(demo_scene.cameras, R=demo_scene.cameras.R[order], t=demo_scene.cameras.t[order])
+    with pytest.warns(InputWarning, match=rf"the views hardly agree \(.*{facts}.*\), and ids may be wrong: do R and t"):
+        matching = match_regions(demo_regions, cameras)
+    assert matching_metrics(matching.instance_ids, demo_truth).ari < 0.7
+
+
+@pytest.mark.parametrize(("px", "is_warned"), [(5, False), (20, True)])
+def test_scores_fall_with_the_poses(
+    px: float, is_warned: bool, demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
+) -> None:
+    """Cameras turned by noise: five pixels change no id, twenty spoil them."""
+    cameras, rng = demo_scene.cameras, np.random.default_rng(0)
+    angles = torch.from_numpy(rng.normal(0, px / float(cameras.K[0, 0, 0]), (9, 3)))
+    turn = torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3).double()[None], angles[:, None, :], dim=2))
+    turned = dataclasses.replace(cameras, R=turn @ cameras.R, t=(turn @ cameras.t[:, :, None])[:, :, 0])
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        matching = match_regions(demo_regions, turned)
+    assert [("reprojection error of 8 pixels or more" in str(each.message)) for each in caught] == [True] * is_warned
+    ari = matching_metrics(matching.instance_ids, demo_truth).ari
+    mean = float(matching.match_scores[matching.instance_ids > 0].mean())
+    assert (ari, mean > 0.95) == (1.0, True) if not is_warned else (ari < 0.6 and mean < 0.6)
+
+
+def test_odd_views_explain_far_less_than_the_median() -> None:
+    explained = torch.tensor([0.8, 0.7, float("nan"), 0.48, 0.9])
+    assert odd_views(explained) == [3]
+    assert odd_views(torch.tensor([0.8, 0.8, 0.1])) == []  # of three, any one may be wrong
+    assert odd_views(torch.full((5,), float("nan"))) == []
+    assert odd_views(torch.zeros(5)) == []
 
 
 def test_empty_masks_are_data() -> None:

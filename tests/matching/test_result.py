@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -22,6 +24,7 @@ def matching() -> Matching:
         merged=(MergedMask(region=2, own=2, other=3, part=PART),),
         residual_px=1,
         explained=0.8,
+        view_explained=torch.tensor([0.7, float("nan")]),
     )
 
 
@@ -93,11 +96,16 @@ def test_concatenated_matchings_share_no_instance() -> None:
     assert joined.support is not None
     assert joined.support.tolist() == [1] * 6
     assert joined.explained == pytest.approx(0.8)
+    other = replace(matching(), view_explained=torch.tensor([0.5, 0.6]))
+    joined = Matching.concatenate([matching(), other])
+    assert joined.view_explained is not None
+    assert joined.view_explained.tolist() == pytest.approx([0.6, 0.6])
     plain = Matching(torch.tensor([1, -1]), torch.zeros(2), num_instances=1, method="symnmf")
     mixed = Matching.concatenate([plain, matching()])
     assert mixed.support is None
     assert mixed.residual_px is None
     assert mixed.explained is None
+    assert mixed.view_explained is None
     assert same(Matching.concatenate([matching()]), matching())
 
 

@@ -8,13 +8,14 @@ from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.ops import box_iou
 
 from mvseg.detectors.mask_cut import decide_masks
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.nms import cluster_aware_nms
 from mvseg.multiview.proposals import Proposals, gather_proposals
 from mvseg.regions import regions_from_label_maps
+from mvseg.scene import Cameras
 from simulated_proposals import simulate_proposals
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
 
@@ -237,6 +238,17 @@ def test_iterating_is_deterministic_and_zero_iterations_only_match() -> None:
     keep, _ = match_proposals(proposals, scene.cameras, num_iterations=0)
     groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
     assert torch.equal(keep, cluster_aware_nms(proposals.boxes, proposals.scores, groups, 0.3))
+
+
+def test_views_that_disagree_are_warned_of_once() -> None:
+    """Whatever was said of the matchings before the last one."""
+    scene = ball_scene(6, 5, seed=7)
+    proposals, _ = simulate_proposals(scene.label_maps, seed=0)
+    order = [2, 0, 4, 1, 3]
+    cameras = Cameras(K=scene.cameras.K, R=scene.cameras.R[order], t=scene.cameras.t[order], sizes=scene.cameras.sizes)
+    with pytest.warns(InputWarning) as caught:
+        match_proposals(proposals, cameras, num_iterations=2)
+    assert ["hardly agree" in str(each.message) for each in caught] == [True]
 
 
 def test_classes_are_matched_apart_and_their_matchings_joined() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 import torch
@@ -14,13 +14,14 @@ from mvseg.formats.lens import undistort
 from mvseg.regions import Regions, regions_from_label_maps, stack_regions
 from mvseg.scene import Scene
 
-ViewMasks = np.ndarray | Sequence[tuple[int, np.ndarray]]
+ViewMasks = np.ndarray | Iterable[tuple[int, np.ndarray]]
 
 
 def stack_views(
     views: Iterable[ViewMasks], scene: Scene | None, *, source: object, num_views: int | None = None
 ) -> Regions:
-    """The regions of all views, with the lens distortion of the scene removed; one view is in memory at a time.
+    """The regions of all views, with the lens distortion of the scene removed; one mask is in memory at a time, if the
+    views are iterators.
 
     Args:
         views: V times a label map (H, W) uint16 (0 = nothing, 65535 = ignore), or pairs of a number and a mask (H, W)
@@ -46,9 +47,13 @@ def stack_views(
             num_empty += len(np.setdiff1d(content, [0, 65535])) - len(part)
             found = _items(part)
         else:
-            masks = [(label, undistort(mask.astype(np.uint8), lens, K).astype(bool)) for label, mask in content]
-            found = [(*_crop(mask), label) for label, mask in masks if mask.any()]
-            num_empty += len(masks) - len(found)
+            found = []
+            for label, mask in content:
+                shown = undistort(mask.view(np.uint8), lens, K).view(bool)
+                if shown.any():
+                    found.append((*_crop(shown), label))
+                else:
+                    num_empty += 1
         for box, crop, label in found:
             view_index.append(view)
             boxes.append(box)
@@ -76,4 +81,4 @@ def _crop(mask: np.ndarray) -> tuple[tuple[int, int, int, int], Tensor]:
     """The box of a mask with pixels, and its crop, flat."""
     rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
     y1, y2, x1, x2 = int(rows[0]), int(rows[-1]) + 1, int(columns[0]), int(columns[-1]) + 1
-    return (x1, y1, x2, y2), torch.from_numpy(mask[y1:y2, x1:x2].ravel())
+    return (x1, y1, x2, y2), torch.from_numpy(mask[y1:y2, x1:x2].flatten())

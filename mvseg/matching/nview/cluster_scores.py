@@ -145,6 +145,13 @@ class ClusterScores:
         is_together = np.bincount(clusters, minlength=1)[clusters] > 1
         return float(self.own(clusters)[is_together].mean()) if is_together.any() else 0.0
 
+    def explained_per_view(self, clusters: Ints) -> Floats:
+        """(V,) float64: `explained` of the regions of each view; NaN without any."""
+        is_together = np.bincount(clusters, minlength=1)[clusters] > 1
+        views, scores = self.table.view_index[is_together], self.own(clusters)[is_together]
+        counts, total = (np.bincount(views, weights, self.table.num_views) for weights in (None, scores))
+        return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
+
     def gains(self, view: int, clusters: Ints, landings: Floats) -> ViewGains:
         """What the regions of one view would gain by joining the clusters of the other views.
 

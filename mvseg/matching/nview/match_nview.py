@@ -8,7 +8,7 @@ cover two instances are found (`merged_masks.py`).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -62,26 +62,69 @@ def match_nview(
     pairwise_ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))[order].cpu().numpy()
     pairwise = renumber(separate_unmatched(pairwise_ids))
 
-    scores, residual_px = fit_poses(
-        ordered, cameras, graph, pairwise=pairwise, config=config, progress=progress
-    )
-    clusters = search(scores, pairwise, progress=progress) if len(cameras) > 2 else pairwise
-    method, explained = "nview", scores.explained(clusters)
-    if explained < UNEXPLAINED or len(cameras) == 2:
-        clusters, method, explained = pairwise, "one-per-view", scores.explained(pairwise)
-
+    found = find_clusters(ordered, cameras, graph, pairwise=pairwise, config=config, progress=progress)
+    scores, clusters = found.scores, found.clusters
+    evidence = collect_evidence(scores, clusters, pairwise)
     matching = Matching(
         instance_ids=torch.from_numpy(clusters + 1),
-        match_scores=torch.from_numpy(match_scores(collect_evidence(scores, clusters))).float(),
+        match_scores=torch.from_numpy(match_scores(evidence)).float(),
         num_instances=int(clusters.max(initial=-1)) + 1,
-        method=method,
+        method=found.method,
         merged=find_merged(scores, clusters, ordered),
-        residual_px=residual_px,
-        explained=explained,
+        residual_px=found.residual_px,
+        explained=scores.explained(clusters),
+        view_explained=torch.from_numpy(scores.explained_per_view(clusters)).float(),
     ).reorder(order.cpu())
     matching = matching.relabel(_final_numbers(matching))
     matching = replace(matching, support=count_sure_views(matching, regions.view_index.cpu()))
     return matching.to(regions.device)
+
+
+@dataclass(frozen=True, eq=False)
+class FoundClusters:
+    """The clusters of D regions that are ordered by view, and what they were found with.
+
+    Attributes:
+        clusters: (D,) int64 in [0, K), regions alone included.
+        scores: of the rows.
+        residual_px: see `fit_poses`.
+        method: "nview", or "one-per-view" where these are the pairwise clusters.
+    """
+
+    clusters: Ints
+    scores: ClusterScores
+    residual_px: int
+    method: str
+
+
+def find_clusters(
+    regions: Regions,
+    cameras: Cameras,
+    graph: ViewGraph,
+    *,
+    pairwise: Ints,
+    config: NViewConfig = NViewConfig(),
+    progress: bool = False,
+) -> FoundClusters:
+    """The clusters that explain all views best, or where rows explain too little, those from the weights alone.
+
+    Args:
+        regions: D regions, ordered by view.
+        cameras: V cameras.
+        graph: their epipolar weights.
+        pairwise: (D,) int64, clusters from the weights alone, in [0, K).
+        config: costs, gains and thresholds.
+        progress: show progress bars.
+    """
+    scores, residual_px = fit_poses(
+        regions, cameras, graph, pairwise=pairwise, config=config, progress=progress
+    )
+    clusters, method = pairwise, "one-per-view"
+    if len(cameras) > 2:
+        searched = search(scores, pairwise, progress=progress)
+        if scores.explained(searched) >= UNEXPLAINED:
+            clusters, method = searched, "nview"
+    return FoundClusters(clusters=clusters, scores=scores, residual_px=residual_px, method=method)
 
 
 def fit_poses(

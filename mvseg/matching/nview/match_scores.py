@@ -1,8 +1,13 @@
 """How sure a match is: the probability that a region's id is right, from the evidence for it.
 
-A logistic regression, fitted once on simulated development plants (true and degraded masks, 3 to 20 views, 4 to 32
-leaves): of the regions scored about 0.8, about 80 % are right there (`benchmarks/confidence.py`). A region is right
-when its cluster is the largest one of its leaf, and its leaf is the most frequent one of its cluster.
+Two logistic regressions, fitted on simulated development plants of 3 to 20 views and 4 to 32 leaves: of the regions
+scored about 0.8, about 80 % are right there (`benchmarks/confidence.py`). A region is right when its cluster is the
+largest one of its leaf, and its leaf is the most frequent one of its cluster.
+
+The first regression looks at the region alone, and knows exact poses only. Where poses are wrong, nearly every region
+finds some cluster that explains it well. The scene tells: its regions are less sure on average, and the clusters are
+others than those from the epipolar weights alone. So the second one, fitted with wrong poses, too, decides how far the
+regions of this scene are to be believed.
 """
 
 from __future__ import annotations
@@ -19,6 +24,9 @@ Ints = NDArray[np.int64]
 
 # Intercept, then one for each column of `features`.
 COEFFICIENTS = (1.24, 1.20, 2.96, -0.69, 1.26, -0.90, -1.59, -0.95)
+# Intercept, then one for each column of `scene_features`.
+SCENE_COEFFICIENTS = (-2.889, 0.050, 0.303, 0.173, 2.911)
+SUREST = 0.999, 0.99  # the most that the first regression says of a region, and of a scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,6 +40,7 @@ class IdEvidence:
         weight: (D,) mean epipolar weight to the members in other views.
         num_partners: (D,) int64, members of the cluster in other views; 0 for a region that is alone.
         num_pieces: (D,) int64, members of the cluster in the region's own view, itself included.
+        agreement: (D,) share of the regions of other views in this cluster or in the pairwise one that are in both.
         num_views: V.
     """
 
@@ -41,13 +50,17 @@ class IdEvidence:
     weight: Floats
     num_partners: Ints
     num_pieces: Ints
+    agreement: Floats
     num_views: int
 
 
-def collect_evidence(scores: ClusterScores, clusters: Ints) -> IdEvidence:
+def collect_evidence(scores: ClusterScores, clusters: Ints, pairwise: Ints) -> IdEvidence:
     """The evidence for the cluster of each region; there is none for regions alone in theirs.
 
-    `clusters` (D,) int64 is the cluster of each region in [0, K).
+    Args:
+        scores: of D regions.
+        clusters: (D,) int64, the cluster of each region in [0, K).
+        pairwise: (D,) int64, likewise, from the epipolar weights alone: a second opinion.
     """
     table, alone = scores.table, scores.config.gains.alone
     landings = scores.landings(clusters)
@@ -63,6 +76,7 @@ def collect_evidence(scores: ClusterScores, clusters: Ints) -> IdEvidence:
     is_partner = scores.together(clusters)
     is_same_view = table.view_index[:, None] == table.view_index
     num_partners = is_partner.sum(1)
+    is_paired = scores.together(pairwise)
     return IdEvidence(
         score=score,
         margin=own_gain - rival_gain,
@@ -70,6 +84,7 @@ def collect_evidence(scores: ClusterScores, clusters: Ints) -> IdEvidence:
         weight=(scores.graph.weights * is_partner).sum(1) / np.maximum(num_partners, 1),
         num_partners=num_partners,
         num_pieces=((clusters[:, None] == clusters) & is_same_view).sum(1),
+        agreement=(is_partner & is_paired).sum(1) / np.maximum((is_partner | is_paired).sum(1), 1),
         num_views=table.num_views,
     )
 
@@ -91,7 +106,26 @@ def features(evidence: IdEvidence) -> Floats:
     )
 
 
+def scene_features(evidence: IdEvidence) -> Floats:
+    """(D, 4): what the region says, what the scene says, their product, and how far the second opinion agrees.
+
+    The first two are log-odds, of the first regression for the region and of its mean over the matched regions.
+    """
+    sure = 1 / (1 + np.exp(-(COEFFICIENTS[0] + features(evidence) @ np.array(COEFFICIENTS[1:]))))
+    is_matched = evidence.num_partners > 0
+    mean = sure[is_matched].mean() if is_matched.any() else 0.0
+    agreement = evidence.agreement[is_matched].mean() if is_matched.any() else 0.0
+    region, scene = (_log_odds(x, most) for x, most in zip((sure, mean), SUREST, strict=True))
+    ones = np.ones(len(sure))
+    return np.stack([region, scene * ones, region * scene, agreement * ones], 1)
+
+
 def match_scores(evidence: IdEvidence) -> Floats:
     """(D,) in [0, 1]: the probability that each id is right; 0 for regions that are alone."""
-    logit = COEFFICIENTS[0] + features(evidence) @ np.array(COEFFICIENTS[1:])
+    logit = SCENE_COEFFICIENTS[0] + scene_features(evidence) @ np.array(SCENE_COEFFICIENTS[1:])
     return np.where(evidence.num_partners > 0, 1 / (1 + np.exp(-logit)), 0.0)
+
+
+def _log_odds(probability: Floats, most: float) -> Floats:
+    clipped = np.clip(probability, 1 - most, most)
+    return np.log(clipped / (1 - clipped))
