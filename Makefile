@@ -2,7 +2,7 @@
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 
-.PHONY: demo test fuzz lint docs clean
+.PHONY: demo test fuzz bench lint docs clean
 
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
@@ -14,6 +14,11 @@ test: $(VENV)/installed
 fuzz: $(VENV)/installed
 	MVSEG_FUZZ_EXAMPLES=2000 $(PYTHON) -m pytest tests/fuzz
 	MVSEG_KILLS=20 MVSEG_KILL_SEED=$$(date +%s) $(PYTHON) -m pytest tests/test_kill.py
+
+# ten minutes or more; PREVIOUS=DIR takes turns with another checkout, FULL=--full takes hours
+bench: $(VENV)/installed
+	$(PYTHON) -m benchmarks.speed $(FULL) $(if $(PREVIOUS),--previous $(PREVIOUS)) --cache results/speed \
+	  --json docs/performance.json --plot docs/performance.png
 
 lint: $(VENV)/installed
 	$(PYTHON) -m ruff check .

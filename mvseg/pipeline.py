@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import torch
 from tqdm import tqdm
 
 from mvseg._version import __version__
 from mvseg.config import RunConfig
-from mvseg.detectors.zoo import find_weights, load_detector
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import check_photos, read_photo
@@ -26,16 +26,17 @@ from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.kept_detections import KeptDetections, delete_kept, read_detections, write_detections
-from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
-from mvseg.multiview.proposals import Proposals
-from mvseg.multiview.witnesses import revise_masks
-from mvseg.reconstruction.shapes import reconstruct_shapes
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.results.provenance import hash_files
 from mvseg.results.result import Result
 from mvseg.scene import Scene
-from mvseg.traits.measure import measure_plant
 from mvseg.traits.up import find_up
+
+if TYPE_CHECKING:
+    from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
+    from mvseg.multiview.proposals import Proposals
+
+# What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
+# scenes to match.
 
 
 def run_scene(
@@ -100,6 +101,8 @@ def run_scene(
             mask_kind=kind,
         )
     with _timed(seconds, "reconstruct"):
+        from mvseg.reconstruction.shapes import reconstruct_shapes
+
         has_photos = scene.views[0].path.is_file()
         surfaces, voxels = reconstruct_shapes(
             regions,
@@ -110,6 +113,8 @@ def run_scene(
             progress=progress,
         )
     with _timed(seconds, "measure"):
+        from mvseg.traits.measure import measure_plant
+
         traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels, config=config.traits)
     return Result(
         scene=scene,
@@ -159,6 +164,9 @@ def detect_regions(
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
     """
+    from mvseg.detectors.zoo import load_detector
+    from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
+
     detect = config.detect
     detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
@@ -202,6 +210,10 @@ def hear_witnesses(
         D' detections and their matching; (D',) bool, the masks that only the other views show. These have the mean
         detection score of their instance.
     """
+    from mvseg.multiview.proposals import Proposals
+    from mvseg.multiview.witnesses import revise_masks
+    from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
         surfaces = fit_surfaces(detections.regions, matching.instance_ids, scene.cameras, progress=progress)
@@ -224,6 +236,8 @@ def hear_witnesses(
 
 def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
     """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
+    from mvseg.detectors.zoo import find_weights
+
     weights = find_weights(detect.weights) or Path(detect.weights)
     options = {**asdict(detect), "weights": hash_files(weights), "num_iterations": None, "witnesses": None}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "mvseg": __version__}

@@ -19,6 +19,7 @@ import torch
 
 import mvseg.pipeline
 import mvseg.results.folder
+import mvseg.results.plant_files
 import mvseg.training.state
 from mvseg.cli import main
 from mvseg.simulation.dataset import PRESETS, Preset

@@ -332,3 +332,53 @@ def leaf_metrics_reference(
         "num_false": len(wrong),
         "num_missed": len(leaves) - len(whole),
     }
+
+
+def soft_affinity_reference(
+    rows: list[list[int]], ray_of_row: list[int], region_of_ray: list[int], *, num_regions: int, sharpness: list[float]
+) -> np.ndarray:
+    """(D, D) affinity by expectation maximisation, row by row and pair by pair; -1 = no region there, -2 = outside."""
+    rays = range(len(region_of_ray))
+    on_ray = [[row for row, ray in zip(rows, ray_of_row, strict=True) if ray == number] for number in rays]
+    weights = [[{m: 1.0 for row in on_ray[ray] for m in row if m >= 0}] for ray in rays]  # at first, all that is shown
+    affinity = np.zeros((num_regions, num_regions))
+    for beta in [None, *sharpness]:
+        if beta is not None:
+            for ray in rays:
+                scores = [_row_score(affinity, row, region_of_ray[ray]) for row in on_ray[ray]]
+                beliefs = np.exp(beta * (np.array(scores) - max(scores, default=0)))
+                beliefs /= max(beliefs.sum(), 1e-12)
+                weights[ray] = [
+                    {m: belief for m in row if m >= 0} for row, belief in zip(on_ray[ray], beliefs, strict=True)
+                ]
+        mass = np.zeros((num_regions, num_regions))
+        for ray in rays:
+            for of_row in weights[ray]:
+                for m, weight in of_row.items():
+                    mass[region_of_ray[ray], m] += weight
+        mass /= np.maximum(np.bincount(region_of_ray, minlength=num_regions), 1)[:, None]
+        affinity = (mass + mass.T) / 2
+    return affinity
+
+
+def _row_score(affinity: np.ndarray, row: list[int], own: int) -> float:
+    """Mean affinity between all regions of a row and the ray's own, less 0.7 for the share of views without one."""
+    inside = [label for label in row if label >= -1]
+    named = [own, *(label for label in inside if label >= 0)]
+    pairs = sum(affinity[first, second] for first, second in combinations(named, 2))
+    return 2 * pairs / (len(inside) * (len(inside) + 1)) - 0.7 * inside.count(-1) / len(inside)
+
+
+def spread_pixels_reference(mask: np.ndarray, most: int) -> np.ndarray:
+    """(n, 2) at most `most` pixel centres of a mask, evenly spread over its pixels in reading order."""
+    pixels = np.argwhere(mask)[:, ::-1] + 0.5
+    taken = min(len(pixels), most)
+    return pixels[[((2 * rank + 1) * len(pixels)) // (2 * taken) for rank in range(taken)]]
+
+
+def thinned_pixels_reference(mask: np.ndarray, most: int) -> np.ndarray:
+    """(n, 2) the pixel centres of a mask on a square lattice from the image's corner on; all if none is on it."""
+    pixels = np.argwhere(mask)[:, ::-1]
+    step = max(1, int(np.ceil(np.sqrt(len(pixels) / most))))
+    on_lattice = pixels[(pixels % step == 0).all(1)]
+    return (on_lattice if len(on_lattice) else pixels) + 0.5

@@ -9,6 +9,7 @@ import torchvision
 
 from mvseg.errors import InputError
 from mvseg.regions import IGNORE_LABEL, Regions, mask_box, masks_to_boxes, regions_from_label_maps
+from reference import spread_pixels_reference, thinned_pixels_reference
 
 
 def random_maps(seed: int = 0) -> list[np.ndarray]:
@@ -53,6 +54,31 @@ def test_thinned_pixels_stand_for_the_whole_mask() -> None:
     sums = torch.zeros(2).index_add(0, owner, weight)
     torch.testing.assert_close(sums, regions.areas.float())
     torch.testing.assert_close(xy[owner == 0].mean(0), torch.tensor([200.0, 130.0]), atol=10, rtol=0)
+
+
+@pytest.mark.parametrize("most", [1, 5, 12, 100])
+def test_thinned_and_spread_pixels_agree_with_full_frames(most: int) -> None:
+    maps = random_maps(seed=3)
+    maps[0][0, :] = 9  # a sliver, which a lattice may miss
+    regions = regions_from_label_maps(maps)
+    thinned, owner, weight = regions.pixels(max_per_region=most)
+    spread, region = regions.spread_pixels(most)
+    for index in range(len(regions)):
+        mask = maps[int(regions.view_index[index])] == int(regions.labels[index])
+        expected = thinned_pixels_reference(mask, most)
+        np.testing.assert_array_equal(thinned[owner == index].numpy(), expected)
+        assert weight[owner == index].sum() == pytest.approx(mask.sum())
+        np.testing.assert_array_equal(spread[region == index].numpy(), spread_pixels_reference(mask, most))
+    nothing = regions.select(torch.zeros(0, dtype=torch.int64))
+    assert [len(each) for each in (*nothing.pixels(5), *nothing.spread_pixels(5))] == [0] * 5
+
+
+def test_label_maps_of_any_integer_type_give_the_same_regions() -> None:
+    maps = random_maps(seed=4)
+    expected = regions_from_label_maps(maps)
+    found = regions_from_label_maps([labels.astype(np.int64) for labels in maps])
+    for name in ("view_index", "boxes", "crops", "labels"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
 
 
 def test_select_keeps_order_and_content() -> None:

@@ -8,8 +8,8 @@ from torch import Tensor
 from mvseg.baselines.edges import edge_graph
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.epipolar import is_coincident
 from mvseg.matching.match import check_views, match_graph
+from mvseg.matching.pencil import is_coincident
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.checks.finding import Finding, name_views
-from mvseg.matching.epipolar import is_coincident
+from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras, Scene
 
 Floats = NDArray[np.float64]

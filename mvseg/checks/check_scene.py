@@ -9,8 +9,8 @@ from mvseg.checks.finding import Finding
 from mvseg.checks.masks import mask_findings
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
-from mvseg.matching.epipolar import is_coincident
 from mvseg.matching.match import check_views
+from mvseg.matching.pencil import is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.checks.finding import Finding, Level, name_views
-from mvseg.matching.epipolar import Pencil, epipolar_pencil, is_coincident
+from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 

@@ -53,16 +53,16 @@ def region_affinity(
     """
     samples, members = view_samples(regions)
     senders = None if num_points is None else draw_points(samples, num_points, seed)
-    edges, weights = [torch.zeros(0, 2, dtype=torch.int64, device=regions.device)], []
+    edges = [torch.zeros(2, 0, dtype=torch.int64, device=regions.device)]
+    weights = [torch.zeros(0, device=regions.device)]
     for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):
         i, j = pair.i, pair.j
         j_from_i, i_from_j = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
         mean = (j_from_i + i_from_j.T) / 2
         first, second = mean.nonzero().unbind(1)
-        edges.append(torch.stack((members[i][first], members[j][second]), 1).sort(1).values)
+        edges.append(torch.stack((members[i][first], members[j][second])))
         weights.append(mean[first, second])
-    empty = torch.zeros(0, device=regions.device)
-    return Affinity(torch.cat(edges), torch.cat([empty, *weights]), len(regions))
+    return Affinity(torch.cat(edges, 1).T.sort(1).values, torch.cat(weights), len(regions))
 
 
 def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -78,12 +78,17 @@ def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Te
     Returns:
         w(i -> j) (N, M) and w(j -> i) (M, N), float32 in [0, 1].
     """
-    j_from_i = _directed(lines[0], pixels[1], band_radius=bins.band_radius(0), half_line=bins.half_line[1])
-    return j_from_i, _directed(lines[1], pixels[0], band_radius=bins.band_radius(1), half_line=bins.half_line[0])
-
-
-def _directed(lines: Tensor, pixels: Tensor, *, band_radius: int, half_line: int) -> Tensor:
-    """(N, M) affinity from (N, B) line counts and (M, B) pixel counts."""
-    covered = dilate(lines > 0, band_radius) @ pixels.T / pixels.sum(1).clamp(min=1)
-    passing = lines @ dilate(pixels > 0, half_line).T / lines.sum(1, keepdim=True).clamp(min=1)
-    return covered * passing
+    bands = tuple(dilate(lines[side], bins.band_radius(side)) for side in (0, 1))
+    inside = bands[0] @ pixels[1].T, bands[1] @ pixels[0].T  # pixels of the other view in each region's band
+    through = tuple(
+        # one line per pixel, as thick as the band: then the same pixels are counted
+        inside[1 - side].T
+        if lines is pixels and bins.band_radius(1 - side) == bins.half_line[1 - side]
+        else lines[side] @ dilate(pixels[1 - side], bins.half_line[1 - side]).T
+        for side in (0, 1)
+    )
+    num_pixels, num_lines = (tuple(each.sum(1).clamp(min=1) for each in counts) for counts in (pixels, lines))
+    j_from_i, i_from_j = (
+        inside[side] / num_pixels[1 - side] * (through[side] / num_lines[side][:, None]) for side in (0, 1)
+    )
+    return j_from_i, i_from_j

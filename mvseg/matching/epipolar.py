@@ -19,14 +19,14 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from mvseg.errors import InputError
+from mvseg.matching.pencil import Pencil, epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 BINS_PER_PIXEL = 2  # a bin is half a pixel wide, so that a line of two pixels is resolved
 MIN_BINS, MAX_BINS = 64, 8192
+PITCH_PIXELS = 1024  # of a view's pixels tell how thick a line is, at least about this many
 LINE_PX = 2.0  # thickness of an epipolar line (Sec. 3.1)
-COINCIDENT = 1e-6  # baselines shorter than this fraction of the longest one have no epipolar geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,86 +80,6 @@ def draw_points(samples: Sequence[Samples], num_points: int, seed: int) -> list[
 
 
 @dataclass(frozen=True, eq=False)
-class Pencil:
-    """The half-planes through the baseline of cameras i and j.
-
-    Attributes:
-        plane_from_px: (2, 2, 3) float64, for camera i and camera j: (u, v, 1) -> (x, y), the viewing ray of the pixel
-            projected along the baseline. The angle of (x, y) is the angle of the half-plane, equal in both images.
-    """
-
-    plane_from_px: Tensor
-
-    def angles(self, side: int, xy: Tensor) -> Tensor:
-        """Half-plane of each pixel (Eq. 1: pixels of i and j with equal angle lie on each other's epipolar lines).
-
-        Args:
-            side: 0 for camera i, 1 for camera j.
-            xy: (P, 2) pixel positions.
-
-        Returns:
-            (P,) float32 in [-2, 2], a monotone stand-in for atan2 that needs one division (the 1-norm angle
-            y / (|x| + |y|), continued over the left half-plane). 0 at an epipole, where no half-plane is defined.
-        """
-        x, y = self._plane(side, xy)
-        angle = y / (x.abs() + y.abs()).clamp(min=torch.finfo(x.dtype).tiny)
-        return torch.where(x < 0, torch.where(y < 0, -2 - angle, 2 - angle), angle)
-
-    def pitch(self, side: int, xy: Tensor) -> float:
-        """Mean change of the angle when a pixel moves by one pixel across its epipolar line.
-
-        It is the mean of |x grad y - y grad x| / (|x| + |y|)^2 over the pixels; pixels within a pixel of the epipole,
-        where it diverges, count as if one pixel away.
-        """
-        x, y = self._plane(side, xy)
-        (x_u, x_v, _), (y_u, y_v, _) = self.plane_from_px[side].tolist()
-        across = torch.hypot(x * y_u - y * x_u, x * y_v - y * x_v)
-        reach = (x.abs() + y.abs()).clamp(min=abs(x_u) + abs(x_v) + abs(y_u) + abs(y_v))
-        return float((across / reach**2).mean())
-
-    def _plane(self, side: int, xy: Tensor) -> tuple[Tensor, Tensor]:
-        u, v = xy.unbind(1)
-        # plain numbers: a product of (P, 2) with (2, 2) is ten times slower
-        first, second = self.plane_from_px[side].tolist()
-        x = u * first[0] + v * first[1] + first[2]
-        y = u * second[0] + v * second[1] + second[2]
-        return x, y
-
-
-def is_coincident(cameras: Cameras) -> Tensor:
-    """(V, V) bool: the pair has no baseline (shorter than 1e-6 of the scene's longest), so no epipolar geometry."""
-    centers = cameras.centers
-    # Differences, not torch.cdist: that one cancels for many cameras far from the world's origin.
-    distance = torch.linalg.vector_norm(centers[:, None] - centers, dim=2)
-    return distance <= COINCIDENT * distance.max()
-
-
-def epipolar_pencil(cameras: Cameras, i: int, j: int) -> Pencil:
-    """The pencil of two cameras.
-
-    Any baseline will do: an epipole inside an image or at infinity, or cameras that face each other, need no special
-    treatment.
-
-    Raises:
-        InputError: cameras i and j share a centre (no epipolar geometry).
-    """
-    baseline = cameras.centers[j] - cameras.centers[i]
-    length = torch.linalg.vector_norm(baseline)
-    if length == 0:
-        raise InputError(f"views {i} and {j} share a camera centre, expected a baseline between them")
-    axis = baseline / length
-    world_from_px = cameras.world_from_px[[i, j]]
-    # Angle 0 points where both cameras look, so that the jump at +-2 is as far from the regions as possible.
-    forward = cameras.R[[i, j], 2].sum(0)
-    forward = forward - (forward @ axis) * axis
-    if torch.linalg.vector_norm(forward) < 1e-9:  # both look along the baseline: any direction across it will do
-        forward = torch.linalg.cross(axis, torch.eye(3).to(axis)[axis.abs().argmin()])
-    e1 = forward / torch.linalg.vector_norm(forward)
-    e2 = torch.linalg.cross(axis, e1)
-    return Pencil(torch.stack((e1, e2)) @ world_from_px)
-
-
-@dataclass(frozen=True, eq=False)
 class Bins:
     """A common binning of the angles of two images.
 
@@ -179,7 +99,7 @@ class Bins:
 
     def index(self, angles: Tensor) -> Tensor:
         """(P,) int32 bin of each angle; -1 below the first bin and B above the last."""
-        return ((angles - self.low) * self.per_unit).floor().clamp(-1, self.num_bins).int()
+        return torch.sub(angles, self.low).mul_(self.per_unit).floor_().clamp_(-1, self.num_bins).int()
 
     def band_radius(self, source: int) -> int:
         """How many bins a band of image `source` (0 or 1) extends beyond its pixels' centres.
@@ -190,20 +110,18 @@ class Bins:
         return max(self.half_line[1 - source], self.half_pixel[source])
 
 
-def choose_bins(pencil: Pencil, xy: tuple[Tensor, Tensor], angles: tuple[Tensor, Tensor]) -> Bins:
+def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> Bins:
     """Bins of half a pixel over the angles of both views' pixels; lines are two pixels thick, as in the paper.
 
     A line is a wedge of the pencil, so its thickness in pixels varies with the distance to the epipole; it is two
     pixels on average over the pixels of each image. Both views need at least one pixel.
 
     Args:
-        pencil: of views i and j.
-        xy: (P, 2) and (Q, 2) pixels of views i and j.
-        angles: (P,) and (Q,), their angles.
+        pitches: angle per pixel in views i and j, see `mean_pitches`.
+        angles: (P,) and (Q,), the angles of the pixels of views i and j.
     """
     ends = torch.stack([torch.stack(torch.aminmax(part)) for part in angles]).tolist()
     low, high = min(end[0] for end in ends), max(end[1] for end in ends)
-    pitches = [pencil.pitch(side, xy[side]) for side in (0, 1)]
     per_unit = BINS_PER_PIXEL / max(min(pitches), 1e-12)
     num_bins = int(min(max((high - low) * per_unit, MIN_BINS), MAX_BINS))
     per_unit = num_bins / max(high - low, 1e-12) * (1 - 1e-6)
@@ -224,9 +142,9 @@ def bin_histogram(bins: Bins, angles: Tensor, samples: Samples) -> Tensor:
     Pixels whose half-plane lies outside the bins are left out.
     """
     padded = bins.num_bins + 2  # an extra bin at either end collects what lies outside
-    flat = samples.owner * padded + (bins.index(angles) + 1)
-    counts = torch.bincount(flat, weights=samples.weight, minlength=samples.num_regions * padded)
-    return counts.reshape(samples.num_regions, padded)[:, 1:-1].float()
+    flat = torch.add(samples.owner.int() * padded, bins.index(angles)).add_(1).long()  # int32: half the memory traffic
+    counts = samples.weight.new_zeros(samples.num_regions * padded).scatter_add_(0, flat, samples.weight)
+    return counts.reshape(samples.num_regions, padded)[:, 1:-1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,10 +186,11 @@ def binned_pairs(
     skip = is_coincident(cameras).tolist()
     occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
     pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
-    for i, j in tqdm(pairs, desc="epipolar weights", unit="pair", disable=not progress):
-        pencil = epipolar_pencil(cameras, i, j)
+    pencils = epipolar_pencils(cameras, pairs)
+    every_pair = zip(pairs, pencils, _pair_pitches(samples, pairs, pencils), strict=True)
+    for (i, j), pencil, pitches in tqdm(every_pair, "epipolar weights", len(pairs), unit="pair", disable=not progress):
         angles = pencil.angles(0, samples[i].xy), pencil.angles(1, samples[j].xy)
-        bins = choose_bins(pencil, (samples[i].xy, samples[j].xy), angles)
+        bins = choose_bins(pitches, angles)
         pixels = bin_histogram(bins, angles[0], samples[i]), bin_histogram(bins, angles[1], samples[j])
         lines = pixels
         if senders is not None:
@@ -283,12 +202,40 @@ def binned_pairs(
         yield BinnedPair(i=i, j=j, pencil=pencil, bins=bins, pixels=pixels, lines=lines)
 
 
-def dilate(occupied: Tensor, radius: int) -> Tensor:
-    """(N, B) bool -> (N, B) float32 of 0 and 1: bins within `radius` bins of an occupied one."""
-    total = torch.nn.functional.pad(occupied.float().cumsum(1), (radius + 1, radius), mode="constant")
-    num_bins = occupied.shape[1]
-    total[:, num_bins + radius + 1 :] = total[:, num_bins + radius, None]
-    return (total[:, 2 * radius + 1 :] > total[:, :num_bins]).float()
+def _pair_pitches(
+    samples: Sequence[Samples], pairs: Sequence[tuple[int, int]], pencils: Sequence[Pencil]
+) -> list[tuple[float, float]]:
+    """The pitch of each pair of views in its first and in its second view; all pairs of a view at once."""
+    pitches = [[0.0, 0.0] for _ in pairs]
+    for view, sample in enumerate(samples):
+        sides = [(index, pair.index(view)) for index, pair in enumerate(pairs) if view in pair]
+        if not sides:
+            continue
+        planes = torch.stack([pencils[index].plane_from_px[side] for index, side in sides])
+        for (index, side), pitch in zip(sides, mean_pitches(planes, _thin(sample.xy)), strict=True):
+            pitches[index][side] = pitch
+    return [(first, second) for first, second in pitches]
+
+
+def _thin(xy: Tensor) -> Tensor:
+    """Of many pixels, about PITCH_PIXELS on a square lattice: enough for a mean, whatever their order."""
+    step = int((len(xy) / PITCH_PIXELS) ** 0.5)
+    if step < 2:
+        return xy
+    column, row = (each.int() for each in xy.unbind(1))
+    on_lattice = (column % step == 0) & (row % step == 0)
+    return xy[on_lattice] if on_lattice.any() else xy
+
+
+def dilate(counts: Tensor, radius: int) -> Tensor:
+    """(N, B) counts or bool -> (N, B) float32 of 0 and 1: bins within `radius` bins of one that is not 0."""
+    grown = torch.nn.functional.pad((counts if counts.is_floating_point() else counts.float()).sign(), (radius, radius))
+    reach, window = 1, 2 * radius + 1
+    while reach < window:  # the maximum over `reach` bins, doubled again and again
+        step = min(reach, window - reach)
+        grown = torch.maximum(grown[:, :-step], grown[:, step:])
+        reach += step
+    return grown
 
 
 def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:
@@ -313,8 +260,8 @@ def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor)
             continue
         pencil = epipolar_pencil(cameras, other, view)
         angles = pencil.angles(0, source.xy), pencil.angles(1, xy)
-        bins = choose_bins(pencil, (source.xy, xy), angles)
-        occupied = dilate(bin_histogram(bins, angles[0], source) > 0, bins.band_radius(0))
+        bins = choose_bins((pencil.pitch(0, source.xy), pencil.pitch(1, xy)), angles)
+        occupied = dilate(bin_histogram(bins, angles[0], source), bins.band_radius(0))
         bands[members] = occupied[:, bins.index(angles[1]).clamp(0, bins.num_bins - 1)] > 0
     return bands
 

@@ -10,9 +10,9 @@ from torch import Tensor
 from mvseg.errors import InputError, InputWarning
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.epipolar import is_coincident
 from mvseg.matching.nview.match_nview import WIDENINGS, match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
+from mvseg.matching.pencil import is_coincident
 from mvseg.matching.result import Matching
 from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions

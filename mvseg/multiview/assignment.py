@@ -93,7 +93,7 @@ def ruzicka_similarity(
     for pair in binned_pairs(joint, cameras, progress=progress):
         for source, target, side in ((pair.i, pair.j, 0), (pair.j, pair.i, 1)):
             clusters = cluster_of[source_members[source]]
-            sent = pair.pixels[side][: len(clusters)] > 0
+            sent = pair.pixels[side][: len(clusters)]
             bands = torch.zeros(num_clusters, pair.bins.num_bins, device=regions.device)
             bands.index_add_(0, clusters, dilate(sent, pair.bins.band_radius(side)))
             count[target] += torch.bincount(clusters, minlength=num_clusters)

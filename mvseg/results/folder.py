@@ -7,8 +7,9 @@ Numbers in files are instance ids: label 3, `leaf_003.ply`, leaf 3 in `traits.cs
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from tqdm import tqdm
@@ -19,22 +20,17 @@ from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import distort
-from mvseg.formats.mesh import simplify_mesh, write_glb, write_ply
 from mvseg.formats.photos import read_photo
-from mvseg.reconstruction.shapes import best_shape
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
-from mvseg.results.gltf import describe_leaves, describe_world, gltf_from_world
-from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile, instance_color
-from mvseg.results.report.page import write_report
+from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
-from mvseg.results.rims import visible_rims
-from mvseg.traits.measure import Traits
-from mvseg.traits.table import write_long, write_wide
+
+if TYPE_CHECKING:
+    from mvseg.results.rims import Rims
+    from mvseg.traits.measure import Traits
 
 REPORT_FILE = "report.html"
-MAX_FACES = 4000  # triangles of a leaf in scene.glb; its own file has all of them
 
 
 def save_result(
@@ -69,16 +65,17 @@ def save_result(
             pictures = _write_images(result, folder, progress, draw_rims=draw_rims)
             _write_instances(result, folder, progress)
             if result.surfaces is not None or result.voxels is not None:
-                _write_shapes(result, folder)
-            if result.traits is not None:
-                write_long(folder / "traits.csv", result.traits)
-                write_wide(folder / "traits_wide.csv", result.traits)
+                from mvseg.results.plant_files import write_plant  # loads trimesh and scikit-image
+
+                write_plant(result, folder)
             counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
             seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
             matched = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
             measured = {} if result.traits is None else {"traits": _describe_traits(result.traits)}
             said = run | matched | measured | {"counts": counts, "seconds": seconds}
             if report:
+                from mvseg.results.report.page import write_report  # loads trimesh
+
                 write_report(folder / REPORT_FILE, result, pictures, run=said)
             text = json.dumps(said | {"files": list_files(folder)}, indent=1, default=str)
             (folder / RUN_FILE).write_text(text + "\n", encoding="utf-8")
@@ -91,7 +88,7 @@ def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bo
     """Labels, overlays and the contact sheet; what the report shows of the photos, which are read only once."""
     scene, ids = result.scene, result.matching.instance_ids
     tiles, pictures, has_photos = [], [], any(view.path.exists() for view in scene.views)
-    rims = visible_rims((result.surfaces or {}) if draw_rims else {}, scene.cameras)
+    rims = _rims_of(result) if draw_rims else [{}] * len(scene.views)
     views = list(enumerate(scene.views))
     for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
         width, height = scene.cameras.sizes[index].tolist()
@@ -107,6 +104,15 @@ def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bo
         write_png(overlay, drawn)
     write_png(folder / "contact.png", draw_contact_sheet(tiles, [view.name for view in scene.views]))
     return pictures
+
+
+def _rims_of(result: Result) -> Sequence[Rims]:
+    """{instance id: lines} of each view; empty where there are no surfaces."""
+    if not result.surfaces:
+        return [{}] * len(result.scene.views)
+    from mvseg.results.rims import visible_rims  # loads trimesh
+
+    return visible_rims(result.surfaces, result.scene.cameras)
 
 
 def _write_instances(result: Result, folder: Path, progress: bool) -> None:
@@ -149,26 +155,6 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         **source,
         "segmentation": encode_mask(distort(mask, result.scene.views[view].lens, K)),
     }
-
-
-def _write_shapes(result: Result, folder: Path) -> None:
-    """leaves/*.ply and scene.glb: credible surfaces, for other instances voxels. The voxels of a leaf that has both get
-    a file of their own."""
-    (folder / "leaves").mkdir()
-    meshes, colors = {}, {}
-    for instance in range(1, result.matching.num_instances + 1):
-        shape = best_shape(instance, result.surfaces, result.voxels)
-        name, color = f"leaf_{instance:03d}", instance_color(instance)
-        if shape is not None and len((mesh := shape.mesh()).faces):
-            meshes[name], colors[name] = simplify_mesh(mesh, MAX_FACES), color
-            write_ply(folder / "leaves" / f"{name}.ply", mesh, color, instance_id=instance)
-        if isinstance(shape, LeafSurface) and result.voxels and instance in result.voxels:
-            voxels = result.voxels[instance].mesh()
-            write_ply(folder / "leaves" / f"{name}_voxels.ply", voxels, color, instance_id=instance)
-    about, extras = describe_world(result.scene), describe_leaves(result.traits)
-    write_glb(
-        folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras
-    )
 
 
 def _describe_traits(traits: Traits) -> dict[str, Any]:

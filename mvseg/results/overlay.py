@@ -6,13 +6,16 @@ import colorsys
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from mvseg.matching.result import SURE, Matching
 from mvseg.regions import Regions
-from mvseg.results.rims import Rims
+
+if TYPE_CHECKING:
+    from mvseg.results.rims import Rims  # loads trimesh
 
 MAX_SIDE = 1600  # pixels of an overlay's longer side
 TILE_WIDTH = 480
@@ -134,16 +137,21 @@ def _draw(
     for index in members.tolist():
         instance = int(matching.instance_ids[index])
         mask = window.cut(regions.mask(index, width, height).cpu().numpy().astype(np.uint8), cv2.INTER_NEAREST)
-        color = instance_color(instance)
-        painted[mask > 0] = 0.45 * canvas[mask > 0] + 0.55 * np.array(color)
-        outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        x, y, mask_width, mask_height = cv2.boundingRect(mask)
+        if not mask_width:  # too small to be seen here
+            continue
+        here = slice(y, y + mask_height), slice(x, x + mask_width)
+        mask, color = mask[here], instance_color(instance)
+        inside = mask > 0
+        painted[here][inside] = 0.45 * canvas[here][inside] + 0.55 * np.array(color)
+        outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE, offset=(x, y))
         cv2.drawContours(painted, outlines, -1, color, max(1, round(longer / 600)))
-        if instance > 0 and mask.any():
+        if instance > 0:
             # The number goes where the mask is thickest, which is always inside it.
             depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
             row, column = np.unravel_index(depth.argmax(), depth.shape)
             doubt = "?" if matching.match_scores[index] < SURE else ""
-            labels.append(_Number(f"{instance}{doubt}", (int(column), int(row)), float(depth.max())))
+            labels.append(_Number(f"{instance}{doubt}", (x + int(column), y + int(row)), float(depth.max())))
     for instance, lines in rims.items():
         placed = [window.place(line) for line in lines]
         _trace(painted, placed, instance_color(instance), width=max(1, round(longer / 800)))

@@ -13,7 +13,6 @@ import torch
 
 from mvseg._version import __version__
 from mvseg.config import RunConfig
-from mvseg.detectors.zoo import find_weights
 from mvseg.results.result import Result
 
 
@@ -34,7 +33,7 @@ def describe_run(
     if config.reconstruct is None:
         for name in ("reconstruct", "traits", "scale", "unit", "up", "draw_rims"):
             del options[name]
-    source = masks or find_weights(config.detect.weights) or Path(config.detect.weights)
+    source = masks or _weights_of(config)
     return {
         "mvseg": __version__,
         "torch": torch.__version__,
@@ -45,6 +44,12 @@ def describe_run(
         "mask_kind": result.mask_kind or None,
         "warnings": list(messages),
     }
+
+
+def _weights_of(config: RunConfig) -> Path:
+    from mvseg.detectors.zoo import find_weights  # loads torchvision
+
+    return find_weights(config.detect.weights) or Path(config.detect.weights)
 
 
 def hash_files(path: Path) -> str:

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 from torch import Tensor
 
 from mvseg.matching.result import Matching
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.regions import Regions
 from mvseg.scene import Scene
-from mvseg.traits.measure import Traits
+
+if TYPE_CHECKING:  # loads trimesh and scikit-image
+    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+    from mvseg.reconstruction.voxels import VoxelGrid
+    from mvseg.traits.measure import Traits
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 import torch
+from torch.overrides import TorchFunctionMode
 
 from mvseg.errors import InputError
+from mvseg.matching.affinity import region_affinity
 from mvseg.matching.epipolar import (
     bin_histogram,
     choose_bins,
     dilate,
     epipolar_bands,
     epipolar_map,
-    epipolar_pencil,
-    is_coincident,
     view_samples,
 )
+from mvseg.matching.pencil import epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
+from mvseg.multiview.assignment import ruzicka_similarity
 from mvseg.scene import Cameras
 from reference import epipolar_map_reference, fundamental_reference
 from synthetic import arc_positions, ball_scene, cameras_at, moved
@@ -99,6 +102,48 @@ def test_pitch_is_the_angle_of_one_pixel_across_the_line() -> None:
     assert pencil.pitch(0, xy) == pytest.approx(float(change), rel=1e-3)
 
 
+def test_pencils_of_many_pairs_are_those_of_each_pair() -> None:
+    cameras = cameras_at(torch.cat([torch.tensor(positions) for positions in RIGS.values()]))
+    pairs = (~is_coincident(cameras)).nonzero().tolist()
+    for (i, j), pencil in zip(pairs, epipolar_pencils(cameras, pairs), strict=True):
+        expected = epipolar_pencil(cameras, i, j).plane_from_px
+        torch.testing.assert_close(pencil.plane_from_px, expected, atol=1e-12, rtol=0)
+    assert epipolar_pencils(cameras, []) == []
+
+
+def test_pitches_of_many_pencils_are_those_of_each() -> None:
+    cameras = cameras_at(arc_positions(4))
+    xy = pixels_of_a_grid(cameras, 0).double()
+    pencils = epipolar_pencils(cameras, [(0, 1), (0, 2), (0, 3)])
+    together = mean_pitches(torch.stack([pencil.plane_from_px[0] for pencil in pencils]), xy)
+    assert together == pytest.approx([pencil.pitch(0, xy) for pencil in pencils])
+    steps = torch.cat((xy + torch.tensor([0.005, 0]), xy - torch.tensor([0.005, 0])))
+    for pencil, pitch in zip(pencils, together, strict=True):  # the line's slope is what is missing from one direction
+        along_x = pencil.angles(0, steps).reshape(2, -1).diff(dim=0).abs().mean() / 0.01
+        assert along_x <= pitch * (1 + 1e-3)
+
+
+def test_every_tensor_is_made_where_the_regions_are() -> None:
+    """What would fail on a GPU shows on the CPU: a tensor that is made without naming its device."""
+    scene = ball_scene(4, 3)
+    ids = scene.regions.labels
+    with DeviceNamed():
+        region_affinity(scene.regions, scene.cameras)
+        ruzicka_similarity(scene.regions, scene.regions, ids, cameras=scene.cameras, max_pixels=50)
+        scene.regions.spread_pixels(5)
+        with pytest.raises(AssertionError, match="device"):
+            torch.zeros(3)
+
+
+class DeviceNamed(TorchFunctionMode):
+    """Inside, tensors made from nothing must say on which device."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in (torch.zeros, torch.ones, torch.full, torch.empty, torch.arange, torch.tensor, torch.linspace):
+            assert (kwargs or {}).get("device") is not None, f"{func.__name__} without a device"
+        return func(*args, **(kwargs or {}))
+
+
 def test_pencil_does_not_depend_on_the_world() -> None:
     cameras = rig("side by side")
     rotation = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(3)).double())[0]
@@ -137,7 +182,7 @@ def test_histograms_hold_every_pixel_once() -> None:
     samples, members = view_samples(scene.regions)
     pencil = epipolar_pencil(scene.cameras, 0, 2)
     angles = pencil.angles(0, samples[0].xy), pencil.angles(1, samples[2].xy)
-    bins = choose_bins(pencil, (samples[0].xy, samples[2].xy), angles)
+    bins = choose_bins((pencil.pitch(0, samples[0].xy), pencil.pitch(1, samples[2].xy)), angles)
     for side, view in ((0, 0), (1, 2)):
         counts = bin_histogram(bins, angles[side], samples[view])
         torch.testing.assert_close(counts.sum(1), scene.regions.areas[members[view]].float())

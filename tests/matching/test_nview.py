@@ -13,8 +13,17 @@ from sklearn.metrics import adjusted_rand_score
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores, members_of
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import EMPTY, OUTSIDE, RowTable, row_table, sample_pixels
+from mvseg.matching.nview.label_rows import (
+    EMPTY,
+    OUTSIDE,
+    RowTable,
+    blocks_of_runs,
+    row_table,
+    row_tables,
+    run_starts,
+)
 from mvseg.matching.nview.match_nview import match_nview
+from mvseg.matching.nview.row_index import index_rows
 from mvseg.matching.nview.search import refine, search
 from mvseg.matching.nview.soft_start import em_affinities
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
@@ -22,6 +31,7 @@ from mvseg.matching.result import Matching
 from mvseg.partition import renumber
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
+from reference import soft_affinity_reference
 from synthetic import (
     BallScene,
     arc_positions,
@@ -181,7 +191,7 @@ def test_rows_are_what_points_on_the_ray_show(balls: BallScene, table: RowTable)
 
 
 def test_pixels_are_spread_evenly_and_never_more_than_asked(balls: BallScene) -> None:
-    xy, region = sample_pixels(balls.regions, most=25)
+    xy, region = balls.regions.spread_pixels(25)
     counts = torch.bincount(region)
     assert torch.equal(counts, balls.regions.areas.clamp(max=25))
     for index in (0, 5):
@@ -195,6 +205,52 @@ def test_members_are_in_rising_order_and_the_unmatched_are_left_out() -> None:
     members = members_of(np.array([2, -1, 0, 2]), 4)
     assert [cluster.tolist() for cluster in members] == [[2], [], [0, 3], []]
     assert members_of(np.zeros(0, np.int64), 0) == []
+
+
+def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvseg.matching.nview.label_rows.BLOCK_ROWS", 10)
+    runs = np.repeat(np.arange(40), np.random.default_rng(0).integers(1, 9, 40))
+    runs = np.append(runs, [40] * 35)  # longer than a block
+    blocks = blocks_of_runs(run_starts(runs), len(runs))
+    assert np.concatenate([runs[block] for block in blocks]).tolist() == runs.tolist()
+    assert len(blocks) > 10
+    assert all(runs[block.stop - 1] != runs[block.stop] for block in blocks[:-1])
+    assert blocks_of_runs(np.zeros(0, np.int64), 0) == []
+
+
+def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
+    scores: ClusterScores, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    clusters = some_ids(scores.table, 5)
+    expected = scores.own(clusters), scores.landings(clusters), em_affinities(scores.table)[-1]
+    monkeypatch.setattr("mvseg.matching.nview.label_rows.BLOCK_ROWS", 50)
+    monkeypatch.setattr("mvseg.matching.nview.soft_start.BLOCK_ROWS", 7)
+    again = ClusterScores(scores.table, scores.graph, scores.config)
+    found = again.own(clusters), again.landings(clusters), em_affinities(scores.table)[-1]
+    for each, wanted in zip(found, expected, strict=True):
+        np.testing.assert_allclose(each, wanted, atol=1e-5)
+
+
+def test_own_scores_are_kept_cluster_by_cluster(scores: ClusterScores) -> None:
+    clusters = some_ids(scores.table, 6)
+    scores.own(clusters)
+    moved_on = renumber(np.where(np.arange(len(clusters)) == 3, clusters.max() + 1, clusters))
+    fresh = ClusterScores(scores.table, scores.graph, scores.config)
+    np.testing.assert_array_equal(scores.own(moved_on), fresh.own(moved_on))
+
+
+def test_rows_are_found_by_the_regions_that_they_name(table: RowTable) -> None:
+    index, members = index_rows(table.labels, len(table.view_index)), [np.array([0, 9, 17]), np.zeros(0, np.int64)]
+    expected = [np.isin(table.labels, cluster).sum(1) for cluster in members]
+    np.testing.assert_array_equal(index.count(members), expected)
+
+
+def test_label_maps_that_grow_step_by_step_give_the_tables_of_each_step(balls: BallScene) -> None:
+    widenings = (1, 2, 5)
+    for widen_px, grown in zip(widenings, row_tables(balls.regions, balls.cameras, widenings=widenings), strict=True):
+        expected = row_table(balls.regions, balls.cameras, widen_px=widen_px)
+        np.testing.assert_array_equal(grown.labels, expected.labels)
+        np.testing.assert_array_equal(grown.pixel, expected.pixel)
 
 
 # --- the search
@@ -319,6 +375,30 @@ def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, tabl
     assert A.max() <= 1 + 1e-6
     assert A[same & across].mean() > 0.6 > 0.1 > A[~same & across].mean()
     assert (A[~across] == 0).all()
+
+
+def test_soft_affinity_agrees_with_loops(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = ball_scene(3, 4, seed=2)
+    monkeypatch.setattr("mvseg.matching.nview.label_rows.PIXELS", 4)
+    table = row_table(scene.regions, scene.cameras)
+    expected = soft_affinity_reference(
+        table.labels.tolist(),
+        table.pixel.tolist(),
+        table.pixel_region.tolist(),
+        num_regions=len(table.view_index),
+        sharpness=[8.0, 12.0],
+    )
+    np.testing.assert_allclose(em_affinities(table)[1], expected, atol=2e-4)
+
+
+def test_a_few_of_many_views_tell_the_soft_affinity(
+    balls: BallScene, table: RowTable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mvseg.matching.nview.soft_start.EM_VIEWS", 4)
+    A = em_affinities(table)[-1]
+    same = (balls.regions.labels[:, None] == balls.regions.labels).numpy()
+    across = table.view_index[:, None] != table.view_index
+    assert A[same & across].mean() > 0.6 > 0.1 > A[~same & across].mean()
 
 
 # --- cameras of every kind

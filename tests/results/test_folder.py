@@ -15,6 +15,8 @@ import trimesh
 
 import mvseg.results.earlier
 import mvseg.results.folder
+import mvseg.results.plant_files
+import mvseg.results.report.page
 from known_leaves import bent_blade, flat_leaf
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
@@ -228,7 +230,7 @@ class TestVariants:
     def test_leaves_have_few_triangles_in_the_scene_and_all_in_their_files(
         self, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        monkeypatch.setattr(mvseg.results.folder, "MAX_FACES", 300)
+        monkeypatch.setattr(mvseg.results.plant_files, "MAX_FACES", 300)
         save_result(result, tmp_path / "out", {})
         shown = trimesh.load_scene(tmp_path / "out" / "scene.glb")
         for leaf in (1, 2, 3):
@@ -357,6 +359,7 @@ WRITERS = [
 ]  # fmt: skip
 
 
+OF_A_PLANT = ("write_ply", "write_glb", "write_long", "write_wide")
 SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_tile", "draw_picture", "write_png", "write_ply")
 
 
@@ -368,7 +371,9 @@ class TestWholeOrNotAtAll:
     def test_a_failure_half_way_leaves_nothing(
         self, writer: str, error: BaseException, result: Result, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        original, calls = getattr(mvseg.results.folder, writer), []
+        home = mvseg.results.plant_files if writer in OF_A_PLANT else mvseg.results.folder
+        home = mvseg.results.report.page if writer == "write_report" else home
+        original, calls = getattr(home, writer), []
 
         def fail_at_the_second_call(*args: object, **named: object) -> object:
             calls.append(args)
@@ -376,7 +381,7 @@ class TestWholeOrNotAtAll:
                 raise error
             return original(*args, **named)
 
-        monkeypatch.setattr(mvseg.results.folder, writer, fail_at_the_second_call)
+        monkeypatch.setattr(home, writer, fail_at_the_second_call)
         expected = InputError if isinstance(error, OSError) else type(error)
         with pytest.raises(expected):
             save_result(result, tmp_path / "out", {})
@@ -386,7 +391,7 @@ class TestWholeOrNotAtAll:
         save_result(ids_only(result), tmp_path / "out", {"first": True})
         before = {name: (tmp_path / "out" / name).read_bytes() for name in files_below(tmp_path / "out")}
         calls.clear()
-        monkeypatch.setattr(mvseg.results.folder, writer, fail_at_the_second_call)
+        monkeypatch.setattr(home, writer, fail_at_the_second_call)
         with pytest.raises(expected):
             save_result(result, tmp_path / "out", {"first": False})
         assert [path.name for path in tmp_path.iterdir()] == ["out"]

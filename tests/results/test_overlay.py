@@ -62,6 +62,24 @@ def test_an_instance_has_one_colour_in_every_view(regions: Regions) -> None:
     assert (GREY == 90).all()
 
 
+def test_drawing_in_the_box_of_a_mask_is_drawing_in_the_whole_picture() -> None:
+    noise = np.random.default_rng(0).random((25, 38))
+    labels = np.kron((noise > 0.7).astype(np.uint16), np.ones((8, 8), np.uint16))[:200, :300]  # up to every border
+    regions = regions_from_label_maps([labels])
+    expected = GREY.copy()
+    expected[labels > 0] = 0.45 * GREY[labels > 0] + 0.55 * np.array(UNMATCHED)
+    outlines, _ = cv2.findContours(labels.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(expected, outlines, -1, UNMATCHED, 1)
+    np.testing.assert_array_equal(draw_overlay(GREY, regions, matching([-1]), view=0), expected)
+
+
+def test_a_mask_that_is_too_small_for_the_picture_is_not_drawn() -> None:
+    labels = np.zeros((4000, 6000), np.uint16)
+    labels[12, 13] = 1  # between the pixels that the overlay takes
+    photo = np.full((4000, 6000, 3), 90, np.uint8)
+    assert (draw_overlay(photo, regions_from_label_maps([labels]), matching([1]), view=0) == 90).all()
+
+
 def test_the_small_one_is_on_top(regions: Regions) -> None:
     labels = np.zeros((200, 300), np.uint16)
     labels[20:180, 20:180] = 1

@@ -6,16 +6,16 @@ views: the rows of `label_rows.py`, so that neither a volume nor a surface is ne
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import EMPTY, RowTable, run_starts
+from mvseg.matching.nview.label_rows import EMPTY, RowTable, blocks_of_runs, run_starts
 from mvseg.matching.one_per_view import ViewGraph
 
 # Log-odds that two regions show one instance, by epipolar weight; measured on degraded masks of development plants.
@@ -128,10 +128,16 @@ class ClusterScores:
 
     def own(self, clusters: Ints) -> Floats:
         """(D,) score of each region in its own cluster, its own view left out; `clusters` (D,) in [0, K)."""
-        key = clusters.tobytes()
-        if key not in self._own:
-            self._own[key] = self._score_own(clusters)
-        return self._own[key]
+        members = members_of(clusters, int(clusters.max(initial=-1)) + 1)
+        keys = [cluster.tobytes() for cluster in members]
+        new = np.array([k for k, key in enumerate(keys) if key not in self._own], np.int64)
+        if len(new):
+            fresh = self._score_own(clusters, new)
+            self._own.update({keys[k]: fresh[members[k]] for k in new.tolist()})
+        own = np.zeros(len(clusters))
+        for key, cluster in zip(keys, members, strict=True):
+            own[cluster] = self._own[key]
+        return own
 
     def value(self, clusters: Ints) -> float:
         """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all
@@ -205,24 +211,18 @@ class ClusterScores:
         """(P, C) float32: the scores of the view's pixels in C clusters without members in this view."""
         table, hidden, num_clusters = self.table, self.config.costs.hidden, len(members)
         pixels, rows = table.bounds.pixels(view), table.bounds.rows(view)
-        number_of = np.full(len(table.view_index) + 2, num_clusters)  # the last two for EMPTY and OUTSIDE
-        for number, regions in enumerate(members):
-            number_of[regions] = number
-        # torch on the CPU: NumPy has no match for its scatter_add
-        labels = torch.from_numpy(table.labels[rows].T.astype(np.int64))
-        cluster = torch.from_numpy(number_of)[labels]
-        shown = torch.zeros(num_clusters + 1, labels.shape[1])  # rows vary fastest: the maximum runs over them
-        shown.scatter_add_(0, cluster, torch.ones(1).expand(cluster.shape))
-        is_empty = (labels == EMPTY).float()
-        num_labels = (labels >= 0).sum(0).float()
-        num_inside = num_labels + is_empty.sum(0)
-        cost = torch.from_numpy(self._empty_costs(members)) @ is_empty
-        score = shown[:num_clusters].mul_(1 + hidden).sub_(cost).sub_(hidden * num_labels).div_(num_inside)
         best = np.full((pixels.stop - pixels.start, num_clusters), -hidden, np.float32)
         start = run_starts(table.pixel[rows])
-        if len(start):
-            pixel = table.pixel[rows][start] - pixels.start
-            best[pixel] = np.maximum(np.maximum.reduceat(score.numpy(), start, 1), -hidden).T
+        if not len(start):
+            return best
+        shown = table.rows_of_regions(view).count(members)  # rows vary fastest: the maximum runs over them
+        is_empty = table.labels[rows] == EMPTY
+        num_labels = (table.labels[rows] >= 0).sum(1, dtype=np.float32)
+        num_inside = num_labels + is_empty.sum(1, dtype=np.float32)
+        cost = self._empty_costs(members) @ is_empty.astype(np.float32).T
+        score = (shown * np.float32(1 + hidden) - cost - np.float32(hidden) * num_labels) / num_inside
+        pixel = table.pixel[rows][start] - pixels.start
+        best[pixel] = np.maximum(np.maximum.reduceat(score, start, 1), np.float32(-hidden)).T
         return best
 
     def _empty_costs(self, members: list[Ints]) -> Floats:
@@ -234,50 +234,91 @@ class ClusterScores:
 
     def _land(self, clusters: Ints, asked: Ints) -> Floats:
         """(C, D) float32: the landings of the C clusters in `asked`."""
-        table = self.table
+        num_regions, num_views = len(clusters), self.table.num_views
         row_of = np.full(int(clusters.max(initial=-1)) + 1, -1)
         row_of[asked] = np.arange(len(asked))
-        region = table.pixel_region[table.pixel]
-        rows = np.flatnonzero(row_of[clusters[region]] >= 0)
-        labels, region, pixel = table.labels[rows], region[rows], table.pixel[rows]
-        cluster = row_of[clusters[region]]
-        gain, is_inside = self._row_gains(clusters, rows)
-        total, count = gain.sum(1), is_inside.sum(1)
-        start = run_starts(pixel)
-        run = np.repeat(np.arange(len(start)), np.diff(np.append(start, len(total))))
-        landing = np.zeros((len(asked), len(clusters)), np.float32)
-        for view in np.unique(table.view_index).tolist() if len(start) else ():
-            score = (total - gain[:, view]) / np.maximum(count - is_inside[:, view], 1)
-            best = np.maximum.reduceat(score, start)
-            use = np.flatnonzero((score >= best[run] - 1e-6) & (best[run] >= 0) & (table.view_index[region] != view))
-            share = 1 / np.bincount(run[use], minlength=len(start))[run[use]]
-            pixels = np.bincount(cluster[use], share, len(asked))
-            hit = labels[use, view] >= 0
-            flat = cluster[use][hit] * len(clusters) + labels[use, view][hit]
-            landed = np.bincount(flat, share[hit], len(asked) * len(clusters)).reshape(landing.shape)
-            landing += landed / np.maximum(pixels, 1e-9)[:, None]
-        return landing
+        num_pixels = np.zeros((len(asked), num_views))
+        landed = np.zeros((len(asked), num_regions))
+        for block in self._row_gains(clusters, asked):
+            row, view, share = block.best_elsewhere(self.table.view_index[block.region])
+            cluster, label = row_of[clusters[block.region[row]]], block.labels[row, view]
+            num_pixels += np.bincount(cluster * num_views + view, share, num_pixels.size).reshape(num_pixels.shape)
+            hit = label >= 0
+            landed += np.bincount(
+                cluster[hit] * num_regions + label[hit], share[hit], landed.size
+            ).reshape(landed.shape)
+        return (landed / np.maximum(num_pixels, 1e-9)[:, self.table.view_index]).astype(np.float32)
 
-    def _score_own(self, clusters: Ints) -> Floats:
-        """(D,) score of each region in its own cluster."""
+    def _score_own(self, clusters: Ints, asked: Ints) -> Floats:
+        """(D,) score of each region in its own cluster, for those in the clusters `asked`."""
         table, hidden = self.table, self.config.costs.hidden
-        gain, is_inside = self._row_gains(clusters)
-        score = gain.sum(1) / np.maximum(is_inside.sum(1), 1)
         best = np.full(len(table.pixel_region), -hidden)
-        start = run_starts(table.pixel)
-        if len(start):
-            best[table.pixel[start]] = np.maximum(np.maximum.reduceat(score, start), -hidden)
+        for block in self._row_gains(clusters, asked):
+            score = block.gain.sum(1) / np.maximum(block.is_inside.sum(1), 1)
+            best[block.pixel[block.start]] = np.maximum(np.maximum.reduceat(score, block.start), -hidden)
         counts = np.bincount(table.pixel_region, minlength=len(clusters))
         return np.bincount(table.pixel_region, best, len(clusters)) / np.maximum(counts, 1)
 
-    def _row_gains(self, clusters: Ints, rows: Ints | slice = slice(None)) -> tuple[Floats, NDArray[np.bool_]]:
-        """(I, V) float32, what each view of each row adds to the score of the region in its own cluster; and (I, V)
-        bool, whether the point lies in that view. The sum of the gains over the number of these views is the score."""
-        table, hidden = self.table, self.config.costs.hidden
-        labels, own = table.labels[rows], clusters[table.pixel_region[table.pixel[rows]]]
-        empty = self._empty_costs(members_of(clusters, int(clusters.max(initial=-1)) + 1))
-        gain = np.full(labels.shape, -hidden, np.float32)
-        gain[np.append(clusters, [-1, -1])[labels] == own[:, None]] = 1
-        gain = np.where(labels == EMPTY, -empty[own], gain)
-        is_inside = labels >= EMPTY
-        return gain * is_inside, is_inside
+    def _row_gains(self, clusters: Ints, asked: Ints) -> Iterator[_RowGains]:
+        """What each view adds to the score of the regions of the clusters `asked` in their own cluster, row by row."""
+        table, hidden = self.table, np.float32(self.config.costs.hidden)
+        is_asked = np.zeros(int(clusters.max(initial=-1)) + 1, bool)
+        is_asked[asked] = True
+        rows = np.flatnonzero(is_asked[clusters][table.pixel_region][table.pixel])
+        cluster_of = np.append(clusters, [-1, -1])  # the last two for EMPTY and OUTSIDE
+        empty = self._empty_costs(members_of(clusters, len(is_asked)))
+        for block in blocks_of_runs(run_starts(table.pixel[rows]), len(rows)):
+            pixel, labels = table.pixel[rows[block]], table.labels[rows[block]]
+            region = table.pixel_region[pixel]
+            own = clusters[region]
+            gain = np.where(cluster_of[labels] == own[:, None], np.float32(1), -hidden)
+            np.copyto(gain, -empty[own], where=labels == EMPTY)
+            is_inside = labels >= EMPTY
+            gain *= is_inside
+            yield _RowGains(
+                labels=labels, pixel=pixel, region=region, start=run_starts(pixel), gain=gain, is_inside=is_inside
+            )
+
+
+@dataclass(frozen=True, eq=False)
+class _RowGains:
+    """R whole runs of rows, with what each view adds to the score of the region in its own cluster.
+
+    Attributes:
+        labels: (R, V), the rows.
+        pixel: (R,) int64, the pixel of each.
+        region: (R,) int64, the region of that.
+        start: where the rows of a pixel start.
+        gain: (R, V) float32; the sum of the gains over the number of views that the point lies in is the score.
+        is_inside: (R, V) bool, whether the point lies in that view.
+    """
+
+    labels: NDArray[np.integer]
+    pixel: Ints
+    region: Ints
+    start: Ints
+    gain: Floats
+    is_inside: NDArray[np.bool_]
+
+    def best_elsewhere(self, own_view: Ints) -> tuple[Ints, Ints, Floats]:
+        """The best rows of each pixel when one view does not count.
+
+        Args:
+            own_view: (R,) int64, the view of each row's pixel, for which there is no answer.
+
+        Returns:
+            Three arrays with one entry per best row: the row, the view left out, and the row's share of the pixel: rows
+            that tie within 1e-6 share it. A pixel whose best row scores below 0 has none.
+        """
+        total, count = self.gain.sum(1), self.is_inside.sum(1, dtype=np.float32)
+        score = total[:, None] - self.gain
+        score /= np.maximum(count[:, None] - self.is_inside, np.float32(1))
+        best = np.maximum.reduceat(score, self.start, 0)
+        lengths = np.diff(np.append(self.start, len(score)))
+        least = np.where(best >= 0, best - np.float32(1e-6), np.float32(np.inf))
+        is_best = score >= np.repeat(least, lengths, 0)
+        is_best[np.arange(len(score)), own_view] = False
+        row, view = is_best.nonzero()
+        run = np.repeat(np.arange(len(lengths)), lengths)[row]
+        tie = run * score.shape[1] + view
+        return row, view, 1 / np.bincount(tie)[tie]

@@ -10,8 +10,10 @@ device, everything from the table on is NumPy.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -19,6 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from mvseg.matching.nview.row_index import RowsOfRegions, index_rows
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -29,6 +32,7 @@ DEPTHS = 96  # along a ray
 NEAREST = 0.05  # no depth below this fraction of the longest baseline
 MAX_EMPTY = 0.5  # share of the other views that may show no region
 DOMINANCE_PASSES = 3
+BLOCK_ROWS = 2048  # rows at a time: what is computed from them fits into the cache
 CHUNK = 512  # rays at a time: their samples fit into the cache
 
 Floats = NDArray[np.float32]
@@ -77,6 +81,7 @@ class RowTable:
     pixel_xy: Floats
     view_index: Ints
     num_views: int
+    _rows_of_regions: dict[int, RowsOfRegions] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def bounds(self) -> ViewBounds:
@@ -88,6 +93,12 @@ class RowTable:
             pixel_starts=pixel_starts,
             row_starts=np.searchsorted(self.pixel, pixel_starts),
         )
+
+    def rows_of_regions(self, view: int) -> RowsOfRegions:
+        """Which rows on rays of one view name which regions; kept for the next call."""
+        if view not in self._rows_of_regions:
+            self._rows_of_regions[view] = index_rows(self.labels[self.bounds.rows(view)], len(self.view_index))
+        return self._rows_of_regions[view]
 
 
 def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1, progress: bool = False) -> RowTable:
@@ -103,14 +114,32 @@ def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1, progress
         The table. A row is kept when at least one view shows a region, at most half of the views that the point lies in
         show none (one always may), and no neighbour on the ray shows the same regions and more.
     """
+    return next(row_tables(regions, cameras, widenings=(widen_px,), progress=progress))
+
+
+def row_tables(
+    regions: Regions, cameras: Cameras, *, widenings: Sequence[int], progress: bool = False
+) -> Iterator[RowTable]:
+    """The table of each of several widenings, in ascending order; see `row_table`."""
     sizes = cameras.sizes.tolist()
-    maps = [_padded_labels(regions, view, size, widen_px=widen_px) for view, size in enumerate(sizes)]
-    sweep = _Sweep(cameras, maps, [_label_box(labels) for labels in maps])
-    xy, region = sample_pixels(regions, max(1, round(PIXELS * min(1, PLENTY / len(cameras)))))
+    maps, grown_px = [_padded_labels(regions, view, size) for view, size in enumerate(sizes)], 0
+    xy, region = regions.spread_pixels(max(1, round(PIXELS * min(1, PLENTY / len(cameras)))))
+    for widen_px in widenings:
+        boxes = [regions.boxes[regions.view_index == view] for view in range(len(cameras))]
+        for labels, of_view in zip(maps, boxes, strict=True):
+            _widen(labels, of_view, start_px=grown_px, stop_px=widen_px)
+        grown_px = widen_px
+        sweep = _Sweep(cameras, maps, [_label_box(labels) for labels in maps])
+        yield _sweep_views(sweep, regions, xy, region=region, title=f"rays, {widen_px} px" if progress else "")
+
+
+def _sweep_views(sweep: _Sweep, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> RowTable:
+    """The table of the rays through pixels `xy` (Q, 2) of `region` (Q,); a title shows a progress bar."""
+    num_views = len(sweep.maps)
     pixels = [torch.zeros(0, dtype=torch.int64)]
-    labels = [torch.zeros(0, len(cameras), dtype=maps[0].dtype)]
+    labels = [torch.zeros(0, num_views, dtype=sweep.maps[0].dtype)]
     inverse = [torch.zeros(0)]
-    for view in tqdm(range(len(cameras)), desc=f"rays, {widen_px} px", unit="view", disable=not progress):
+    for view in tqdm(range(num_views), desc=title, unit="view", disable=not title):
         here = (regions.view_index[region] == view).nonzero()[:, 0]
         for chunk in torch.split(here, CHUNK) if len(here) else ():
             pixel, label, inverse_depth = _join_equal(*sweep.rows(view, xy[chunk]))
@@ -124,39 +153,36 @@ def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1, progress
         pixel_region=region.cpu().numpy(),
         pixel_xy=xy.cpu().numpy(),
         view_index=regions.view_index.cpu().numpy(),
-        num_views=len(cameras),
+        num_views=num_views,
     )
 
 
-def sample_pixels(regions: Regions, most: int) -> tuple[Tensor, Tensor]:
-    """At most `most` pixels of each region, evenly spread over its pixels in reading order.
-
-    Returns:
-        xy (Q, 2) float32, pixel centres; region (Q,) int64, ordered.
-    """
-    xy, owner, _ = regions.pixels()
-    count = torch.bincount(owner, minlength=len(regions))
-    taken = count.clamp(max=most)
-    region = torch.repeat_interleave(torch.arange(len(regions), device=xy.device), taken)
-    rank = torch.arange(len(region), device=xy.device) - (taken.cumsum(0) - taken)[region]
-    nth_pixel = ((2 * rank + 1) * count[region]) // (2 * taken[region])
-    return xy[(count.cumsum(0) - count)[region] + nth_pixel], region
-
-
-def _padded_labels(regions: Regions, view: int, size: list[int], *, widen_px: int) -> Tensor:
+def _padded_labels(regions: Regions, view: int, size: list[int]) -> Tensor:
     """(H + 2, W + 2) int16 or int32 region index per pixel, EMPTY elsewhere, in a frame of OUTSIDE."""
     index = torch.arange(1, len(regions) + 1, device=regions.device)
     kind = torch.int16 if len(regions) < 2**15 else torch.int32
     labels = (regions.label_map(view, index, size) - 1).to(kind)
-    for _ in range(widen_px):
+    return torch.nn.functional.pad(labels, (1, 1, 1, 1), value=OUTSIDE)
+
+
+def _widen(padded: Tensor, boxes: Tensor, *, start_px: int, stop_px: int) -> None:
+    """Grow the regions of a padded label map into EMPTY pixels, in place, from `start_px` to `stop_px` pixels; `boxes`
+    (N, 4) are those of the regions before they grew. Nothing changes far from them."""
+    if not len(boxes):
+        return
+    labels = padded[1:-1, 1:-1]
+    low, high = (boxes[:, :2].amin(0) - stop_px).clamp(min=0).tolist(), (boxes[:, 2:].amax(0) + stop_px).tolist()
+    window = labels[low[1] : high[1], low[0] : high[0]]
+    labels = window.clone()
+    for _ in range(start_px, stop_px):
         grown = labels.clone()
         for axis in (0, 1):
             for start in (0, 1):
-                target, source = (labels.narrow(axis, k, labels.shape[axis] - 1) for k in (start, 1 - start))
+                source = labels.narrow(axis, 1 - start, labels.shape[axis] - 1)
                 patch = grown.narrow(axis, start, labels.shape[axis] - 1)
-                patch.copy_(torch.where((target < 0) & (patch < 0), source, patch))
+                patch.copy_(torch.where(patch < 0, source, patch))
         labels = grown
-    return torch.nn.functional.pad(labels, (1, 1, 1, 1), value=OUTSIDE)
+    window.copy_(labels)
 
 
 def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
@@ -191,25 +217,17 @@ class _Sweep:
 
     def rows(self, view: int, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Rows along the rays of P pixels of one view: pixel (I,) in [0, P), labels (I, V), inverse depth (I,)."""
-        cameras = self.cameras
-        ones = torch.ones(len(xy), 1).to(xy)
-        rays = torch.cat((xy, ones), 1).double() @ cameras.world_from_px[view].T
-        others = [other for other in range(len(cameras)) if other != view]
-        # A point at inverse depth w along a ray projects to base + w * offset, homogeneous.
-        bases = {other: (rays @ (cameras.K[other] @ cameras.R[other]).T).float() for other in others}
-        offsets = {
-            other: (cameras.K[other] @ (cameras.R[other] @ cameras.centers[view] + cameras.t[other])).tolist()
-            for other in others
-        }
-        low, high = self._inverse_range(bases, offsets)
+        others = torch.tensor([other for other in range(len(self.maps)) if other != view], device=xy.device)
+        bases, offsets = self._project_rays(view, xy, others)
+        low, high = self._inverse_range(bases, offsets, others)
         steps = (torch.arange(DEPTHS, device=xy.device) + 0.5) / DEPTHS
         is_seen = low < high
         low, high = torch.where(is_seen, low, 0), torch.where(is_seen, high, 0)
         inverse = low[:, None] + (high - low)[:, None] * steps
-        size = (len(cameras), *inverse.shape)
+        size = (len(self.maps), *inverse.shape)
         labels = torch.full(size, OUTSIDE, dtype=self.maps[0].dtype, device=xy.device)
-        for other in others:
-            labels[other] = _look_up(inverse, bases[other], offsets[other], labels=self.maps[other])
+        for other, base, offset in zip(others.tolist(), bases, offsets.tolist(), strict=True):
+            labels[other] = _look_up(inverse, base, offset, labels=self.maps[other])
         num_empty = (labels == EMPTY).sum(0, dtype=torch.int16)
         num_labels = (labels >= 0).sum(0, dtype=torch.int16)
         most_empty = (MAX_EMPTY * (num_empty + num_labels)).floor().clamp(min=1)
@@ -217,50 +235,56 @@ class _Sweep:
         pixel = keep.nonzero()[:, 0]
         return pixel, labels[:, keep].T.contiguous(), inverse[keep]
 
-    def _inverse_range(self, bases: dict[int, Tensor], offsets: dict[int, list[float]]) -> tuple[Tensor, Tensor]:
+    def _project_rays(self, view: int, xy: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
+        """A point at inverse depth w along a ray projects to base + w * offset, homogeneous: bases (O, P, 3) float32,
+        offsets (O, 3) float64."""
+        cameras = self.cameras
+        ones = torch.ones(len(xy), 1).to(xy)
+        rays = torch.cat((xy, ones), 1).double() @ cameras.world_from_px[view].T
+        bases = rays @ (cameras.K[others] @ cameras.R[others]).mT
+        shift = cameras.R[others] @ cameras.centers[view] + cameras.t[others]
+        return bases.float(), (cameras.K[others] @ shift[..., None])[..., 0]
+
+    def _inverse_range(self, bases: Tensor, offsets: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         """(P,) smallest and largest inverse depth at which half of the other views may see a region."""
         distance = torch.cdist(self.cameras.centers, self.cameras.centers).max()
         nearest = float(1 / (NEAREST * distance)) if distance > 0 else 0.0
-        lows, highs = [], []
-        for other, base in bases.items():
-            box = self.boxes[other]
-            if box is None:
-                continue
-            e = offsets[other]
-            interval = torch.zeros(len(base)).to(base), torch.full((len(base),), nearest).to(base)
-            for edge, axis, sign in zip(box, (0, 1, 0, 1), (1, 1, -1, -1), strict=True):
-                if abs(edge) == torch.inf:
-                    continue
-                slope, start = sign * (e[axis] - edge * e[2]), sign * (base[:, axis] - edge * base[:, 2])
-                interval = _cut(interval, slope, start)
-            low, high = _cut(interval, e[2], base[:, 2])
-            lows.append(torch.where(low < high, low, torch.inf))
-            highs.append(torch.where(low < high, high, 0.0))
-        if not lows:
-            nothing = torch.zeros_like(next(iter(bases.values()))[:, 0])
+        shown = [index for index, other in enumerate(others.tolist()) if self.boxes[other] is not None]
+        if not shown:
+            nothing = torch.zeros_like(bases[0, :, 0])
             return nothing, nothing
-        needed = (len(lows) + 1) // 2
-        low = torch.stack(lows).sort(0).values[needed - 1]
-        return low, torch.stack(highs).sort(0, descending=True).values[needed - 1]
+        boxes = torch.tensor([self.boxes[other] for other in others[shown].tolist()], device=bases.device)[..., None]
+        base, e = bases[shown].mT, offsets[shown].float()[..., None]  # (S, 3, P) and (S, 3, 1)
+        interval = torch.zeros_like(base[:, 0]), torch.full_like(base[:, 0], nearest)
+        for side, (axis, sign) in enumerate(((0, 1), (1, 1), (0, -1), (1, -1))):
+            edge = boxes[:, side]
+            slope, start = sign * (e[:, axis] - edge * e[:, 2]), sign * (base[:, axis] - edge * base[:, 2])
+            is_cut = edge.isfinite()
+            interval = _cut(interval, torch.where(is_cut, slope, 0), torch.where(is_cut, start, 1))
+        low, high = _cut(interval, e[:, 2], base[:, 2])
+        is_any = low < high
+        needed = (len(shown) + 1) // 2
+        low = torch.where(is_any, low, torch.inf).sort(0).values[needed - 1]
+        return low, torch.where(is_any, high, 0).sort(0, descending=True).values[needed - 1]
 
 
-def _cut(interval: tuple[Tensor, Tensor], slope: float, start: Tensor) -> tuple[Tensor, Tensor]:
-    """The part of the intervals (P,), (P,) in which start + slope * w >= 0."""
+def _cut(interval: tuple[Tensor, Tensor], slope: Tensor, start: Tensor) -> tuple[Tensor, Tensor]:
+    """The part of the intervals (S, P), (S, P) in which start + slope * w >= 0, for slopes (S, 1)."""
     low, high = interval
-    if slope == 0:
-        return low, torch.where(start >= 0, high, -1.0)
     root = -start / slope
-    return (torch.maximum(low, root), high) if slope > 0 else (low, torch.minimum(high, root))
+    low = torch.where(slope > 0, torch.maximum(low, root), low)
+    high = torch.where(slope < 0, torch.minimum(high, root), high)
+    return low, torch.where((slope == 0) & (start < 0), -1.0, high)
 
 
 def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tensor) -> Tensor:
     """(P, DEPTHS) label at the projection of each sample."""
     height, width = labels.shape
-    depth = inverse * offset[2] + base[:, 2:]
+    depth = torch.add(base[:, 2:], inverse, alpha=offset[2])
     scale = 1 / depth
-    column = ((inverse * offset[0] + base[:, :1]) * scale + 1).clamp_(0, width - 1).int()
-    row = ((inverse * offset[1] + base[:, 1:2]) * scale + 1).clamp_(0, height - 1).int()
-    return labels.flatten()[torch.where(depth > 0, row * width + column, 0)]
+    column = torch.add(base[:, :1], inverse, alpha=offset[0]).mul_(scale).add_(1).clamp_(0, width - 1).int()
+    row = torch.add(base[:, 1:2], inverse, alpha=offset[1]).mul_(scale).add_(1).clamp_(0, height - 1).int()
+    return labels.flatten()[torch.where(depth > 0, row.mul_(width).add_(column), 0)]
 
 
 def _join_equal(pixel: Tensor, labels: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -288,3 +312,11 @@ def _join_equal(pixel: Tensor, labels: Tensor, inverse: Tensor) -> tuple[Tensor,
 def run_starts(values: NDArray[np.integer]) -> Ints:
     """(R,) int64: where the runs of equal values start."""
     return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else np.zeros(0, np.int64)
+
+
+def blocks_of_runs(start: Ints, num_rows: int) -> list[slice]:
+    """Consecutive slices of rows, of about BLOCK_ROWS each; no run is cut. `start` is where the runs start."""
+    if not len(start):
+        return []
+    first = start[run_starts(start // BLOCK_ROWS)].tolist()
+    return [slice(begin, end) for begin, end in pairwise([*first, num_rows])]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import row_table
+from mvseg.matching.nview.label_rows import row_tables
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.search import search
@@ -141,8 +141,8 @@ def fit_poses(
     The error is the least widening with which the rows explain the pairwise clusters nearly as well as with any.
     """
     config, candidates = config.for_views(len(cameras)), []
-    for width in WIDENINGS:
-        table = row_table(regions, cameras, widen_px=width, progress=progress)
+    tables = row_tables(regions, cameras, widenings=WIDENINGS, progress=progress)
+    for width, table in zip(WIDENINGS, tables, strict=True):
         candidates.append(ClusterScores(table, graph, config))
         if candidates[0].explained(pairwise) >= EXPLAINED:
             return candidates[0], width

@@ -1,0 +1,119 @@
+"""The half-planes through the baseline of two cameras (Eq. 1); what they are good for is in `epipolar.py`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from mvseg.errors import InputError
+from mvseg.scene import Cameras
+
+COINCIDENT = 1e-6  # baselines shorter than this fraction of the longest one have no epipolar geometry
+
+
+@dataclass(frozen=True, eq=False)
+class Pencil:
+    """The half-planes through the baseline of cameras i and j.
+
+    Attributes:
+        plane_from_px: (2, 2, 3) float64 on the CPU, for camera i and camera j: (u, v, 1) -> (x, y), the viewing ray of
+            the pixel projected along the baseline. The angle of (x, y) is the angle of the half-plane, equal in both
+            images.
+    """
+
+    plane_from_px: Tensor
+
+    def angles(self, side: int, xy: Tensor) -> Tensor:
+        """Half-plane of each pixel (Eq. 1: pixels of i and j with equal angle lie on each other's epipolar lines).
+
+        Args:
+            side: 0 for camera i, 1 for camera j.
+            xy: (P, 2) pixel positions.
+
+        Returns:
+            (P,) float32 in [-2, 2], a monotone stand-in for atan2 that needs one division (the 1-norm angle
+            y / (|x| + |y|), continued over the left half-plane). 0 at an epipole, where no half-plane is defined.
+        """
+        x, y = self._plane(side, xy)
+        angle = y / x.abs().add_(y.abs()).clamp_(min=torch.finfo(x.dtype).tiny)
+        is_left = x < 0
+        if not is_left.any():  # as in most pairs: the pencil faces where both cameras look
+            return angle
+        return torch.where(is_left, torch.where(y < 0, -2 - angle, 2 - angle), angle)
+
+    def pitch(self, side: int, xy: Tensor) -> float:
+        """Mean change of the angle when a pixel moves by one pixel across its epipolar line; see `mean_pitches`."""
+        return mean_pitches(self.plane_from_px[None, side], xy)[0]
+
+    def _plane(self, side: int, xy: Tensor) -> tuple[Tensor, Tensor]:
+        u, v = xy.unbind(1)
+        # plain numbers: a product of (P, 2) with (2, 2) is ten times slower
+        x, y = (
+            torch.mul(u, of_u).add_(v, alpha=of_v).add_(constant)
+            for of_u, of_v, constant in self.plane_from_px[side].tolist()
+        )
+        return x, y
+
+
+def mean_pitches(planes_from_px: Tensor, xy: Tensor) -> list[float]:
+    """Mean change of the angle when a pixel moves by one pixel across its epipolar line, in each of Q pencils.
+
+    It is the mean of |x grad y - y grad x| / (|x| + |y|)^2 over the pixels; pixels within a pixel of the epipole,
+    where it diverges, count as if one pixel away.
+
+    Args:
+        planes_from_px: (Q, 2, 3), one side of each pencil: see `Pencil.plane_from_px`.
+        xy: (P, 2) pixels of one view.
+    """
+    planes = planes_from_px.to(xy)[..., None]
+    x, y = (planes[:, row, 0] * xy[:, 0] + planes[:, row, 1] * xy[:, 1] + planes[:, row, 2] for row in (0, 1))
+    across = torch.hypot(x * planes[:, 1, 0] - y * planes[:, 0, 0], x * planes[:, 1, 1] - y * planes[:, 0, 1])
+    one_pixel = planes[:, :, :2].abs().sum((1, 2))
+    means: list[float] = (across / torch.maximum(x.abs() + y.abs(), one_pixel) ** 2).mean(1).tolist()
+    return means
+
+
+def is_coincident(cameras: Cameras) -> Tensor:
+    """(V, V) bool: the pair has no baseline (shorter than 1e-6 of the scene's longest), so no epipolar geometry."""
+    centers = cameras.centers
+    # Differences, not torch.cdist: that one cancels for many cameras far from the world's origin.
+    distance = torch.linalg.vector_norm(centers[:, None] - centers, dim=2)
+    return distance <= COINCIDENT * distance.max()
+
+
+def epipolar_pencil(cameras: Cameras, i: int, j: int) -> Pencil:
+    """The pencil of two cameras; see `epipolar_pencils`."""
+    return epipolar_pencils(cameras, [(i, j)])[0]
+
+
+def epipolar_pencils(cameras: Cameras, pairs: Sequence[tuple[int, int]]) -> list[Pencil]:
+    """The pencils of pairs of cameras.
+
+    Any baseline will do: an epipole inside an image or at infinity, or cameras that face each other, need no special
+    treatment.
+
+    Raises:
+        InputError: the cameras of a pair share a centre (no epipolar geometry).
+    """
+    if not len(pairs):
+        return []
+    index = torch.tensor(pairs, device=cameras.device)
+    baseline = cameras.centers[index].diff(dim=1)[:, 0]
+    length = torch.linalg.vector_norm(baseline, dim=1, keepdim=True)
+    if (length == 0).any():
+        i, j = pairs[int(length[:, 0].argmin())]
+        raise InputError(f"views {i} and {j} share a camera centre, expected a baseline between them")
+    axis = baseline / length
+    # Angle 0 points where both cameras look, so that the jump at +-2 is as far from the regions as possible.
+    forward = cameras.R[index, 2].sum(1)
+    forward = forward - (forward * axis).sum(1, keepdim=True) * axis
+    # When both look along the baseline, any direction across it will do.
+    across = torch.linalg.cross(axis, torch.eye(3).to(axis)[axis.abs().argmin(1)])
+    forward = torch.where(torch.linalg.vector_norm(forward, dim=1, keepdim=True) < 1e-9, across, forward)
+    e1 = forward / torch.linalg.vector_norm(forward, dim=1, keepdim=True)
+    e2 = torch.linalg.cross(axis, e1)
+    plane_from_px = torch.stack((e1, e2), 1)[:, None] @ cameras.world_from_px[index]
+    return [Pencil(planes) for planes in plane_from_px.cpu()]
