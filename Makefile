@@ -2,7 +2,7 @@
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 
-.PHONY: demo test fuzz bench lint docs clean
+.PHONY: demo test slow fuzz bench lint docs clean
 
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
@@ -10,10 +10,14 @@ demo: $(VENV)/installed
 test: $(VENV)/installed
 	$(PYTHON) -m pytest -n 2
 
+# whole commands, killed workers, notebooks: about two minutes
+slow: $(VENV)/installed
+	$(PYTHON) -m pytest -n 2 -m slow
+
 # about ten minutes: broken files for every reader, and runs that are killed at random moments
 fuzz: $(VENV)/installed
 	MVSEG_FUZZ_EXAMPLES=2000 $(PYTHON) -m pytest tests/fuzz
-	MVSEG_KILLS=20 MVSEG_KILL_SEED=$$(date +%s) $(PYTHON) -m pytest tests/test_kill.py
+	MVSEG_KILLS=20 MVSEG_KILL_SEED=$$(date +%s) $(PYTHON) -m pytest -m "" tests/test_kill.py
 
 # ten minutes or more; PREVIOUS=DIR takes turns with another checkout, FULL=--full takes hours
 bench: $(VENV)/installed

@@ -38,6 +38,7 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     return import_module("mkdocs_pages")
 
 
+@pytest.mark.slow
 def test_the_guides_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """All of them, as they stand, one after the other; on five of the nine photos, which is quicker."""
     blocks = re.findall(r"```\n(.*?)```", (DOCS / "guide.md").read_text(encoding="utf-8"), re.DOTALL)
@@ -74,6 +75,7 @@ def test_other_commands_are_understood(name: str) -> None:
         build_parser().parse_args(words)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
 def test_notebooks_run_and_print_what_they_show(path: Path, tmp_path: Path) -> None:
     nbformat = pytest.importorskip("nbformat")

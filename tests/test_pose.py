@@ -143,6 +143,7 @@ def test_places_that_are_not_ours(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "plant"]
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="signals of POSIX systems")
 @pytest.mark.parametrize(
     ("number", "step", "code", "said"),

@@ -212,6 +212,7 @@ def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
     assert (status.state, status.sentence) == ("failed", sentence)
 
 
+@pytest.mark.slow
 def test_a_worker_that_is_killed_for_good(plants: Path, tmp_path: Path) -> None:
     """Real processes: whichever has the first scene is killed, twice."""
     if not Path("/proc/self/status").exists():
@@ -249,6 +250,7 @@ def test_a_worker_that_is_killed_for_good(plants: Path, tmp_path: Path) -> None:
     assert sorted(path.name for path in out.iterdir()) == ["_batch", "mint", "tables"]
 
 
+@pytest.mark.slow
 def test_scenes_on_a_dask_cluster(plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     distributed = pytest.importorskip("distributed")
     dask = pytest.importorskip("dask")

@@ -301,7 +301,9 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
 
 
 def test_every_photo_is_seen_at_every_scale() -> None:
-    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), scales=(0.5, 1.0)), some_images(), small_cameras()
+    wrapped, images, cameras = MultiViewMaskRCNN(
+        tiny_detector(), scales=(0.5, 1.0), proposals_per_view=40
+    ), some_images(), small_cameras()
     seen: list[int] = []
     wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0].shape[-1]))
     proposals, _ = wrapped.find_regions(iter(images), cameras)
