@@ -14,6 +14,7 @@ HOSTILE = '"\'></script><script>document.title = "owned"</script><img src=x oner
 RUN = {
     "mvseg": "1.2.3",
     "warnings": [f"warned {HOSTILE}"],
+    "checks": [{"where": "photos", "what": f"found {HOSTILE}", "level": "error", "views": [0]}],
     "config": {"masks": HOSTILE, "limit": float("inf")},
     "inputs": {HOSTILE: "0" * 64},
     "seconds": {"match": 1.5},

@@ -112,3 +112,19 @@ def test_real_plants_have_no_error(plant: str, masks: str | None, shared_data: P
     warned = [finding.what.split(" have ")[-1] for finding in check.findings if finding.level == "warning"]
     expected = ["stray pixels far from the rest of them: remove the small pieces"] if plant == "maize-plant1" else []
     assert warned == expected
+
+
+def test_a_result_says_what_the_check_finds(tmp_path: Path) -> None:
+    plant = write_scene(tmp_path / "plant", 4)
+    shutil.copyfile(plant / "images" / "001.png", plant / "images" / "002.png")
+    write_image(plant / "images" / "003.png", np.full((96, 128, 3), 255, np.uint8))
+    for report in (True, False):
+        out = tmp_path / f"out-{report}"
+        assert main(["match", str(plant), "--out", str(out), "--report", str(report).lower(), "--quiet"]) == 0
+        run = json.loads((out / "plant" / "run.json").read_text())
+        assert ("checks" in run) == report
+        if report:
+            scene = load_scene(plant)
+            findings = check_scene(scene, load_masks(scene, plant / "masks")).findings
+            assert any("003" in finding.what for finding in findings)
+            assert [each["what"] for each in run["checks"]] == [finding.what for finding in findings]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -67,12 +68,15 @@ def save_scene(
     messages: Sequence[str],
     progress: bool,
 ) -> None:
-    """Write the result folder, run.json included."""
+    """Write the result folder, run.json included; with the report, what the checks of the scene and its masks say."""
+    from mvseg.checks.check_scene import check_scene
     from mvseg.results.folder import save_result
     from mvseg.results.provenance import describe_run
 
     run = describe_run(result, masks, config, messages=messages)
     run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
+    if config.report:
+        run["checks"] = [asdict(finding) for finding in check_scene(result.scene, result.regions).findings]
     save_result(result, out, run, progress=progress, draw_rims=config.draw_rims, report=config.report)
 
 

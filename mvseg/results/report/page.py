@@ -23,7 +23,9 @@ ASSETS = files("mvseg.results.report") / "assets"
 SCRIPTS = (
     "selection.js", "numbers.js", "shapes.js", "space.js", "photos.js", "table.js", "leaf.js", "run.js", "page.js"
 )  # fmt: skip
-RUN_FIELDS = ("mvseg", "torch", "python", "mask_kind", "matched_by", "residual_px", "seconds", "warnings", "inputs")
+RUN_FIELDS = (
+    "mvseg", "torch", "python", "mask_kind", "matched_by", "residual_px", "seconds", "warnings", "checks", "inputs"
+)  # fmt: skip
 
 
 def write_report(path: Path, result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> None:

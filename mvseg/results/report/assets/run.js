@@ -14,6 +14,7 @@ function buildRun(data) {
   const list = warnings.length
     ? element("ul", {}, ...warnings.map((text) => element("li", {}, text)))
     : element("p", { class: "note" }, "There were none.");
+  const checks = (run.checks ?? []).map(({ level, where, what }) => element("li", {}, `${level}, ${where}: ${what}`));
   const facts = [
     ["mvseg", run.mvseg], ["Python", run.python], ["PyTorch", run.torch],
     ["masks", run.mask_kind ?? "found by a detector"], ["matched by", run.matched_by],
@@ -24,6 +25,7 @@ function buildRun(data) {
   const terms = facts.flatMap(([name, value]) => [element("dt", {}, name), element("dd", {}, String(value))]);
   document.getElementById("run").append(
     element("div", { id: "warnings" }, element("h2", {}, "Warnings"), list),
+    ...(checks.length ? [element("div", { id: "checks" }, element("h2", {}, "Checks"), element("ul", {}, ...checks))] : []),
     element("div", {}, element("h2", {}, "Run"), element("dl", {}, ...terms)),
     element("details", {}, element("summary", {}, "Options"), element("pre", {}, run.config)),
   );
