@@ -16,6 +16,7 @@ from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.atomic import clear_begun
 from mvseg.sigterm import Terminated, stopped_by_sigterm
 
 INTERRUPTED, TERMINATED = 130, 143
@@ -64,9 +65,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         return complain(InputError(f"there is not enough memory ({str(error) or 'no more is known'})"))
     except KeyboardInterrupt:
+        clear_begun()
         print("mvseg: interrupted", file=sys.stderr)
         return INTERRUPTED
     except Terminated:
+        clear_begun()
         print("mvseg: stopped by SIGTERM", file=sys.stderr)
         return TERMINATED
 

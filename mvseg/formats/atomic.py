@@ -34,6 +34,7 @@ MOVES = 10_000  # attempts, before a place that other processes keep taking is g
 
 _numbers = itertools.count()
 _in_use: set[str] = set()  # temporary names of this process
+_begun: set[Path] = set()  # temporary files and folders of this process that may still be there
 _locked: set[int] = set()  # handles of folders that this process has locked
 
 
@@ -42,10 +43,24 @@ def _let_go() -> None:
     for handle in _locked:
         os.close(handle)
     _locked.clear()
+    _begun.clear()
 
 
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_let_go)
+
+
+def clear_begun() -> None:
+    """Delete the temporary files and folders of this process that are still there.
+
+    For the end of a process that a signal stops: its exception may come while another one is being cleared up.
+    """
+    for partial in [*_begun]:
+        if partial.is_dir() and not partial.is_symlink():
+            shutil.rmtree(partial, ignore_errors=True)
+        else:
+            partial.unlink(missing_ok=True)
+    _begun.clear()
 
 
 def is_partial(path: Path) -> bool:
@@ -178,10 +193,14 @@ def _beside(path: Path, kind: str = "") -> Iterator[Path]:
     """A temporary name that nobody else uses."""
     partial = path.with_name(f".{path.name}.{MACHINE}-{os.getpid()}-{next(_numbers)}{kind}{SUFFIX}")
     _in_use.add(partial.name)
+    if not kind:  # an earlier result is not to be deleted
+        _begun.add(partial)
     try:
         yield partial
     finally:
         _in_use.discard(partial.name)
+        if not os.path.lexists(partial):
+            _begun.discard(partial)
 
 
 def _escape(name: str) -> str:

@@ -14,6 +14,7 @@ from mvseg.errors import InputError
 from mvseg.formats import atomic
 from mvseg.formats.atomic import (
     MACHINE,
+    clear_begun,
     folder_whole,
     is_abandoned,
     is_partial,
@@ -221,3 +222,33 @@ def test_a_process_that_was_forked_off_does_not_hold_the_lock(tmp_path: Path) ->
         os.waitpid(child, 0)
         for handle in (hold, ready, say_ready):
             os.close(handle)
+
+
+@pytest.mark.parametrize("what", ["file", "folder"])
+def test_a_signal_while_it_is_cleared_up(what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    class Stop(BaseException):
+        pass
+
+    def stop(*_: object, **__: object) -> None:
+        raise Stop
+
+    def write_half(path: Path) -> None:
+        path.write_text("half")
+        raise OSError
+
+    def write() -> None:
+        if what == "file":
+            write_whole(tmp_path / "new.txt", write_half)
+        with folder_whole(tmp_path / "new") as folder:
+            write_half(folder / "half.txt")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "unlink", stop)
+        patch.setattr("mvseg.formats.atomic.shutil.rmtree", stop)
+        with pytest.raises(Stop):
+            write()
+    (left,) = tmp_path.iterdir()
+    assert is_partial(left)
+    clear_begun()
+    assert [*tmp_path.iterdir()] == []
+    clear_begun()  # nothing is left to do
