@@ -140,6 +140,7 @@ def test_demo_evaluates_to_one(demo: Path, capsys: pytest.CaptureFixture[str]) -
     assert printed["s_match"] == "1.0000"
 
 
+@pytest.mark.slow
 def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "out"
     assert main(["infer", "--quiet", *COARSE, "--out", str(out)]) == 0

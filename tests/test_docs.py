@@ -124,6 +124,7 @@ def test_the_first_page_links_into_the_site(pages: ModuleType) -> None:
     assert [link for link in outside if not (ROOT / link).exists()] == []
 
 
+@pytest.mark.slow
 def test_the_site_is_built_and_loads_nothing_from_elsewhere(pages: ModuleType, tmp_path: Path) -> None:
     command = ["build", "--strict", "--quiet", "--config-file", str(ROOT / ".ci" / "mkdocs.yml"), "--site-dir"]
     where = {**os.environ, "PYTHONPATH": str(ROOT), "NO_MKDOCS_2_WARNING": "1"}

@@ -68,6 +68,7 @@ def read_table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_a_broken_scene_does_not_stop_the_others(
     plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -99,6 +99,7 @@ def test_other_options_are_done_again(scene: BatchScene, tmp_path: Path) -> None
     assert done[2].status.warnings == ["the cameras are in mm: unit cm without a scale only renames it"]
 
 
+@pytest.mark.slow
 def test_detections_are_kept_for_other_options_of_later_stages(
     scene: BatchScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

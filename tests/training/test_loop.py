@@ -139,6 +139,7 @@ def test_a_shipped_architecture_trains_and_its_export_loads(tmp_path: Path) -> N
 # --- laws
 
 
+@pytest.mark.slow
 def test_two_processes_do_what_one_does(leaves: Path, tmp_path: Path, finished: Path) -> None:
     """The same losses in every step, the same weights and AP; one process does two forward passes where two do one."""
     out = tmp_path / "out"
@@ -297,6 +298,7 @@ def test_tensorboard_log(finished: Path) -> None:
 # --- real plants
 
 
+@pytest.mark.slow
 @pytest.mark.shared_data
 def test_a_few_steps_on_real_rosettes(shared_data: Path, tmp_path: Path) -> None:
     shared = shared_data / "rosettes-cvppp-a1"
