@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from mvseg.adaptation.config import AdaptConfig
-from mvseg.adaptation.confirmed_masks import confirmed_masks
 from mvseg.adaptation.labels import FoundLeaves, write_labels
 from mvseg.config import RunConfig
 from mvseg.detectors.weights_file import Description, encode_weights, read_weights
@@ -20,6 +19,7 @@ from mvseg.formats.atomic import lock_folder, write_text_whole, write_whole
 from mvseg.formats.photos import check_photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.matching.match import check_baselines
+from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.pipeline import detect_regions, hear_witnesses
 from mvseg.scene import Scene
 from mvseg.training.config import TrainConfig

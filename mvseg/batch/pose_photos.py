@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import json
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -15,23 +13,20 @@ from typing import Any
 import pycolmap
 import torch
 
-from mvseg._version import __version__
-from mvseg.errors import InputError, InputWarning
-from mvseg.formats.atomic import folder_whole, sweep_abandoned
+from mvseg.batch.pose_folder import check_folders, new_scene_folder, write_pose_file
+from mvseg.errors import InputWarning
 from mvseg.formats.find_views import list_some
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.positions import read_positions
 from mvseg.poses.config import Known, PoseConfig
 from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
-from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
+from mvseg.poses.photo_files import PhotoFile, copy_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
-from mvseg.results.earlier import check_out, keep_user_files, list_files
 from mvseg.scene import Scene
 from mvseg.traits.config import Up
 from mvseg.traits.up import find_up
 
-POSE_FILE = "pose.json"
 UPSIDE_DOWN = -0.5  # mean of the cameras' own up along the known one
 
 
@@ -60,17 +55,13 @@ def pose_photos(
         InputError: a photo is broken, too few photos register, what is known does not fit them, or `out` holds
             something else than an earlier scene of this kind.
     """
-    sweep_abandoned(out)
-    check_out(out, POSE_FILE)
-    source, names = list_photos(photos)
-    if out.resolve() in (source.resolve(), *source.resolve().parents):
-        raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
+    source, names = check_folders(photos, out)
     file = config.calibration
     calibration = None if file is None else read_calibration(file.parent, file.name)
     if known.positions is not None:
         read_positions(known.positions)  # a mistake in it must not cost the minutes that follow
     start = time.perf_counter()
-    with warnings.catch_warnings(record=True) as caught, _writing(out) as folder:
+    with warnings.catch_warnings(record=True) as caught, new_scene_folder(out) as folder:
         warnings.simplefilter("always", InputWarning)
         files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
         structure = find_structure(
@@ -85,23 +76,12 @@ def pose_photos(
         run = describe_poses(structure, placement, files)
         run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
         run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}
-        run["files"] = list_files(folder, POSE_FILE)
-        (folder / POSE_FILE).write_text(json.dumps(run, indent=1, default=str) + "\n", encoding="utf-8")
-        keep_user_files(out, folder, POSE_FILE)
+        write_pose_file(folder, out, run)
     for message in messages:
         print(f"mvseg: warning: {message}", file=sys.stderr)
     if not quiet:
         print(describe_result(out, structure, placement, scene))
     return scene
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[Path]:
-    try:
-        with folder_whole(out) as folder:
-            yield folder
-    except OSError as error:
-        raise InputError(f"{out}: the scene folder is not writable ({error.strerror})") from None
 
 
 def warn_of_upside_down(scene: Scene) -> None:
@@ -119,7 +99,6 @@ def describe_poses(structure: Structure, placement: Placement, files: Sequence[P
     cameras = structure.model.cameras.values()
     turned = [photo.name for photo in files if photo.is_turned]
     return {
-        "mvseg": __version__,
         "pycolmap": pycolmap.__version__,
         "photos": len(files),
         "registered": list(structure.registered),

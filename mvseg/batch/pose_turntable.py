@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -14,19 +12,18 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from mvseg._version import __version__
+from mvseg.batch.pose_folder import check_folders, new_scene_folder, write_pose_file
 from mvseg.errors import InputError
-from mvseg.formats.atomic import folder_whole, sweep_abandoned
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.image_file import read_rgb
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.turntable import read_turntable_angles, write_turntable
 from mvseg.poses.board_calibration import TurntableCalibration, calibrate_turntable
-from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
-from mvseg.results.earlier import check_out, keep_user_files, list_files
+from mvseg.poses.photo_files import PhotoFile, copy_photos
+from mvseg.poses.scene_files import IMAGES
 from mvseg.scene import Scene
 
-POSE_FILE, TURNTABLE_FILE, IMAGES = "pose.json", "turntable.json", "images"
+TURNTABLE_FILE = "turntable.json"
 
 
 def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str = "", quiet: bool = False) -> Scene:
@@ -42,8 +39,8 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
     Raises:
         InputError: see `calibrate_turntable`; a photo is broken, or `out` holds something else.
     """
-    source, names = _check_folders(photos, out)
-    with _writing(out) as folder:
+    source, names = check_folders(photos, out)
+    with new_scene_folder(out) as folder:
         files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
         found = calibrate_turntable(_read_grey(folder, files, quiet=quiet), board)
         shown = [index for index in range(len(files)) if math.isfinite(found.angles[index])]
@@ -55,7 +52,7 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
         run: dict[str, Any] = {"residual_px": round(found.residual_px, 4), "corners": found.num_corners}
         run["photos"] = len(files)
         run |= {"registered": [files[index].name for index in shown], "board": asdict(board), "unit": unit}
-        _finish(folder, out, run)
+        write_pose_file(folder, out, run)
     if not quiet:
         share = f"{len(shown)} of {len(files)} photos show the board"
         print(f"{out}: {share}, {found.residual_px:.2f} px, axis and camera are in {TURNTABLE_FILE}")
@@ -76,12 +73,12 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, quiet: bo
         InputError: another number or size of photos than the file says; a photo is broken, or `out` holds something
             else.
     """
-    source, names = _check_folders(photos, out)
+    source, names = check_folders(photos, out)
     camera, angles, unit = read_turntable_angles(turntable)
     if len(names) != len(angles):
         message = f"{len(angles)} views for {len(names)} photos, expected one per photo, in the order of their names"
         raise InputError(f"{turntable}: {message}")
-    with _writing(out) as folder:
+    with new_scene_folder(out) as folder:
         files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
         for file in files:
             size, expected = (file.width, file.height), (camera["width"], camera["height"])
@@ -91,28 +88,10 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, quiet: bo
         views = [(f"{IMAGES}/{file.name}", angle) for file, angle in zip(files, angles, strict=True)]
         write_turntable(folder / TURNTABLE_FILE, camera, views, unit=unit)
         scene = load_scene(folder)
-        _finish(folder, out, {"photos": len(files), "turntable": str(turntable), "unit": unit})
+        write_pose_file(folder, out, {"photos": len(files), "turntable": str(turntable), "unit": unit})
     if not quiet:
         print(f"{out}: {len(files)} photos at the angles of {turntable}")
     return replace(scene, source=out / TURNTABLE_FILE)
-
-
-def _check_folders(photos: Path, out: Path) -> tuple[Path, list[str]]:
-    sweep_abandoned(out)
-    check_out(out, POSE_FILE)
-    source, names = list_photos(photos)
-    if out.resolve() in (source.resolve(), *source.resolve().parents):
-        raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
-    return source, names
-
-
-@contextmanager
-def _writing(out: Path) -> Iterator[Path]:
-    try:
-        with folder_whole(out) as folder:
-            yield folder
-    except OSError as error:
-        raise InputError(f"{out}: the scene folder is not writable ({error.strerror})") from None
 
 
 def _read_grey(folder: Path, files: Sequence[PhotoFile], *, quiet: bool) -> list[np.ndarray]:
@@ -123,9 +102,3 @@ def _read_grey(folder: Path, files: Sequence[PhotoFile], *, quiet: bool) -> list
 def _describe_camera(found: TurntableCalibration) -> dict[str, Any]:
     arrays = {"K": found.K, "R": found.R, "t": found.t, "distortion": found.distortion}
     return {"width": found.size[0], "height": found.size[1]} | {name: each.tolist() for name, each in arrays.items()}
-
-
-def _finish(folder: Path, out: Path, run: dict[str, Any]) -> None:
-    text = json.dumps({"mvseg": __version__, **run, "files": list_files(folder, POSE_FILE)}, indent=1)
-    (folder / POSE_FILE).write_text(text + "\n", encoding="utf-8")
-    keep_user_files(out, folder, POSE_FILE)

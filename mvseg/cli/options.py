@@ -66,6 +66,7 @@ def find_config(name: str) -> Path:
 
 
 def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
+    """The options of every verb that matches; `masks` is where they are when --masks does not say it."""
     help_config = "YAML file with any of these options; fine.yaml and paper.yaml ship"
     parser.add_argument("--config", action=CheckedConfig, help=help_config)
     parser.add_argument(
@@ -143,6 +144,11 @@ def _is_number(text: str) -> bool:
 
 
 def read_up(up: str | list[float] | None) -> Up | None:
+    """What --up says: three numbers, "rig", "board", or nothing.
+
+    Raises:
+        InputError: anything else.
+    """
     if up is None:
         return None
     if up == "rig":

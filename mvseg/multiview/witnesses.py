@@ -16,6 +16,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.matching.result import SURE, Matching, count_sure_views
+from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.multiview.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.visible_leaves import VisibleLeaf, visible_leaves
@@ -42,14 +43,12 @@ class Revised:
         source: (D',) int64, the largest of the regions that a mask was made of; -1 for one that only the other views
             show.
         old_ids: (K',) int64, the former id of each instance.
-        counts: of the D masks, how many were "kept" and "dropped"; "shown", how many only the other views show.
     """
 
     regions: Regions
     matching: Matching
     source: Tensor
     old_ids: Tensor
-    counts: dict[str, int]
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +97,8 @@ def revise_masks(
         The masks and their ids, on the CPU. A mask made of several has the best match score of theirs; one that only
         the other views show has the mean of its instance's.
     """
-    regions, ids = regions.to("cpu"), matching.instance_ids.cpu()
+    ids, scores = matching.instance_ids.cpu(), matching.match_scores.cpu()
+    regions, matching = regions.to("cpu"), replace(matching, instance_ids=ids, match_scores=scores)
     colors = _colors_of_leaves(regions, matching, photos)
     found: list[_Found] = []
     for view in tqdm(range(regions.num_views), "witnesses", unit="view", disable=not progress):
@@ -119,8 +119,6 @@ def revise_masks(
         labels=range(1, len(found) + 1),
         num_views=regions.num_views,
     )
-    num_kept = sum(len(each.members) for each in found if each.is_own)
-    counts = {"kept": num_kept, "dropped": len(regions) - num_kept, "shown": sum(not each.is_own for each in found)}
     areas = regions.areas
     source = [max(each.members, key=lambda n: int(areas[n])) if each.is_own else -1 for each in found]
     return Revised(
@@ -128,17 +126,14 @@ def revise_masks(
         matching=_rematch(matching, found, number),
         source=torch.tensor(source, dtype=torch.int64),
         old_ids=torch.tensor(list(number), dtype=torch.int64),
-        counts=counts,
     )
 
 
 def _colors_of_leaves(regions: Regions, matching: Matching, photos: Photos) -> NDArray[np.bool_]:
     """The colours of masks that are surely matched in `SURE_VIEWS` views, or in all where there are fewer; where there
     are no such masks, those of all that are matched."""
-    ids, scores = matching.instance_ids.cpu(), matching.match_scores.cpu()
-    views = torch.cat((count_sure_views(matching, regions.view_index), torch.zeros(1, dtype=torch.int64)))
-    is_sure = (ids > 0) & (scores >= SURE) & (views[ids.clamp(min=0) - 1] >= min(SURE_VIEWS, regions.num_views))
-    chosen = is_sure if is_sure.any() else ids > 0
+    is_sure = confirmed_masks(regions, matching, min_match_score=SURE, min_views=SURE_VIEWS)
+    chosen = is_sure if is_sure.any() else matching.instance_ids > 0
     counts = ColorCounts.none()
     for view in range(regions.num_views):
         photo = photos(view)
@@ -179,16 +174,14 @@ def _seen_twice(found: list[_Found]) -> list[_Found]:
 
 def _rematch(matching: Matching, found: list[_Found], number: Mapping[int, int]) -> Matching:
     """The matching of the revised masks."""
-    old = matching.match_scores.cpu()
-    scores = [float(old[each.members].max()) if each.is_own else float("nan") for each in found]
-    for place, each in enumerate(found):
-        if not each.is_own:
-            own = [score for score, other in zip(scores, found, strict=True)
-                   if other.is_own and other.instance == each.instance]  # fmt: skip
-            scores[place] = sum(own) / len(own) if own else 0.0
+    ids = torch.tensor([number[each.instance] for each in found], dtype=torch.int64)
+    is_own = torch.tensor([each.is_own for each in found], dtype=torch.bool)
+    scores = torch.tensor([float(matching.match_scores[each.members].max()) if each.is_own else 0.0 for each in found])
+    for instance in ids[~is_own].unique().tolist():
+        scores[~is_own & (ids == instance)] = scores[is_own & (ids == instance)].mean().nan_to_num(0)
     revised = Matching(
-        instance_ids=torch.tensor([number[each.instance] for each in found], dtype=torch.int64),
-        match_scores=torch.tensor(scores),
+        instance_ids=ids,
+        match_scores=scores,
         num_instances=len(number),
         method=matching.method,
         residual_px=matching.residual_px,

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from mvseg.adaptation.confirmed_masks import confirmed_masks
 from mvseg.matching.result import Matching
+from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.regions import Regions, stack_regions
 
 
