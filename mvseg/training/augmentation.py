@@ -20,6 +20,7 @@ from mvseg.formats.labelled_photo import LabelledPhoto
 from mvseg.regions import masks_to_boxes
 from mvseg.training.config import Orientation
 from mvseg.training.data import SampleList, read_sample
+from mvseg.training.photo_faults import add_clutter, light_unevenly, spoil
 
 MEAN_COLOR = (124, 116, 104)  # RGB; what the detectors' normalisation maps to zero
 MIN_INSTANCE_PX = 16  # smaller remains of an instance at the edge of a crop are noise
@@ -40,6 +41,8 @@ class Augmentation:
         color_jitter: strength of brightness, contrast and saturation changes, in [0, 1]; hue gets a tenth of it.
         blur_probability: share of the samples that are blurred (Gaussian, sigma 0.1 to 2 px).
         light_probability: share of the samples that are lit unevenly, see `light_unevenly`.
+        fault_probability: share of the samples with a fault of real photos, see `spoil`.
+        clutter_probability: share of the samples with things in front that are no leaves, see `add_clutter`.
     """
 
     image_size: int
@@ -48,6 +51,8 @@ class Augmentation:
     color_jitter: float = 0.3
     blur_probability: float = 0.2
     light_probability: float = 0.0
+    fault_probability: float = 0.0
+    clutter_probability: float = 0.0
 
 
 class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
@@ -89,10 +94,19 @@ def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> t
         torch.default_generator.manual_seed(seed)
         photo, layers = orient(photo, labelled.layers, augmentation.orientation)
         photo, layers = rescale(photo, layers, augmentation)
-        if augmentation.light_probability and float(torch.rand(())) < augmentation.light_probability:
+        if happens(augmentation.clutter_probability):
+            photo, layers = add_clutter(photo, layers)
+        if happens(augmentation.light_probability):
             photo = light_unevenly(photo)
-        photo = distort_color(augmentation)(tv_tensors.Image(photo))
-    return photo.as_subclass(Tensor).float() / 255, make_target(layers, labelled.classes)
+        photo = distort_color(augmentation)(tv_tensors.Image(photo)).as_subclass(Tensor)
+        if happens(augmentation.fault_probability):
+            photo = spoil(photo)
+    return photo.float() / 255, make_target(layers, labelled.classes)
+
+
+def happens(probability: float) -> bool:
+    """Whether it does; nothing is drawn for what never does, so that a new option leaves old recipes as they were."""
+    return bool(probability) and float(torch.rand(())) < probability
 
 
 def orient(photo: Tensor, layers: Tensor, orientation: Orientation) -> tuple[Tensor, Tensor]:
@@ -146,19 +160,6 @@ def distort_color(augmentation: Augmentation) -> v2.Transform:
             v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=augmentation.blur_probability),
         ]
     )
-
-
-def light_unevenly(photo: Tensor) -> Tensor:
-    """Put patches of shadow, or of glare up to overexposure, on a photo (3, H, W) uint8; their edges are sharp or soft.
-
-    Detectors that have not seen it break leaves in two where a shadow ends.
-    """
-    cells, sharpness = int(torch.randint(2, 9, ())), 2 ** (6 * float(torch.rand(())))
-    rough = torch.randn(1, 1, cells, cells)
-    field = torch.nn.functional.interpolate(rough, photo.shape[1:], mode="bicubic", align_corners=True)[0]
-    amount = torch.sigmoid(sharpness * (field - 0.5 * torch.randn(())))
-    gain = math.exp(float(torch.rand(())) * 2.2 - 1.3)  # 0.27 to 2.5
-    return (photo.float() * (1 + (gain - 1) * amount)).clamp(0, 255).to(photo.dtype)
 
 
 def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_PX) -> Target:

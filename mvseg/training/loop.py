@@ -261,6 +261,8 @@ def augmented_samples(run: Run) -> AugmentedSamples:
         color_jitter=config.color_jitter,
         blur_probability=config.blur_probability,
         light_probability=config.light_probability,
+        fault_probability=config.fault_probability,
+        clutter_probability=config.clutter_probability,
     )
     return AugmentedSamples(run.samples, augmentation, config.seed)
 

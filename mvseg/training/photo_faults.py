@@ -1,0 +1,96 @@
+"""What real photos have and rendered ones lack: uneven light, the faults of cameras, things that are no leaves.
+
+All of it is drawn from torch's global generator.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import torch
+from torch import Tensor
+
+
+def light_unevenly(photo: Tensor) -> Tensor:
+    """Put patches of shadow, or of glare up to overexposure, on a photo (3, H, W) uint8; their edges are sharp or soft.
+
+    Detectors that have not seen it break leaves in two where a shadow ends.
+    """
+    cells, sharpness = int(torch.randint(2, 9, ())), 2 ** (6 * draw(0, 1))
+    rough = torch.randn(1, 1, cells, cells)
+    field = torch.nn.functional.interpolate(rough, photo.shape[1:], mode="bicubic", align_corners=True)[0]
+    amount = torch.sigmoid(sharpness * (field - 0.5 * torch.randn(())))
+    gain = math.exp(draw(-1.3, 0.9))  # 0.27 to 2.5
+    return (photo.float() * (1 + (gain - 1) * amount)).clamp(0, 255).to(photo.dtype)
+
+
+def spoil(photo: Tensor) -> Tensor:
+    """One of five faults of a camera, for a photo (3, H, W) uint8: motion blur, JPEG of quality 10 to 60, sensor noise,
+    overexposure, or an image without colour, as infrared cameras take at night."""
+    fault = int(torch.randint(5, ()))
+    if fault == 0:
+        return blur_motion(photo, length=draw(3, 11), angle=draw(0, math.pi))
+    if fault == 1:
+        return compress(photo, quality=int(torch.randint(10, 61, ())))
+    if fault == 2:
+        return (photo.float() + draw(5, 25) * torch.randn(photo.shape)).clamp(0, 255).to(photo.dtype)
+    if fault == 3:
+        return (photo.float() * draw(1.3, 2.5)).clamp(0, 255).to(photo.dtype)
+    bright = photo.float().amax(0, keepdim=True)  # leaves are bright in the near infrared
+    return (255 * (bright / 255) ** draw(0.6, 1.6)).to(photo.dtype).expand(3, -1, -1).clone()
+
+
+def compress(photo: Tensor, *, quality: int) -> Tensor:
+    """What JPEG of a quality from 1 to 100 leaves of a photo (3, H, W) uint8, RGB."""
+    _, coded = cv2.imencode(".jpg", photo.permute(1, 2, 0).numpy()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
+    return torch.from_numpy(cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1].copy()).permute(2, 0, 1)
+
+
+def blur_motion(photo: Tensor, *, length: float, angle: float) -> Tensor:
+    """A camera that moved along a line of so many pixels, in the direction of the angle (radians)."""
+    radius = math.ceil(length / 2)
+    offsets = torch.arange(-radius, radius + 1, dtype=torch.float32)
+    y, x = torch.meshgrid(offsets, offsets, indexing="ij")
+    along, across = math.cos(angle) * x + math.sin(angle) * y, math.cos(angle) * y - math.sin(angle) * x
+    kernel = (1 - across.abs()).clamp(min=0) * (along.abs() <= length / 2)
+    kernel = (kernel / kernel.sum()).expand(3, 1, -1, -1)
+    padded = torch.nn.functional.pad(photo.float()[None], [radius] * 4, mode="replicate")
+    return torch.nn.functional.conv2d(padded, kernel, groups=3)[0].round().clamp(0, 255).to(photo.dtype)
+
+
+def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
+    """Put one to three things in front that are no leaves: tapes, labels, sticks and discs, every other one in a colour
+    of the photo itself, so that green alone makes no leaf.
+
+    Args:
+        photo: (3, H, W) uint8.
+        layers: (L, H, W) int, k where instance k is; 0 where a thing hides it.
+
+    Returns:
+        New tensors of the same shapes.
+    """
+    height, width = photo.shape[1:]
+    rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
+    photo, layers = photo.clone(), layers.clone()
+    for _ in range(int(torch.randint(1, 4, ()))):
+        half_length = max(height, width) * draw(0.02, 0.35)
+        half_width = min(half_length, max(height, width) * draw(0.01, 0.08))
+        row, column, angle = draw(0, height), draw(0, width), draw(0, math.pi)
+        along = (math.cos(angle) * (columns - column) + math.sin(angle) * (rows - row)) / half_length
+        across = (math.cos(angle) * (rows - row) - math.sin(angle) * (columns - column)) / half_width
+        is_round = draw(0, 1) < 0.3
+        shape = along.square() + across.square() < 1 if is_round else torch.maximum(along.abs(), across.abs()) < 1
+        of_photo = photo[:, int(torch.randint(height, ())), int(torch.randint(width, ()))].float()
+        color = of_photo if draw(0, 1) < 0.5 else 255 * torch.rand(3)
+        shading = 1 + draw(-0.3, 0.3) * along + draw(-0.3, 0.3) * across
+        grain = 1 + draw(0, 0.1) * torch.randn(height, width)
+        thing = (color[:, None, None] * shading * grain).clamp(0, 255).to(photo.dtype)
+        photo = torch.where(shape, thing, photo)
+        layers = layers.masked_fill(shape, 0)
+    return photo, layers
+
+
+def draw(low: float, high: float) -> float:
+    """A number, evenly distributed."""
+    return low + (high - low) * float(torch.rand(()))
