@@ -1,9 +1,11 @@
 """What does a detector find, and what does the cluster-aware loop add? `python benchmarks/detector.py --scenes DIR ...`
 
 Scenes are folders as `mvseg simulate` writes them (photos, true label images, true leaf meshes) or others with the same
-layout; without `truth/leaves` there are no figures for hidden leaves. Three questions:
+layout; without `truth/leaves` there are no figures for hidden leaves. With `--photos DIR --labels DIR [--every N]` in
+their place, single photos, or every n-th of them, answer the first question. Three questions:
 
-1. Average precision of the detector alone, photo by photo (all detections with a class score of 0.05 or more).
+1. Average precision of the detector alone, photo by photo (all detections with a class score of 0.05 or more), and, of
+   those that score `--min_score` or more, symmetric best Dice and the difference in count, see `count_and_dice`.
 2. The loop, for detections with a score of `--min_score` or more: plain NMS against cluster-aware NMS after 1, 2, 3
    iterations, and after one with the other views as witnesses. Mask AP, precision, recall of all leaves, and recall of
    leaves that are less than half visible (visible pixels against the silhouette that the leaf would have alone). What
@@ -33,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.average_precision import annotate_truth, average_precision, describe_mask
+from mvseg.evaluation.best_dice import count_and_dice
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
@@ -177,7 +180,10 @@ def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dic
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", type=Path, nargs="+", required=True, help="scene folders with truth/")
+    parser.add_argument("--scenes", type=Path, nargs="+", default=[], help="scene folders with truth/")
+    parser.add_argument("--photos", type=Path, help="in place of scenes: a folder of photos")
+    parser.add_argument("--labels", type=Path, help="of --photos: a folder of label PNGs, or a COCO file")
+    parser.add_argument("--every", type=int, default=1, help="every n-th of --photos only, see hold_out_every")
     parser.add_argument("--weights", default="leaf-slim")
     parser.add_argument("--image_size", type=int, help="longer side of scaled photos (default: as the weights say)")
     parser.add_argument("--scales", type=float, nargs="+", default=[1.0], help="factors of it, in the loop")
@@ -185,13 +191,18 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=3, help="of the loop at most; 0 for average precision alone")
     parser.add_argument("--json", type=Path, help="write the figures here")
     args = parser.parse_args()
-    samples = list_photos(args.scenes)
+    if bool(args.scenes) == bool(args.photos) or bool(args.photos) != bool(args.labels):
+        parser.error("expected either --scenes, or --photos and --labels")
+    samples = list_photos(args.scenes) if args.scenes else list_samples(args.photos, args.labels)
+    samples = samples.select(range(0, len(samples), args.every))
     indices = tqdm(range(len(samples)), "photos")
     detector = load_detector(args.weights, image_size=args.image_size)
-    alone = average_precision(*detect_and_label(detector, samples, indices), len(samples))
+    truth, detections = detect_and_label(detector, samples, indices)
+    alone = average_precision(truth, detections, len(samples))
+    alone |= count_and_dice(truth, detections, len(samples), min_score=args.min_score)
     print(json.dumps(alone))
     report: dict[str, Any] = {"num_photos": len(samples), "detector": alone}
-    if args.iterations:
+    if args.scenes and args.iterations:
         report["loop"] = measure_loop(args.scenes, args)
         for row, values in report["loop"].items():
             print(f"{row:12}", "  ".join(f"{name} {value:.3f}" for name, value in values.items()))

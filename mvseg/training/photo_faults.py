@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 
 import cv2
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -44,7 +45,8 @@ def spoil(photo: Tensor) -> Tensor:
 def compress(photo: Tensor, *, quality: int) -> Tensor:
     """What JPEG of a quality from 1 to 100 leaves of a photo (3, H, W) uint8, RGB."""
     _, coded = cv2.imencode(".jpg", photo.permute(1, 2, 0).numpy()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
-    return torch.from_numpy(cv2.imdecode(coded, cv2.IMREAD_COLOR)[..., ::-1].copy()).permute(2, 0, 1)
+    decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
+    return torch.from_numpy(decoded[..., ::-1].copy()).permute(2, 0, 1)
 
 
 def blur_motion(photo: Tensor, *, length: float, angle: float) -> Tensor:
