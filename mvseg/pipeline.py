@@ -166,6 +166,7 @@ def detect_regions(
     """
     from mvseg.detectors.zoo import load_detector
     from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
+    from mvseg.multiview.plant_box import LEAST_GAIN, crop_cameras, gain_of_crops, place_crops, plant_boxes
 
     detect = config.detect
     detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)
@@ -174,25 +175,49 @@ def detect_regions(
         detector, num_iterations=detect.num_iterations, scales=detect.scales, match=config.match
     ).to(device)
     kept = None if keep is None else KeptDetections(keep, _describe_detector(detect, model, device))
+    found, names = _look(model, scene, kept=kept, progress=progress)
+    detections, matching = model.match_detections(found, scene.cameras, progress=progress)
+    if detect.crop == "auto":
+        boxes = plant_boxes(detections.regions, matching, scene.cameras)
+        gain = gain_of_crops(boxes, scene.cameras.sizes, model.transform.max_size)
+        if float(gain.median()) >= LEAST_GAIN:
+            found, more_names = _look(model, scene, boxes, kept=kept, progress=progress)
+            cropped = crop_cameras(scene.cameras, boxes)
+            detections, matching = model.match_detections(found, cropped, progress=progress)
+            detections, names = place_crops(detections, boxes), names | more_names
+    if keep is not None and prune:
+        delete_kept(keep, but=names)
+    if not len(detections.regions):
+        message = f"the detector finds nothing that scores {detect.min_score:g} or more"
+        warnings.warn(message, InputWarning, stacklevel=3)
+    return detections, matching
+
+
+def _look(
+    model: MultiViewMaskRCNN,
+    scene: Scene,
+    boxes: torch.Tensor | None = None,
+    *,
+    kept: KeptDetections | None,
+    progress: bool,
+) -> tuple[list[dict[str, torch.Tensor]], set[str]]:
+    """What the detector finds in every photo, or in its box (V, 4) xyxy, and the names of the files that keep it."""
     found, names = [], set()
+    device = next(model.parameters()).device
     for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress):
-        path = kept.path(scene, view) if kept is not None and scene.views[view].path.is_file() else None
+        box = None if boxes is None else boxes[view].tolist()
+        path = kept.path(scene, view, box) if kept is not None and scene.views[view].path.is_file() else None
         shown = None if path is None else read_detections(path)
         if shown is None:
-            photo = torch.from_numpy(read_photo(scene, view)).to(device).permute(2, 0, 1)
+            x1, y1, x2, y2 = box or (0, 0, *scene.cameras.sizes[view].tolist())
+            photo = torch.from_numpy(read_photo(scene, view)[y1:y2, x1:x2]).to(device).permute(2, 0, 1)
             shown = model.detect(photo.float().div_(255))
             if path is not None:
                 write_detections(path, shown)
         if path is not None:
             names.add(path.name)
         found.append(shown)
-    if keep is not None and prune:
-        delete_kept(keep, but=names)
-    detections, matching = model.match_detections(found, scene.cameras, progress=progress)
-    if not len(detections.regions):
-        message = f"the detector finds nothing that scores {detect.min_score:g} or more"
-        warnings.warn(message, InputWarning, stacklevel=3)
-    return detections, matching
+    return found, names
 
 
 def hear_witnesses(
@@ -239,7 +264,8 @@ def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: s
     from mvseg.detectors.zoo import find_weights
 
     weights = find_weights(detect.weights) or Path(detect.weights)
-    options = {**asdict(detect), "weights": hash_files(weights), "num_iterations": None, "witnesses": None}
+    options = asdict(detect) | {"weights": hash_files(weights)}
+    options |= {"num_iterations": None, "witnesses": None, "crop": None}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "mvseg": __version__}
     return json.dumps(options | {"torch": torch.__version__, "device": device})
 

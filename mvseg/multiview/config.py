@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from mvseg.errors import InputError
 
@@ -22,6 +23,8 @@ class DetectConfig:
             size given with the weights, smaller ones stay as they are.
         scales: factors of this size. At several, every photo is looked at once for each, and a mask scores best that
             most of them show; [0.5, 1, 2] takes three to four times as long as [1].
+        crop: auto: where the plant fills a small part of large photos, they are cut to it after a first look and looked
+            at again: leaves are seen larger. off: one look at whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
         witnesses: let surfaces that are fitted to the matched masks correct them: the other views show which masks are
             no leaves or pieces of one, and which leaves were missed (`mvseg.multiview.witnesses`). Finds leaves: not
@@ -32,6 +35,7 @@ class DetectConfig:
     min_score: float = 0.3
     image_size: int | None = None
     scales: tuple[float, ...] = (1.0,)
+    crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
     witnesses: bool = True
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,14 +37,14 @@ class KeptDetections:
     folder: Path
     made_by: str
 
-    def path(self, scene: Scene, view: int) -> Path:
-        """The file for the detections in the photo of a view; the photo must exist."""
+    def path(self, scene: Scene, view: int, box: Sequence[int] | None = None) -> Path:
+        """The file for the detections in the photo of a view, or in a box (xyxy) of it; the photo must exist."""
         lens, K = scene.views[view].lens, scene.cameras.K[view].tolist()
         size = scene.cameras.sizes[view].tolist()
         camera = [None if lens is None else [lens.model_name, list(lens.params)], K, size]
         with scene.views[view].path.open("rb") as file:
             photo = hashlib.file_digest(file, "sha256").hexdigest()
-        text = json.dumps([photo, camera, self.made_by])
+        text = json.dumps([photo, camera, self.made_by, box])
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.safetensors"
 
 
