@@ -166,7 +166,7 @@ def detect_regions(
     """
     from mvseg.detectors.zoo import load_detector
     from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
-    from mvseg.multiview.plant_box import LEAST_GAIN, crop_cameras, gain_of_crops, place_crops, plant_boxes
+    from mvseg.multiview.plant_box import boxes_to_look_at, crop_cameras, place_crops
 
     detect = config.detect
     detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)
@@ -178,9 +178,9 @@ def detect_regions(
     found, names = _look(model, scene, kept=kept, progress=progress)
     detections, matching = model.match_detections(found, scene.cameras, progress=progress)
     if detect.crop == "auto":
-        boxes = plant_boxes(detections.regions, matching, scene.cameras)
-        gain = gain_of_crops(boxes, scene.cameras.sizes, model.transform.max_size)
-        if float(gain.median()) >= LEAST_GAIN:
+        longest = model.transform.max_size
+        boxes = boxes_to_look_at(detections.regions, matching, scene.cameras, longest=longest)
+        if boxes is not None:
             found, more_names = _look(model, scene, boxes, kept=kept, progress=progress)
             cropped = crop_cameras(scene.cameras, boxes)
             detections, matching = model.match_detections(found, cropped, progress=progress)

@@ -29,13 +29,18 @@ from mvseg import (
     match_regions,
     run_scene,
 )
+from mvseg.formats.image_file import read_rgb, write_png
+from mvseg.formats.photos import read_photo
 from mvseg.matching.result import Matching
+from mvseg.multiview.config import DetectConfig
+from mvseg.multiview.plant_box import crop_cameras, place_crops, plant_boxes
 from mvseg.multiview.proposals import Proposals
-from mvseg.pipeline import hear_witnesses
+from mvseg.pipeline import detect_regions, hear_witnesses
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
 from mvseg.results.provenance import describe_run
 from mvseg.results.result import Result
+from mvseg.scene import Scene, View
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)
@@ -208,3 +213,33 @@ def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
     save_result(result, tmp_path / "out", {})
     written = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
     assert [entry["from_other_views"] for entry in written] == from_views.tolist()
+
+
+@pytest.mark.slow
+def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path: Path) -> None:
+    whole = load_scene(demo_scene())
+    chosen, margin = [0, 3, 6, 8], torch.tensor([700, 500])
+    K = whole.cameras.K[chosen].clone()
+    K[:, :2, 2] += margin
+    cameras = replace(whole.cameras[chosen], K=K, sizes=whole.cameras.sizes[chosen] + 2 * margin)
+    views = []
+    for view in chosen:
+        photo = np.pad(read_photo(whole, view), ((500, 500), (700, 700), (0, 0)), mode="edge")
+        views.append(View(f"{view:03d}", tmp_path / f"{view:03d}.png"))
+        write_png(views[-1].path, photo)
+    scene = Scene("far", tuple(views), cameras)
+    kept = tmp_path / "kept"
+    first, matching = detect_regions(scene, RunConfig(detect=DetectConfig(crop="off")))
+    again, rematched = detect_regions(scene, keep=kept)
+    assert len(again.regions) > len(first.regions)
+    assert len([*kept.iterdir()]) == 2 * len(chosen)
+
+    boxes = plant_boxes(first.regions, matching, cameras)
+    for view, (x1, y1, x2, y2) in zip(views, boxes.tolist(), strict=True):
+        write_png(view.path, np.ascontiguousarray(read_rgb(view.path)[y1:y2, x1:x2]))
+    expected, _ = detect_regions(Scene("cut", tuple(views), crop_cameras(cameras, boxes)))
+    placed = place_crops(expected, boxes)
+    assert torch.equal(again.regions.boxes, placed.regions.boxes)
+    assert torch.equal(again.regions.crops, placed.regions.crops)
+    assert torch.equal(again.boxes, placed.boxes)
+    assert int(rematched.instance_ids.max()) >= 10  # of 12 leaves

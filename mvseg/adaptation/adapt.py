@@ -9,6 +9,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+import torch
+
 from mvseg.adaptation.config import AdaptConfig
 from mvseg.adaptation.labels import FoundLeaves, write_labels
 from mvseg.config import RunConfig
@@ -20,6 +22,7 @@ from mvseg.formats.photos import check_photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.matching.match import check_baselines
 from mvseg.multiview.confirmed_masks import confirmed_masks
+from mvseg.multiview.plant_box import boxes_to_look_at
 from mvseg.pipeline import detect_regions, hear_witnesses
 from mvseg.scene import Scene
 from mvseg.training.config import TrainConfig
@@ -94,12 +97,12 @@ def adapt_detector(
         check_baselines(scene.cameras)
     out.mkdir(parents=True, exist_ok=True)
     with lock_folder(out):
-        found = find_leaves(scenes, config, run=run, keep=out / "detections", progress=progress)
+        size = detection_size(scenes.values(), run.detect.image_size, usual=description.image_size)
+        found = find_leaves(scenes, config, size, run=run, keep=out / "detections", progress=progress)
         before = Agreement.of(found)
         if not before.num_labels:
             least = f"in {config.min_views} views with a match score of {config.min_match_score:g}"
             raise InputError(f"none of the {before.num_found} masks found is confirmed {least}: nothing to learn from")
-        size = detection_size(scenes.values(), run.detect.image_size, usual=description.image_size)
         if not (out / "training" / "config.yaml").is_file():
             write_labels(found, out / "labels", longest_side=math.ceil(SCALES[1] * size), progress=progress)
         train(
@@ -126,7 +129,7 @@ def adapt_detector(
         adapted = out / "weights.safetensors"
         write_adapted(out / "training" / "model.safetensors", adapted, image_size=size)
         run = replace(run, detect=replace(run.detect, weights=str(adapted)))
-        after = Agreement.of(find_leaves(scenes, config, run=run, keep=out / "detections", progress=progress))
+        after = Agreement.of(find_leaves(scenes, config, size, run=run, keep=out / "detections", progress=progress))
         text = json.dumps({"before": asdict(before), "after": asdict(after)}, indent=1) + "\n"
         write_text_whole(out / "agreement.json", text)
     if after.num_kept * before.num_found < before.num_kept * after.num_found or after.num_labels < before.num_labels:
@@ -158,13 +161,22 @@ def detection_size(scenes: Iterable[Scene], image_size: int | None, *, usual: in
 
 
 def find_leaves(
-    scenes: Mapping[str, Scene], config: AdaptConfig, *, run: RunConfig, keep: Path, progress: bool = False
+    scenes: Mapping[str, Scene],
+    config: AdaptConfig,
+    size: int,
+    *,
+    run: RunConfig,
+    keep: Path,
+    progress: bool = False,
 ) -> list[FoundLeaves]:
-    """Detect and match in every scene, and hear the other views."""
+    """Detect and match in every scene, photos with a longer side of at most `size` pixels, and hear the other views."""
     found = []
     for name, scene in scenes.items():
         detections, matching = detect_regions(scene, run, keep=keep, progress=progress)
         revised, rematched, from_views = hear_witnesses(scene, detections, matching, progress=progress)
+        whole, boxes = torch.nn.functional.pad(scene.cameras.sizes, (2, 0)), None
+        if run.detect.crop == "auto":
+            boxes = boxes_to_look_at(revised.regions, rematched, scene.cameras, longest=size)
         confirmed = confirmed_masks(
             revised.regions, rematched, min_match_score=config.min_match_score, min_views=config.min_views
         )
@@ -172,6 +184,7 @@ def find_leaves(
             FoundLeaves(
                 name=name,
                 scene=scene,
+                boxes=whole if boxes is None else boxes,
                 found=detections.regions,
                 revised=revised.regions,
                 confirmed=confirmed,

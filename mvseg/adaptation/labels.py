@@ -26,6 +26,7 @@ class FoundLeaves:
     Attributes:
         name: of the scene, different from those of the others.
         scene: photos and cameras.
+        boxes: (V, 4) int64 xyxy, half-open: the part of each photo that the detector looks at.
         found: what the detector found.
         revised: D masks as the other views corrected them, see `revise_masks`.
         confirmed: (D,) bool, which of these are labels, see `confirmed_masks`.
@@ -34,6 +35,7 @@ class FoundLeaves:
 
     name: str
     scene: Scene
+    boxes: Tensor
     found: Regions
     revised: Regions
     confirmed: Tensor
@@ -54,7 +56,8 @@ class FoundLeaves:
 
 
 def write_labels(found: list[FoundLeaves], folder: Path, *, longest_side: int, progress: bool = False) -> int:
-    """Write every photo that shows a confirmed mask, undistorted, and its labels: what `mvseg train` takes.
+    """Write every photo that shows a confirmed mask, undistorted and cut to its box, and its labels: what `mvseg train`
+    takes.
 
     Pixels of other masks, and those of a leaf's colour without a mask, are ignored (65535): the detector learns neither
     a leaf nor background from them. Two passes over the photos, one at a time in memory: leaves of all scenes
@@ -63,7 +66,7 @@ def write_labels(found: list[FoundLeaves], folder: Path, *, longest_side: int, p
     Args:
         found: the scenes.
         folder: gets `images/` and `labels/`, with PNGs NAME-VIEW.png.
-        longest_side: larger photos are scaled down to this, pixels.
+        longest_side: larger ones are scaled down to this, pixels.
         progress: show progress bars.
 
     Returns:
@@ -75,13 +78,13 @@ def write_labels(found: list[FoundLeaves], folder: Path, *, longest_side: int, p
         counts += count_colors(read_photo(leaves.scene, view), leaves.label_map(view) > 0)
     colors, num_written = leaf_colors(counts), 0
     for leaves, view in tqdm(places, "labels", unit="photo", disable=not progress):
-        labels = leaves.label_map(view)
-        if not labels.any():
+        labels, (x1, y1, x2, y2) = leaves.label_map(view), leaves.boxes[view].tolist()
+        if not labels[y1:y2, x1:x2].any():
             continue
         photo = read_photo(leaves.scene, view)
         may_be_leaf = has_leaf_color(photo, colors) | leaves.found_pixels(view)
         labels[(labels == 0) & may_be_leaf] = IGNORE_LABEL
-        photo, labels = shrink(photo, labels, longest_side)
+        photo, labels = shrink(photo[y1:y2, x1:x2], labels[y1:y2, x1:x2], longest_side)
         name = f"{leaves.name}-{leaves.scene.views[view].name.replace('/', '-')}.png"
         for kind in ("images", "labels"):
             (folder / kind).mkdir(parents=True, exist_ok=True)

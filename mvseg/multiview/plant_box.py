@@ -22,6 +22,14 @@ MARGIN = 0.1  # of the longer side of a box, on each side: leaves that were miss
 LEAST_GAIN = 1.5  # by which a second look must see the plant larger, for most photos
 
 
+def boxes_to_look_at(regions: Regions, matching: Matching, cameras: Cameras, *, longest: int) -> Tensor | None:
+    """`plant_boxes`, if a detector that scales larger images down to a longer side of `longest` pixels sees the plant
+    at least `LEAST_GAIN` times as large in them, in most views; else None."""
+    boxes = plant_boxes(regions, matching, cameras)
+    gain = gain_of_crops(boxes, cameras.sizes, longest)
+    return boxes if float(gain.median()) >= LEAST_GAIN else None
+
+
 def plant_boxes(regions: Regions, matching: Matching, cameras: Cameras) -> Tensor:
     """The box of the plant in each view: all instances that are surely matched, wherever they were found or not.
 

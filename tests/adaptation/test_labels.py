@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +31,7 @@ def find(plant: Path, confirmed: list[int]) -> FoundLeaves:
     return FoundLeaves(
         name="plant",
         scene=scene,
+        boxes=torch.nn.functional.pad(scene.cameras.sizes, (2, 0)),
         found=regions,
         revised=regions.select(is_confirmed),
         confirmed=torch.ones(int(is_confirmed.sum()), dtype=torch.bool),
@@ -55,6 +57,7 @@ def test_what_has_the_colour_of_a_leaf_is_no_background(plant: Path, tmp_path: P
     missed = FoundLeaves(
         name="plant",
         scene=leaves.scene,
+        boxes=leaves.boxes,
         found=leaves.revised.select(~is_first),
         revised=leaves.revised.select(~is_first),
         confirmed=leaves.confirmed[~is_first],
@@ -63,6 +66,7 @@ def test_what_has_the_colour_of_a_leaf_is_no_background(plant: Path, tmp_path: P
     twin = FoundLeaves(
         name="twin",
         scene=leaves.scene,
+        boxes=leaves.boxes,
         found=leaves.revised,
         revised=leaves.revised,
         confirmed=torch.arange(len(leaves.revised)) == 3,
@@ -76,6 +80,20 @@ def test_what_has_the_colour_of_a_leaf_is_no_background(plant: Path, tmp_path: P
     labels = read_labels(tmp_path / "labels" / "plant-001.png")
     assert (labels[truth == 1] == 1).all()
     assert (labels[np.isin(truth, (2, 3))] == 0).all()  # of another colour, and found by nobody
+
+
+def test_photos_and_labels_are_cut_to_their_boxes(plant: Path, tmp_path: Path) -> None:
+    leaves = find(plant, [1, 2, 3])
+    write_labels([leaves], tmp_path / "whole", longest_side=1000)
+    is_here = leaves.revised.view_index == 1
+    x1, y1 = leaves.revised.boxes[is_here, :2].amin(0).tolist()
+    x2, y2 = leaves.revised.boxes[is_here, 2:].amax(0).tolist()
+    empty = torch.tensor([0, 0, 1, 1])
+    boxes = torch.stack((empty, torch.tensor([x1, y1, x2, y2]), empty, empty))
+    assert write_labels([replace(leaves, boxes=boxes)], tmp_path / "cut", longest_side=1000) == 1
+    for kind, read in (("images", read_rgb), ("labels", read_labels)):
+        whole, cut = (read(tmp_path / name / kind / "plant-001.png") for name in ("whole", "cut"))
+        np.testing.assert_array_equal(cut, whole[y1:y2, x1:x2])
 
 
 def test_larger_photos_are_scaled_down_with_their_labels() -> None:
