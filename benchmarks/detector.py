@@ -160,7 +160,7 @@ def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dic
         for row in rows:
             proposals, matching = build_model(args, row).find_regions(photos, scene.cameras)
             if row.endswith("witnesses"):
-                proposals, matching, _ = hear_witnesses(scene, proposals, matching)
+                proposals, matching, *_ = hear_witnesses(scene, proposals, matching)
             detections[row] += annotate(proposals, scene.cameras.sizes.tolist(), num_images)
             totals[row].update(count_found(proposals, matching.instance_ids, truth))
         num_images += len(photos)

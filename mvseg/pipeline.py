@@ -34,9 +34,12 @@ from mvseg.traits.up import find_up
 if TYPE_CHECKING:
     from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
     from mvseg.multiview.proposals import Proposals
+    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
+
+ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
 
 
 def run_scene(
@@ -66,6 +69,7 @@ def run_scene(
     """
     seconds: dict[str, float] = {}
     scores = from_views = None
+    starts: dict[int, LeafSurface] = {}
     with _timed(seconds, "load"):
         scene = place_scene(load_scene(folder), config)
         check_photos(scene)
@@ -80,7 +84,9 @@ def run_scene(
             detections, matching = detect_regions(scene, config, keep=keep, prune=True, progress=progress)
         if config.detect.witnesses:
             with _timed(seconds, "witnesses"):
-                detections, matching, from_views = hear_witnesses(scene, detections, matching, progress=progress)
+                detections, matching, from_views, starts = hear_witnesses(
+                    scene, detections, matching, progress=progress
+                )
         regions, scores = detections.regions, detections.scores
     else:
         with _timed(seconds, "match"):
@@ -109,6 +115,7 @@ def run_scene(
             matching.instance_ids,
             scene.cameras,
             config=config.reconstruct,
+            starts=starts,
             photos=partial(read_photo, scene) if has_photos else None,
             progress=progress,
         )
@@ -222,7 +229,7 @@ def _look(
 
 def hear_witnesses(
     scene: Scene, detections: Proposals, matching: Matching, *, progress: bool = False
-) -> tuple[Proposals, Matching, torch.Tensor]:
+) -> tuple[Proposals, Matching, torch.Tensor, dict[int, LeafSurface]]:
     """Detections as the other views correct them, see `revise_masks`.
 
     Args:
@@ -232,8 +239,8 @@ def hear_witnesses(
         progress: show progress bars.
 
     Returns:
-        D' detections and their matching; (D',) bool, the masks that only the other views show. These have the mean
-        detection score of their instance.
+        D' detections and their matching; (D',) bool, the masks that only the other views show, which have the mean
+        detection score of their instance; and {instance id: surface}, what these masks were judged by.
     """
     from mvseg.multiview.proposals import Proposals
     from mvseg.multiview.witnesses import revise_masks
@@ -241,7 +248,9 @@ def hear_witnesses(
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
-        surfaces = fit_surfaces(detections.regions, matching.instance_ids, scene.cameras, progress=progress)
+        surfaces = fit_surfaces(
+            detections.regions, matching.instance_ids, scene.cameras, most_views=ROUGH_VIEWS, progress=progress
+        )
     photos = partial(read_photo, scene)
     revised = revise_masks(
         detections.regions, matching, surfaces, cameras=scene.cameras, photos=photos, progress=progress
@@ -256,7 +265,8 @@ def hear_witnesses(
     corrected = Proposals(
         regions=revised.regions, boxes=revised.regions.boxes.float(), scores=scores, classes=classes
     )
-    return corrected, revised.matching, from_views
+    starts = {number: surfaces[old] for number, old in enumerate(revised.old_ids.tolist(), start=1)}
+    return corrected, revised.matching, from_views, starts
 
 
 def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:

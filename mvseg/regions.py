@@ -94,6 +94,17 @@ class Regions:
         width, height = self.crop_sizes[index].tolist()
         return self.crops[start:end].reshape(height, width)
 
+    def union(self, indices: Sequence[int]) -> tuple[tuple[int, int, int, int], Tensor]:
+        """The box x1, y1, x2, y2 around one or more regions of one view, and (y2 - y1, x2 - x1) bool, what they cover
+        in it."""
+        boxes = self.boxes[indices]
+        x1, y1 = boxes[:, :2].amin(0).tolist()
+        x2, y2 = boxes[:, 2:].amax(0).tolist()
+        covered = torch.zeros(y2 - y1, x2 - x1, dtype=torch.bool, device=self.device)
+        for index, (a, b, c, d) in zip(indices, boxes.tolist(), strict=True):
+            covered[b - y1 : d - y1, a - x1 : c - x1] |= self.crop(index)
+        return (x1, y1, x2, y2), covered
+
     def mask(self, index: int, width: int, height: int) -> Tensor:
         """(height, width) bool: one region as a full frame, for drawing and writing."""
         frame = torch.zeros(height, width, dtype=torch.bool, device=self.device)

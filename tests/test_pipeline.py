@@ -192,7 +192,7 @@ def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
     )
     scores = torch.linspace(0.4, 0.9, count)
     found = Proposals(regions=regions, boxes=regions.boxes.float(), scores=scores, classes=regions.labels + 3)
-    corrected, rematched, from_views = hear_witnesses(leafy.scene, found, matching)
+    corrected, rematched, from_views, starts = hear_witnesses(leafy.scene, found, matching)
     assert len(corrected.regions) == count + 1
     (new,) = from_views.nonzero()[:, 0].tolist()
     assert (int(corrected.regions.view_index[new]), int(rematched.instance_ids[new])) == (2, 1)
@@ -202,6 +202,9 @@ def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
     shown = corrected.regions.mask(new, 160, 160)
     assert float((true & shown).sum() / (true | shown).sum()) > 0.9
     assert torch.equal(corrected.boxes, corrected.regions.boxes.float())
+    assert list(starts) == [1, 2]
+    for number, start in starts.items():  # the new mask is drawn from it
+        assert set(start.views.tolist()) <= set(corrected.regions.view_index[rematched.instance_ids == number].tolist())
 
     result = Result(
         scene=leafy.scene,

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial.transform import Rotation
 
 from mvseg.cli import main
 from mvseg.formats.image_file import write_png
@@ -17,7 +18,7 @@ from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.reconstruction.triangulate import triangulate_points
 from room_scene import BOARD
-from turntable_board import ANGLES, HEIGHT, WIDTH, draw_board
+from turntable_board import ANGLES, HEIGHT, SIDE_R, SIDE_T, WIDTH, draw_board
 
 OPTIONS = ["--board.columns", "5", "--board.rows", "4", "--board.square", "40", "--board.marker", "30", "--quiet"]
 
@@ -64,7 +65,8 @@ def test_a_table_is_calibrated_once_and_serves_other_photos(
 
     (photos / "7.png").unlink()
     assert main(again) == 2
-    assert "8 views for 7 photos, expected one per photo" in capsys.readouterr().err
+    said = "8 views for 7 photos, expected one per photo, in the order of their names, or --angles"
+    assert said in capsys.readouterr().err
     write_png(photos / "7.png", np.zeros((20, 30, 3), np.uint8))
     assert main([*again, "--quiet"]) == 2
     assert "7.png has 30 x 20 pixels, the turntable's camera 640 x 480" in capsys.readouterr().err
@@ -72,9 +74,82 @@ def test_a_table_is_calibrated_once_and_serves_other_photos(
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "plant", "table"]
 
 
+@pytest.mark.slow
+def test_two_cameras_and_other_angles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    photos, table = tmp_path / "photos", tmp_path / "table"
+    photos.mkdir()
+    write_photos(photos / "top", [draw_board(angle) for angle in ANGLES])
+    write_photos(photos / "side", [draw_board(angle, pose=(SIDE_R, SIDE_T)) for angle in ANGLES])
+    assert main(["pose", str(photos), "--out", str(table), "--turntable", "board", "--unit", "mm", *OPTIONS]) == 0
+    assert len(load_scene(table).views) == 2 * len(ANGLES)
+    written = json.loads((table / "turntable.json").read_text())
+    assert sorted(written["cameras"]) == ["side", "top"]
+
+    again = ["pose", str(photos), "--out", str(tmp_path / "plant"), "--turntable", str(table / "turntable.json")]
+    (photos / "side" / "7.png").unlink()
+    assert main([*again, "--quiet"]) == 2
+    assert "8 views of camera side for 7 photos" in capsys.readouterr().err
+    log = tmp_path / "angles.csv"
+    lines = [f"top/{index}.png,{10 * index}" for index in range(8)]
+    lines += [f"side/{index}.png,{10 * index + 5}" for index in range(7)]
+    log.write_text("\n".join(["photo,angle", *lines]))
+    for angles, expected in ((["--angles", str(log)], [5, 15]), (["--angles=-7.5"], [0, -7.5])):
+        assert main([*again, "--quiet", *angles]) == 0
+        views = json.loads((tmp_path / "plant" / "turntable.json").read_text())["views"]
+        assert [view["angle"] for view in views if view["camera"] == "side"][:2] == expected
+        assert len(load_scene(tmp_path / "plant").views) == 15
+    log.write_text("photo,angle\ntop/0.png,0")
+    assert main([*again, "--quiet", "--angles", str(log)]) == 2
+    assert "there is no angle of photo" in capsys.readouterr().err
+    (photos / "side").rename(photos / "other")
+    assert main([*again, "--quiet", "--angles", "10"]) == 2
+    assert "other/0.png is in no folder of a camera, expected folders of these names" in capsys.readouterr().err
+
+
+def write_disturbed(path: Path, scene: Path, *, degrees: float = 0.3) -> list[float]:
+    """The turntable file of a scene with a camera that is tilted against the axis, and angles that are a bit off."""
+    content = json.loads((scene / "turntable.json").read_text())
+    turn = Rotation.from_rotvec([np.radians(degrees), 0, 0]).as_matrix()
+    camera = content["cameras"]["camera"]
+    camera["R"] = (np.array(camera["R"]) @ turn).tolist()
+    angles = [view["angle"] for view in content["views"]]
+    for index, view in enumerate(content["views"]):
+        view["angle"] += degrees * (-1) ** index
+    path.write_text(json.dumps(content))
+    return angles
+
+
+@pytest.mark.slow
+def test_the_plants_own_texture_refines_the_table(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    angles = [12.0 * index for index in range(10)]
+    board = write_photos(tmp_path / "board", [draw_board(angle) for angle in angles])
+    table, plant = tmp_path / "table", tmp_path / "plant"
+    assert main(["pose", str(board), "--out", str(table), "--turntable", "board", "--unit", "mm", *OPTIONS]) == 0
+    right = write_disturbed(tmp_path / "wrong.json", table)
+    photos = write_photos(tmp_path / "photos", [draw_board(angle, has_texture=True) for angle in angles])
+    command = ["--out", str(plant), "--turntable", str(tmp_path / "wrong.json"), "--refine", "true", "--quiet"]
+    assert main(["pose", str(photos), *command]) == 0
+    told = json.loads((plant / "pose.json").read_text())["refinement"]
+    assert told["taken"]
+    assert told["held_out_px_after"] < told["held_out_px_before"]
+    found = [view["angle"] for view in json.loads((plant / "turntable.json").read_text())["views"]]
+    np.testing.assert_allclose(np.diff(found), np.diff(right), atol=0.2)  # degrees; they were off by 0.6
+
+    capsys.readouterr()
+    plain = write_photos(tmp_path / "plain", [np.full((HEIGHT, WIDTH), 90, np.uint8)] * len(angles))
+    assert main(["pose", str(plain), *command]) == 0
+    assert "not refined: the photos share 0 points, expected 50 or more: kept" in capsys.readouterr().out
+    kept, given = (json.loads(path.read_text()) for path in (plant / "turntable.json", tmp_path / "wrong.json"))
+    assert [view["angle"] for view in kept["views"]] == [view["angle"] for view in given["views"]]
+    assert kept["cameras"] == given["cameras"]
+    assert not json.loads((plant / "pose.json").read_text())["refinement"]["taken"]
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        (["--angles", "10"], "--angles: of no use without --turntable and a turntable.json"),
+        (["--turntable", "board", "--refine", "true"], "--refine: of no use without --turntable and a turntable.json"),
         (["--turntable", "board"], "needs the board"),
         (["--turntable", "board", "--marker", "30"], "marker: of no use with --turntable board"),
         (["--turntable", "t.json", "--unit", "mm", "--up", "rig"], "unit, up: of no use with --turntable t.json"),
@@ -96,6 +171,7 @@ def test_wrong_options(
     [
         ({"axis": {"point": [1, 0, 0], "direction": [0, 0, 1]}}, "the axis 0 0 1 at 0 0 0"),
         ({"cameras": {"camera": {"calibration": "c.yaml", "R": np.eye(3).tolist(), "t": [0, 0, 1]}}}, "has no K"),
+        ({"views": [{"file": "0.png", "camera": "top", "angle": 0}]}, "there is no camera 'top'"),
     ],
 )
 def test_turntables_of_others(tmp_path: Path, capsys: pytest.CaptureFixture[str], change, message: str) -> None:

@@ -42,6 +42,15 @@ def test_areas_and_pixels_count_what_the_masks_hold() -> None:
     assert (weight == 1).all()
 
 
+def test_a_union_is_that_of_whole_frames() -> None:
+    regions = regions_from_label_maps(random_maps())
+    (x1, y1, x2, y2), covered = regions.union([0, 2])
+    whole = regions.mask(0, 24, 24) | regions.mask(2, 24, 24)
+    assert torch.equal(covered, whole[y1:y2, x1:x2])
+    assert covered.sum() == whole.sum()
+    assert (x1, y1, x2, y2) == mask_box(whole)
+
+
 def test_thinned_pixels_stand_for_the_whole_mask() -> None:
     maps = [np.zeros((300, 400), np.uint16)]
     maps[0][10:250, 20:380] = 1

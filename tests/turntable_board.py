@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from room_scene import BOARD, PX_PER_MM, board_picture
+from room_scene import BOARD, PX_PER_MM, board_picture, texture
 
 WIDTH, HEIGHT, FOCAL = 640, 480, 700.0
 K = np.array([[FOCAL, 0, 325.0], [0, FOCAL, 236.0], [0, 0, 1]])
@@ -24,9 +24,28 @@ BOARD_TURN = Rotation.from_euler("xyz", [6, -4, 20], degrees=True)
 BOARD_SHIFT = BOARD_TURN.apply([-90.0, -70, 0]) + [12, -7, 0]
 
 
-def draw_board(angle: float, *, shift: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
-    """(H, W) uint8: the board after the table has turned by `angle` degrees; `shift` of the table, mm."""
-    picture = cv2.copyMakeBorder(board_picture(BOARD), 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=255)
+# A second camera, lower and on another side.
+SIDE_R = R @ Rotation.from_euler("z", 50, degrees=True).as_matrix()
+SIDE_R = Rotation.from_euler("x", 12, degrees=True).as_matrix() @ SIDE_R
+SIDE_T = np.array([6.0, -4, 450])
+
+
+def draw_board(
+    angle: float,
+    *,
+    shift: tuple[float, float, float] = (0, 0, 0),
+    pose: tuple[np.ndarray, np.ndarray] = (R, T),
+    has_texture: bool = False,
+) -> np.ndarray:
+    """(H, W) uint8: the board after the table has turned by `angle` degrees; `shift` of the table, mm.
+
+    Seen by a camera whose cam_from_world is `pose` at angle 0. With texture, a poster lies in place of the board.
+    """
+    R, T = pose
+    picture = board_picture(BOARD)
+    if has_texture:
+        picture = np.ascontiguousarray(texture(7)[: picture.shape[0], : picture.shape[1], 0])
+    picture = cv2.copyMakeBorder(picture, 20, 20, 20, 20, cv2.BORDER_CONSTANT, value=255)
     board_from_picture = np.diag([1 / PX_PER_MM, -1 / PX_PER_MM, 1.0])
     board_from_picture[:2, 2] = [-10, BOARD.rows * BOARD.square + 10]
     turn = Rotation.from_euler("z", angle, degrees=True)

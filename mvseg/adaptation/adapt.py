@@ -173,7 +173,7 @@ def find_leaves(
     found = []
     for name, scene in scenes.items():
         detections, matching = detect_regions(scene, run, keep=keep, progress=progress)
-        revised, rematched, from_views = hear_witnesses(scene, detections, matching, progress=progress)
+        revised, rematched, from_views, _ = hear_witnesses(scene, detections, matching, progress=progress)
         whole, boxes = torch.nn.functional.pad(scene.cameras.sizes, (2, 0)), None
         if run.detect.crop == "auto":
             boxes = boxes_to_look_at(revised.regions, rematched, scene.cameras, longest=size)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,17 @@ def add(verbs: Any) -> None:
     help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers)"
     parser.add_argument("--up", type=str | list[float] | None, help=help_up)
     help_turntable = (
-        "photos from a turntable, by one camera that stands still: 'board' calibrates it from photos of --board on the "
-        "table; a turntable.json made so gives the cameras of a plant that was photographed at the same angles"
+        "photos from a turntable, by cameras that stand still: 'board' calibrates it from photos of --board on the "
+        "table; a turntable.json made so gives the cameras of a plant on it"
     )
     parser.add_argument("--turntable", type=str | None, help=help_turntable)
+    help_angles = (
+        "with a turntable.json: the angles of the plant's photos, where they are not the calibration's: CSV with "
+        "photo,angle, or the degrees from one photo to the next"
+    )
+    parser.add_argument("--angles", type=float | Path | None, help=help_angles)
+    help_refine = "with a turntable.json: refine cameras and angles with the features of the plant's own photos"
+    parser.add_argument("--refine", type=bool, default=False, help=help_refine)
     verbs.add_subcommand("pose", parser, help="a scene folder from photos alone")
 
 
@@ -51,6 +59,10 @@ def run(args: Namespace) -> int:
         unit=args.unit or "",
     )
     config = build_options(PoseConfig, args)
+    if args.turntable in (None, "board"):
+        useless = [f"--{name}" for name in ("angles", "refine") if getattr(args, name) not in (None, False)]
+        if useless:
+            raise InputError(f"{', '.join(useless)}: of no use without --turntable and a turntable.json")
     if args.turntable is not None:
         _run_turntable(args, known, config)
         return 0
@@ -71,7 +83,16 @@ def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
     if useless:
         raise InputError(f"{', '.join(useless)}: of no use with --turntable {args.turntable}, expected none of them")
     if not is_board:
-        pose_turntable_photos(args.photos, args.out, turntable=Path(args.turntable), quiet=args.quiet)
+        if isinstance(args.angles, float) and not math.isfinite(args.angles):
+            raise InputError(f"angles is {args.angles}, expected degrees or a CSV file")
+        pose_turntable_photos(
+            args.photos,
+            args.out,
+            turntable=Path(args.turntable),
+            angles=args.angles,
+            refine=args.refine,
+            quiet=args.quiet,
+        )
     elif known.board is None:
         raise InputError("--turntable board needs the board: --board.columns, .rows, .square and .marker")
     else:

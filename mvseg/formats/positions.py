@@ -54,7 +54,7 @@ def read_positions(path: Path) -> Positions:
         InputError: the file cannot be read, has no columns for photo, x, y and z, holds something else than numbers
             there, names a photo twice or has columns in different units.
     """
-    rows = read_json(path, _Positions).views if path.suffix.lower() == ".json" else _read_csv(path)
+    rows = read_json(path, _Positions).views if path.suffix.lower() == ".json" else read_table(path, "positions")
     if not rows:
         raise InputError(f"{path}: holds no positions, expected a line for each photo")
     columns, unit = _find_columns(path, rows[0])
@@ -67,22 +67,27 @@ def read_positions(path: Path) -> Positions:
             raise InputError(f"{path}: photo {name} has two positions, expected one")
         names.append(name)
         found = zip(numbers, columns[1:], strict=True)
-        xyz.append([_number(value, f"{path}: {column} of {name}") for value, column in found])
+        xyz.append([read_number(value, f"{path}: {column} of {name}") for value, column in found])
     return Positions(names=tuple(names), xyz=np.array(xyz), unit=unit)
 
 
-def _read_csv(path: Path) -> list[dict[str, Any]]:
+def read_table(path: Path, what: str) -> list[dict[str, Any]]:
+    """The rows of a CSV file, as {column: entry}.
+
+    Raises:
+        InputError: it cannot be read as a table; `what` says of what it should be one.
+    """
     try:
         if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: is too large for a table of positions")
+            raise InputError(f"{path}: is too large for a table of {what}")
         lines = path.read_text(encoding="utf-8-sig").splitlines()
         head = lines[0] if lines else ""
         delimiter = max(",;\t", key=head.count)
         return list(csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True))
     except OSError as error:
-        raise InputError(f"{path}: the positions cannot be read ({error.strerror})") from None
+        raise InputError(f"{path}: the {what} cannot be read ({error.strerror})") from None
     except (ValueError, csv.Error) as error:
-        raise InputError(f"{path}: is not a table of positions ({error})") from None
+        raise InputError(f"{path}: is not a table of {what} ({error})") from None
 
 
 def _find_columns(path: Path, row: Mapping[str, Any]) -> tuple[list[str], str]:
@@ -102,7 +107,8 @@ def _find_columns(path: Path, row: Mapping[str, Any]) -> tuple[list[str], str]:
     return [photo, *(axes[axis] for axis in "xyz")], units.pop()
 
 
-def _number(value: Any, where: str) -> float:
+def read_number(value: Any, where: str) -> float:
+    """A number of moderate size; InputError, which begins with `where`, if it is none."""
     try:
         number = float(value)
     except (TypeError, ValueError):

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -85,40 +85,48 @@ def read_turntable(path: Path) -> Scene:
     return build_scene(path.parent, photos, unit=table.unit, source=path)
 
 
-def read_turntable_angles(path: Path) -> tuple[dict[str, Any], list[float], str]:
-    """The camera (as in a rig file), the angles of its views in order, and the unit of a turntable whose axis is the
-    world's z axis: what `write_turntable` takes.
+def read_turntable_parts(path: Path) -> tuple[dict[str, dict[str, Any]], list[tuple[str, float]], str]:
+    """The cameras (as in a rig file) by name, the camera and the angle of each view in order, and the unit of a
+    turntable whose axis is the world's z axis: what `write_turntable` takes.
 
     Raises:
-        InputError: the file cannot be read, has several cameras or another axis, or its camera has no K and size.
+        InputError: the file cannot be read, has no camera or another axis, a view names no camera of it, or a camera
+            has no K and size, or a distortion of more than five numbers.
     """
     table = read_json(path, _Turntable)
-    axis, cameras = table.axis, list(table.cameras.values())
-    if len(cameras) != 1 or (*axis.point, *axis.direction) != (0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
-        raise InputError(f"{path}: expected one camera and the axis 0 0 1 at 0 0 0, as mvseg pose writes it")
-    camera = cameras[0].model_dump(exclude_none=True)
-    if not {"K", "width", "height"} <= camera.keys():
-        raise InputError(f"{path}: the camera has no K, width and height, expected a file of mvseg pose --turntable")
-    return camera, [view.angle for view in table.views], table.unit
+    axis = table.axis
+    if not table.cameras or (*axis.point, *axis.direction) != (0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
+        raise InputError(f"{path}: expected cameras and the axis 0 0 1 at 0 0 0, as mvseg pose writes it")
+    cameras = {name: camera.model_dump(exclude_none=True) for name, camera in table.cameras.items()}
+    for name, camera in cameras.items():
+        if not {"K", "width", "height"} <= camera.keys():
+            message = f"camera {name} has no K, width and height"
+            raise InputError(f"{path}: {message}, expected a file of mvseg pose --turntable")
+        if len(camera.get("distortion", [])) > 5:
+            raise InputError(f"{path}: the distortion of camera {name} is not k1, k2, p1, p2, k3")
+    unknown = next((view.camera for view in table.views if view.camera not in cameras), None)
+    if unknown is not None:
+        raise InputError(f"{path}: there is no camera '{unknown}', expected of these: {', '.join(cameras)}")
+    return cameras, [(view.camera, view.angle) for view in table.views], table.unit
 
 
 def write_turntable(
-    path: Path, camera: dict[str, Any], views: Sequence[tuple[str, float]], *, unit: str
+    path: Path, cameras: Mapping[str, dict[str, Any]], views: Sequence[tuple[str, str, float]], *, unit: str
 ) -> None:
-    """Write the file of one camera beside a table whose axis is the world's z axis.
+    """Write the file of cameras beside a table whose axis is the world's z axis.
 
     Args:
         path: where; its folder must exist.
-        camera: width, height, K, R, t and distortion, as in a rig file.
-        views: file and angle in degrees of each photo.
+        cameras: width, height, K, R, t and distortion, as in a rig file, by name.
+        views: file, camera and angle in degrees of each photo.
         unit: of t.
     """
     content = {
         "format": TURNTABLE_FORMAT,
         "unit": unit,
         "axis": {"point": [0, 0, 0], "direction": [0, 0, 1]},
-        "cameras": {"camera": camera},
-        "views": [{"file": file, "camera": "camera", "angle": angle} for file, angle in views],
+        "cameras": cameras,
+        "views": [{"file": file, "camera": camera, "angle": angle} for file, camera, angle in views],
     }
     path.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 

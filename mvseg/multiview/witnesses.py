@@ -25,6 +25,7 @@ from mvseg.scene import Cameras
 
 Photos = Callable[[int], NDArray[np.uint8]]
 Mask = NDArray[np.bool_]
+Box = tuple[int, int, int, int]
 
 AGREES = 0.5  # IoU of a mask with what its surface shows, from which it stays as it is
 LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for that part to become a mask
@@ -59,7 +60,7 @@ class _Found:
     instance: int
     members: list[int]
     is_own: bool
-    box: tuple[int, int, int, int]
+    box: Box
     crop: Tensor
 
 
@@ -105,11 +106,13 @@ def revise_masks(
         colored = has_leaf_color(photos(view), colors)
         for leaf in visible_leaves(surfaces, cameras, view):
             members = ((regions.view_index == view) & (ids == leaf.instance)).nonzero()[:, 0].tolist()
-            own = _union(regions, members, colored.shape)
-            if _iou(own, leaf.mask) >= AGREES:
-                found.append(_found(view, leaf, members, own, is_own=True))
-            elif _is_leaf(leaf, colored):
-                found.append(_found(view, leaf, members, leaf.mask & colored, is_own=False))
+            x1, y1, x2, y2 = leaf.box
+            colored_here = colored[y1:y2, x1:x2]
+            box, own = regions.union(members) if members else (leaf.box, torch.zeros(leaf.mask.shape, dtype=torch.bool))
+            if _iou(box, own.numpy(), leaf) >= AGREES:
+                found.append(_found(view, leaf, members, (box, own.numpy()), is_own=True))
+            elif _is_leaf(leaf, colored_here):
+                found.append(_found(view, leaf, members, (leaf.box, leaf.mask & colored_here), is_own=False))
     found = _seen_twice(found)
     number = {instance: place for place, instance in enumerate(sorted({each.instance for each in found}), start=1)}
     revised = stack_regions(
@@ -142,27 +145,35 @@ def _colors_of_leaves(regions: Regions, matching: Matching, photos: Photos) -> N
     return leaf_colors(counts)
 
 
-def _union(regions: Regions, members: list[int], shape: tuple[int, ...]) -> Mask:
-    frame = np.zeros(shape, bool)
-    for index in members:
-        x1, y1, x2, y2 = regions.boxes[index].tolist()
-        frame[y1:y2, x1:x2] |= regions.crop(index).numpy()
-    return frame
+def _iou(box: Box, mask: Mask, leaf: VisibleLeaf) -> float:
+    """IoU of a mask in its box with a leaf in its own."""
+    x1, y1 = max(box[0], leaf.box[0]), max(box[1], leaf.box[1])
+    x2, y2 = min(box[2], leaf.box[2]), min(box[3], leaf.box[3])
+    if x1 >= x2 or y1 >= y2:
+        return 0.0
+    common = (x1, y1, x2, y2)
+    both = int((_cut(box, mask, common) & _cut(leaf.box, leaf.mask, common)).sum())
+    return float(both / max(int(mask.sum()) + int(leaf.mask.sum()) - both, 1))
 
 
-def _iou(first: Mask, second: Mask) -> float:
-    return float((first & second).sum() / max(int((first | second).sum()), 1))
+def _cut(box: Box, mask: Mask, inner: Box) -> Mask:
+    """The part of a mask in its box that lies in a box within that."""
+    return mask[inner[1] - box[1] : inner[3] - box[1], inner[0] - box[0] : inner[2] - box[0]]
 
 
 def _is_leaf(leaf: VisibleLeaf, colored: Mask) -> bool:
-    """Whether the photo can show a leaf where the other views say that there is one."""
+    """Whether the photo can show a leaf where the other views say that there is one; `colored` is of its box."""
     size, num_colored = int(leaf.mask.sum()), int((leaf.mask & colored).sum())
     return leaf.share >= LEAST_VISIBLE and size >= LEAST_PIXELS and num_colored >= LEAST_COLORED * size
 
 
-def _found(view: int, leaf: VisibleLeaf, members: list[int], mask: Mask, *, is_own: bool) -> _Found:
-    x1, y1, x2, y2 = box = mask_box(torch.from_numpy(mask))
+def _found(
+    view: int, leaf: VisibleLeaf, members: list[int], placed: tuple[Box, Mask], *, is_own: bool
+) -> _Found:
+    (left, top, _, _), mask = placed
+    x1, y1, x2, y2 = mask_box(torch.from_numpy(mask))
     crop = torch.from_numpy(mask[y1:y2, x1:x2].copy()).flatten()
+    box = (left + x1, top + y1, left + x2, top + y2)
     return _Found(view=view, instance=leaf.instance, members=members, is_own=is_own, box=box, crop=crop)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -26,6 +27,7 @@ def reconstruct_shapes(
     cameras: Cameras,
     *,
     config: ReconstructConfig,
+    starts: Surfaces = MappingProxyType({}),
     photos: Callable[[int], NDArray[np.uint8]] | None = None,
     progress: bool = False,
 ) -> tuple[Surfaces | None, Voxels]:
@@ -36,6 +38,7 @@ def reconstruct_shapes(
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
         config: what to make, and how.
+        starts: instance id -> a surface that is nearly right, see `fit_surfaces`.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; None: there are none.
         progress: show progress bars over the instances.
 
@@ -52,6 +55,7 @@ def reconstruct_shapes(
             regions,
             instance_ids,
             cameras,
+            starts=starts,
             photos=photos if config.photos else None,
             jackknife=config.jackknife,
             progress=progress,

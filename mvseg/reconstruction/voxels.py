@@ -207,13 +207,7 @@ class _ViewMask:
 
     @staticmethod
     def union(members: Regions, view: int, cameras: Cameras) -> _ViewMask:
-        parts = (members.view_index == view).nonzero()[:, 0].tolist()
-        boxes = members.boxes[parts]
-        x1, y1 = boxes[:, :2].amin(0).tolist()
-        x2, y2 = boxes[:, 2:].amax(0).tolist()
-        mask = torch.zeros(y2 - y1, x2 - x1, dtype=torch.bool, device=members.device)
-        for part, (a, b, c, d) in zip(parts, boxes.tolist(), strict=True):
-            mask[b - y1 : d - y1, a - x1 : c - x1] |= members.crop(part)
+        (x1, y1, x2, y2), mask = members.union((members.view_index == view).nonzero()[:, 0].tolist())
         rows, columns = mask.nonzero().double().mean(0) + 0.5
         ray = cameras.world_from_px[view] @ torch.stack((columns + x1, rows + y1, torch.ones_like(rows)))
         ray = ray / torch.linalg.vector_norm(ray)

@@ -18,6 +18,7 @@ from mvseg.formats.scene_folder import load_masks
 from mvseg.matching.result import Matching
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.proposals import Proposals
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Scene
 from mvseg.training.config import TrainConfig
 from scene_folders import write_scene
@@ -50,8 +51,10 @@ def trained(plant: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainConfig]:
         ones = torch.ones(count)
         return Proposals(regions=regions, boxes=regions.boxes.float(), scores=ones, classes=ones.long()), matching
 
-    def hear(_: Scene, found: Proposals, matching: Matching, **__: object) -> tuple[Proposals, Matching, torch.Tensor]:
-        return found, matching, torch.zeros(len(found.regions), dtype=torch.bool)
+    def hear(
+        _: Scene, found: Proposals, matching: Matching, **__: object
+    ) -> tuple[Proposals, Matching, torch.Tensor, dict[int, LeafSurface]]:
+        return found, matching, torch.zeros(len(found.regions), dtype=torch.bool), {}
 
     def train(config: TrainConfig) -> None:
         asked.append(config)

@@ -30,7 +30,8 @@ def true_maps() -> list[np.ndarray]:
     for view in range(len(CAMERAS)):
         labels = np.zeros((SIZE, SIZE), np.int64)
         for leaf in visible_leaves(LEAVES, CAMERAS, view):
-            labels[leaf.mask] = leaf.instance
+            x1, y1, x2, y2 = leaf.box
+            labels[y1:y2, x1:x2][leaf.mask] = leaf.instance
         maps.append(labels)
     return maps
 

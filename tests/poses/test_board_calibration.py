@@ -8,44 +8,75 @@ import pytest
 from mvseg.errors import InputError
 from mvseg.poses.board_calibration import calibrate_turntable
 from room_scene import BOARD
-from turntable_board import ANGLES, HEIGHT, WIDTH, K, R, T, draw_board
+from turntable_board import ANGLES, HEIGHT, SIDE_R, SIDE_T, WIDTH, K, R, T, draw_board
 
 
 def test_camera_axis_and_angles_come_back() -> None:
     photos = [draw_board(angle) for angle in ANGLES]
     photos.insert(3, np.full((HEIGHT, WIDTH), 90, np.uint8))  # one without the board
-    found = calibrate_turntable(photos, BOARD)
+    found = calibrate_turntable({"camera": photos}, BOARD)
+    camera = found.cameras["camera"]
     assert np.isnan(found.angles[3])
     turned = np.delete(found.angles, 3) % 360
     np.testing.assert_allclose((turned - ANGLES + 180) % 360 - 180, 0, atol=0.2)  # degrees
-    np.testing.assert_allclose(found.K, K, atol=6)
+    np.testing.assert_allclose(camera.K, K, atol=6)
     assert found.residual_px < 0.3
     # Where the camera stands from the axis: its distance, its height and the direction in which it looks.
-    center, true_center = -found.R.T @ found.t, -R.T @ T
+    center, true_center = -camera.R.T @ camera.t, -R.T @ T
     assert np.hypot(*center[:2]) == pytest.approx(np.hypot(*true_center[:2]), rel=0.01)
-    assert found.R[:, 2] @ R[:, 2] == pytest.approx(1, abs=1e-4)  # the axis in the camera's frame
+    assert camera.R[:, 2] @ R[:, 2] == pytest.approx(1, abs=1e-4)  # the axis in the camera's frame
     # The origin is on the axis: both cameras see the same line there, whatever its height.
-    on_axis = found.t + found.R[:, 2] * ((T - found.t) @ found.R[:, 2])
+    on_axis = camera.t + camera.R[:, 2] * ((T - camera.t) @ camera.R[:, 2])
     np.testing.assert_allclose(on_axis, T, atol=5)
 
 
 def test_points_on_the_table_are_seen_where_they_are() -> None:
     """Corners of the board at an angle that was left out, in the world of the calibration."""
-    found = calibrate_turntable([draw_board(angle) for angle in ANGLES[:-1]], BOARD)
-    both = calibrate_turntable([draw_board(angle) for angle in ANGLES], BOARD)
+    found = calibrate_turntable({"camera": [draw_board(angle) for angle in ANGLES[:-1]]}, BOARD)
+    both = calibrate_turntable({"camera": [draw_board(angle) for angle in ANGLES]}, BOARD)
     assert both.angles[-1] % 360 == pytest.approx(300, abs=0.2)
     np.testing.assert_allclose(found.angles, both.angles[:-1], atol=0.2)
-    np.testing.assert_allclose(found.K, both.K, atol=4)
+    np.testing.assert_allclose(found.cameras["camera"].K, both.cameras["camera"].K, atol=4)
+
+
+def test_two_cameras_share_axis_and_angles() -> None:
+    """Also angles that only one of them sees."""
+    nothing = np.full((HEIGHT, WIDTH), 90, np.uint8)
+    top = [draw_board(angle) for angle in ANGLES]
+    side = [draw_board(angle, pose=(SIDE_R, SIDE_T)) for angle in ANGLES]
+    top[0], side[5], side[6] = nothing, nothing, nothing
+    found = calibrate_turntable({"top": top, "side": side}, BOARD)
+    np.testing.assert_allclose((found.angles - ANGLES + 180) % 360 - 180, 0, atol=0.2)  # degrees
+    assert found.angles[0] == 0
+    assert found.residual_px < 0.3
+    np.testing.assert_allclose(found.cameras["side"].K, K, atol=6)
+    # The one as the other sees it.
+    true_turn, true_shift = SIDE_R @ R.T, SIDE_T - SIDE_R @ R.T @ T
+    top_camera, side_camera = (found.cameras[name] for name in ("top", "side"))
+    turn = side_camera.R @ top_camera.R.T
+    assert np.degrees(np.arccos(min(1, (np.trace(turn @ true_turn.T) - 1) / 2))) < 0.5
+    np.testing.assert_allclose(side_camera.t - turn @ top_camera.t, true_shift, atol=5)
+
+
+def test_cameras_that_do_not_belong_together() -> None:
+    top = [draw_board(angle) for angle in ANGLES]
+    with pytest.raises(InputError, match=r"^camera side: 7 photos, 8 of camera top, expected as many"):
+        calibrate_turntable({"top": top, "side": top[1:]}, BOARD)
+    nothing = [np.full((HEIGHT, WIDTH), 90, np.uint8)] * 4
+    with pytest.raises(InputError, match=r"^camera side: it sees the board at no angle at which another camera does"):
+        calibrate_turntable({"top": top[:4] + nothing, "side": nothing + top[4:]}, BOARD)
+    with pytest.raises(InputError, match=r"^camera side: 1 of 8 photos show 6 corners"):
+        calibrate_turntable({"top": top, "side": top[:1] + nothing + nothing[:3]}, BOARD)
 
 
 def test_what_is_no_turntable() -> None:
     still = [draw_board(0.0)] * 5
     with pytest.raises(InputError, match=r"turned by 0.0 degrees"):
-        calibrate_turntable(still, BOARD)
+        calibrate_turntable({"camera": still}, BOARD)
     moved = [draw_board(angle, shift=(3 * angle % 70, 0, angle % 40)) for angle in ANGLES]
     with pytest.raises(InputError, match=r"one turning axis explains the board to .* px only"):
-        calibrate_turntable(moved, BOARD)
+        calibrate_turntable({"camera": moved}, BOARD)
     with pytest.raises(InputError, match=r"^3 of 5 photos show 6 corners"):
-        calibrate_turntable([*still[:3], *[np.full((HEIGHT, WIDTH), 90, np.uint8)] * 2], BOARD)
+        calibrate_turntable({"camera": [*still[:3], *[np.full((HEIGHT, WIDTH), 90, np.uint8)] * 2]}, BOARD)
     with pytest.raises(InputError, match=r"photo 1 has 480 x 640 pixels, the first 640 x 480"):
-        calibrate_turntable([still[0], still[0].T], BOARD)
+        calibrate_turntable({"camera": [still[0], still[0].T]}, BOARD)

@@ -7,7 +7,7 @@ from scipy import ndimage
 
 from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_cameras
 from mvseg.errors import InputError
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, spread_views
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 
@@ -79,6 +79,27 @@ def test_world_may_be_moved_turned_and_scaled(bent: LeafSurface) -> None:
     assert other.width / scale == pytest.approx(bent.width, rel=5e-3)
     middle = turn @ bent.points().mean((0, 1)) * scale + shift
     assert float((other.points().mean((0, 1)) - middle).norm()) < 0.01 * other.length
+
+
+def test_of_very_many_views_some_are_looked_at() -> None:
+    """Slow twin: the fit to these views alone."""
+    regions, ids = as_regions(blade_masks(BENT, CAMERAS))
+    surface = fit_surfaces(regions, ids, CAMERAS, most_views=6)[1]
+    assert surface.views.tolist() == [0, 1, 3, 5, 6, 8]
+    kept = torch.isin(regions.view_index, surface.views)
+    same = fit_surfaces(regions.select(kept), ids[kept], CAMERAS)[1]
+    assert torch.equal(surface.coefficients, same.coefficients)
+    assert spread_views(torch.tensor([2, 5, 7]), 3).tolist() == [2, 5, 7]
+
+
+def test_a_known_start_saves_the_search_for_one(bent: LeafSurface, monkeypatch: pytest.MonkeyPatch) -> None:
+    regions, ids = as_regions(blade_masks(BENT, CAMERAS))
+    rough = fit_surfaces(regions, ids, CAMERAS, most_views=4)
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.back_project", None)
+    surface = fit_surfaces(regions, ids, CAMERAS, starts=rough)[1]
+    assert surface.area == pytest.approx(bent.area, rel=5e-3)
+    assert surface.length == pytest.approx(bent.length, rel=5e-3)
+    assert np.abs(errors(surface, BENT)).max() < 0.015
 
 
 def test_one_wrong_mask_in_five_does_little_harm() -> None:

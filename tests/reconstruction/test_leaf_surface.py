@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from known_leaves import bent_blade, fit_coefficients, flat_sheet, make_surface
+from blade_scene import SIZE, ring_cameras
+from known_leaves import bent_blade, fit_coefficients, flat_leaf, flat_sheet, make_surface
 from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS, Floats, measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, measure_slopes
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, measure_slopes
+from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 
 
 def area_and_length(coefficients: Floats) -> Floats:
@@ -52,3 +54,20 @@ def test_numbers_that_are_none_have_no_deviation() -> None:
     assert not nothing.is_credible
     assert surface.is_credible
     assert np.isnan(nothing.deviation(area_and_length)).all()
+
+
+def test_parts_are_what_whole_frames_show() -> None:
+    """Slow twin: all polygons drawn into the whole frame; of leaves inside it, across its border, beside and behind."""
+    cameras = ring_cameras(3)
+    for at in ((-0.5, 0.1, 0.0), (0.6, 0.8, 0.3), (30.0, 0.0, 0.0), (0.0, 0.0, 12.0)):
+        leaf = flat_leaf(length=1.3, half_width=0.4, at=at)
+        px, depth = cameras.project(leaf.points().reshape(-1, 3))
+        for view, (mask, (box, part)) in enumerate(
+            zip(leaf.project(cameras), leaf.project_parts(cameras), strict=True)
+        ):
+            is_ahead = (grid_quads(depth[view].reshape(*MESH_SHAPE, 1).numpy()) > 0).all((1, 2))
+            quads = grid_quads(px[view].reshape(*MESH_SHAPE, 2).numpy())[is_ahead]
+            whole = draw_polygons(quads, (SIZE, SIZE), np.zeros(2)) >= 0.5
+            np.testing.assert_array_equal(mask.numpy(), whole)
+            np.testing.assert_array_equal(part, whole[box[1] : box[3], box[0] : box[2]])
+            assert part.sum() == whole.sum()

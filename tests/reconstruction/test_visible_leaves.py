@@ -9,11 +9,19 @@ import torch
 
 from blade_scene import SIZE, ring_cameras
 from known_leaves import flat_leaf
-from mvseg.reconstruction.surface.visible_leaves import visible_leaves
+from mvseg.reconstruction.surface.visible_leaves import VisibleLeaf, visible_leaves
 
 CAMERAS = ring_cameras(4, elevations_deg=(60, 75))
 UPPER = flat_leaf(length=1.6, half_width=0.3, at=(-0.8, 0, 0.5))
 LOWER = flat_leaf(length=1.6, half_width=0.5, at=(-0.8, 0, 0))
+
+
+def whole(leaf: VisibleLeaf) -> np.ndarray:
+    """Its mask as a full frame."""
+    x1, y1, x2, y2 = leaf.box
+    frame = np.zeros((SIZE, SIZE), bool)
+    frame[y1:y2, x1:x2] = leaf.mask
+    return frame
 
 
 def test_the_nearer_surface_hides_the_other() -> None:
@@ -21,8 +29,8 @@ def test_the_nearer_surface_hides_the_other() -> None:
         near, far = visible_leaves({5: LOWER, 7: UPPER}, CAMERAS, view)
         upper, lower = (surface.project(CAMERAS)[view].numpy() for surface in (UPPER, LOWER))
         assert (near.instance, far.instance) == (7, 5)
-        np.testing.assert_array_equal(near.mask, upper)
-        np.testing.assert_array_equal(far.mask, lower & ~upper)
+        np.testing.assert_array_equal(whole(near), upper)
+        np.testing.assert_array_equal(whole(far), lower & ~upper)
         assert near.share == 1
         assert 0 < far.share == (lower & ~upper).sum() / lower.sum() < 1
 
@@ -33,5 +41,5 @@ def test_what_is_not_credible_or_not_in_the_photo_is_left_out() -> None:
     (only,) = visible_leaves({1: doubtful, 2: LOWER, 3: beside}, CAMERAS, 0)
     assert only.instance == 2
     assert only.share == 1
-    assert only.mask.shape == (SIZE, SIZE)
+    np.testing.assert_array_equal(whole(only), LOWER.project(CAMERAS)[0].numpy())
     assert [*visible_leaves({}, CAMERAS, 0)] == []

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -48,24 +49,32 @@ BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this 
 # What a surface must reach not to be doubted.
 LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
 
+MOST_VIEWS = 20  # of an instance that its fit looks at; more add time, and next to nothing else
+
 
 def fit_surfaces(
     regions: Regions,
     instance_ids: Tensor,
     cameras: Cameras,
     *,
+    starts: Mapping[int, LeafSurface] = MappingProxyType({}),
     photos: Callable[[int], NDArray[np.uint8]] | None = None,
+    most_views: int = MOST_VIEWS,
     jackknife: bool = False,
     progress: bool = False,
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
 
+    An instance that more than `most_views` views show is fitted to that many of them, spread evenly over their order.
+
     Args:
         regions: D regions. Those matched to nothing hide leaves as well.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
+        starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
         photos: view index -> (H, W, 3) uint8 RGB, `list.__getitem__` for photos in memory; each is asked for once. The
             texture of the leaves then says more of their shape between the outlines, see docs/surfaces.md.
+        most_views: at least 2.
         jackknife: fit each leaf again without each of its views in turn; deviations come from how much that changes it.
             Takes as many times longer as there are views.
         progress: show a progress bar over the instances.
@@ -91,8 +100,15 @@ def fit_surfaces(
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
+        kept = spread_views(views, most_views)
+        members = members.select(torch.isin(members.view_index, kept))
         stacks[instance] = _stack(members, cameras, frames, instance=instance)
-        stacks[instance], fit = _fit_from_hull(stacks[instance], members, cameras, free=free)
+        if instance in starts and starts[instance].exists:
+            start = starts[instance].coefficients.numpy()
+            fits[instance] = fit_patch(stacks[instance], start, num_steps=NUM_WARM_STEPS)
+            continue
+        good_iou = GOOD_IOU if len(kept) == len(views) else LEAST_IOU
+        stacks[instance], fit = _fit_from_hull(stacks[instance], members, cameras, free=free, good_iou=good_iou)
         if fit is None:
             surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
@@ -113,6 +129,13 @@ def _ids(instance_ids: Tensor) -> list[int]:
     return instance_ids[instance_ids > 0].unique().tolist()
 
 
+def spread_views(views: Tensor, most: int) -> Tensor:
+    """At most so many of the views (S,), the first one and others at even distances in their order."""
+    if len(views) <= most:
+        return views
+    return views[torch.arange(most) * len(views) // most]
+
+
 def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
     """V frames (H, W) int32: the instance that each pixel shows, higher numbers for unmatched regions, 0 = none."""
     last = int(instance_ids.max()) if len(instance_ids) else 0
@@ -122,11 +145,12 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
 
 
 def _fit_from_hull(
-    masks: MaskStack, members: Regions, cameras: Cameras, *, free: list[Tensor]
+    masks: MaskStack, members: Regions, cameras: Cameras, *, free: list[Tensor], good_iou: float
 ) -> tuple[MaskStack, PatchFit | None]:
     """The best of the fits from several starts, which are tried until one explains the masks; and the masks it is to.
 
     The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
+    Very many views leave a hull that shows how the blade lies: there a lower IoU is good.
     """
     best, best_score, is_good, is_checked = None, -np.inf, False, False
     for config in (HULL, HULL_BY_VOTE):
@@ -147,7 +171,7 @@ def _fit_from_hull(
             iou = _median_iou(masks, fit.coefficients, offsets=np.nan_to_num(fit.offsets_px))
             score = iou - AREA_COST * np.log(measure_sizes(fit.coefficients)[0])
             if score > best_score + LEAST_GAIN:
-                best, best_score, is_good = fit, score, iou > GOOD_IOU
+                best, best_score, is_good = fit, score, iou > good_iou
         if is_good:
             break
     return masks, best
@@ -194,13 +218,16 @@ def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
 def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
     """The outlines of one instance; its masks of one view are united."""
     views = members.view_index.unique().tolist()
-    masks = []
-    for view in views:
-        ones = torch.ones_like(members.view_index)
-        masks.append(members.label_map(view, ones, cameras.sizes[view].tolist()).numpy() > 0)
-    others = [np.where(frames[view] == instance, 0, frames[view]) for view in views]
+    united = [members.union((members.view_index == view).nonzero()[:, 0].tolist()) for view in views]
     px_from_world = cameras.K[views] @ torch.cat((cameras.R[views], cameras.t[views][:, :, None]), 2)
-    return stack_masks(masks, others, views, px_from_world=px_from_world.numpy())
+    return stack_masks(
+        [mask.numpy() for _, mask in united],
+        [frames[view] for view in views],
+        views,
+        px_from_world=px_from_world.numpy(),
+        mask_corners=[box[:2] for box, _ in united],
+        own=instance,
+    )
 
 
 def _fit_again(

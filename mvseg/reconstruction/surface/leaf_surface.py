@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 import torch
 import trimesh
+from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.reconstruction.surface.leaf_patch import (
@@ -24,6 +25,7 @@ from mvseg.scene import Cameras
 
 MESH_SHAPE = (64, 17)
 LEAST_CREDIBLE_IOU = 0.7
+BESIDE = 2  # pixels around a drawn surface: OpenCV draws polygons a little too large
 STEP = 1e-4  # of the coefficients' spread, for differences
 
 
@@ -181,17 +183,39 @@ class LeafSurface:
 
         Parts behind a camera are left out.
         """
+        masks = []
+        for (width, height), ((x1, y1, x2, y2), part) in zip(
+            cameras.sizes.tolist(), self.project_parts(cameras), strict=True
+        ):
+            mask = torch.zeros(height, width, dtype=torch.bool)
+            mask[y1:y2, x1:x2] = torch.from_numpy(part)
+            masks.append(mask)
+        return masks
+
+    def project_parts(self, cameras: Cameras) -> list[tuple[tuple[int, int, int, int], NDArray[np.bool_]]]:
+        """V boxes x1, y1, x2, y2 that hold what `project` shows, and these parts (y2 - y1, x2 - x1) of its masks."""
         sizes = cameras.sizes.tolist()
+        nothing = (0, 0, 0, 0), np.zeros((0, 0), bool)
         if not self.exists:
-            return [torch.zeros(height, width, dtype=torch.bool) for width, height in sizes]
+            return [nothing] * len(sizes)
         points = self.points()
         px, depth = cameras.project(points.reshape(-1, 3))
-        masks = []
-        for view, (width, height) in enumerate(sizes):
+        parts = []
+        for view, size in enumerate(sizes):
             is_ahead = (grid_quads(depth[view].reshape(*MESH_SHAPE, 1).numpy()) > 0).all((1, 2))
             quads = grid_quads(px[view].reshape(*MESH_SHAPE, 2).numpy())[is_ahead]
-            masks.append(torch.from_numpy(draw_polygons(quads, (width, height), np.zeros(2)) >= 0.5))
-        return masks
+            if not len(quads):
+                parts.append(nothing)
+                continue
+            low = np.clip(np.floor(quads.min((0, 1))) - BESIDE, 0, size).astype(int)
+            high = np.clip(np.ceil(quads.max((0, 1))) + BESIDE, 0, size).astype(int)
+            (width, height), corner = (high - low).tolist(), low.astype(float)
+            if width == 0 or height == 0:
+                parts.append(nothing)
+                continue
+            shown = draw_polygons(quads, (width, height), corner) >= 0.5
+            parts.append(((*low.tolist(), *high.tolist()), shown))
+        return parts
 
 
 def measure_sizes(coefficients: Floats) -> tuple[float, float, float]:

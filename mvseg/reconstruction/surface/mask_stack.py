@@ -117,25 +117,35 @@ class MaskStack:
 
 
 def stack_masks(
-    masks: Sequence[NDArray[np.bool_]], others: Sequence[Labels], views: Sequence[int], *, px_from_world: Floats
+    masks: Sequence[NDArray[np.bool_]],
+    others: Sequence[Labels],
+    views: Sequence[int],
+    *,
+    px_from_world: Floats,
+    mask_corners: Sequence[tuple[int, int]] | None = None,
+    own: int = 0,
 ) -> MaskStack:
     """The outlines of one leaf.
 
     Args:
-        masks: S full frames (H, W) of its own pixels; each with at least one.
+        masks: S frames of its own pixels, each with at least one: full ones (H, W), or parts (h, w) of these.
         others: S full frames (H, W) with the ids (> 0) of other instances, 0 elsewhere.
         views: the view index of each.
         px_from_world: (S, 3, 4), pixel centres at half integers.
+        mask_corners: x, y of the top-left pixel of each mask that is a part.
+        own: the id of the leaf itself, which hides nothing, in `others`.
     """
+    mask_corners = [(0, 0)] * len(masks) if mask_corners is None else mask_corners
     margin = round(MARGIN * mask_enlargement(np.array([mask.sum() for mask in masks])))
     corners, shapes, blurs, insides, hiding, edges = [], [], [], [], [], []
-    for mask, other in zip(masks, others, strict=True):
+    for mask, (left, top), other in zip(masks, mask_corners, others, strict=True):
         rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        (y1, y2), (x1, x2) = (rows[0], rows[-1] + 1), (columns[0], columns[-1] + 1)
-        crop = np.pad(mask[y1:y2, x1:x2], margin)
-        around = _cut(other, (x1 - margin, y1 - margin), (crop.shape[1], crop.shape[0]))
+        crop = np.pad(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], margin)
+        x1, y1 = left + int(columns[0]) - margin, top + int(rows[0]) - margin
+        around = _cut(other, (x1, y1), (crop.shape[1], crop.shape[0]))
+        around[around == own] = 0
         blurred = cv2.GaussianBlur(crop.astype(np.float32), (0, 0), BLUR_PX)
-        corner = np.array([x1 - margin, y1 - margin], float)
+        corner = np.array([x1, y1], float)
         corners.append(corner)
         shapes.append(crop.shape)
         blurs.append(blurred.ravel())

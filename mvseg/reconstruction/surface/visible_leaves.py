@@ -19,11 +19,13 @@ class VisibleLeaf:
 
     Attributes:
         instance: its id.
-        mask: (H, W) bool, pixels that it covers and no nearer surface does.
+        box: x1, y1, x2, y2 of the part of the frame that holds it.
+        mask: (y2 - y1, x2 - x1) bool, pixels that it covers and no nearer surface does.
         share: of all the pixels that it covers.
     """
 
     instance: int
+    box: tuple[int, int, int, int]
     mask: NDArray[np.bool_]
     share: float
 
@@ -46,12 +48,14 @@ def visible_leaves(surfaces: Mapping[int, LeafSurface], cameras: Cameras, view: 
         return
     middles = torch.stack([surface.points().reshape(-1, 3).mean(0) for surface in shown.values()])
     _, depth = camera.project(middles)
-    taken: NDArray[np.bool_] | None = None
+    width, height = camera.sizes[0].tolist()
+    taken = np.zeros((height, width), bool)
     for index in depth[0].argsort(stable=True).tolist():
         instance = list(shown)[index]
-        covered = shown[instance].project(camera)[0].numpy()
-        taken = np.zeros_like(covered) if taken is None else taken
-        mask = covered & ~taken
+        ((x1, y1, x2, y2), covered) = shown[instance].project_parts(camera)[0]
+        taken_here = taken[y1:y2, x1:x2]
+        mask = covered & ~taken_here
         if mask.any():
-            yield VisibleLeaf(instance=instance, mask=mask, share=float(mask.sum() / covered.sum()))
-        taken = taken | covered
+            share = float(mask.sum() / covered.sum())
+            yield VisibleLeaf(instance=instance, box=(x1, y1, x2, y2), mask=mask, share=share)
+        taken_here |= covered
