@@ -21,6 +21,7 @@ import json
 import sys
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,12 +42,12 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import undistort
-from mvseg.formats.photos import load_photos
+from mvseg.formats.photos import load_photos, read_photo
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
-from mvseg.pipeline import hear_witnesses
+from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.data import SampleList, list_samples, read_sample
@@ -160,7 +161,9 @@ def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dic
         for row in rows:
             proposals, matching = build_model(args, row).find_regions(photos, scene.cameras)
             if row.endswith("witnesses"):
-                proposals, matching, *_ = hear_witnesses(scene, proposals, matching)
+                proposals, matching, _ = hear_witnesses(
+                    proposals, matching, cameras=scene.cameras, photos=partial(read_photo, scene)
+                )
             detections[row] += annotate(proposals, scene.cameras.sizes.tolist(), num_images)
             totals[row].update(count_found(proposals, matching.instance_ids, truth))
         num_images += len(photos)

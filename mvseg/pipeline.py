@@ -39,8 +39,6 @@ if TYPE_CHECKING:
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
 
-ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
-
 
 def run_scene(
     folder: Path,
@@ -84,10 +82,12 @@ def run_scene(
             detections, matching = detect_regions(scene, config, keep=keep, prune=True, progress=progress)
         if config.detect.witnesses:
             with _timed(seconds, "witnesses"):
-                detections, matching, from_views, starts = hear_witnesses(
-                    scene, detections, matching, progress=progress
+                from mvseg.multiview.witnesses import hear_witnesses
+
+                detections, matching, starts = hear_witnesses(
+                    detections, matching, cameras=scene.cameras, photos=partial(read_photo, scene), progress=progress
                 )
-        regions, scores = detections.regions, detections.scores
+        regions, scores, from_views = detections.regions, detections.scores, detections.from_views
     else:
         with _timed(seconds, "match"):
             matching = match_regions(regions, scene.cameras, config.match, progress=progress)
@@ -225,48 +225,6 @@ def _look(
             names.add(path.name)
         found.append(shown)
     return found, names
-
-
-def hear_witnesses(
-    scene: Scene, detections: Proposals, matching: Matching, *, progress: bool = False
-) -> tuple[Proposals, Matching, torch.Tensor, dict[int, LeafSurface]]:
-    """Detections as the other views correct them, see `revise_masks`.
-
-    Args:
-        scene: with photos.
-        detections: D detections.
-        matching: of these.
-        progress: show progress bars.
-
-    Returns:
-        D' detections and their matching; (D',) bool, the masks that only the other views show, which have the mean
-        detection score of their instance; and {instance id: surface}, what these masks were judged by.
-    """
-    from mvseg.multiview.proposals import Proposals
-    from mvseg.multiview.witnesses import revise_masks
-    from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
-        surfaces = fit_surfaces(
-            detections.regions, matching.instance_ids, scene.cameras, most_views=ROUGH_VIEWS, progress=progress
-        )
-    photos = partial(read_photo, scene)
-    revised = revise_masks(
-        detections.regions, matching, surfaces, cameras=scene.cameras, photos=photos, progress=progress
-    )
-    from_views = revised.source < 0
-    ids = revised.matching.instance_ids
-    scores, classes = detections.scores[revised.source], detections.classes[revised.source]
-    for number in ids[from_views].unique().tolist():
-        of_instance = revised.old_ids[number - 1] == matching.instance_ids
-        scores[from_views & (ids == number)] = detections.scores[of_instance].mean()
-        classes[from_views & (ids == number)] = detections.classes[of_instance].mode()[0]
-    corrected = Proposals(
-        regions=revised.regions, boxes=revised.regions.boxes.float(), scores=scores, classes=classes
-    )
-    starts = {number: surfaces[old] for number, old in enumerate(revised.old_ids.tolist(), start=1)}
-    return corrected, revised.matching, from_views, starts
 
 
 def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:

@@ -8,6 +8,7 @@ import math
 import shutil
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,8 @@ from mvseg.matching.result import Matching
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.plant_box import crop_cameras, place_crops, plant_boxes
 from mvseg.multiview.proposals import Proposals
-from mvseg.pipeline import detect_regions, hear_witnesses
+from mvseg.multiview.witnesses import hear_witnesses
+from mvseg.pipeline import detect_regions
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
 from mvseg.results.provenance import describe_run
@@ -192,9 +194,11 @@ def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
     )
     scores = torch.linspace(0.4, 0.9, count)
     found = Proposals(regions=regions, boxes=regions.boxes.float(), scores=scores, classes=regions.labels + 3)
-    corrected, rematched, from_views, starts = hear_witnesses(leafy.scene, found, matching)
+    photos = partial(read_photo, leafy.scene)
+    corrected, rematched, starts = hear_witnesses(found, matching, cameras=leafy.scene.cameras, photos=photos)
     assert len(corrected.regions) == count + 1
-    (new,) = from_views.nonzero()[:, 0].tolist()
+    assert corrected.from_views is not None
+    (new,) = corrected.from_views.nonzero()[:, 0].tolist()
     assert (int(corrected.regions.view_index[new]), int(rematched.instance_ids[new])) == (2, 1)
     assert float(corrected.scores[new]) == pytest.approx(float(scores[regions.labels == 1].mean()))
     assert torch.equal(corrected.classes, rematched.instance_ids + 3)
@@ -211,11 +215,11 @@ def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
         regions=corrected.regions,
         matching=rematched,
         detection_scores=corrected.scores,
-        from_other_views=from_views,
+        from_other_views=corrected.from_views,
     )
     save_result(result, tmp_path / "out", {})
     written = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
-    assert [entry["from_other_views"] for entry in written] == from_views.tolist()
+    assert [entry["from_other_views"] for entry in written] == corrected.from_views.tolist()
 
 
 @pytest.mark.slow

@@ -7,6 +7,7 @@ import math
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -18,12 +19,13 @@ from mvseg.detectors.weights_file import Description, encode_weights, read_weigh
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.atomic import lock_folder, write_text_whole, write_whole
-from mvseg.formats.photos import check_photos
+from mvseg.formats.photos import check_photos, read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.matching.match import check_baselines
 from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.multiview.plant_box import boxes_to_look_at
-from mvseg.pipeline import detect_regions, hear_witnesses
+from mvseg.multiview.witnesses import hear_witnesses
+from mvseg.pipeline import detect_regions
 from mvseg.scene import Scene
 from mvseg.training.config import TrainConfig
 from mvseg.training.loop import train
@@ -173,7 +175,11 @@ def find_leaves(
     found = []
     for name, scene in scenes.items():
         detections, matching = detect_regions(scene, run, keep=keep, progress=progress)
-        revised, rematched, from_views, _ = hear_witnesses(scene, detections, matching, progress=progress)
+        photos = partial(read_photo, scene)
+        revised, rematched, _ = hear_witnesses(
+            detections, matching, cameras=scene.cameras, photos=photos, progress=progress
+        )
+        assert revised.from_views is not None  # the other views were heard
         whole, boxes = torch.nn.functional.pad(scene.cameras.sizes, (2, 0)), None
         if run.detect.crop == "auto":
             boxes = boxes_to_look_at(revised.regions, rematched, scene.cameras, longest=size)
@@ -188,7 +194,7 @@ def find_leaves(
                 found=detections.regions,
                 revised=revised.regions,
                 confirmed=confirmed,
-                num_kept=int((~from_views).sum()),
+                num_kept=int((~revised.from_views).sum()),
             )
         )
     return found

@@ -15,6 +15,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.proposals import Proposals, gather_proposals
+from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.scene import Cameras
 
 
@@ -34,6 +35,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        survivors again. Masks that resemble no map form one more group.
     4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
        better one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
+    5. With `witnesses`, surfaces fitted to what is matched correct it: for leaves only (`mvseg.multiview.witnesses`).
 
     Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
     here, where `match` selects "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the
@@ -50,6 +52,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         scales: factors of the size at which the detector sees photos; at several, what most of them show scores best
             (`mvseg.detectors.scales`).
         match: how regions are matched; a given number of instances applies to each class.
+        witnesses: let the other views correct what is found. All photos are then in memory, 3 bytes a pixel.
 
     Raises:
         InputError: the detector has no mask head.
@@ -65,6 +68,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         proposals_per_view: int = 300,
         scales: Sequence[float] = (1.0,),
         match: MatchConfig = MatchConfig(),
+        witnesses: bool = False,
     ) -> None:
         if not (isinstance(detector, GeneralizedRCNN) and detector.roi_heads.has_mask()):
             raise InputError(f"{type(detector).__name__} has no mask head, expected a torchvision Mask R-CNN")
@@ -75,6 +79,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         self.proposals_per_view = proposals_per_view
         self.scales = tuple(scales)
         self.match = match
+        self.witnesses = witnesses
         self.train(detector.training)
 
     def forward(
@@ -95,6 +100,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`
             (probabilities, to be cut at 0.5); with cameras also `instance_ids` (int64, the same number for the same
             instance in every view, -1 = matched to nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
+            With witnesses, masks are 0 or 1, and `from_views` (bool) marks those that only the other views show.
 
         Raises:
             InputError: fewer than two images, not one camera per image, or an image of another size than its camera.
@@ -103,6 +109,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return super().forward(images, targets)
         sizes = [[image.shape[-1], image.shape[-2]] for image in images]
         _check_cameras(cameras, sizes)
+        if self.witnesses:
+            return _result_dicts(*self.find_regions(images, cameras), sizes=sizes, device=images[0].device)
         with torch.no_grad():
             detections = [self._propose(image) for image in images]
         # Pixel counts need single precision.
@@ -123,17 +131,25 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             progress: show progress bars while the detections are matched.
 
         Returns:
-            The D detections that are kept, on the CPU, ordered by view and by falling score, and their matching.
+            The D detections that are kept, on the CPU, ordered by view and by falling score (with witnesses: by view
+            and instance), and their matching.
 
         Raises:
             InputError: as `forward`.
         """
-        detections, sizes = [], []
+        detections, sizes, photos = [], [], []
         for image in images:
             detections.append(self.detect(image))
             sizes.append([image.shape[-1], image.shape[-2]])
+            if self.witnesses:
+                photos.append((255 * image.detach().cpu()).round().to(torch.uint8).permute(1, 2, 0).numpy())
         _check_cameras(cameras, sizes)
-        return self.match_detections(detections, cameras, progress=progress)
+        proposals, matching = self.match_detections(detections, cameras, progress=progress)
+        if self.witnesses:
+            proposals, matching, _ = hear_witnesses(
+                proposals, matching, cameras=cameras, photos=photos.__getitem__, progress=progress
+            )
+        return proposals, matching
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:
@@ -196,6 +212,30 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             results.append(result | ids)
             start += len(proposals["boxes"])
         return results
+
+
+def _result_dicts(
+    proposals: Proposals, matching: Matching, *, sizes: list[list[int]], device: torch.device
+) -> list[dict[str, Tensor]]:
+    """torchvision's result dicts of what is left when the other views were heard, best score first."""
+    assert proposals.from_views is not None  # they were heard
+    results = []
+    for view, (width, height) in enumerate(sizes):
+        here = (proposals.regions.view_index == view).nonzero()[:, 0]
+        here = here[proposals.scores[here].argsort(descending=True, stable=True)]
+        masks = [proposals.regions.mask(index, width, height) for index in here.tolist()]
+        empty = torch.zeros((0, height, width))
+        result = {
+            "boxes": proposals.boxes[here],
+            "labels": proposals.classes[here],
+            "scores": proposals.scores[here],
+            "masks": (torch.stack(masks).float() if masks else empty)[:, None],
+            "instance_ids": matching.instance_ids[here],
+            "match_scores": matching.match_scores[here],
+            "from_views": proposals.from_views[here],
+        }
+        results.append({key: value.to(device) for key, value in result.items()})
+    return results
 
 
 def _check_cameras(cameras: Cameras, sizes: list[list[int]]) -> None:

@@ -6,6 +6,7 @@ photo can by itself: which piece of a leaf is the leaf, which mask is none, and 
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
@@ -15,9 +16,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
+from mvseg.errors import InputWarning
 from mvseg.matching.result import SURE, Matching, count_sure_views
 from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.multiview.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.multiview.proposals import Proposals
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.visible_leaves import VisibleLeaf, visible_leaves
 from mvseg.regions import Regions, mask_box, stack_regions
@@ -31,6 +35,7 @@ AGREES = 0.5  # IoU of a mask with what its surface shows, from which it stays a
 LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for that part to become a mask
 LEAST_PIXELS = 64  # of that part
 LEAST_COLORED = 0.8  # of it, that have the colour of leaves
+ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
 SURE_VIEWS = 4  # of an instance whose masks tell that colour
 
 
@@ -62,6 +67,45 @@ class _Found:
     is_own: bool
     box: Box
     crop: Tensor
+
+
+def hear_witnesses(
+    proposals: Proposals, matching: Matching, *, cameras: Cameras, photos: Photos, progress: bool = False
+) -> tuple[Proposals, Matching, dict[int, LeafSurface]]:
+    """Detections as the other views correct them: surfaces are fitted to them, and they are revised as these say.
+
+    Args:
+        proposals: D detections.
+        matching: of these.
+        cameras: V cameras.
+        photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view.
+        progress: show progress bars.
+
+    Returns:
+        D' detections with `from_views`, on the CPU, and their matching, see `revise_masks`; a mask that only the other
+        views show has the mean detection score of its instance. And {instance id: surface}, what they were judged by.
+    """
+    regions, ids = proposals.regions.to("cpu"), matching.instance_ids.cpu()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
+        surfaces = fit_surfaces(regions, ids, cameras.to("cpu"), most_views=ROUGH_VIEWS, progress=progress)
+    revised = revise_masks(regions, matching, surfaces, cameras=cameras.to("cpu"), photos=photos, progress=progress)
+    from_views, new_ids = revised.source < 0, revised.matching.instance_ids
+    old_scores, old_classes = proposals.scores.cpu(), proposals.classes.cpu()
+    scores, classes = old_scores[revised.source], old_classes[revised.source]
+    for number in new_ids[from_views].unique().tolist():
+        of_instance = revised.old_ids[number - 1] == ids
+        scores[from_views & (new_ids == number)] = old_scores[of_instance].mean()
+        classes[from_views & (new_ids == number)] = old_classes[of_instance].mode()[0]
+    corrected = Proposals(
+        regions=revised.regions,
+        boxes=revised.regions.boxes.float(),
+        scores=scores,
+        classes=classes,
+        from_views=from_views,
+    )
+    judged_by = {number: surfaces[old] for number, old in enumerate(revised.old_ids.tolist(), start=1)}
+    return corrected, revised.matching, judged_by
 
 
 def revise_masks(

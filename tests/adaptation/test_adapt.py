@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -51,10 +52,8 @@ def trained(plant: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainConfig]:
         ones = torch.ones(count)
         return Proposals(regions=regions, boxes=regions.boxes.float(), scores=ones, classes=ones.long()), matching
 
-    def hear(
-        _: Scene, found: Proposals, matching: Matching, **__: object
-    ) -> tuple[Proposals, Matching, torch.Tensor, dict[int, LeafSurface]]:
-        return found, matching, torch.zeros(len(found.regions), dtype=torch.bool), {}
+    def hear(found: Proposals, matching: Matching, **_: object) -> tuple[Proposals, Matching, dict[int, LeafSurface]]:
+        return replace(found, from_views=torch.zeros(len(found.regions), dtype=torch.bool)), matching, {}
 
     def train(config: TrainConfig) -> None:
         asked.append(config)

@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from functools import partial
+from pathlib import Path
+
 import pytest
 import torch
 from torchvision.models.detection import MaskRCNN, fasterrcnn_mobilenet_v3_large_320_fpn, maskrcnn_resnet50_fpn
@@ -7,13 +10,17 @@ from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.ops import box_iou
 
+from leafy_scene import write_leafy_scene
 from mvseg.detectors.mask_cut import decide_masks
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.photos import load_photos, read_photo
+from mvseg.matching.result import Matching
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.nms import cluster_aware_nms
 from mvseg.multiview.proposals import Proposals, gather_proposals
+from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from simulated_proposals import simulate_proposals
@@ -286,6 +293,38 @@ def test_nothing_found_is_an_empty_answer() -> None:
     results = MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
     assert [len(result["instance_ids"]) for result in results] == [0, 0, 0]
     assert results[0]["masks"].shape == (0, 1, 120, 160)
+
+
+def test_the_other_views_are_heard_where_that_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160)
+    missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
+    regions = leafy.regions.select(~missed)
+    ones = torch.ones(len(regions))
+    found = Proposals(regions=regions, boxes=regions.boxes.float(), scores=ones / 2, classes=ones.long())
+    matching = Matching(regions.labels, 0.9 * ones, num_instances=2, method="nview")
+    wrapped = MultiViewMaskRCNN(tiny_detector(), witnesses=True)
+    monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: (found, matching))
+    images, cameras = load_photos(leafy.scene), leafy.scene.cameras
+    results = wrapped(images, cameras=cameras)
+    assert [result["from_views"].tolist() for result in results].count([False, False]) == 4
+    assert sorted(results[2]["from_views"].tolist()) == [False, True]
+    shown = results[2]["masks"][results[2]["from_views"]][0, 0].bool()
+    true = leafy.regions.mask(int(missed.nonzero()), 160, 160)
+    assert float((true & shown).sum() / (true | shown).sum()) > 0.9
+    corrected, rematched = wrapped.find_regions(iter(images), cameras)
+    by_view = torch.cat([result["instance_ids"].sort().values for result in results])
+    assert torch.equal(rematched.instance_ids, by_view)
+    expected, *_ = hear_witnesses(found, matching, cameras=cameras, photos=partial(read_photo, leafy.scene))
+    assert torch.equal(corrected.regions.crops, expected.regions.crops)
+    assert {key: (value.dtype, value.shape[1:]) for key, value in results[0].items()} == {
+        "boxes": (torch.float32, (4,)),
+        "labels": (torch.int64, ()),
+        "scores": (torch.float32, ()),
+        "masks": (torch.float32, (1, 160, 160)),
+        "instance_ids": (torch.int64, ()),
+        "match_scores": (torch.float32, ()),
+        "from_views": (torch.bool, ()),
+    }
 
 
 def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
