@@ -117,24 +117,17 @@ class Regions:
         if index.dtype == torch.bool and len(index) != len(self):
             raise InputError(f"a bool index of {len(index)} for {len(self)} regions, expected one per region")
         keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        parts = self._parts()
-        crops = torch.cat([parts[number] for number in keep.tolist()]) if len(keep) else self.crops[:0]
+        ends = torch.stack((self.offsets[:-1][keep], self.offsets[1:][keep]), 1).tolist()
+        crops = torch.cat([self.crops[start:end] for start, end in ends]) if len(keep) else self.crops[:0]
         view_index, boxes, labels = self.view_index[keep], self.boxes[keep], self.labels[keep]
         return replace(self, view_index=view_index, boxes=boxes, crops=crops, labels=labels)
 
-    def pixels(self, max_per_region: int | None = None) -> tuple[Tensor, Tensor, Tensor]:
+    def pixels(self) -> tuple[Tensor, Tensor]:
         """Centres of the mask pixels.
 
-        Args:
-            max_per_region: masks of more pixels are thinned to a square lattice of at most about this many (at least
-                a quarter as many); None for all pixels.
-
         Returns:
-            xy (P, 2) float32, pixel centres at half integers; owner (P,) int64, the region of each; weight (P,)
-            float32, how many pixels each one stands for: the weights of a region sum to its area.
+            xy (P, 2) float32, pixel centres at half integers; owner (P,) int64, the region of each.
         """
-        if max_per_region is not None:
-            return self._thinned_pixels(max_per_region)
         flat = self.crops.nonzero()[:, 0]
         of_region = torch.stack((self.offsets[:-1], self.crop_sizes[:, 0], self.boxes[:, 0], self.boxes[:, 1]))
         start, width, x1, y1 = (torch.repeat_interleave(of, self.areas, output_size=len(flat)) for of in of_region)
@@ -143,29 +136,62 @@ class Regions:
         owner = torch.repeat_interleave(self.areas, output_size=len(flat))
         # one column after the other in memory: what works on all x, then on all y, is four times faster
         xy = torch.stack((local - down * width + x1, down + y1)).float().add_(0.5).T
-        return xy, owner, torch.ones(len(flat), device=self.device)
+        return xy, owner
 
-    def _thinned_pixels(self, most: int) -> tuple[Tensor, Tensor, Tensor]:
-        """See `pixels`; region by region, so that only the pixels of a lattice are looked at."""
+    def thin(self, most: int) -> tuple[Regions, Tensor, Tensor]:
+        """Masks of more than `most` pixels, thinned to a square lattice of at most about `most` points; a sliver that
+        misses every lattice point keeps all of its pixels.
+
+        Returns:
+            The masks of lattice points, each with the box (0, 0, columns, rows); (D, 2) float32, the centre of the
+            first lattice point; (D,) int64, the step of the lattice, pixels.
+        """
         steps = (self.areas / most).sqrt().ceil().long().clamp(min=1).tolist()
-        found, origin = [torch.zeros(0, 2, dtype=torch.int64, device=self.device)], []
-        for part, (x1, y1, x2, y2), step in zip(self._parts(), self.boxes.tolist(), steps, strict=True):
-            crop = part.reshape(y2 - y1, x2 - x1)
+        crops, boxes, origin = [self.crops[:0]], [], []
+        for index, (part, (x1, y1, x2, y2)) in enumerate(zip(self._parts(), self.boxes.tolist(), strict=True)):
+            crop, step = part.reshape(y2 - y1, x2 - x1), steps[index]
             row, column = -y1 % step, -x1 % step
-            on_lattice = crop[row::step, column::step].nonzero()
-            if not len(on_lattice):  # a sliver may miss every lattice point: then it keeps all of its pixels
-                row, column, step, on_lattice = 0, 0, 1, crop.nonzero()
-            found.append(on_lattice * step)
-            origin.append((y1 + row, x1 + column))
-        count = torch.tensor([len(each) for each in found[1:]], dtype=torch.int64, device=self.device)
-        owner = torch.repeat_interleave(count)
-        first = torch.tensor(origin, dtype=torch.int64, device=self.device).reshape(-1, 2)
-        xy = (torch.cat(found) + first[owner]).flip(1).T.contiguous().float().add_(0.5).T
-        return xy, owner, (self.areas / count.clamp(min=1)).float()[owner]
+            on_lattice = crop[row::step, column::step]
+            if step > 1 and not on_lattice.any():
+                row, column, steps[index], on_lattice = 0, 0, 1, crop
+            crops.append(on_lattice.flatten())
+            boxes.append((0, 0, on_lattice.shape[1], on_lattice.shape[0]))
+            origin.append((x1 + column + 0.5, y1 + row + 0.5))
+        box = torch.tensor(boxes, dtype=torch.int64, device=self.device).reshape(-1, 4)
+        first = torch.tensor(origin, dtype=torch.float32, device=self.device).reshape(-1, 2)
+        thinned = replace(self, boxes=box, crops=torch.cat(crops))
+        return thinned, first, torch.tensor(steps, dtype=torch.int64, device=self.device)
 
     def _parts(self) -> tuple[Tensor, ...]:
         """D views into `crops`, one per region, flat."""
         return self.crops.split(self.crop_sizes.prod(1).tolist())
+
+    def runs(self, longest: int) -> tuple[Tensor, Tensor, Tensor]:
+        """The mask pixels as runs along the rows of the image, of at most `longest` pixels.
+
+        Returns:
+            xy (P, 2) float32, the centre of the first pixel of each run; length (P,) int64, pixels; owner (P,) int64,
+            the region of each, ordered.
+        """
+        widths, heights = self.crop_sizes.unbind(1)
+        region = torch.repeat_interleave(heights)
+        row = torch.arange(len(region), device=self.device) - (heights.cumsum(0) - heights)[region]
+        left = self.offsets[region] + row * widths[region]  # of each row, in the flat crops
+        right = left + widths[region] - 1
+        starts, ends = self.crops.clone(), self.crops.clone()
+        starts[1:] &= ~self.crops[:-1]
+        ends[:-1] &= ~self.crops[1:]
+        starts[left], ends[right] = self.crops[left], self.crops[right]
+        first = starts.nonzero()[:, 0]
+        length = ends.nonzero()[:, 0] - first + 1
+        of_row = torch.searchsorted(left, first, right=True) - 1
+        x = first - left[of_row] + self.boxes[region[of_row], 0]
+        y = row[of_row] + self.boxes[region[of_row], 1]
+        pieces = (length + longest - 1) // longest
+        of_run = torch.repeat_interleave(pieces)
+        begin = longest * (torch.arange(len(of_run), device=self.device) - (pieces.cumsum(0) - pieces)[of_run])
+        xy = torch.stack((x[of_run] + begin, y[of_run])).float().add_(0.5).T
+        return xy, (length[of_run] - begin).clamp(max=longest), region[of_row][of_run]
 
     def spread_pixels(self, most: int) -> tuple[Tensor, Tensor]:
         """At most `most` pixels of each region, evenly spread over its pixels in reading order.

@@ -8,6 +8,7 @@ import torch
 import torchvision
 
 from mvseg.errors import InputError
+from mvseg.matching.samples import view_runs
 from mvseg.regions import IGNORE_LABEL, Regions, mask_box, masks_to_boxes, regions_from_label_maps
 from reference import spread_pixels_reference, thinned_pixels_reference
 
@@ -18,6 +19,13 @@ def random_maps(seed: int = 0) -> list[np.ndarray]:
     numbers = np.array([0, 0, 3, 700, 65534, IGNORE_LABEL], np.uint16)
     blocks = [generator.choice(numbers, (6, 8)), np.zeros((5, 5), np.uint16), generator.choice(numbers, (9, 4))]
     return [np.kron(block, np.ones((4, 3), np.uint16)) for block in blocks]
+
+
+def thinned_pixels(regions: Regions, most: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Where the lattice points of thinned masks are in the image, and the region of each."""
+    thinned, origin, step = regions.thin(most)
+    xy, owner = thinned.pixels()
+    return (xy - 0.5) * step[owner, None] + origin[owner], owner
 
 
 def test_label_maps_make_the_round_trip() -> None:
@@ -32,14 +40,28 @@ def test_label_maps_make_the_round_trip() -> None:
 def test_areas_and_pixels_count_what_the_masks_hold() -> None:
     maps = random_maps()
     regions = regions_from_label_maps(maps)
-    xy, owner, weight = regions.pixels()
+    xy, owner = regions.pixels()
     for index in range(len(regions)):
         mask = maps[int(regions.view_index[index])] == int(regions.labels[index])
         assert regions.areas[index] == mask.sum()
         expected = np.argwhere(mask)[:, ::-1] + 0.5
         np.testing.assert_array_equal(xy[owner == index].numpy(), expected)
         np.testing.assert_array_equal(regions.mask(index, mask.shape[1], mask.shape[0]).numpy(), mask)
-    assert (weight == 1).all()
+
+
+@pytest.mark.parametrize("longest", [1, 2, 16])
+def test_runs_are_the_pixels_of_the_masks(longest: int) -> None:
+    regions = regions_from_label_maps(random_maps(seed=1))
+    xy, length, owner = regions.runs(longest)
+    assert 1 <= int(length.min()) <= int(length.max()) <= longest
+    runs = zip(xy.tolist(), length.tolist(), owner.tolist(), strict=True)
+    expanded = [(region, x + step, y) for (x, y), count, region in runs for step in range(count)]
+    pixels, owner = regions.pixels()
+    assert expanded == [(region, x, y) for (x, y), region in zip(pixels.tolist(), owner.tolist(), strict=True)]
+    if longest == 16:  # no run could be longer
+        assert len(xy) < len(pixels) / 2
+    nothing = regions.select(torch.zeros(0, dtype=torch.int64))
+    assert [len(each) for each in nothing.runs(longest)] == [0] * 3
 
 
 def test_a_union_is_that_of_whole_frames() -> None:
@@ -56,11 +78,13 @@ def test_thinned_pixels_stand_for_the_whole_mask() -> None:
     maps[0][10:250, 20:380] = 1
     maps[0][299, 0:300] = 2  # a sliver that the lattice may miss
     regions = regions_from_label_maps(maps)
-    xy, owner, weight = regions.pixels(max_per_region=100)
+    xy, owner = thinned_pixels(regions, 100)
     counts = torch.bincount(owner)
     assert 25 <= counts[0] <= 130
     assert counts[1] >= 1
-    sums = torch.zeros(2).index_add(0, owner, weight)
+    runs = view_runs(regions, 100)[0][0]
+    torch.testing.assert_close(runs.pixels().xy, xy)
+    sums = torch.zeros(2).index_add(0, runs.owner, runs.weight)
     torch.testing.assert_close(sums, regions.areas.float())
     torch.testing.assert_close(xy[owner == 0].mean(0), torch.tensor([200.0, 130.0]), atol=10, rtol=0)
 
@@ -70,16 +94,15 @@ def test_thinned_and_spread_pixels_agree_with_full_frames(most: int) -> None:
     maps = random_maps(seed=3)
     maps[0][0, :] = 9  # a sliver, which a lattice may miss
     regions = regions_from_label_maps(maps)
-    thinned, owner, weight = regions.pixels(max_per_region=most)
+    thinned, owner = thinned_pixels(regions, most)
     spread, region = regions.spread_pixels(most)
     for index in range(len(regions)):
         mask = maps[int(regions.view_index[index])] == int(regions.labels[index])
         expected = thinned_pixels_reference(mask, most)
         np.testing.assert_array_equal(thinned[owner == index].numpy(), expected)
-        assert weight[owner == index].sum() == pytest.approx(mask.sum())
         np.testing.assert_array_equal(spread[region == index].numpy(), spread_pixels_reference(mask, most))
     nothing = regions.select(torch.zeros(0, dtype=torch.int64))
-    assert [len(each) for each in (*nothing.pixels(5), *nothing.spread_pixels(5))] == [0] * 5
+    assert [len(each) for each in (*thinned_pixels(nothing, 5), *nothing.spread_pixels(5))] == [0] * 4
 
 
 def test_label_maps_of_any_integer_type_give_the_same_regions() -> None:

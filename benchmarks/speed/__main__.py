@@ -1,5 +1,8 @@
 """Speed of every stage, and how it grows: `make bench`, or `python -m benchmarks.speed [--full] [--previous DIR]`
 
+Writes performance.json and performance.png into a folder, and its tables between two marks of the performance.md that
+lies there.
+
 Simulated plants with a segmenter's faults, one axis at a time: views, leaves, megapixels. Each scene runs in a process
 of its own, one thread, and with --previous the two versions of mvseg take turns. Figures are medians of CPU seconds,
 which others on the machine change least; wall seconds are in the JSON. Slopes are fitted: log cost against log (pairs
@@ -24,6 +27,7 @@ import torch
 
 from benchmarks.label_maps import visible_ids
 from benchmarks.speed.rivals import measure_rivals
+from benchmarks.speed.write_up import draw_plot, fit_slopes, table_lines, write_between
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
@@ -32,6 +36,7 @@ from mvseg.simulation.growth import grow_plant
 
 ROOT = Path(__file__).parents[2]
 Cell = tuple[int, int, float]  # views, leaves, megapixels
+PROPOSALS = 100  # of each view, for the loop in the base scene
 STAGES = ("load", "bytes", "affinity", "matching", "gather", "loop", "shapes", "pictures")
 BASE: Cell = (10, 16, 0.3)
 QUICK = {"views": (5, 20, 40), "leaves": (4, 32), "megapixels": (1.2, 4.8)}
@@ -72,14 +77,19 @@ def run_cell(scene: Path, checkout: Path, options: list[str]) -> dict[str, Any]:
     return record
 
 
-def run_shell(verb: str, checkout: Path, out: Path) -> tuple[float, float]:
+def run_shell(verb: str, checkout: Path) -> tuple[float, float]:
     """Wall and CPU seconds of `mvseg VERB` on the shipped plant."""
     environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
     program = "import sys; from mvseg.cli import main; sys.exit(main())"
     command = [sys.executable, "-P", "-c", program, verb, str(checkout / "mvseg" / "demo_plant"), "--quiet"]
-    before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
-    subprocess.run([*command, "--out", str(out / verb)], env=environment, capture_output=True, check=True)
-    wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    with tempfile.TemporaryDirectory() as out:
+        before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
+        done = subprocess.run(
+            [*command, "--out", str(Path(out) / verb)], env=environment, capture_output=True, text=True, check=False
+        )
+        wall, after = time.perf_counter() - start, resource.getrusage(resource.RUSAGE_CHILDREN)
+    if done.returncode:
+        raise SystemExit(f"mvseg {verb}: {done.stderr[-2000:]}")
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
@@ -90,7 +100,7 @@ def measure(args: argparse.Namespace, cache: Path) -> list[dict[str, Any]]:
     cells = list_cells(FULL if args.full else QUICK)
     for _ in range(args.rounds):
         for cell in cells:
-            options = ["--shapes", "--proposals", "100"] if cell == BASE else []
+            options = ["--shapes", "--proposals", str(PROPOSALS)] if cell == BASE else []
             for name, checkout in versions.items():
                 runs.setdefault((cell, name), []).append(run_cell(make_scene(cell, cache), checkout, options))
                 print(f"{cell} {name}", file=sys.stderr)
@@ -107,90 +117,21 @@ def measure(args: argparse.Namespace, cache: Path) -> list[dict[str, Any]]:
     for _ in range(args.rounds):
         for verb in ("match", "infer"):
             for name, checkout in versions.items():
-                shell.setdefault((name, verb), []).append(run_shell(verb, checkout, cache))
+                shell.setdefault((name, verb), []).append(run_shell(verb, checkout))
+                print(f"mvseg {verb} {name}", file=sys.stderr)
     for record in base_runs:
         for verb in ("match", "infer"):
             record["seconds"][f"mvseg {verb}"] = np.median(shell[record["version"], verb], 0).round(3).tolist()
     return records
 
 
-def fit_slopes(records: list[dict[str, Any]]) -> dict[str, float]:
-    """Exponent of the cost of each stage over all cells."""
-    slopes = {}
-    for stage in ("affinity", "matching", "pictures"):
-        cost = [record["seconds"][stage][1] for record in records]
-        pairs = [record["views"] * (record["views"] - 1) / 2 * record["labelled_px"] for record in records]
-        size = pairs if stage == "affinity" else [record["masks"] * record["views"] for record in records]
-        slopes[stage] = round(float(np.polyfit(np.log(size), np.log(cost), 1)[0]), 2)
-    return slopes
-
-
-def print_table(records: list[dict[str, Any]], rivals: dict[str, float]) -> None:
-    """Markdown: one row per cell, CPU seconds; "a / b" is now / previous."""
-    cells = list(dict.fromkeys(tuple(record["cell"]) for record in records))
-    of = {(tuple(record["cell"]), record["version"]): record for record in records}
-    shown = ("load", "affinity", "matching", "pictures")
-    print("| views | leaves | Mpx | masks | " + " | ".join(shown) + " | GB | ids |")
-    print("|---" * (6 + len(shown)) + "|")
-    for cell in cells:
-        now, previous = of[cell, "now"], of.get((cell, "previous"))
-        figures = []
-        for stage in shown:
-            both = [record["seconds"][stage][1] for record in (now, previous) if record]
-            figures.append(" / ".join(f"{seconds:.3f}" for seconds in both))
-        memory = " / ".join(f"{record['matching_GB']:.2f}" for record in (now, previous) if record)
-        ids = "" if previous is None else "same" if now["ids"] == previous["ids"] else "differ"
-        print(f"| {cell[0]} | {cell[1]} | {cell[2]} | {now['masks']} | {' | '.join(figures)} | {memory} | {ids} |")
-    base = [of[BASE, name] for name in ("now", "previous") if (BASE, name) in of]
-    print("\n| base scene | CPU s | wall s |\n|---|---|---|")
-    for stage in base[0]["seconds"]:
-        wall, cpu = (" / ".join(f"{record['seconds'][stage][n]:.3f}" for record in base) for n in (0, 1))
-        print(f"| {stage} | {cpu} | {wall} |")
-    for name, seconds in rivals.items():
-        print(f"| {name} | {seconds:.3f} | |")
-
-
-def draw_plot(records: list[dict[str, Any]], path: Path) -> None:
-    """CPU seconds along each axis, on logarithmic scales; the version before is dashed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), sharey=True)
-    for axis, (panel, title) in enumerate(zip(axes, ("views", "leaves", "megapixels"), strict=True)):
-        others = [n for n in range(3) if n != axis]
-        for version, style in (("now", "-"), ("previous", "--")):
-            on_axis = [
-                record
-                for record in records
-                if record["version"] == version and all(record["cell"][n] == BASE[n] for n in others)
-            ]
-            on_axis.sort(key=lambda record: record["cell"][axis])
-            for color, stage in enumerate(("load", "affinity", "matching", "pictures")):
-                x = [record["cell"][axis] for record in on_axis]
-                y = [record["seconds"][stage][1] for record in on_axis]
-                label = stage if version == "now" else None
-                panel.plot(x, y, style, color=f"C{color}", marker="o", markersize=3, label=label)
-        panel.set(xscale="log", yscale="log", xlabel=title)
-        ticks = sorted({record["cell"][axis] for record in records})
-        panel.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
-        panel.minorticks_off()
-        panel.grid(alpha=0.3)
-    axes[0].set_ylabel("CPU seconds, one thread")
-    axes[2].legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="5 to 80 views, 4 to 64 leaves, up to 24 megapixels")
     parser.add_argument("--previous", type=Path, help="another checkout of mvseg, which takes turns with this one")
-    parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=2, help="of all scenes; the figures are medians")
     parser.add_argument("--cache", type=Path, help="folder for the rendered scenes")
-    parser.add_argument("--json", type=Path, default=Path("speed.json"))
-    parser.add_argument("--plot", type=Path, default=Path("speed.png"))
+    parser.add_argument("--into", type=Path, default=Path("results/speed"), help="folder for what is written")
     args = parser.parse_args()
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as scratch:
@@ -202,10 +143,15 @@ def main() -> None:
             rivals = measure_rivals(regions_from_label_maps(list(saved["true"])), cameras)
     versions = {record["version"] for record in records}
     slopes = {name: fit_slopes([record for record in records if record["version"] == name]) for name in versions}
-    args.json.write_text(json.dumps({"cells": records, "rivals": rivals, "slopes": slopes}, indent=1), encoding="utf-8")
-    print_table(records, rivals)
-    print("\nslopes:", json.dumps(slopes))
-    draw_plot(records, args.plot)
+    args.into.mkdir(parents=True, exist_ok=True)
+    report = json.dumps({"cells": records, "rivals": rivals, "slopes": slopes}, indent=1)
+    (args.into / "performance.json").write_text(report + "\n", encoding="utf-8")
+    lines = table_lines(records, rivals, slopes)
+    print("\n".join(lines))
+    draw_plot(records, args.into / "performance.png")
+    page = args.into / "performance.md"
+    if page.is_file():
+        page.write_text(write_between(page.read_text(encoding="utf-8"), lines), encoding="utf-8")
 
 
 if __name__ == "__main__":

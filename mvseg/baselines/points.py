@@ -65,7 +65,7 @@ def nearest_ray_graph(regions: Regions, cameras: Cameras) -> Affinity:
 def centroid_rays(regions: Regions, cameras: Cameras) -> tuple[Tensor, Tensor]:
     """The viewing rays through the centroids of D masks: their origins (D, 3) and unit directions (D, 3), float64,
     world frame. A mask without pixels has no ray (NaN)."""
-    xy, owner, _ = regions.pixels()
+    xy, owner = regions.pixels()
     total = torch.zeros(len(regions), 2, dtype=torch.float64, device=regions.device).index_add_(0, owner, xy.double())
     centroids = total / regions.areas[:, None]
     homogeneous = torch.nn.functional.pad(centroids, (0, 1), value=1.0)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from mvseg.matching.epipolar import Bins, binned_pairs, dilate, draw_points, view_samples
+from mvseg.matching.epipolar import Bins, binned_pairs, dilate
+from mvseg.matching.samples import draw_points, view_runs, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -51,8 +52,8 @@ def region_affinity(
     Returns:
         The graph. A region of weight 0 to all regions of the other views has no edge.
     """
-    samples, members = view_samples(regions)
-    senders = None if num_points is None else draw_points(samples, num_points, seed)
+    samples, members = view_runs(regions)
+    senders = None if num_points is None else draw_points(view_samples(regions)[0], num_points, seed)
     edges = [torch.zeros(2, 0, dtype=torch.int64, device=regions.device)]
     weights = [torch.zeros(0, device=regions.device)]
     for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):

@@ -12,7 +12,7 @@ behind one of the cameras; where both epipoles lie outside the images the two ag
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
 
 import torch
@@ -20,63 +20,16 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.matching.pencil import Pencil, epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
+from mvseg.matching.samples import Samples, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 BINS_PER_PIXEL = 2  # a bin is half a pixel wide, so that a line of two pixels is resolved
 MIN_BINS, MAX_BINS = 64, 8192
 PITCH_PIXELS = 1024  # of a view's pixels tell how thick a line is, at least about this many
+WIDE = 0.25  # change of the angle up to which it is even along a run; near an epipole and across the jump it is not
+SHARE = 4096  # of a pixel: what whole numbers count
 LINE_PX = 2.0  # thickness of an epipolar line (Sec. 3.1)
-
-
-@dataclass(frozen=True, eq=False)
-class Samples:
-    """P pixels of N regions of one view.
-
-    Attributes:
-        xy: (P, 2) float32, pixel centres.
-        owner: (P,) int64 in [0, N), the region of each pixel.
-        weight: (P,) float32, number of mask pixels that each stands for.
-        num_regions: N.
-    """
-
-    xy: Tensor
-    owner: Tensor
-    weight: Tensor
-    num_regions: int
-
-
-def view_samples(regions: Regions, max_per_region: int | None = None) -> tuple[list[Samples], list[Tensor]]:
-    """The pixels of the regions, view by view.
-
-    Args:
-        regions: D regions in V views.
-        max_per_region: see `Regions.pixels`.
-
-    Returns:
-        V `Samples`, and V int64 tensors: the index in `regions` of each region of the view, in the order of `owner`.
-    """
-    members = [(regions.view_index == view).nonzero()[:, 0] for view in range(regions.num_views)]
-    samples = []
-    for nodes in members:
-        xy, owner, weight = regions.select(nodes).pixels(max_per_region)
-        samples.append(Samples(xy=xy, owner=owner, weight=weight, num_regions=len(nodes)))
-    return samples, members
-
-
-def draw_points(samples: Sequence[Samples], num_points: int, seed: int) -> list[Samples]:
-    """`num_points` random pixels of each region, drawn with replacement as in the paper (Sec. 3.1); weights 1."""
-    generator = torch.Generator().manual_seed(seed)
-    drawn = []
-    for sample in samples:
-        counts = torch.bincount(sample.owner, minlength=sample.num_regions)
-        first = counts.cumsum(0) - counts
-        draw = torch.rand(sample.num_regions, num_points, generator=generator).to(sample.xy.device)
-        order = sample.owner.argsort(stable=True)
-        picks = order[(first[:, None] + (draw * counts[:, None]).long()).flatten()]
-        ones = torch.ones_like(sample.weight[picks])
-        drawn.append(replace(sample, xy=sample.xy[picks], owner=sample.owner[picks], weight=ones))
-    return drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +63,43 @@ class Bins:
         return max(self.half_line[1 - source], self.half_pixel[source])
 
 
+@dataclass(frozen=True, eq=False)
+class Spans:
+    """The half-planes of S samples of N regions of one view.
+
+    Attributes:
+        low: (S,) the smallest angle of each.
+        high: (S,) the largest; the same tensor for pixels.
+        owner: (S,) int64 in [0, N).
+        weight: (S,) float32, number of mask pixels.
+        num_regions: N.
+    """
+
+    low: Tensor
+    high: Tensor
+    owner: Tensor
+    weight: Tensor
+    num_regions: int
+
+
+def find_spans(pencil: Pencil, side: int, samples: Samples) -> Spans:
+    """The half-planes of samples of camera i (side 0) or j (side 1) of a pencil. Runs along which the angle may not
+    change evenly become pixels."""
+    low = high = pencil.angles(side, samples.ends_xy)
+    owner, weight = samples.owner, samples.weight
+    if samples.last_xy is not None:
+        first, last = low.split(len(owner))
+        low, high = torch.minimum(first, last), torch.maximum(first, last)
+        is_wide = high - low > WIDE
+        if is_wide.any():
+            pixels = samples.pixels(is_wide)
+            angles = pencil.angles(side, pixels.xy)
+            low, high = (torch.cat((ends[~is_wide], angles)) for ends in (low, high))
+            owner = torch.cat((owner[~is_wide], pixels.owner))
+            weight = torch.cat((weight[~is_wide], pixels.weight))
+    return Spans(low=low, high=high, owner=owner, weight=weight, num_regions=samples.num_regions)
+
+
 def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> Bins:
     """Bins of half a pixel over the angles of both views' pixels; lines are two pixels thick, as in the paper.
 
@@ -118,7 +108,7 @@ def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> 
 
     Args:
         pitches: angle per pixel in views i and j, see `mean_pitches`.
-        angles: (P,) and (Q,), the angles of the pixels of views i and j.
+        angles: angles of the pixels of views i and j, at least the smallest and the largest of each.
     """
     ends = torch.stack([torch.stack(torch.aminmax(part)) for part in angles]).tolist()
     low, high = min(end[0] for end in ends), max(end[1] for end in ends)
@@ -141,10 +131,29 @@ def bin_histogram(bins: Bins, angles: Tensor, samples: Samples) -> Tensor:
 
     Pixels whose half-plane lies outside the bins are left out.
     """
-    padded = bins.num_bins + 2  # an extra bin at either end collects what lies outside
-    flat = torch.add(samples.owner.int() * padded, bins.index(angles)).add_(1).long()  # int32: half the memory traffic
-    counts = samples.weight.new_zeros(samples.num_regions * padded).scatter_add_(0, flat, samples.weight)
-    return counts.reshape(samples.num_regions, padded)[:, 1:-1]
+    spans = Spans(
+        low=angles, high=angles, owner=samples.owner, weight=samples.weight, num_regions=samples.num_regions
+    )
+    return span_histogram(bins, spans)
+
+
+def span_histogram(bins: Bins, spans: Spans) -> Tensor:
+    """(N, B) float32: how many mask pixels of each region lie in each bin; those of a run are spread evenly over the
+    bins between its ends. Whole numbers count shares of pixels, so that empty bins are exactly 0."""
+    if spans.high is spans.low:
+        padded = bins.num_bins + 2  # an extra bin at either end collects what lies outside
+        # int32: half the memory traffic
+        flat = torch.add(spans.owner.int() * padded, bins.index(spans.low)).add_(1).long()
+        counts = spans.weight.new_zeros(spans.num_regions * padded).scatter_add_(0, flat, spans.weight)
+        return counts.reshape(spans.num_regions, padded)[:, 1:-1]
+    low, high = bins.index(spans.low), bins.index(spans.high)
+    share = torch.div(SHARE * spans.weight, high - low + 1).round_().long()
+    padded = bins.num_bins + 3  # a bin at either end collects what lies outside; one more where the last runs end
+    start = spans.owner * padded + low + 1
+    changes = share.new_zeros(spans.num_regions * padded)
+    changes.index_add_(0, start, share).index_add_(0, start + (high - low + 1), share.neg())
+    counts = changes.reshape(spans.num_regions, padded).cumsum(1)
+    return counts[:, 1:-2].float().mul_(1 / SHARE)
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,9 +198,10 @@ def binned_pairs(
     pencils = epipolar_pencils(cameras, pairs)
     every_pair = zip(pairs, pencils, _pair_pitches(samples, pairs, pencils), strict=True)
     for (i, j), pencil, pitches in tqdm(every_pair, "epipolar weights", len(pairs), unit="pair", disable=not progress):
-        angles = pencil.angles(0, samples[i].xy), pencil.angles(1, samples[j].xy)
-        bins = choose_bins(pitches, angles)
-        pixels = bin_histogram(bins, angles[0], samples[i]), bin_histogram(bins, angles[1], samples[j])
+        spans = find_spans(pencil, 0, samples[i]), find_spans(pencil, 1, samples[j])
+        ends = tuple(torch.stack((part.low.min(), part.high.max())) for part in spans)
+        bins = choose_bins(pitches, (ends[0], ends[1]))
+        pixels = span_histogram(bins, spans[0]), span_histogram(bins, spans[1])
         lines = pixels
         if senders is not None:
             first, second = (
@@ -212,19 +222,20 @@ def _pair_pitches(
         if not sides:
             continue
         planes = torch.stack([pencils[index].plane_from_px[side] for index, side in sides])
-        for (index, side), pitch in zip(sides, mean_pitches(planes, _thin(sample.xy)), strict=True):
+        for (index, side), pitch in zip(sides, mean_pitches(planes, _thin(sample)), strict=True):
             pitches[index][side] = pitch
     return [(first, second) for first, second in pitches]
 
 
-def _thin(xy: Tensor) -> Tensor:
+def _thin(samples: Samples) -> Tensor:
     """Of many pixels, about PITCH_PIXELS on a square lattice: enough for a mean, whatever their order."""
-    step = int((len(xy) / PITCH_PIXELS) ** 0.5)
+    step = int((float(samples.weight.sum()) / PITCH_PIXELS) ** 0.5)
     if step < 2:
-        return xy
+        return samples.pixels().xy
+    xy = samples.pixels(samples.xy[:, 1].int() % step == 0).xy
     column, row = (each.int() for each in xy.unbind(1))
     on_lattice = (column % step == 0) & (row % step == 0)
-    return xy[on_lattice] if on_lattice.any() else xy
+    return xy[on_lattice] if on_lattice.any() else samples.pixels().xy
 
 
 def dilate(counts: Tensor, radius: int) -> Tensor:

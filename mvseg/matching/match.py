@@ -25,7 +25,12 @@ MIN_VIEWS = 4  # with fewer there is no telling which one is wrong
 
 
 def match_regions(
-    regions: Regions, cameras: Cameras, config: MatchConfig = MatchConfig(), *, progress: bool = False
+    regions: Regions,
+    cameras: Cameras,
+    config: MatchConfig = MatchConfig(),
+    *,
+    residual_px: int | None = None,
+    progress: bool = False,
 ) -> Matching:
     """Give every region an instance id by epipolar region matching (Sec. 3.1).
 
@@ -36,6 +41,8 @@ def match_regions(
         regions: D regions in V views.
         cameras: V >= 2 cameras.
         config: method and options.
+        residual_px: the reprojection error, one of 1, 2, 4 and 8 pixels, where an earlier matching of these views has
+            found it (`Matching.residual_px`); None: it is estimated. Only "nview" makes use of it.
         progress: show progress bars.
 
     Returns:
@@ -44,8 +51,10 @@ def match_regions(
 
     Raises:
         InputError: fewer than two views, regions and cameras of different numbers of views, cameras that are all at
-            one place, or a region that reaches beyond the image of its camera.
+            one place, a region that reaches beyond the image of its camera, or another `residual_px`.
     """
+    if residual_px is not None and residual_px not in WIDENINGS:
+        raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, WIDENINGS))}")
     cameras = cameras.to(regions.device)
     check_views(regions, cameras)
     check_baselines(cameras)
@@ -54,7 +63,7 @@ def match_regions(
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
     method = config.resolved_method
     if method == "nview":
-        matching = match_nview(regions, cameras, affinity, progress=progress)
+        matching = match_nview(regions, cameras, affinity, residual_px=residual_px, progress=progress)
         if len(cameras) > 2 and len(regions):
             _warn_of_disagreement(matching, regions)
         return matching

@@ -6,7 +6,8 @@ import torch
 from torch import Tensor, nn
 
 from mvseg.errors import InputError
-from mvseg.matching.epipolar import Samples, bin_histogram, binned_pairs, dilate, view_samples
+from mvseg.matching.epipolar import binned_pairs, dilate, find_spans, span_histogram
+from mvseg.matching.samples import Samples, view_runs
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -17,7 +18,7 @@ LATTICE = 65_536  # pixels of an image that sample the area of a band, at most a
 class EpipolarAssignment(nn.Module):
     """Assigns each proposal to the instance whose epipolar map it resembles most (Eq. 5). Has no parameters.
 
-    Masks of more than 1024 pixels are thinned (see `Regions.pixels`); those of Mask R-CNN carry no more detail than
+    Masks of more than 1024 pixels are thinned (see `Regions.thin`); those of Mask R-CNN carry no more detail than
     28 x 28.
     """
 
@@ -83,8 +84,8 @@ def ruzicka_similarity(
     num_clusters = max(int(instance_ids.max()), 0) if len(instance_ids) else 0
     clustered = regions.select(instance_ids > 0)
     cluster_of = instance_ids[instance_ids > 0] - 1
-    sources, source_members = view_samples(clustered)
-    targets, target_members = view_samples(proposals, max_pixels)
+    sources, source_members = view_runs(clustered)
+    targets, target_members = view_runs(proposals, max_pixels)
     images = [_image_lattice(size, regions.device) for size in cameras.sizes.tolist()]
     on_mask = torch.zeros(len(proposals), num_clusters, device=regions.device)  # sum of bands over the mask
     on_image = torch.zeros(len(cameras), num_clusters, device=regions.device)  # sum of bands over the image
@@ -99,7 +100,7 @@ def ruzicka_similarity(
             count[target] += torch.bincount(clusters, minlength=num_clusters)
             received = pair.pixels[1 - side][sources[target].num_regions :]
             on_mask[target_members[target]] += received @ bands.T
-            image = bin_histogram(pair.bins, pair.pencil.angles(1 - side, images[target].xy), images[target])
+            image = span_histogram(pair.bins, find_spans(pair.pencil, 1 - side, images[target]))
             on_image[target] += (image @ bands.T)[0]
     count = count.clamp(min=1)
     sum_min = on_mask / count[proposals.view_index]
@@ -108,22 +109,26 @@ def ruzicka_similarity(
 
 
 def _concatenate(first: Samples, second: Samples) -> Samples:
-    """The regions of both sets in one, those of `first` first."""
+    """The runs of both sets of regions in one, those of `first` first."""
+    assert first.last_xy is not None
+    assert first.length is not None
+    assert second.last_xy is not None
+    assert second.length is not None
     return Samples(
-        xy=torch.cat((first.xy, second.xy)),
+        xy=torch.cat((first.xy.T, second.xy.T), 1).T,
         owner=torch.cat((first.owner, second.owner + first.num_regions)),
         weight=torch.cat((first.weight, second.weight)),
         num_regions=first.num_regions + second.num_regions,
+        last_xy=torch.cat((first.last_xy.T, second.last_xy.T), 1).T,
+        length=torch.cat((first.length, second.length)),
     )
 
 
 def _image_lattice(size: list[int], device: torch.device) -> Samples:
     """All pixels of an image as one region, thinned to at most about LATTICE of them."""
     width, height = size
-    step = max(1, round((width * height / LATTICE) ** 0.5))
-    x = torch.arange(step // 2, width, step, device=device) + 0.5
-    y = torch.arange(step // 2, height, step, device=device) + 0.5
-    xy = torch.cartesian_prod(x, y)
-    weight = torch.full((len(xy),), width * height / len(xy), device=device)
-    owner = torch.zeros(len(xy), dtype=torch.int64, device=device)
-    return Samples(xy=xy, owner=owner, weight=weight, num_regions=1)
+    crop = torch.ones(width * height, dtype=torch.bool, device=device)
+    box = torch.tensor([[0, 0, width, height]], device=device)
+    nothing = torch.zeros(1, dtype=torch.int64, device=device)
+    image = Regions(view_index=nothing, boxes=box, crops=crop, num_views=1, labels=nothing)
+    return view_runs(image, LATTICE)[0][0]

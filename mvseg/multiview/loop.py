@@ -52,11 +52,18 @@ def match_proposals(
         matching, num_instances = _match_classes(proposals.select(keep), cameras, match, progress=progress)
         if match.resolved_method != "symnmf":
             num_instances = {}
+        residual_px = matching.residual_px  # of the poses, which stay the same
 
         def rematch(kept: Tensor) -> Matching:
             caught.clear()
-            chosen = proposals.select(kept)
-            return _match_classes(chosen, cameras, match, num_instances=num_instances, progress=progress)[0]
+            return _match_classes(
+                proposals.select(kept),
+                cameras,
+                match,
+                num_instances=num_instances,
+                residual_px=residual_px,
+                progress=progress,
+            )[0]
 
         for _ in range(num_iterations):
             regions = proposals.regions.select(keep)
@@ -96,18 +103,27 @@ def _match_classes(
     match: MatchConfig,
     *,
     num_instances: Mapping[int, int] = MappingProxyType({}),
+    residual_px: int | None = None,
     progress: bool = False,
 ) -> tuple[Matching, dict[int, int]]:
     """Match proposals class by class; instances of different classes get different ids.
 
-    `num_instances` maps classes to their numbers of instances; those of the other classes are estimated. Returns the
-    matching and the number of instances of each class.
+    `num_instances` maps classes to their numbers of instances; those of the other classes are estimated.
+    For `residual_px` see `match_regions`. Returns the matching and the number of instances of each
+    class.
     """
     parts, indices, counts = [], [], {}
     for label in proposals.classes.unique().tolist():
         members = (proposals.classes == label).nonzero()[:, 0]
         config = replace(match, num_instances=num_instances.get(label) or match.num_instances)
-        parts.append(match_regions(proposals.regions.select(members), cameras, config, progress=progress))
+        part = match_regions(
+            proposals.regions.select(members),
+            cameras,
+            config,
+            residual_px=residual_px,
+            progress=progress,
+        )
+        parts.append(part)
         indices.append(members)
         counts[label] = parts[-1].num_instances
     if not parts:

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from mvseg.matching.affinity import region_affinity
+from mvseg.matching.samples import view_samples
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene
 from reference import affinity_reference
@@ -39,6 +40,16 @@ def test_agrees_with_drawn_lines_better_than_two_samplings_do(two_views: tuple[R
     assert difference.max() <= 0.12
     samplings = torch.stack([(drawn[a] - drawn[b])[pairs].abs().mean() for a in range(3) for b in range(a)])
     assert difference.mean() < samplings.mean()
+
+
+def test_runs_of_pixels_give_the_weights_of_pixels(
+    demo_scene: Scene, demo_regions: Regions, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ours = region_affinity(demo_regions, demo_scene.cameras).to_dense()
+    monkeypatch.setattr("mvseg.matching.affinity.view_runs", view_samples)
+    difference = (ours - region_affinity(demo_regions, demo_scene.cameras).to_dense()).abs()
+    assert difference.max() < 0.05
+    assert difference[ours > 0].mean() < 0.003
 
 
 def test_random_points_agree_with_all_points(two_views: tuple[Regions, Scene]) -> None:

@@ -19,10 +19,13 @@ from mvseg.matching.epipolar import (
     dilate,
     epipolar_bands,
     epipolar_map,
-    view_samples,
+    find_spans,
+    span_histogram,
 )
 from mvseg.matching.pencil import epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
+from mvseg.matching.samples import view_runs, view_samples
 from mvseg.multiview.assignment import ruzicka_similarity
+from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from reference import epipolar_map_reference, fundamental_reference
 from synthetic import arc_positions, ball_scene, cameras_at, moved
@@ -191,6 +194,42 @@ def test_histograms_hold_every_pixel_once() -> None:
 
 
 @pytest.mark.parametrize("name", RIGS)
+def test_runs_lie_in_the_bins_of_their_pixels(name: str) -> None:
+    scene, cameras = ball_scene(6, 2, seed=3), rig(name)
+    regions = scene.regions
+    runs, pixels = view_runs(regions)[0], view_samples(regions)[0]
+    pencil = epipolar_pencil(cameras, 0, 1)
+    for side in (0, 1):
+        assert len(runs[side].xy) < len(pixels[side].xy) / 3
+        torch.testing.assert_close(runs[side].pixels().xy, pixels[side].xy)
+        angles = pencil.angles(side, pixels[side].xy)
+        bins = choose_bins((pencil.pitch(side, pixels[side].xy),) * 2, (angles, angles))
+        expected = bin_histogram(bins, angles, pixels[side])
+        counts = span_histogram(bins, find_spans(pencil, side, runs[side]))
+        torch.testing.assert_close(counts.sum(1), expected.sum(1), rtol=1e-3, atol=0)
+        occupied, shown = dilate(expected, 1), dilate(counts, 1)
+        assert (shown >= occupied).all()
+        assert (shown != occupied).float().mean() < 0.01  # bins that a run crosses between two of its pixels
+        far = (counts.cumsum(1) - expected.cumsum(1)).abs().amax(1) / expected.sum(1)
+        assert far.max() < 0.06  # hardly any pixel is in another bin: balls of a few hundred pixels
+
+
+def test_runs_across_the_jump_and_near_an_epipole_count_as_pixels() -> None:
+    cameras = rig("one behind the other")
+    epipole = cameras.project(cameras.centers[1:])[0][0, 0].int().tolist()
+    labels = np.zeros((2, 240, 320), np.uint8)
+    labels[:, epipole[1] - 3 : epipole[1] + 3, epipole[0] - 40 : epipole[0] + 40] = 1
+    runs, pixels = (view(regions_from_label_maps(labels))[0][0] for view in (view_runs, view_samples))
+    pencil = epipolar_pencil(cameras, 0, 1)
+    spans, angles = find_spans(pencil, 0, runs), pencil.angles(0, pixels.xy)
+    bins = choose_bins((pencil.pitch(0, pixels.xy),) * 2, (angles, angles))
+    assert float((spans.high - spans.low).max()) <= 0.25
+    assert (spans.high == spans.low).sum() > 50
+    far = (span_histogram(bins, spans) - bin_histogram(bins, angles, pixels)).cumsum(1).abs().max()
+    assert far < 0.02 * len(angles)
+
+
+@pytest.mark.parametrize("name", RIGS)
 def test_epipolar_map_agrees_with_drawn_lines(name: str) -> None:
     """All pixels of a ball send out lines; the map and the drawing may differ only along the rim of a band."""
     scene = ball_scene(5, 3, seed=4)
@@ -222,7 +261,7 @@ def test_a_region_has_no_band_in_its_own_view_and_true_matches_lie_in_each_other
     regions = scene.regions
     for view in range(4):
         here = regions.select(regions.view_index == view)
-        xy, owner, _ = here.pixels()
+        xy, owner = here.pixels()
         bands = epipolar_bands(regions, scene.cameras, view=view, xy=xy)
         assert not bands[regions.view_index == view].any()
         for number, label in enumerate(here.labels.tolist()):

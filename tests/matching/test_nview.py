@@ -10,7 +10,9 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
+from mvseg.errors import InputError
 from mvseg.matching.affinity import region_affinity
+from mvseg.matching.match import match_regions
 from mvseg.matching.nview.cluster_scores import ClusterScores, members_of
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.label_rows import (
@@ -475,6 +477,30 @@ def test_large_pose_errors_are_measured_and_tolerated() -> None:
     assert matching.residual_px > 1
     assert matching.method == "nview"
     assert same_partition(matching.instance_ids, scene.regions.labels)
+
+
+def test_the_reprojection_error_may_be_known_from_an_earlier_matching(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = ball_scene(6, 6, seed=7, radius=0.1)
+    cameras = turned_a_little(scene.cameras, 0.008)
+    first, affinity = solve(scene.regions, cameras), region_affinity(scene.regions, cameras)
+    monkeypatch.setattr("mvseg.matching.nview.match_nview.row_tables", None)  # nothing is tried
+    again = match_nview(scene.regions, cameras, affinity, residual_px=first.residual_px)
+    assert torch.equal(again.instance_ids, first.instance_ids)
+    assert again.residual_px == first.residual_px
+    with pytest.raises(InputError, match="residual_px is 3, expected one of 1, 2, 4, 8"):
+        match_regions(scene.regions, cameras, residual_px=3)
+
+
+@pytest.mark.parametrize("angle", [0.004, 0.008, 0.02])
+def test_a_few_rays_tell_the_reprojection_error(angle: float, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = ball_scene(6, 6, seed=7, radius=0.1)
+    cameras = turned_a_little(scene.cameras, angle)
+    monkeypatch.setattr("mvseg.matching.nview.match_nview.PROBE_RAYS", 10**9)
+    everything = solve(scene.regions, cameras)
+    monkeypatch.setattr("mvseg.matching.nview.match_nview.PROBE_RAYS", 5 * len(scene.regions))
+    few = solve(scene.regions, cameras)
+    assert few.residual_px == everything.residual_px
+    assert torch.equal(few.instance_ids, everything.instance_ids)
 
 
 def test_where_the_views_agree_on_nothing_the_pairs_answer() -> None:

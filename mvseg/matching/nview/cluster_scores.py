@@ -215,12 +215,16 @@ class ClusterScores:
         start = run_starts(table.pixel[rows])
         if not len(start):
             return best
-        shown = table.rows_of_regions(view).count(members)  # rows vary fastest: the maximum runs over them
-        is_empty = table.labels[rows] == EMPTY
-        num_labels = (table.labels[rows] >= 0).sum(1, dtype=np.float32)
-        num_inside = num_labels + is_empty.sum(1, dtype=np.float32)
-        cost = self._empty_costs(members) @ is_empty.astype(np.float32).T
-        score = (shown * np.float32(1 + hidden) - cost - np.float32(hidden) * num_labels) / num_inside
+        score = table.rows_of_regions(view).count(members)  # rows vary fastest: the maximum runs over them
+        labels = table.labels[rows]
+        is_empty = (labels == EMPTY).T
+        num_inside = (labels >= EMPTY).sum(1, dtype=np.float32)
+        shares = np.empty((len(is_empty) + 1, len(labels)), np.float32)  # of the views inside: each empty one, labelled
+        np.divide(is_empty, num_inside, out=shares[:-1])
+        shares[-1] = 1 - is_empty.sum(0) / num_inside
+        costs = np.pad(self._empty_costs(members), ((0, 0), (0, 1)), constant_values=hidden)
+        score *= np.float32(1 + hidden) / num_inside
+        score -= costs @ shares
         pixel = table.pixel[rows][start] - pixels.start
         best[pixel] = np.maximum(np.maximum.reduceat(score, start, 1), np.float32(-hidden)).T
         return best
@@ -265,16 +269,16 @@ class ClusterScores:
         is_asked = np.zeros(int(clusters.max(initial=-1)) + 1, bool)
         is_asked[asked] = True
         rows = np.flatnonzero(is_asked[clusters][table.pixel_region][table.pixel])
-        cluster_of = np.append(clusters, [-1, -1])  # the last two for EMPTY and OUTSIDE
+        cluster_of = np.append(clusters, [-1, -1]).astype(np.int32)  # the last two for EMPTY and OUTSIDE
         empty = self._empty_costs(members_of(clusters, len(is_asked)))
         for block in blocks_of_runs(run_starts(table.pixel[rows]), len(rows)):
-            pixel, labels = table.pixel[rows[block]], table.labels[rows[block]]
+            pixel, labels = table.pixel[rows[block]], table.labels.take(rows[block], 0)
             region = table.pixel_region[pixel]
-            own = clusters[region]
-            gain = np.where(cluster_of[labels] == own[:, None], np.float32(1), -hidden)
+            own = cluster_of[region]
+            gain = np.where(cluster_of.take(labels) == own[:, None], np.float32(1), -hidden)
             np.copyto(gain, -empty[own], where=labels == EMPTY)
             is_inside = labels >= EMPTY
-            gain *= is_inside
+            np.copyto(gain, 0, where=~is_inside)
             yield _RowGains(
                 labels=labels, pixel=pixel, region=region, start=run_starts(pixel), gain=gain, is_inside=is_inside
             )

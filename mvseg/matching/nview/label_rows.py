@@ -5,7 +5,7 @@ or outside the image. These labels form a row. Most depths give the same row as 
 rows are left per pixel; everything later works on those.
 
 This is the one border between torch and NumPy in the N-view matcher: regions and cameras come in as tensors on any
-device, everything from the table on is NumPy.
+device, labels and everything from the table on are NumPy (which compares and looks up small integers much faster).
 """
 
 from __future__ import annotations
@@ -118,12 +118,19 @@ def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1, progress
 
 
 def row_tables(
-    regions: Regions, cameras: Cameras, *, widenings: Sequence[int], progress: bool = False
+    regions: Regions,
+    cameras: Cameras,
+    *,
+    widenings: Sequence[int],
+    rays: int | None = None,
+    progress: bool = False,
 ) -> Iterator[RowTable]:
-    """The table of each of several widenings, in ascending order; see `row_table`."""
+    """The table of each of several widenings, in ascending order; see `row_table`. `rays` of each region are swept, at
+    most; None: `rays_per_region`."""
+    regions, cameras = regions.to("cpu"), cameras.to("cpu")
     sizes = cameras.sizes.tolist()
     maps, grown_px = [_padded_labels(regions, view, size) for view, size in enumerate(sizes)], 0
-    xy, region = regions.spread_pixels(max(1, round(PIXELS * min(1, PLENTY / len(cameras)))))
+    xy, region = regions.spread_pixels(rays_per_region(len(cameras)) if rays is None else rays)
     for widen_px in widenings:
         boxes = [regions.boxes[regions.view_index == view] for view in range(len(cameras))]
         for labels, of_view in zip(maps, boxes, strict=True):
@@ -133,26 +140,30 @@ def row_tables(
         yield _sweep_views(sweep, regions, xy, region=region, title=f"rays, {widen_px} px" if progress else "")
 
 
+def rays_per_region(num_views: int) -> int:
+    """How many rays of each region are swept, at most."""
+    return max(1, round(PIXELS * min(1, PLENTY / num_views)))
+
+
 def _sweep_views(sweep: _Sweep, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> RowTable:
     """The table of the rays through pixels `xy` (Q, 2) of `region` (Q,); a title shows a progress bar."""
     num_views = len(sweep.maps)
-    pixels = [torch.zeros(0, dtype=torch.int64)]
-    labels = [torch.zeros(0, num_views, dtype=sweep.maps[0].dtype)]
-    inverse = [torch.zeros(0)]
+    pixels, inverse = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
+    labels = [np.zeros((0, num_views), sweep.maps[0].numpy().dtype)]
     for view in tqdm(range(num_views), desc=title, unit="view", disable=not title):
         here = (regions.view_index[region] == view).nonzero()[:, 0]
         for chunk in torch.split(here, CHUNK) if len(here) else ():
             pixel, label, inverse_depth = _join_equal(*sweep.rows(view, xy[chunk]))
-            pixels.append((pixel + chunk[0]).cpu())
-            labels.append(label.cpu())
-            inverse.append(inverse_depth.cpu())
+            pixels.append(pixel + int(chunk[0]))
+            labels.append(np.ascontiguousarray(label.T))
+            inverse.append(inverse_depth)
     return RowTable(
-        labels=torch.cat(labels).numpy(),
-        pixel=torch.cat(pixels).numpy(),
-        inverse_depth=torch.cat(inverse).numpy(),
-        pixel_region=region.cpu().numpy(),
-        pixel_xy=xy.cpu().numpy(),
-        view_index=regions.view_index.cpu().numpy(),
+        labels=np.concatenate(labels),
+        pixel=np.concatenate(pixels),
+        inverse_depth=np.concatenate(inverse),
+        pixel_region=region.numpy(),
+        pixel_xy=xy.numpy(),
+        view_index=regions.view_index.numpy(),
         num_views=num_views,
     )
 
@@ -203,7 +214,7 @@ def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
 
 @dataclass(frozen=True, eq=False)
 class _Sweep:
-    """The label maps of V views, ready to be looked up along rays.
+    """The label maps of V views, on the CPU, ready to be looked up along rays.
 
     Attributes:
         cameras: V cameras.
@@ -215,25 +226,25 @@ class _Sweep:
     maps: list[Tensor]
     boxes: list[tuple[float, float, float, float] | None]
 
-    def rows(self, view: int, xy: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Rows along the rays of P pixels of one view: pixel (I,) in [0, P), labels (I, V), inverse depth (I,)."""
-        others = torch.tensor([other for other in range(len(self.maps)) if other != view], device=xy.device)
+    def rows(self, view: int, xy: Tensor) -> tuple[Ints, NDArray[np.integer], Floats]:
+        """Rows along the rays of P pixels of one view: pixel (I,) in [0, P), labels (V, I), inverse depth (I,)."""
+        others = torch.tensor([other for other in range(len(self.maps)) if other != view])
         bases, offsets = self._project_rays(view, xy, others)
         low, high = self._inverse_range(bases, offsets, others)
-        steps = (torch.arange(DEPTHS, device=xy.device) + 0.5) / DEPTHS
+        steps = (torch.arange(DEPTHS) + 0.5) / DEPTHS
         is_seen = low < high
         low, high = torch.where(is_seen, low, 0), torch.where(is_seen, high, 0)
         inverse = low[:, None] + (high - low)[:, None] * steps
-        size = (len(self.maps), *inverse.shape)
-        labels = torch.full(size, OUTSIDE, dtype=self.maps[0].dtype, device=xy.device)
+        labels = np.full((len(self.maps), inverse.numel()), OUTSIDE, self.maps[0].numpy().dtype)
+        num_empty, num_labels = np.zeros((2, inverse.numel()), np.int16)
         for other, base, offset in zip(others.tolist(), bases, offsets.tolist(), strict=True):
             labels[other] = _look_up(inverse, base, offset, labels=self.maps[other])
-        num_empty = (labels == EMPTY).sum(0, dtype=torch.int16)
-        num_labels = (labels >= 0).sum(0, dtype=torch.int16)
-        most_empty = (MAX_EMPTY * (num_empty + num_labels)).floor().clamp(min=1)
-        keep = (num_labels > 0) & (num_empty <= most_empty) & is_seen[:, None]
-        pixel = keep.nonzero()[:, 0]
-        return pixel, labels[:, keep].T.contiguous(), inverse[keep]
+            num_empty += labels[other] == EMPTY
+            num_labels += labels[other] >= 0
+        most_empty = np.maximum(np.floor(MAX_EMPTY * (num_empty + num_labels)), 1)
+        keep = (num_labels > 0) & (num_empty <= most_empty) & np.repeat(is_seen.numpy(), DEPTHS)
+        kept = np.flatnonzero(keep)
+        return kept // DEPTHS, labels.take(kept, 1), inverse.numpy().ravel()[kept]
 
     def _project_rays(self, view: int, xy: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         """A point at inverse depth w along a ray projects to base + w * offset, homogeneous: bases (O, P, 3) float32,
@@ -277,35 +288,45 @@ def _cut(interval: tuple[Tensor, Tensor], slope: Tensor, start: Tensor) -> tuple
     return low, torch.where((slope == 0) & (start < 0), -1.0, high)
 
 
-def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tensor) -> Tensor:
-    """(P, DEPTHS) label at the projection of each sample."""
+def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tensor) -> NDArray[np.integer]:
+    """(P * DEPTHS,) label at the projection of each sample."""
     height, width = labels.shape
     depth = torch.add(base[:, 2:], inverse, alpha=offset[2])
-    scale = 1 / depth
+    is_behind = depth <= 0 if float(depth.min()) <= 0 else None
+    scale = depth.reciprocal_()
     column = torch.add(base[:, :1], inverse, alpha=offset[0]).mul_(scale).add_(1).clamp_(0, width - 1).int()
     row = torch.add(base[:, 1:2], inverse, alpha=offset[1]).mul_(scale).add_(1).clamp_(0, height - 1).int()
-    return labels.flatten()[torch.where(depth > 0, row.mul_(width).add_(column), 0)]
+    place = row.mul_(width).add_(column)
+    if is_behind is not None:
+        place.masked_fill_(is_behind, 0)  # the frame of the map is OUTSIDE
+    found: NDArray[np.integer] = labels.numpy().ravel().take(place.numpy().ravel())  # torch's look-up is slower
+    return found
 
 
-def _join_equal(pixel: Tensor, labels: Tensor, inverse: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Join runs of equal rows on a ray; discard rows that equal a neighbour's but lack some of its regions."""
+def _join_equal(
+    pixel: Ints, labels: NDArray[np.integer], inverse: Floats
+) -> tuple[Ints, NDArray[np.integer], Floats]:
+    """Join runs of equal rows on a ray; discard rows that equal a neighbour's but lack some of its regions. The rows
+    are the columns of `labels` (V, I): neighbours are compared view by view, many of them at a time."""
     if not len(pixel):
         return pixel, labels, inverse
-    is_new = torch.ones(len(pixel), dtype=torch.bool, device=pixel.device)
-    is_new[1:] = (labels[1:] != labels[:-1]).any(1) | (pixel[1:] != pixel[:-1])
-    run = is_new.cumsum(0) - 1
-    total = torch.zeros(int(run[-1]) + 1).to(inverse).index_add_(0, run, inverse)
-    inverse = total / torch.bincount(run)
-    pixel, labels = pixel[is_new], labels[is_new]
+    is_new = np.append(True, (labels[:, 1:] != labels[:, :-1]).any(0) | (pixel[1:] != pixel[:-1]))
+    start = np.flatnonzero(is_new)
+    counts = np.diff(np.append(start, len(pixel)))
+    inverse = (np.add.reduceat(inverse, start) / counts).astype(np.float32)
+    pixel, labels = pixel[start], labels.take(start, 1)
     for _ in range(DOMINANCE_PASSES):
         same_ray = pixel[1:] == pixel[:-1]
-        differs = labels[1:] != labels[:-1]
-        less = ~(differs & (labels[1:] != EMPTY)).any(1) & same_ray
-        more = ~(differs & (labels[:-1] != EMPTY)).any(1) & same_ray
-        keep = torch.ones(len(pixel), dtype=torch.bool, device=pixel.device)
+        differs, is_empty = labels[:, 1:] != labels[:, :-1], labels == EMPTY
+        less = ~(differs & ~is_empty[:, 1:]).any(0) & same_ray
+        more = ~(differs & ~is_empty[:, :-1]).any(0) & same_ray
+        keep = np.ones(len(pixel), bool)
         keep[1:] &= ~less
         keep[:-1] &= ~(more & ~less)
-        pixel, labels, inverse = pixel[keep], labels[keep], inverse[keep]
+        if keep.all():
+            break
+        kept = np.flatnonzero(keep)
+        pixel, labels, inverse = pixel[kept], labels.take(kept, 1), inverse[kept]
     return pixel, labels, inverse
 
 

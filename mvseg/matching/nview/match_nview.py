@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import row_tables
+from mvseg.matching.nview.label_rows import RowTable, rays_per_region, row_table, row_tables
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.search import search
@@ -30,6 +30,7 @@ from mvseg.scene import Cameras
 Ints = NDArray[np.int64]
 
 WIDENINGS = (1, 2, 4, 8)  # reprojection errors that are tried, pixels
+PROBE_RAYS = 1500  # tell whether a widening helps, at least about this many
 EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean score above which the poses are sound; below which the rows are useless
 
 
@@ -39,6 +40,7 @@ def match_nview(
     affinity: Affinity,
     *,
     config: NViewConfig = NViewConfig(),
+    residual_px: int | None = None,
     progress: bool = False,
 ) -> Matching:
     """Match the regions of V >= 2 views by what all views show.
@@ -48,6 +50,7 @@ def match_nview(
         cameras: V cameras.
         affinity: the epipolar weights of the regions.
         config: costs, gains and thresholds.
+        residual_px: the reprojection error where it is known, one of WIDENINGS; None: estimated.
         progress: show progress bars.
 
     Returns:
@@ -62,7 +65,9 @@ def match_nview(
     pairwise_ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))[order].cpu().numpy()
     pairwise = renumber(separate_unmatched(pairwise_ids))
 
-    found = find_clusters(ordered, cameras, graph, pairwise=pairwise, config=config, progress=progress)
+    found = find_clusters(
+        ordered, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
+    )
     scores, clusters = found.scores, found.clusters
     evidence = collect_evidence(scores, clusters, pairwise)
     matching = Matching(
@@ -104,6 +109,7 @@ def find_clusters(
     *,
     pairwise: Ints,
     config: NViewConfig = NViewConfig(),
+    residual_px: int | None = None,
     progress: bool = False,
 ) -> FoundClusters:
     """The clusters that explain all views best, or where rows explain too little, those from the weights alone.
@@ -114,10 +120,11 @@ def find_clusters(
         graph: their epipolar weights.
         pairwise: (D,) int64, clusters from the weights alone, in [0, K).
         config: costs, gains and thresholds.
+        residual_px: the reprojection error where it is known, one of WIDENINGS; None: estimated.
         progress: show progress bars.
     """
     scores, residual_px = fit_poses(
-        regions, cameras, graph, pairwise=pairwise, config=config, progress=progress
+        regions, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
     )
     clusters, method = pairwise, "one-per-view"
     if len(cameras) > 2:
@@ -134,21 +141,30 @@ def fit_poses(
     *,
     pairwise: Ints,
     config: NViewConfig,
+    residual_px: int | None = None,
     progress: bool = False,
 ) -> tuple[ClusterScores, int]:
     """The scores of the row table whose label maps are widened by the reprojection error, and that error in pixels.
 
-    The error is the least widening with which the rows explain the pairwise clusters nearly as well as with any.
+    The error is the least widening with which the rows explain the pairwise clusters nearly as well as with any; a few
+    rays of each region tell that of all but the first. A `residual_px` that is known is not estimated.
     """
-    config, candidates = config.for_views(len(cameras)), []
-    tables = row_tables(regions, cameras, widenings=WIDENINGS, progress=progress)
-    for width, table in zip(WIDENINGS, tables, strict=True):
-        candidates.append(ClusterScores(table, graph, config))
-        if candidates[0].explained(pairwise) >= EXPLAINED:
-            return candidates[0], width
-    explained = np.array([scores.explained(pairwise) for scores in candidates])
-    best = int(np.argmax(explained >= explained.max() - 0.05))
-    return candidates[best], WIDENINGS[best]
+    config = config.for_views(len(cameras))
+
+    def score(table: RowTable) -> ClusterScores:
+        return ClusterScores(table, graph, config)
+
+    first = score(row_table(regions, cameras, widen_px=residual_px or WIDENINGS[0], progress=progress))
+    explained = [first.explained(pairwise)]
+    if residual_px is not None or explained[0] >= EXPLAINED:
+        return first, residual_px or WIDENINGS[0]
+    rays = min(rays_per_region(len(cameras)), -(-PROBE_RAYS // max(len(regions), 1)))
+    for table in row_tables(regions, cameras, widenings=WIDENINGS[1:], rays=rays, progress=progress):
+        explained.append(score(table).explained(pairwise))
+    best = int(np.argmax(np.array(explained) >= max(explained) - 0.05))
+    if best == 0:
+        return first, WIDENINGS[0]
+    return score(row_table(regions, cameras, widen_px=WIDENINGS[best], progress=progress)), WIDENINGS[best]
 
 
 def _final_numbers(matching: Matching) -> torch.Tensor:
