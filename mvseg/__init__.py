@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from mvseg.matching.match import match_regions as match_regions
     from mvseg.matching.result import Matching as Matching
     from mvseg.matching.result import MergedMask as MergedMask
+    from mvseg.matching.result import RefinedPoses as RefinedPoses
     from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
     from mvseg.multiview.assignment import EpipolarAssignment as EpipolarAssignment
@@ -70,7 +71,7 @@ _HOME = {
     "matching.affinity": ("Affinity", "region_affinity"),
     "matching.symnmf": ("cluster_affinity",),
     "matching.match": ("match_regions",),
-    "matching.result": ("Matching", "MergedMask"),
+    "matching.result": ("Matching", "MergedMask", "RefinedPoses"),
     "matching.split": ("split_merged",),
     "reconstruction.config": ("ReconstructConfig",),
     "reconstruction.voxels": ("reconstruct_instances",),

@@ -18,6 +18,7 @@ from tqdm import tqdm
 from mvseg._version import __version__
 from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import check_photos, read_photo
 from mvseg.formats.scene_folder import load_scene, read_masks
@@ -80,6 +81,7 @@ def run_scene(
     if regions is None:
         with _timed(seconds, "detect"):
             detections, matching = detect_regions(scene, config, keep=keep, prune=True, progress=progress)
+            scene = pose_scene(scene, matching)
         if config.detect.witnesses:
             with _timed(seconds, "witnesses"):
                 from mvseg.multiview.witnesses import hear_witnesses
@@ -91,6 +93,7 @@ def run_scene(
     else:
         with _timed(seconds, "match"):
             matching = match_regions(regions, scene.cameras, config.match, progress=progress)
+            scene = pose_scene(scene, matching)
     if config.split_merged:
         regions, matching, source = split_merged(regions, matching)
         scores = None if scores is None else scores[source]
@@ -155,6 +158,20 @@ def place_scene(scene: Scene, config: RunConfig) -> Scene:
     return find_up(scene, config.up)
 
 
+def pose_scene(scene: Scene, matching: Matching) -> Scene:
+    """The scene with the poses that its masks were matched with, see `MatchConfig.refine_poses`.
+
+    Warns (InputWarning) of refined cameras that no rig file can hold.
+    """
+    if matching.poses is None or not matching.poses.is_refined:
+        return scene
+    odd = [view for view in scene.views if view.lens is not None and opencv_distortion(view.lens) is None]
+    if odd:
+        message = f"the refined cameras are not written: view {odd[0].name} has a lens that no rig file can hold"
+        warnings.warn(message, InputWarning, stacklevel=3)
+    return replace(scene, cameras=matching.poses.cameras)
+
+
 def detect_regions(
     scene: Scene,
     config: RunConfig = RunConfig(),
@@ -192,6 +209,9 @@ def detect_regions(
             cropped = crop_cameras(scene.cameras, boxes)
             detections, matching = model.match_detections(found, cropped, progress=progress)
             detections, names = place_crops(detections, boxes), names | more_names
+            if matching.poses is not None:  # of the crops
+                posed = replace(matching.poses.cameras, K=scene.cameras.K, sizes=scene.cameras.sizes)
+                matching = replace(matching, poses=replace(matching.poses, cameras=posed))
     if keep is not None and prune:
         delete_kept(keep, but=names)
     if not len(detections.regions):

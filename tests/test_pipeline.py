@@ -13,10 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 
 import mvseg
+import mvseg.pipeline
 from leafy_scene import write_leafy_scene
 from mvseg import (
     InputError,
@@ -32,7 +34,7 @@ from mvseg import (
 )
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import read_photo
-from mvseg.matching.result import Matching
+from mvseg.matching.result import Matching, RefinedPoses
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.plant_box import crop_cameras, place_crops, plant_boxes
 from mvseg.multiview.proposals import Proposals
@@ -82,6 +84,24 @@ def test_ids_only(plant: Path) -> None:
     result = run_scene(plant, plant / "masks", IDS_ONLY)
     assert (result.surfaces, result.voxels, result.traits) == (None, None, None)
     assert [*result.seconds] == ["load", "match"]
+
+
+def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    given = load_scene(plant).cameras
+    better = replace(given, t=given.t + 0.01)
+
+    def match(*args: Any, **options: Any) -> Matching:
+        poses = RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2))
+        return replace(match_regions(*args, **options), poses=poses)
+
+    monkeypatch.setattr(mvseg.pipeline, "match_regions", match)
+    result = run_scene(plant, plant / "masks", IDS_ONLY)
+    assert result.scene.cameras is better
+    fisheye = pycolmap.Camera(model="OPENCV_FISHEYE", width=128, height=96, params=[150, 150, 64, 48, 0, 0, 0, 0])
+    view, *others = result.scene.views
+    odd = replace(result.scene, views=(replace(view, lens=fisheye), *others))
+    with pytest.warns(InputWarning, match="view 000 has a lens that no rig file can hold"):
+        assert mvseg.pipeline.pose_scene(odd, result.matching).cameras is better
 
 
 def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
@@ -237,7 +257,11 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
     scene = Scene("far", tuple(views), cameras)
     kept = tmp_path / "kept"
     first, matching = detect_regions(scene, RunConfig(detect=DetectConfig(crop="off")))
-    again, rematched = detect_regions(scene, keep=kept)
+    again, rematched = detect_regions(scene, RunConfig(match=MatchConfig(refine_poses=True)), keep=kept)
+    assert rematched.poses is not None
+    assert torch.equal(rematched.poses.cameras.K, cameras.K)
+    assert torch.equal(rematched.poses.cameras.sizes, cameras.sizes)
+    assert not rematched.poses.is_refined  # exact ones stay
     assert len(again.regions) > len(first.regions)
     assert len([*kept.iterdir()]) == 2 * len(chosen)
 

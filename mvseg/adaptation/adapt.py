@@ -25,7 +25,7 @@ from mvseg.matching.match import check_baselines
 from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.multiview.plant_box import boxes_to_look_at
 from mvseg.multiview.witnesses import hear_witnesses
-from mvseg.pipeline import detect_regions
+from mvseg.pipeline import detect_regions, pose_scene
 from mvseg.scene import Scene
 from mvseg.training.config import TrainConfig
 from mvseg.training.loop import train
@@ -175,6 +175,7 @@ def find_leaves(
     found = []
     for name, scene in scenes.items():
         detections, matching = detect_regions(scene, run, keep=keep, progress=progress)
+        scene = pose_scene(scene, matching)
         photos = partial(read_photo, scene)
         revised, rematched, _ = hear_witnesses(
             detections, matching, cameras=scene.cameras, photos=photos, progress=progress

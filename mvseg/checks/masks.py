@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.checks.finding import Finding, name_views
-from mvseg.checks.poses import without_specks
+from mvseg.matching.outline_gaps import without_specks
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 

@@ -20,6 +20,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.checks.finding import Finding, Level, name_views
+from mvseg.matching.outline_gaps import WIDEST, without_specks
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -28,7 +29,6 @@ Floats = NDArray[np.float64]
 
 NUM_MOVES = 16  # of a view's masks, to see what chance does
 MOST_PARTNERS = 20  # views that each view is compared with
-WIDEST = 1.5  # radians; a mask that fills more of the pencil holds the epipole and begins and ends nowhere
 UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit of offset: masks of large photos are drawn less exactly
 MOST_OFFSET = 40  # units, tried in both directions
 SHARPNESS = 2.0  # units, of the vote for an offset
@@ -40,7 +40,6 @@ CHANCE, OFFSET = 0.22, 1.5  # fitting share, units
 MOST_AGREE = 0.3  # quantile of the offsets over the other views: noise alone puts some of them at 0
 FEW_MASKS = 10  # of two views, in the median: one faulty mask is too large a share of fewer
 FEW_VIEWS = 4  # with fewer, no view is outvoted
-SPECK = 0.002  # share of a mask's pixels
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +183,7 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     missing = tuple(index for index in missed if index not in view.off)
     if missing:
         most = np.nanmax(view.offset_px[list(missing)])
-        step = "refine the poses, as with COLMAP's bundle adjustment"
+        step = "refine the poses, with --match.refine_poses true or COLMAP's bundle adjustment"
         what = f"epipolar lines of {name_views(missing, names)} miss by up to {most:.0f} px: {step}"
         findings.append(Finding(where="poses", what=what, level="warning", views=missing))
     return findings
@@ -214,14 +213,6 @@ def _hulls(regions: Regions, view: int) -> _Hulls:
         corners.append(hull[:, 0] + regions.boxes[index, :2].numpy() + 0.5)
     owner = np.repeat(np.arange(len(members)), [len(hull) for hull in corners[1:]])
     return _Hulls(torch.from_numpy(np.concatenate(corners)), torch.from_numpy(owner), len(members))
-
-
-def without_specks(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A mask (H, W) without its specks, the pieces with less than 0.2 % of its pixels: they would be its ends."""
-    _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    is_kept = stats[:, cv2.CC_STAT_AREA] >= SPECK * mask.sum()
-    is_kept[0] = False
-    return is_kept[pieces].astype(np.uint8) if is_kept.any() else mask.astype(np.uint8)
 
 
 def _spans(pencil: Pencil, side: int, hulls: _Hulls) -> _Spans:

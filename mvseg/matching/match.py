@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -13,6 +14,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.nview.match_nview import WIDENINGS, match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.pencil import is_coincident
+from mvseg.matching.refine_poses import match_refined
 from mvseg.matching.result import Matching
 from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions
@@ -59,6 +61,13 @@ def match_regions(
     check_views(regions, cameras)
     check_baselines(cameras)
     _check_sizes(regions, cameras)
+    if config.refine_poses:
+        every, plain = torch.arange(len(regions), device=regions.device), replace(config, refine_poses=False)
+
+        def match(posed: Cameras) -> tuple[Tensor, Matching]:
+            return every, match_regions(regions, posed, plain, progress=progress)
+
+        return match_refined(regions, cameras, match)[1]
     _warn_of_gaps(regions, cameras)
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
     method = config.resolved_method

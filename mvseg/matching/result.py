@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import InputError
+from mvseg.scene import Cameras
 
 SURE = 0.5  # match score from which a region counts for its instance's support
 
@@ -31,6 +32,22 @@ class MergedMask:
 
 
 @dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """What came of refining the poses with the masks.
+
+    Attributes:
+        cameras: V cameras, the given ones unless they are refined.
+        is_refined: whether refined poses were taken.
+        gap_px: by how many pixels outlines of one leaf miss the same epipolar lines, with the poses as given, and with
+            poses refined without that leaf; NaN where no leaf tells.
+    """
+
+    cameras: Cameras
+    is_refined: bool
+    gap_px: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
 class Matching:
     """Which of D regions shows which of K instances.
 
@@ -50,6 +67,7 @@ class Matching:
         explained: mean score of the matched regions in their clusters; 1 = every pixel is seen in all other views. None
             where it was not estimated.
         view_explained: (V,) float32, the same of each view's matched regions; NaN for a view without any.
+        poses: the cameras that the ids come from, where `MatchConfig.refine_poses` asked for better ones.
     """
 
     instance_ids: Tensor
@@ -61,6 +79,7 @@ class Matching:
     residual_px: int | None = None
     explained: float | None = None
     view_explained: Tensor | None = None
+    poses: RefinedPoses | None = None
 
     def __len__(self) -> int:
         return len(self.instance_ids)
@@ -69,7 +88,8 @@ class Matching:
         support = None if self.support is None else self.support.to(device)
         views = None if self.view_explained is None else self.view_explained.to(device)
         ids, scores = self.instance_ids.to(device), self.match_scores.to(device)
-        return replace(self, instance_ids=ids, match_scores=scores, support=support, view_explained=views)
+        poses = None if self.poses is None else replace(self.poses, cameras=self.poses.cameras.to(device))
+        return replace(self, instance_ids=ids, match_scores=scores, support=support, view_explained=views, poses=poses)
 
     def select(self, index: Tensor) -> Matching:
         """The regions at an int64 index, in that order. All instances stay, even those without regions."""
@@ -123,7 +143,7 @@ class Matching:
 
         No instance is shared by two parts: the ids of each part follow those of the parts before it. The method is that
         of the first part. Support, residual (the largest) and explained share (the mean over the matched regions; of
-        each view, over the parts) are None when a part has none.
+        each view, over the parts) are None when a part has none; `poses` are None.
         """
         ids, merged = [], []
         num_regions = num_instances = 0

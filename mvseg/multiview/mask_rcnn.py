@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 from mvseg.detectors.scales import run_scales
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
+from mvseg.matching.refine_poses import match_refined
 from mvseg.matching.result import Matching
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.proposals import Proposals, gather_proposals
@@ -146,6 +148,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         _check_cameras(cameras, sizes)
         proposals, matching = self.match_detections(detections, cameras, progress=progress)
         if self.witnesses:
+            cameras = cameras if matching.poses is None else matching.poses.cameras
             proposals, matching, _ = hear_witnesses(
                 proposals, matching, cameras=cameras, photos=photos.__getitem__, progress=progress
             )
@@ -173,15 +176,20 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     ) -> tuple[Tensor, Matching]:
         """Indices of the proposals to keep, without those whose mask is empty, and their matching."""
         solid = (proposals.regions.areas > 0).nonzero()[:, 0]
-        keep, matching = match_proposals(
-            proposals.select(solid),
-            cameras,
-            num_iterations=self.num_iterations,
-            cluster_iou=self.cluster_iou,
-            detections_per_view=self.roi_heads.detections_per_img,
-            match=self.match,
-            progress=progress,
-        )
+        chosen = proposals.select(solid)
+
+        def match(posed: Cameras) -> tuple[Tensor, Matching]:
+            return match_proposals(
+                chosen,
+                posed,
+                num_iterations=self.num_iterations,
+                cluster_iou=self.cluster_iou,
+                detections_per_view=self.roi_heads.detections_per_img,
+                match=replace(self.match, refine_poses=False),
+                progress=progress,
+            )
+
+        keep, matching = match_refined(chosen.regions, cameras, match) if self.match.refine_poses else match(cameras)
         return solid[keep], matching
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:

@@ -241,6 +241,7 @@ def _rematch(matching: Matching, found: list[_Found], number: Mapping[int, int])
         method=matching.method,
         residual_px=matching.residual_px,
         explained=matching.explained,
+        poses=matching.poses,
     )
     if matching.support is None:
         return revised

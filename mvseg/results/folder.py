@@ -7,6 +7,8 @@ Numbers in files are instance ids: label 3, `leaf_003.ply`, leaf 3 in `traits.cs
 from __future__ import annotations
 
 import json
+import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -19,18 +21,22 @@ from mvseg.formats.atomic import folder_whole
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
-from mvseg.formats.lens import distort
+from mvseg.formats.lens import distort, opencv_distortion
 from mvseg.formats.photos import read_photo
+from mvseg.formats.rig import write_rig
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
+from mvseg.scene import Scene
 
 if TYPE_CHECKING:
+    from mvseg.matching.result import RefinedPoses
     from mvseg.results.rims import Rims
     from mvseg.traits.measure import Traits
 
 REPORT_FILE = "report.html"
+CAMERAS_FILE = "cameras.json"
 
 
 def save_result(
@@ -70,7 +76,12 @@ def save_result(
                 write_plant(result, folder)
             counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
             seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
-            matched = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
+            matched: dict[str, Any] = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
+            poses = result.matching.poses
+            if poses is not None:
+                matched["poses"] = _describe_poses(poses)
+                if poses.is_refined:
+                    write_refined(folder / CAMERAS_FILE, result.scene)
             measured = {} if result.traits is None else {"traits": _describe_traits(result.traits)}
             said = run | matched | measured | {"counts": counts, "seconds": seconds}
             if report:
@@ -155,6 +166,23 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         **source,
         "segmentation": encode_mask(distort(mask, result.scene.views[view].lens, K)),
     }
+
+
+def write_refined(path: Path, scene: Scene) -> None:
+    """A rig file of refined cameras, to replace or to stand beside the file that the scene's cameras came from; nothing
+    where a lens is none that a rig file can hold."""
+    paths = [str(view.path) for view in scene.views]
+    root = os.path.commonpath(paths if scene.source is None else [str(scene.source), *paths])
+    distortion = [[] if view.lens is None else opencv_distortion(view.lens) for view in scene.views]
+    if None not in distortion:
+        files = [Path(os.path.relpath(photo, root)).as_posix() for photo in paths]
+        write_rig(path, scene, files, distortion=distortion)
+
+
+def _describe_poses(poses: RefinedPoses) -> dict[str, Any]:
+    """What run.json says of the poses: whether they were refined, and the gaps before and after."""
+    gaps = [None if math.isnan(gap) else round(gap, 3) for gap in poses.gap_px]
+    return {"refined": poses.is_refined, "gap_px": gaps}
 
 
 def _describe_traits(traits: Traits) -> dict[str, Any]:

@@ -13,16 +13,10 @@ import pytest
 import torch
 
 from mvseg.checks.finding import Finding
-from mvseg.checks.poses import (
-    SPECK,
-    _chosen_pairs,
-    pairwise_agreement,
-    pose_findings,
-    view_agreement,
-    without_specks,
-)
+from mvseg.checks.poses import _chosen_pairs, pairwise_agreement, pose_findings, view_agreement
 from mvseg.errors import InputWarning
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.matching.outline_gaps import SPECK, without_specks
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
 from mvseg.simulation.faults import Faults, degrade_labels

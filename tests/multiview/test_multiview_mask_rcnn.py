@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,11 +11,13 @@ from torchvision.models.detection.anchor_utils import AnchorGenerator
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.ops import box_iou
 
+import mvseg.multiview.mask_rcnn
 from leafy_scene import write_leafy_scene
 from mvseg.detectors.mask_cut import decide_masks
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import load_photos, read_photo
-from mvseg.matching.result import Matching
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.result import Matching, RefinedPoses
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
@@ -123,6 +126,24 @@ def test_with_cameras_the_usual_dicts_and_ids() -> None:
         for instance, label in zip(result["instance_ids"].tolist(), result["labels"].tolist(), strict=True):
             classes.setdefault(instance, set()).add(label)
     assert all(len(labels) == 1 for instance, labels in classes.items() if instance > 0)
+
+
+def test_poses_are_refined_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    better = small_cameras().scale(2)
+
+    def refine(regions, cameras, match):
+        assert len(regions) > 0
+        kept, matching = match(cameras)
+        return kept, replace(matching, poses=RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2)))
+
+    monkeypatch.setattr(mvseg.multiview.mask_rcnn, "match_refined", refine)
+    plain = MultiViewMaskRCNN(tiny_detector()).find_regions(some_images(), small_cameras())[1]
+    wrapped = MultiViewMaskRCNN(tiny_detector(), match=MatchConfig(refine_poses=True))
+    matching = wrapped.find_regions(some_images(), small_cameras())[1]
+    assert plain.poses is None
+    assert matching.poses is not None
+    assert matching.poses.cameras is better
+    assert torch.equal(matching.instance_ids, plain.instance_ids)
 
 
 def test_the_detectors_own_thresholds_stay_as_they_were() -> None:

@@ -1,0 +1,215 @@
+"""Poses that are a few pixels off, refined with the masks as the only evidence, while these are matched.
+
+Every leaf that two views show whole tells by how many pixels their epipolar lines miss (`outline_gaps.py`), and that is
+far more than the six unknowns of each pose. Not in the paper.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from mvseg.errors import InputWarning
+from mvseg.matching.outline_gaps import Gaps, Outlines, find_outlines, measure_gaps, move_cameras, pair_outlines
+from mvseg.matching.result import Matching, RefinedPoses
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+Match = Callable[[Cameras], tuple[Tensor, Matching]]
+
+ROUNDS = 3  # of refining and matching again, at most
+CLEAR = 0.8  # share of the gap that may be left of refined poses
+LOSS = 0.02  # of the mean match score, that does not count as one
+STEPS = 20  # of Gauss-Newton, at most
+CONVERGED = 0.02  # units, largest step
+# In units of one pixel, or more where photos are large: masks of these are drawn less exactly.
+POSE, GROWTH = 10.0, 2.0  # standard deviations of poses, along each axis, and of how tightly a mask is drawn
+LEAST_SPREAD, DOUBTED = 0.5, 2.0  # of gaps; and the number of spreads from which a gap is doubted
+UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit
+FOLDS = 5  # of the instances
+
+
+def match_refined(regions: Regions, cameras: Cameras, match: Match) -> tuple[Tensor, Matching]:
+    """Match, refine the poses, match with these, and so on until no id changes.
+
+    The refined poses are taken when they explain leaves that they were not fitted to, in turn a fifth of them, clearly
+    better than the given ones do, and ids are as sure as with these. Otherwise all stays as if nothing had been tried.
+
+    Args:
+        regions: D regions.
+        cameras: V cameras, as they are given.
+        match: from cameras to the (S,) int64 indices of the regions that are matched, and their matching.
+
+    Returns:
+        What `match` gives with the poses that were chosen; `Matching.poses` says which. Of its warnings, those with
+        these poses are passed on.
+    """
+    given = kept, matching, said = _listen(match, cameras)
+    refined, gap_px = cameras, held_out_gaps(regions.select(kept), matching, cameras)
+    for _ in range(ROUNDS):
+        if not gap_px[1] < gap_px[0]:
+            break
+        refined = fit_poses(adjust(regions.select(kept), matching, cameras)).to(cameras.device)
+        before = kept, matching
+        kept, matching, said = _listen(match, refined)
+        if torch.equal(kept, before[0]) and torch.equal(matching.instance_ids, before[1].instance_ids):
+            break
+        gap_px = held_out_gaps(regions.select(kept), matching, cameras)
+    is_better = gap_px[1] <= CLEAR * gap_px[0] and mean_score(matching) >= mean_score(given[1]) - LOSS
+    if not is_better:
+        refined, (kept, matching, said) = cameras, given
+    for message in said:
+        warnings.warn(message, stacklevel=3)
+    poses = RefinedPoses(cameras=refined, is_refined=is_better, gap_px=gap_px)
+    return kept, replace(matching, poses=poses)
+
+
+def _listen(match: Match, cameras: Cameras) -> tuple[Tensor, Matching, list[InputWarning]]:
+    """Match, and what was warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        kept, matching = match(cameras)
+    return kept, matching, [each.message for each in caught if isinstance(each.message, InputWarning)]
+
+
+def mean_score(matching: Matching) -> float:
+    """Mean match score of the matched regions; 0 without any."""
+    is_matched = matching.instance_ids > 0
+    return float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Adjustment:
+    """What poses are fitted to.
+
+    Attributes:
+        outlines: N outlines.
+        pairs: (Q, 2) int64, those that should end together.
+        cameras: V cameras as given, on the CPU.
+        world_per_px: (V,) float64, see `move_cameras`.
+        unit_px: pixels per unit.
+    """
+
+    outlines: Outlines
+    pairs: Tensor
+    cameras: Cameras
+    world_per_px: Tensor
+    unit_px: float
+
+    def select(self, index: Tensor) -> Adjustment:
+        """The same with some of the outlines only."""
+        outlines = self.outlines.select(index)
+        return replace(self, outlines=outlines, pairs=pair_outlines(outlines, self.cameras))
+
+    def gaps(self, cameras: Cameras) -> Gaps:
+        """All gaps with these cameras."""
+        return measure_gaps(self.outlines, self.pairs, cameras, world_per_px=self.world_per_px)
+
+    def weights(self, gaps: Gaps, left_px: Tensor) -> Tensor:
+        """(T,) weights by Geman and McClure: what a neighbour hides ends elsewhere, and so does another leaf."""
+        spread = max(LEAST_SPREAD * self.unit_px, 1.4826 * float(left_px.abs().median()))
+        return gaps.weight / spread**2 / (1 + (left_px / (DOUBTED * spread)) ** 2) ** 2
+
+
+def adjust(regions: Regions, matching: Matching, cameras: Cameras) -> Adjustment:
+    """What poses are fitted to, from the matched masks of V views."""
+    cameras = cameras.to("cpu")
+    outlines = find_outlines(regions, matching, cameras)
+    return Adjustment(
+        outlines=outlines,
+        pairs=pair_outlines(outlines, cameras),
+        cameras=cameras,
+        world_per_px=distances(regions.to("cpu"), cameras) / cameras.K[:, 0, 0],
+        unit_px=max(1.0, float(cameras.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL),
+    )
+
+
+def distances(regions: Regions, cameras: Cameras) -> Tensor:
+    """(V,) float64, world units from each camera to the point that is nearest to the rays through all masks."""
+    middle = (regions.boxes[:, :2] + regions.boxes[:, 2:]).double() / 2
+    pixels = torch.cat((middle, torch.ones_like(middle[:, :1])), 1)
+    rays = (cameras.world_from_px[regions.view_index] @ pixels[..., None])[..., 0]
+    rays = rays / rays.norm(dim=1, keepdim=True)
+    across = torch.eye(3).double() - rays[:, :, None] * rays[:, None, :]
+    # From the mean centre: far from the world's origin the products would cancel.
+    centers = cameras.centers - cameras.centers.mean(0)
+    target = (across @ centers[regions.view_index][..., None]).sum(0)
+    return (centers - (torch.linalg.pinv(across.sum(0)) @ target)[:, 0]).norm(dim=1)
+
+
+def fit_poses(problem: Adjustment) -> Cameras:
+    """The cameras with the smallest gaps, by Gauss-Newton with robust weights.
+
+    Beside the poses, how tightly every mask is drawn is unknown (a segmenter's masks are all a little too large or too
+    small). What the masks do not tell, as the similarity of the world, stays as given: the poses have a prior there.
+    """
+    num_views, num_outlines = len(problem.cameras), len(problem.outlines.view)
+    spreads = torch.cat((torch.full((6 * num_views,), POSE), torch.full((num_outlines,), GROWTH))).double()
+    prior = (spreads * problem.unit_px) ** -2
+    state, cameras = torch.zeros(len(prior)).double(), problem.cameras
+    for _ in range(STEPS):
+        gaps = problem.gaps(cameras)
+        if not len(gaps.px):
+            break
+        of_growth = 6 * num_views + gaps.outlines[..., None]
+        of_pose = 6 * problem.outlines.view[gaps.outlines][..., None] + torch.arange(6)
+        columns = torch.cat((of_pose, of_growth), 2).flatten(1)
+        slopes = torch.cat((gaps.by_pose, gaps.by_growth[..., None]), 2).flatten(1)
+        left_px = gaps.px + (gaps.by_growth * state[of_growth[..., 0]]).sum(1)
+        step = _solve(columns, slopes, left_px, weights=problem.weights(gaps, left_px), prior=prior, state=state)
+        state = state + step
+        cameras = move_cameras(cameras, step[: 6 * num_views].reshape(-1, 6), problem.world_per_px)
+        if step.abs().max() < CONVERGED * problem.unit_px:
+            break
+    return cameras
+
+
+def _solve(
+    columns: Tensor, slopes: Tensor, left: Tensor, *, weights: Tensor, prior: Tensor, state: Tensor
+) -> Tensor:
+    """(P,) one step of Gauss-Newton for T residuals, each with derivatives (T, C) by the unknowns `columns` (T, C)."""
+    weighted = weights[:, None] * slopes
+    normal, right = torch.diag(prior), -prior * state
+    products = weighted[:, :, None] * slopes[:, None, :]
+    normal.index_put_((columns[:, :, None], columns[:, None, :]), products, accumulate=True)
+    right.index_put_((columns,), -weighted * left[:, None], accumulate=True)
+    return torch.cholesky_solve(right[:, None], torch.linalg.cholesky(normal))[:, 0]
+
+
+def held_out_gaps(regions: Regions, matching: Matching, cameras: Cameras) -> tuple[float, float]:
+    """Pixels; mean over the views of the median gap of their leaves: with the given cameras, and with cameras that are
+    refined without the leaves that are looked at. NaN where there are no gaps."""
+    problem, parts = adjust(regions, matching, cameras), []
+    fold = problem.outlines.instance % FOLDS
+    for number in range(FOLDS):
+        if (fold == number).any():
+            looked_at, fitted = problem.select(fold == number), fit_poses(problem.select(fold != number))
+            parts.append([_remaining_gaps(looked_at, cameras) for cameras in (problem.cameras, fitted)])
+    if not parts:
+        return float("nan"), float("nan")
+    before, after = (torch.cat(gaps, 1) for gaps in zip(*parts, strict=True))
+    return _mean_of_views(before), _mean_of_views(after)
+
+
+def _remaining_gaps(problem: Adjustment, cameras: Cameras) -> Tensor:
+    """(3, T) float64: what is left of each gap when masks may be drawn too tightly, and its two views."""
+    gaps = problem.gaps(cameras)
+    prior = torch.full((len(problem.outlines.view),), (GROWTH * problem.unit_px) ** -2).double()
+    growth, left_px = torch.zeros_like(prior), gaps.px
+    for _ in range(STEPS if len(gaps.px) else 0):
+        weights = problem.weights(gaps, left_px)
+        step = _solve(gaps.outlines, gaps.by_growth, left_px, weights=weights, prior=prior, state=growth)
+        growth = growth + step
+        left_px = gaps.px + (gaps.by_growth * growth[gaps.outlines]).sum(1)
+        if step.abs().max() < CONVERGED * problem.unit_px:
+            break
+    return torch.cat((left_px.abs()[None], problem.outlines.view[gaps.outlines].T.double()))
+
+
+def _mean_of_views(gaps: Tensor) -> float:
+    px, views = gaps[0], gaps[1:]
+    return float(torch.stack([px[(views == view).any(0)].median() for view in views.unique()]).mean())
