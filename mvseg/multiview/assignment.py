@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from mvseg.errors import InputError
 from mvseg.matching.epipolar import binned_pairs, dilate, find_spans, span_histogram
-from mvseg.matching.samples import Samples, view_runs
+from mvseg.matching.samples import Samples, view_runs, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -84,8 +84,10 @@ def ruzicka_similarity(
     num_clusters = max(int(instance_ids.max()), 0) if len(instance_ids) else 0
     clustered = regions.select(instance_ids > 0)
     cluster_of = instance_ids[instance_ids > 0] - 1
-    sources, source_members = view_runs(clustered)
+    # Pixels, not runs: what is added up over the few pixels of a thinned mask is too sensitive for those.
+    sources, source_members = view_samples(clustered)
     targets, target_members = view_runs(proposals, max_pixels)
+    targets = [each.pixels() for each in targets]
     images = [_image_lattice(size, regions.device) for size in cameras.sizes.tolist()]
     on_mask = torch.zeros(len(proposals), num_clusters, device=regions.device)  # sum of bands over the mask
     on_image = torch.zeros(len(cameras), num_clusters, device=regions.device)  # sum of bands over the image
@@ -109,18 +111,12 @@ def ruzicka_similarity(
 
 
 def _concatenate(first: Samples, second: Samples) -> Samples:
-    """The runs of both sets of regions in one, those of `first` first."""
-    assert first.last_xy is not None
-    assert first.length is not None
-    assert second.last_xy is not None
-    assert second.length is not None
+    """The pixels of both sets of regions in one, those of `first` first."""
     return Samples(
         xy=torch.cat((first.xy.T, second.xy.T), 1).T,
         owner=torch.cat((first.owner, second.owner + first.num_regions)),
         weight=torch.cat((first.weight, second.weight)),
         num_regions=first.num_regions + second.num_regions,
-        last_xy=torch.cat((first.last_xy.T, second.last_xy.T), 1).T,
-        length=torch.cat((first.length, second.length)),
     )
 
 
@@ -131,4 +127,4 @@ def _image_lattice(size: list[int], device: torch.device) -> Samples:
     box = torch.tensor([[0, 0, width, height]], device=device)
     nothing = torch.zeros(1, dtype=torch.int64, device=device)
     image = Regions(view_index=nothing, boxes=box, crops=crop, num_views=1, labels=nothing)
-    return view_runs(image, LATTICE)[0][0]
+    return view_runs(image, LATTICE)[0][0].pixels()
