@@ -109,19 +109,26 @@ def run_scene(
             from_other_views=from_views,
             mask_kind=kind,
         )
+    moved: int | None = None
     with _timed(seconds, "reconstruct"):
         from mvseg.reconstruction.shapes import reconstruct_shapes
 
-        has_photos = scene.views[0].path.is_file()
-        surfaces, voxels = reconstruct_shapes(
+        reconstruct = partial(
+            reconstruct_shapes,
             regions,
-            matching.instance_ids,
-            scene.cameras,
+            cameras=scene.cameras,
             config=config.reconstruct,
-            starts=starts,
-            photos=partial(read_photo, scene) if has_photos else None,
+            photos=partial(read_photo, scene) if scene.views[0].path.is_file() else None,
             progress=progress,
         )
+        surfaces, voxels = reconstruct(matching.instance_ids, starts=starts)
+        if config.reconstruct.check_ids and surfaces is not None and from_views is None:
+            from mvseg.multiview.checked_ids import check_ids
+
+            checked = check_ids(regions, matching, surfaces, cameras=scene.cameras)
+            matching, moved = checked.matching, int(checked.is_moved.sum())
+            if moved:
+                surfaces, voxels = reconstruct(matching.instance_ids, known=checked.unchanged(surfaces))
     with _timed(seconds, "measure"):
         from mvseg.traits.measure import measure_plant
 
@@ -137,6 +144,7 @@ def run_scene(
         detection_scores=scores,
         from_other_views=from_views,
         mask_kind=kind,
+        num_moved=moved,
     )
 
 

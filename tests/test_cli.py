@@ -187,6 +187,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "search_range": None,
             "num_restarts": 2,
             "seed": 9,
+            "refine_poses": False,
         },
         "split_merged": False,
         "coco_crowd": "mask",
@@ -199,6 +200,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "voxel_budget": 250_000,
             "photos": True,
             "jackknife": False,
+            "check_ids": True,
         },
         "traits": {"min_sure_views": 2, "min_quality": 0.5, "min_visible_share": 0.05, "leaves_only": True},
         "scale": None,
@@ -445,7 +447,8 @@ def test_an_empty_pot_is_data(verb: str, plant: Path, tmp_path: Path, capsys: py
     assert len(content["images"]) == 4
     assert content["annotations"] == []
     assert not read_label_png(out / "labels" / "002.png", WIDTH, HEIGHT).any()
-    assert json.loads((out / "run.json").read_text())["counts"] == {"regions": 0, "instances": 0}
+    moved = {"moved": 0} if verb == "infer" else {}
+    assert json.loads((out / "run.json").read_text())["counts"] == {"regions": 0, "instances": 0} | moved
     if verb == "infer":
         assert list(csv.DictReader((out / "traits_wide.csv").read_text().splitlines())) == []
         rows = list(csv.DictReader((out / "traits.csv").read_text().splitlines()))

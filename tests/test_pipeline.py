@@ -35,11 +35,13 @@ from mvseg import (
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import read_photo
 from mvseg.matching.result import Matching, RefinedPoses
+from mvseg.multiview.checked_ids import CheckedIds
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.plant_box import crop_cameras, place_crops, plant_boxes
 from mvseg.multiview.proposals import Proposals
 from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.pipeline import detect_regions
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
 from mvseg.results.provenance import describe_run
@@ -202,6 +204,41 @@ def test_surfaces_are_fitted_to_the_photos_when_wanted_and_there(
     assert (with_photos is not None) == is_wanted
     if with_photos is not None:
         assert with_photos(1).shape == (480, 640, 3)
+
+
+@pytest.mark.parametrize("is_wanted", [True, False])
+def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
+    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_wanted: bool
+) -> None:
+    fits: list[tuple[list[int], dict[int, LeafSurface]]] = []
+
+    def fit(_: object, ids: torch.Tensor, *__: object, known: Any, **___: object) -> dict[int, LeafSurface]:
+        fits.append((ids.tolist(), dict(known)))
+        return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
+
+    def check(_: object, matching: Matching, *__: object, **___: object) -> CheckedIds:
+        ids = matching.instance_ids.clone()
+        ids[0] = ids[0] % 3 + 1
+        is_moved = torch.arange(len(ids)) == 0
+        is_changed = torch.tensor([number in (int(ids[0]), int(matching.instance_ids[0])) for number in (1, 2, 3)])
+        moved = replace(matching, instance_ids=ids)
+        return CheckedIds(matching=moved, is_moved=is_moved, old_ids=torch.arange(1, 4), is_changed=is_changed)
+
+    monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.multiview.checked_ids.check_ids", check)
+    config = RunConfig(reconstruct=ReconstructConfig(check_ids=is_wanted, voxel_budget=500))
+    result = run_scene(plant, plant / "masks", config)
+    save_result(result, tmp_path / "out", {}, report=False)
+    counts = json.loads((tmp_path / "out" / "run.json").read_text())["counts"]
+    assert len(fits) == (2 if is_wanted else 1)
+    assert fits[0][1] == {}
+    assert fits[-1][0] == result.matching.instance_ids.tolist()
+    assert result.num_moved == (1 if is_wanted else None)
+    assert counts.get("moved") == result.num_moved
+    if is_wanted:
+        assert len(fits[1][1]) == 1
+        assert sum(a != b for a, b in zip(fits[0][0], fits[1][0], strict=True)) == 1
+        assert result.voxels is not None
 
 
 def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:

@@ -15,8 +15,7 @@ class ReconstructConfig:
     Attributes:
         shape: surface (a spline surface fitted to the outlines of the masks, with area, length, width and angles, see
             docs/surfaces.md; an instance without a credible one gets voxels), voxels (Eq. 6, a closed shape with a
-            volume) or both. The other options but `photos` and `jackknife` are
-            about voxels.
+            volume) or both. The other options but `photos`, `jackknife` and `check_ids` are about voxels.
         threshold: a voxel belongs to an instance when more than this share of the instance's masks contains it (the
             paper: 0.5); in [0, 1).
         seen_share: keeps thin instances thin: of the instance's views with a clear line of sight to a voxel (its pixel
@@ -28,6 +27,9 @@ class ReconstructConfig:
         photos: let the texture of the leaves in the photos improve surfaces between their outlines; photos that are
             missing are done without.
         jackknife: standard deviations of surfaces from fits without each view in turn; takes many times longer.
+        check_ids: masks that show another instance's surface than their own get its id, and surfaces that lost or won
+            masks are fitted again, see docs/matching.md; not where witnesses were heard (`detect.witnesses`), nor
+            without surfaces.
     """
 
     shape: Literal["surface", "voxels", "both"] = "surface"
@@ -37,6 +39,7 @@ class ReconstructConfig:
     voxel_budget: int = 250_000
     photos: bool = True
     jackknife: bool = False
+    check_ids: bool = True
 
     def __post_init__(self) -> None:
         if not 0 <= self.threshold < 1:

@@ -28,6 +28,7 @@ def reconstruct_shapes(
     *,
     config: ReconstructConfig,
     starts: Surfaces = MappingProxyType({}),
+    known: Surfaces = MappingProxyType({}),
     photos: Callable[[int], NDArray[np.uint8]] | None = None,
     progress: bool = False,
 ) -> tuple[Surfaces | None, Voxels]:
@@ -39,6 +40,7 @@ def reconstruct_shapes(
         cameras: V cameras.
         config: what to make, and how.
         starts: instance id -> a surface that is nearly right, see `fit_surfaces`.
+        known: instance id -> a surface that stays as it is, see `fit_surfaces`.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; None: there are none.
         progress: show progress bars over the instances.
 
@@ -56,6 +58,7 @@ def reconstruct_shapes(
             instance_ids,
             cameras,
             starts=starts,
+            known=known,
             photos=photos if config.photos else None,
             jackknife=config.jackknife,
             progress=progress,

@@ -75,6 +75,7 @@ def save_result(
 
                 write_plant(result, folder)
             counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
+            counts |= {} if result.num_moved is None else {"moved": result.num_moved}
             seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
             matched: dict[str, Any] = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
             poses = result.matching.poses

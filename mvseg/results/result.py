@@ -36,6 +36,7 @@ class Result:
         from_other_views: (D,) bool, masks that no detector found: the other views show that a leaf is there; None where
             masks were given, or the other views were not asked.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
+        num_moved: how many masks got another id from the surfaces, see `check_ids`; None where they were not asked.
     """
 
     scene: Scene
@@ -48,3 +49,4 @@ class Result:
     detection_scores: Tensor | None = None
     from_other_views: Tensor | None = None
     mask_kind: str = ""
+    num_moved: int | None = None

@@ -6,9 +6,11 @@ import torch
 from scipy import ndimage
 
 from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_cameras
+from known_leaves import flat_leaf
 from mvseg.errors import InputError
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, spread_views
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.visible_leaves import visible_leaves
 from mvseg.scene import Cameras
 
 FLAT, BENT = EllipticBlade(), EllipticBlade(bend=0.9)
@@ -100,6 +102,27 @@ def test_a_known_start_saves_the_search_for_one(bent: LeafSurface, monkeypatch: 
     assert surface.area == pytest.approx(bent.area, rel=5e-3)
     assert surface.length == pytest.approx(bent.length, rel=5e-3)
     assert np.abs(errors(surface, BENT)).max() < 0.015
+
+
+def test_known_surfaces_stay_and_the_others_are_fitted_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    cameras, maps = CAMERAS[[0, 2, 4, 6, 8]], []
+    leaves = {1: flat_leaf(length=1.4, half_width=0.3, at=(-0.7, -0.2, 0.3)),
+              2: flat_leaf(length=1.4, half_width=0.35, at=(-0.6, 0.1, 0.0))}  # fmt: skip
+    for view in range(len(cameras)):
+        maps.append(np.zeros((SIZE, SIZE), np.int64))
+        for leaf in visible_leaves(leaves, cameras, view):
+            x1, y1, x2, y2 = leaf.box
+            maps[-1][y1:y2, x1:x2][leaf.mask] = leaf.instance
+    regions, ids = as_regions(maps)
+    both = fit_surfaces(regions, ids, cameras)
+    gone = LeafSurface.none(torch.arange(2), "a reason")
+    again = fit_surfaces(regions, ids, cameras, known={1: both[1]})
+    assert again[1] is both[1]
+    assert torch.allclose(again[2].coefficients, both[2].coefficients, atol=2e-3)
+    assert again[2].area == pytest.approx(both[2].area, rel=2e-3)
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.back_project", None)
+    kept = {1: gone, 2: both[2]}
+    assert fit_surfaces(regions, ids, cameras, known=kept) == kept
 
 
 def test_one_wrong_mask_in_five_does_little_harm() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Container, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -58,6 +58,7 @@ def fit_surfaces(
     cameras: Cameras,
     *,
     starts: Mapping[int, LeafSurface] = MappingProxyType({}),
+    known: Mapping[int, LeafSurface] = MappingProxyType({}),
     photos: Callable[[int], NDArray[np.uint8]] | None = None,
     most_views: int = MOST_VIEWS,
     jackknife: bool = False,
@@ -72,6 +73,8 @@ def fit_surfaces(
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
         starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
+        known: instance id -> a surface that is returned as it is. The others are fitted as if it had been fitted with
+            them: it hides what lies behind it, and its masks tell how all masks err.
         photos: view index -> (H, W, 3) uint8 RGB, `list.__getitem__` for photos in memory; each is asked for once. The
             texture of the leaves then says more of their shape between the outlines, see docs/surfaces.md.
         most_views: at least 2.
@@ -97,12 +100,19 @@ def fit_surfaces(
     for instance in tqdm(_ids(instance_ids), desc="surfaces", unit="instance", disable=not progress):
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
+        if instance in known and not known[instance].exists:
+            continue
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
         kept = spread_views(views, most_views)
+        if instance in known:
+            kept = known[instance].views
         members = members.select(torch.isin(members.view_index, kept))
         stacks[instance] = _stack(members, cameras, frames, instance=instance)
+        if instance in known:
+            fits[instance] = fit_patch(stacks[instance], known[instance].coefficients.numpy(), num_steps=0)
+            continue
         if instance in starts and starts[instance].exists:
             start = starts[instance].coefficients.numpy()
             fits[instance] = fit_patch(stacks[instance], start, num_steps=NUM_WARM_STEPS)
@@ -115,14 +125,15 @@ def fit_surfaces(
             fits[instance] = fit
     offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
     errors = learn_mask_errors([each for each in offsets if len(each) > 1])
-    stacks, fits = _fit_again(stacks, fits, errors)
+    stacks, fits = _fit_again(stacks, fits, errors, known=known)
     if photos is not None:
         fits = fit_photos(stacks, fits, photos, sizes=cameras.sizes.tolist(), errors=errors)
     for instance, fit in tqdm(fits.items(), desc="jackknife", unit="instance", disable=not (progress and jackknife)):
         if jackknife:
             fit = replace(fit, covariance=jackknife_covariance(stacks[instance], fit, errors=errors))
         surfaces[instance] = _surface(stacks[instance], fit)
-    return orient_surfaces(dict(sorted(surfaces.items())), cameras)
+    oriented = orient_surfaces(dict(sorted({**surfaces, **known}.items())), cameras)
+    return {**oriented, **known}
 
 
 def _ids(instance_ids: Tensor) -> list[int]:
@@ -231,12 +242,19 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
 
 
 def _fit_again(
-    stacks: dict[int, MaskStack], fits: dict[int, PatchFit], errors: MaskErrors | None
+    stacks: dict[int, MaskStack],
+    fits: dict[int, PatchFit],
+    errors: MaskErrors | None,
+    *,
+    known: Container[int],
 ) -> tuple[dict[int, MaskStack], dict[int, PatchFit]]:
-    """Leaves fitted to what is their rim, now that all leaves and the errors of the masks are known."""
+    """Leaves, but the known ones, fitted to what is their rim, now that all leaves and the errors of the masks are
+    known."""
     points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
     again: dict[int, PatchFit] = {}
     for instance, fit in fits.items():
+        if instance in known:
+            continue
         margin = BEHIND * measure_patch(fit.coefficients).length
         others = {other: grid for other, grid in points.items() if other != instance}
         hiding = hiding_pixels(stacks[instance], points[instance], others, margin=margin)
