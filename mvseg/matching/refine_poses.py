@@ -22,6 +22,7 @@ from mvseg.scene import Cameras
 Match = Callable[[Cameras], tuple[Tensor, Matching]]
 
 ROUNDS = 3  # of refining and matching again, at most
+LEAST_GAP = 1.0  # pixels; a smaller gap of the given poses is the masks' own error
 CLEAR = 0.8  # share of the gap that may be left of refined poses
 LOSS = 0.02  # of the mean match score, that does not count as one
 STEPS = 20  # of Gauss-Newton, at most
@@ -36,8 +37,9 @@ FOLDS = 5  # of the instances
 def match_refined(regions: Regions, cameras: Cameras, match: Match) -> tuple[Tensor, Matching]:
     """Match, refine the poses, match with these, and so on until no id changes.
 
-    The refined poses are taken when they explain leaves that they were not fitted to, in turn a fifth of them, clearly
-    better than the given ones do, and ids are as sure as with these. Otherwise all stays as if nothing had been tried.
+    Poses whose gaps are below `LEAST_GAP` stay. Refined ones are taken when they explain leaves that they were not
+    fitted to, in turn a fifth of them, clearly better than the given ones do, and ids are as sure as with these.
+    Otherwise all stays as if nothing had been tried.
 
     Args:
         regions: D regions.
@@ -51,7 +53,7 @@ def match_refined(regions: Regions, cameras: Cameras, match: Match) -> tuple[Ten
     given = kept, matching, said = _listen(match, cameras)
     refined, gap_px = cameras, held_out_gaps(regions.select(kept), matching, cameras)
     for _ in range(ROUNDS):
-        if not gap_px[1] < gap_px[0]:
+        if not (gap_px[0] >= LEAST_GAP and gap_px[1] < gap_px[0]):
             break
         refined = fit_poses(adjust(regions.select(kept), matching, cameras)).to(cameras.device)
         before = kept, matching
@@ -59,7 +61,8 @@ def match_refined(regions: Regions, cameras: Cameras, match: Match) -> tuple[Ten
         if torch.equal(kept, before[0]) and torch.equal(matching.instance_ids, before[1].instance_ids):
             break
         gap_px = held_out_gaps(regions.select(kept), matching, cameras)
-    is_better = gap_px[1] <= CLEAR * gap_px[0] and mean_score(matching) >= mean_score(given[1]) - LOSS
+    is_off = gap_px[0] >= LEAST_GAP
+    is_better = is_off and gap_px[1] <= CLEAR * gap_px[0] and mean_score(matching) >= mean_score(given[1]) - LOSS
     if not is_better:
         refined, (kept, matching, said) = cameras, given
     for message in said:
