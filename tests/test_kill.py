@@ -194,6 +194,7 @@ def test_a_resumed_training_run_ends_as_one_that_was_never_killed(
     photos, labels = write_photos(tmp_path, 6)
     options = {"photos": photos, "labels": labels, "hold_out_every": 3, "image_size": 64, "epochs": 2, "batch_size": 2}
     options |= {"num_workers": num_workers, "device": "cpu", "checkpoint_every": 1, "log_every": 1, "ema_decay": 0.5}
+    options["precision"] = "fp32"  # "auto" asks the clock
 
     def arguments(output: Path) -> list[str]:
         given = options | {"output": output, "resume": "true"}

@@ -8,7 +8,8 @@ processes: torchvision normalises its losses over the images of one forward call
 the order in which the gradients of the chunks are added up differs.
 
 All randomness is a function of the seed and the step. A killed run therefore resumes with the same bits (on a CPU, with
-the same number of threads) without the state of any generator or scheduler in its checkpoint.
+the same number of threads) without the state of any generator or scheduler in its checkpoint. Only `precision: auto`
+asks the clock, once; the checkpoint keeps the answer.
 
 Files in `output`: config.yaml (resolved), log.jsonl (losses by step), metrics.json (by epoch), model.safetensors (the
 best epoch by mask AP; without validation samples the last), checkpoint.pt, tensorboard/ if tensorboard is installed,
