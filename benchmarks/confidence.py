@@ -47,7 +47,8 @@ from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
 from mvseg.partition import drop_singletons, renumber, separate_unmatched
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import SceneSpec, run_all
+from mvseg.simulation.dataset import SceneSpec
+from mvseg.worker_pool import run_all
 
 KINDS = ("true", "degraded", "detected")
 EDGES = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.01)

@@ -31,7 +31,8 @@ from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import SceneSpec, run_all
+from mvseg.simulation.dataset import SceneSpec
+from mvseg.worker_pool import run_all
 
 Method = Callable[[Regions, Cameras, Affinity], torch.Tensor]
 

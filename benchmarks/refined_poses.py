@@ -35,8 +35,9 @@ from mvseg.matching.result import Matching
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.simulation.dataset import SceneSpec, run_all
+from mvseg.simulation.dataset import SceneSpec
 from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.worker_pool import run_all
 
 POINTS = 600  # of the plant
 MEASURES = ("ari", "e_k", "pose px", "score", "area %")

@@ -42,9 +42,10 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.simulation.blades import Leaf
-from mvseg.simulation.dataset import EVALUATED_FAMILIES, Preset, SceneSpec, list_scenes, run_all
+from mvseg.simulation.dataset import EVALUATED_FAMILIES, Preset, SceneSpec, list_scenes
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import grow_plant
+from mvseg.worker_pool import run_all
 
 MEASURES = ("area", "length", "width", "inclination", "distance")
 NUM_LEAVES = 8

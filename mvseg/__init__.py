@@ -55,6 +55,7 @@ if TYPE_CHECKING:
     from mvseg.traits.config import TraitsConfig as TraitsConfig
     from mvseg.traits.measure import Traits as Traits
     from mvseg.traits.measure import measure_plant as measure_plant
+    from mvseg.worker_pool import start_workers as start_workers
 
 # The public names, by room.
 _HOME = {
@@ -89,6 +90,7 @@ _HOME = {
     "checks.check_scene": ("Check", "check_scene"),
     "config": ("RunConfig",),
     "pipeline": ("run_scene",),
+    "worker_pool": ("start_workers",),
 }
 __all__ = ["__version__", *(name for names in _HOME.values() for name in names)]
 

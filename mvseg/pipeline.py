@@ -6,6 +6,7 @@ import json
 import time
 import warnings
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
 from functools import partial
@@ -47,6 +48,7 @@ def run_scene(
     config: RunConfig = RunConfig(),
     *,
     keep: Path | None = None,
+    workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> Result:
     """From a scene folder, with or without masks, to ids in every view and, if asked for, shapes in 3D and traits.
@@ -58,6 +60,7 @@ def run_scene(
         keep: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
             from them, and one with other options of later stages uses them again. What it holds of other photos or
             options is deleted; `delete_kept` deletes the rest.
+        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars.
 
     Returns:
@@ -87,7 +90,12 @@ def run_scene(
                 from mvseg.multiview.witnesses import hear_witnesses
 
                 detections, matching, starts = hear_witnesses(
-                    detections, matching, cameras=scene.cameras, photos=partial(read_photo, scene), progress=progress
+                    detections,
+                    matching,
+                    cameras=scene.cameras,
+                    photos=partial(read_photo, scene),
+                    workers=workers,
+                    progress=progress,
                 )
         regions, scores, from_views = detections.regions, detections.scores, detections.from_views
     else:
@@ -119,6 +127,7 @@ def run_scene(
             cameras=scene.cameras,
             config=config.reconstruct,
             photos=partial(read_photo, scene) if scene.views[0].path.is_file() else None,
+            workers=workers,
             progress=progress,
         )
         surfaces, voxels = reconstruct(matching.instance_ids, starts=starts)

@@ -30,6 +30,7 @@ PACKAGE = ROOT / "mvseg"
 # import each other. `__init__` stands for `mvseg` itself: below it, nothing imports the package.
 FLOORS = (
     ("errors", "sigterm", "_version"),
+    ("worker_pool",),
     ("scene",),
     ("regions",),
     ("partition",),

@@ -29,7 +29,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
 from mvseg.multiview.config import DetectConfig
 from mvseg.regions import regions_from_label_maps
-from mvseg.simulation.dataset import list_scenes, start_worker
+from mvseg.simulation.dataset import list_scenes
 
 
 @pytest.fixture(scope="module")
@@ -89,7 +89,7 @@ def test_the_whole_run_is_written_up_and_goes_on_where_it_stopped(
 
 def test_processes_of_a_pool_find_the_functions_that_they_call() -> None:
     """`python -m PACKAGE` does not import its `__main__` in the processes of a pool: they would fail without end."""
-    for function in (run_simulated, run_real, start_worker):
+    for function in (run_simulated, run_real):
         assert not function.__module__.endswith("__main__")
 
 

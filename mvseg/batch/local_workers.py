@@ -23,10 +23,10 @@ from tqdm import tqdm
 from mvseg.batch.lost import Lost
 from mvseg.errors import InputError
 from mvseg.sigterm import Terminated, end_with_parent, stopped_by_sigterm
+from mvseg.worker_pool import one_thread
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 GRACE = 20.0  # seconds for a worker to clear away what it has half written, before it is killed
 TERMINATED = 143
 
@@ -119,25 +119,10 @@ def _start_worker(work: Callable[[Any], Any]) -> _Worker:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(there, work), daemon=True)
-    with _one_thread(), _signals_held_back():
+    with one_thread(), _signals_held_back():
         process.start()
     there.close()  # so that this process hears when the other end is gone
     return _Worker(process, here)
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Processes that are started here compute on one thread: libraries look when they are loaded."""
-    earlier = {name: os.environ.get(name) for name in THREADS}
-    os.environ.update(dict.fromkeys(THREADS, "1"))
-    try:
-        yield
-    finally:
-        for name, value in earlier.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
 
 
 @contextmanager

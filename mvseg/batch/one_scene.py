@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -17,11 +18,14 @@ if TYPE_CHECKING:
     from mvseg.results.result import Result
 
 
-def run_one_scene(scene: Path, masks: Path | None, out: Path, *, config: RunConfig, quiet: bool) -> None:
+def run_one_scene(
+    scene: Path, masks: Path | None, out: Path, *, config: RunConfig, num_workers: int = 1, quiet: bool
+) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
     from mvseg.formats.atomic import sweep_abandoned
     from mvseg.multiview.kept_detections import delete_kept
     from mvseg.results.earlier import check_out
+    from mvseg.worker_pool import start_workers
 
     sweep_abandoned(out)
     check_out(out)
@@ -30,7 +34,8 @@ def run_one_scene(scene: Path, masks: Path | None, out: Path, *, config: RunConf
     keep = out.resolve().with_name(f"{out.resolve().name}.detections")
     if masks is None and keep.is_dir():
         print(f"mvseg: going on from the detections that a run left in {keep}", file=sys.stderr)
-    result, messages = solve_scene(scene, masks, config, keep=keep, progress=not quiet)
+    with start_workers(num_workers) as workers:
+        result, messages = solve_scene(scene, masks, config, keep=keep, workers=workers, progress=not quiet)
     for message in messages:
         print(f"mvseg: warning: {message}", file=sys.stderr)
     save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)
@@ -41,7 +46,13 @@ def run_one_scene(scene: Path, masks: Path | None, out: Path, *, config: RunConf
 
 
 def solve_scene(
-    scene: Path, masks: Path | None, config: RunConfig, *, keep: Path, progress: bool
+    scene: Path,
+    masks: Path | None,
+    config: RunConfig,
+    *,
+    keep: Path,
+    workers: ProcessPoolExecutor | None = None,
+    progress: bool,
 ) -> tuple[Result, list[str]]:
     """The result of one scene and the InputWarnings on the way, each once; other warnings are passed on."""
     from mvseg.pipeline import run_scene  # keeps --help and wrong options quick
@@ -50,7 +61,7 @@ def solve_scene(
         warnings.simplefilter("always", InputWarning)
         if masks is not None and config.detect != DetectConfig():
             warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
-        result = run_scene(scene, masks, config, keep=keep, progress=progress)
+        result = run_scene(scene, masks, config, keep=keep, workers=workers, progress=progress)
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
     # each matching of a detector's loop may repeat a warning

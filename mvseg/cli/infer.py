@@ -20,6 +20,8 @@ def add(verbs: Any) -> None:
     help_scene = "scene folder (photos, cameras of any kind in docs/formats.md); without it, the plant that ships"
     parser.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     add_run_options(parser)
+    help_workers = "processes that fit surfaces (default: one per core, but at most 4)"
+    parser.add_argument("--num_workers", type=int | None, help=help_workers)
     verbs.add_subcommand("infer", parser, help="ids and 3D shapes of one scene")
 
 
@@ -29,5 +31,8 @@ def run(args: Namespace) -> int:
         print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
     scene = args.scene or demo_scene()
     out = args.out or DEFAULT_OUT / scene.resolve().name
-    run_one_scene(scene, args.masks, out, config=build_run(args), quiet=args.quiet)
+    from mvseg.worker_pool import default_workers  # keeps --help and wrong options quick
+
+    num_workers = default_workers() if args.num_workers is None else args.num_workers
+    run_one_scene(scene, args.masks, out, config=build_run(args), num_workers=num_workers, quiet=args.quiet)
     return 0

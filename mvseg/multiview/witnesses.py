@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,7 +71,13 @@ class _Found:
 
 
 def hear_witnesses(
-    proposals: Proposals, matching: Matching, *, cameras: Cameras, photos: Photos, progress: bool = False
+    proposals: Proposals,
+    matching: Matching,
+    *,
+    cameras: Cameras,
+    photos: Photos,
+    workers: ProcessPoolExecutor | None = None,
+    progress: bool = False,
 ) -> tuple[Proposals, Matching, dict[int, LeafSurface]]:
     """Detections as the other views correct them: surfaces are fitted to them, and they are revised as these say.
 
@@ -79,6 +86,7 @@ def hear_witnesses(
         matching: of these.
         cameras: V cameras.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view.
+        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars.
 
     Returns:
@@ -88,7 +96,9 @@ def hear_witnesses(
     regions, ids = proposals.regions.to("cpu"), matching.instance_ids.cpu()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
-        surfaces = fit_surfaces(regions, ids, cameras.to("cpu"), most_views=ROUGH_VIEWS, progress=progress)
+        surfaces = fit_surfaces(
+            regions, ids, cameras.to("cpu"), most_views=ROUGH_VIEWS, workers=workers, progress=progress
+        )
     revised = revise_masks(regions, matching, surfaces, cameras=cameras.to("cpu"), photos=photos, progress=progress)
     from_views, new_ids = revised.source < 0, revised.matching.instance_ids
     old_scores, old_classes = proposals.scores.cpu(), proposals.classes.cpu()

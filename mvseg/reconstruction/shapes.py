@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from types import MappingProxyType
 
 import numpy as np
@@ -30,6 +31,7 @@ def reconstruct_shapes(
     starts: Surfaces = MappingProxyType({}),
     known: Surfaces = MappingProxyType({}),
     photos: Callable[[int], NDArray[np.uint8]] | None = None,
+    workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> tuple[Surfaces | None, Voxels]:
     """The shapes of all instances, as `config.shape` says.
@@ -42,6 +44,7 @@ def reconstruct_shapes(
         starts: instance id -> a surface that is nearly right, see `fit_surfaces`.
         known: instance id -> a surface that stays as it is, see `fit_surfaces`.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; None: there are none.
+        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars over the instances.
 
     Returns:
@@ -61,6 +64,7 @@ def reconstruct_shapes(
             known=known,
             photos=photos if config.photos else None,
             jackknife=config.jackknife,
+            workers=workers,
             progress=progress,
         )
         if config.shape == "surface":

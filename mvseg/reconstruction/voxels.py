@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -130,7 +131,8 @@ def reconstruct_instances(
     shapes, free = {}, None
     if config.seen_share > 0:
         ones = torch.ones_like(instance_ids)
-        free = [regions.label_map(view, ones, size) == 0 for view, size in enumerate(cameras.sizes.tolist())]
+        sizes = enumerate(cameras.sizes.tolist())
+        free = {view: regions.label_map(view, ones, size) == 0 for view, size in sizes}
     instances = instance_ids[instance_ids > 0].unique().tolist()
     for instance in tqdm(instances, desc="back-projection", unit="instance", disable=not progress):
         members = regions.select(instance_ids == instance)
@@ -148,7 +150,7 @@ def back_project(
     cameras: Cameras,
     *,
     config: ReconstructConfig = ReconstructConfig(),
-    free: list[Tensor] | None = None,
+    free: Mapping[int, Tensor] | None = None,
 ) -> VoxelGrid | None:
     """The voxels of one instance from all of its masks (Eq. 6), in its own bounding box.
 
@@ -160,8 +162,8 @@ def back_project(
         members: the masks of the instance.
         cameras: V cameras.
         config: threshold, voxel size (world units) or voxel budget.
-        free: V maps (H, W) bool, where the view shows no region of any instance, for `config.seen_share`. None: no
-            pixel is known to be free, which leaves the paper's rule.
+        free: view -> (H, W) bool, where it shows no region of any instance, for `config.seen_share`; of every view
+            with a mask. None: no pixel is known to be free, which leaves the paper's rule.
 
     Returns:
         The grid, or None for an instance seen in fewer than two views or without a common point. Warns (InputWarning)

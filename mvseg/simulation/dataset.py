@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import json
-import multiprocessing
 import shutil
-import signal
-import threading
-from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
-import cv2
 import numpy as np
-import torch
 from tqdm import tqdm
 
 from mvseg.errors import InputError
@@ -23,13 +17,11 @@ from mvseg.formats.atomic import is_partial, lock_folder, write_text_whole, writ
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.label_png import read_label_png
 from mvseg.scene import Cameras
-from mvseg.sigterm import end_with_parent
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.scene_writer import write_scene, write_table
+from mvseg.worker_pool import run_all
 
-Item = TypeVar("Item")
-Result = TypeVar("Result")
 Photo = tuple[dict[str, Any], list[dict[str, Any]]]  # COCO image and its annotations, still without ids
 
 # Without "leggy", which is there for training only: published figures stay comparable.
@@ -169,27 +161,6 @@ def claim_folder(folder: Path, *, recipe: str) -> None:
         elif is_partial(path):
             path.unlink()
     write_text_whole(made_from, recipe)
-
-
-def run_all(work: Callable[[Item], Result], items: Iterable[Item], num_workers: int) -> Iterator[Result]:
-    """The results of `work` for each item in order, from this process or from a pool of spawned ones."""
-    if num_workers == 1:
-        yield from map(work, items)
-        return
-    with multiprocessing.get_context("spawn").Pool(num_workers, start_worker) as pool:
-        yield from pool.imap(work, items)
-
-
-def start_worker() -> None:
-    """Prepare a process of the pool: OpenCV and torch on one thread, an end as soon as the parent is gone, and one
-    without a word when the parent asks for it (pycolmap's handler would print a trace).
-
-    A worker that outlives a killed parent would go on with the items in its queue and get in the way of the next run.
-    """
-    signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    cv2.setNumThreads(1)
-    torch.set_num_threads(1)
-    threading.Thread(target=end_with_parent, daemon=True).start()
 
 
 def finish_scene(dataset: Path, preset: Preset, scene: SceneSpec) -> list[Photo]:

@@ -123,7 +123,8 @@ def test_what_stands_behind_something_is_not_carved_away() -> None:
 
 def test_without_free_pixels_the_paper_rule_is_left() -> None:
     regions, cameras = ball_from(AXES)
-    nowhere = [torch.zeros(height, width, dtype=torch.bool) for width, height in cameras.sizes.tolist()]
+    sizes = enumerate(cameras.sizes.tolist())
+    nowhere = {view: torch.zeros(height, width, dtype=torch.bool) for view, (width, height) in sizes}
     paper = back_project(regions, cameras, config=ReconstructConfig(voxel_size=0.1, seen_share=0))
     assert paper is not None
     for free in (None, nowhere):

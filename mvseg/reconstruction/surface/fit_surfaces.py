@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping
-from dataclasses import replace
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 
 import numpy as np
@@ -33,6 +35,7 @@ from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.worker_pool import spread
 
 HULL = ReconstructConfig(voxel_budget=25_000)
 HULL_BY_VOTE = ReconstructConfig(voxel_budget=25_000, seen_share=0.0)  # where faulty masks leave nothing of the first
@@ -49,6 +52,7 @@ BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this 
 # What a surface must reach not to be doubted.
 LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
 
+FEW_MASKS = 60  # that one process fits sooner than others start
 MOST_VIEWS = 20  # of an instance that its fit looks at; more add time, and next to nothing else
 
 
@@ -62,6 +66,7 @@ def fit_surfaces(
     photos: Callable[[int], NDArray[np.uint8]] | None = None,
     most_views: int = MOST_VIEWS,
     jackknife: bool = False,
+    workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
@@ -80,6 +85,7 @@ def fit_surfaces(
         most_views: at least 2.
         jackknife: fit each leaf again without each of its views in turn; deviations come from how much that changes it.
             Takes as many times longer as there are views.
+        workers: processes that instances are spread over, see `start_workers`; None: this one does it all.
         progress: show a progress bar over the instances.
 
     Returns:
@@ -87,17 +93,19 @@ def fit_surfaces(
         point) its coefficients are NaN and its `quality` says why.
 
     Raises:
-        InputError: as many ids as regions are expected; a photo is of another size than its camera says.
+        InputError: as many ids as regions are expected; a photo is of another size than its camera says; a worker was
+            killed.
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
+    workers = workers if len(regions) >= FEW_MASKS else None
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
     frames = _instance_frames(regions, instance_ids, cameras)
-    free = [torch.from_numpy(frame == 0) for frame in frames]
     stacks: dict[int, MaskStack] = {}
     fits: dict[int, PatchFit] = {}
     surfaces: dict[int, LeafSurface] = {}
-    for instance in tqdm(_ids(instance_ids), desc="surfaces", unit="instance", disable=not progress):
+    unfitted: dict[int, _Unfitted] = {}
+    for instance in _ids(instance_ids):
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
         if instance in known and not known[instance].exists:
@@ -105,33 +113,46 @@ def fit_surfaces(
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
-        kept = spread_views(views, most_views)
-        if instance in known:
-            kept = known[instance].views
+        kept = known[instance].views if instance in known else spread_views(views, most_views)
         members = members.select(torch.isin(members.view_index, kept))
         stacks[instance] = _stack(members, cameras, frames, instance=instance)
         if instance in known:
             fits[instance] = fit_patch(stacks[instance], known[instance].coefficients.numpy(), num_steps=0)
             continue
-        if instance in starts and starts[instance].exists:
-            start = starts[instance].coefficients.numpy()
-            fits[instance] = fit_patch(stacks[instance], start, num_steps=NUM_WARM_STEPS)
-            continue
-        good_iou = GOOD_IOU if len(kept) == len(views) else LEAST_IOU
-        stacks[instance], fit = _fit_from_hull(stacks[instance], members, cameras, free=free, good_iou=good_iou)
+        start = starts.get(instance)
+        unfitted[instance] = _Unfitted(
+            masks=stacks[instance],
+            members=members,
+            start=start.coefficients.numpy() if start is not None and start.exists else None,
+            good_iou=GOOD_IOU if len(kept) == len(views) else LEAST_IOU,
+        )
+    asked = ((leaf, _pack_free(frames, leaf.members)) for leaf in unfitted.values())
+    answers = spread(partial(_fit_first, cameras), asked, workers)
+    shown = tqdm(answers, "surfaces", len(unfitted), unit="instance", disable=not progress)
+    for instance, (masks, fit) in zip(unfitted, shown, strict=True):
+        stacks[instance] = masks
         if fit is None:
-            surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
+            surfaces[instance] = LeafSurface.none(
+                unfitted[instance].members.view_index.unique(), "its masks agree on no point"
+            )
         else:
             fits[instance] = fit
+    fits = {instance: fits[instance] for instance in stacks if instance in fits}
     offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
     errors = learn_mask_errors([each for each in offsets if len(each) > 1])
-    stacks, fits = _fit_again(stacks, fits, errors, known=known)
+    first, fits = fits, {}
+    points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in first.items()}
+    again = [instance for instance in first if instance not in known]
+    refitted = spread(partial(_fit_again, points, errors), ((i, stacks[i], first[i]) for i in again), workers)
+    for instance, (masks, better) in zip(again, refitted, strict=True):
+        stacks[instance], fits[instance] = masks, better
     if photos is not None:
         fits = fit_photos(stacks, fits, photos, sizes=cameras.sizes.tolist(), errors=errors)
-    for instance, fit in tqdm(fits.items(), desc="jackknife", unit="instance", disable=not (progress and jackknife)):
-        if jackknife:
-            fit = replace(fit, covariance=jackknife_covariance(stacks[instance], fit, errors=errors))
-        surfaces[instance] = _surface(stacks[instance], fit)
+    if jackknife:
+        jackknifed = spread(partial(_jackknife, errors), ((stacks[i], fit) for i, fit in fits.items()), workers)
+        bar = tqdm(jackknifed, "jackknife", len(fits), unit="instance", disable=not progress)
+        fits = dict(zip(list(fits), bar, strict=True))
+    surfaces |= {instance: _surface(stacks[instance], fit) for instance, fit in fits.items()}
     oriented = orient_surfaces(dict(sorted({**surfaces, **known}.items())), cameras)
     return {**oriented, **known}
 
@@ -155,8 +176,38 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
     return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
 
 
+@dataclass(frozen=True, eq=False)
+class _Unfitted:
+    """An instance without a surface: its outlines, its masks, a start that is nearly right, and the IoU of a fit after
+    which no other start is tried."""
+
+    masks: MaskStack
+    members: Regions
+    start: Floats | None
+    good_iou: float
+
+
+def _pack_free(frames: list[np.ndarray], members: Regions) -> dict[int, NDArray[np.uint8]]:
+    """Where the views of the members show no instance at all, eight pixels in a byte; row by row."""
+    return {view: np.packbits(frames[view] == 0, axis=1) for view in members.view_index.unique().tolist()}
+
+
+def _fit_first(
+    cameras: Cameras, asked: tuple[_Unfitted, Mapping[int, NDArray[np.uint8]]]
+) -> tuple[MaskStack, PatchFit | None]:
+    """The first fit of an instance, and the masks it is to."""
+    leaf, packed = asked
+    if leaf.start is not None:
+        return leaf.masks, fit_patch(leaf.masks, leaf.start, num_steps=NUM_WARM_STEPS)
+    widths = cameras.sizes[:, 0].tolist()
+    free = {
+        view: torch.from_numpy(np.unpackbits(bits, axis=1, count=widths[view])).bool() for view, bits in packed.items()
+    }
+    return _fit_from_hull(leaf.masks, leaf.members, cameras, free=free, good_iou=leaf.good_iou)
+
+
 def _fit_from_hull(
-    masks: MaskStack, members: Regions, cameras: Cameras, *, free: list[Tensor], good_iou: float
+    masks: MaskStack, members: Regions, cameras: Cameras, *, free: Mapping[int, Tensor], good_iou: float
 ) -> tuple[MaskStack, PatchFit | None]:
     """The best of the fits from several starts, which are tried until one explains the masks; and the masks it is to.
 
@@ -242,27 +293,23 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
 
 
 def _fit_again(
-    stacks: dict[int, MaskStack],
-    fits: dict[int, PatchFit],
-    errors: MaskErrors | None,
-    *,
-    known: Container[int],
-) -> tuple[dict[int, MaskStack], dict[int, PatchFit]]:
-    """Leaves, but the known ones, fitted to what is their rim, now that all leaves and the errors of the masks are
+    points: Mapping[int, Floats], errors: MaskErrors | None, asked: tuple[int, MaskStack, PatchFit]
+) -> tuple[MaskStack, PatchFit]:
+    """A leaf fitted to what is its rim, now that all leaves (`points` of their grids) and the errors of the masks are
     known."""
-    points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
-    again: dict[int, PatchFit] = {}
-    for instance, fit in fits.items():
-        if instance in known:
-            continue
-        margin = BEHIND * measure_patch(fit.coefficients).length
-        others = {other: grid for other, grid in points.items() if other != instance}
-        hiding = hiding_pixels(stacks[instance], points[instance], others, margin=margin)
-        if errors or (hiding != stacks[instance].others).any():
-            stacks[instance] = stacks[instance].with_others(hiding)
-            fit = fit_patch(stacks[instance], fit.coefficients, num_steps=NUM_WARM_STEPS, errors=errors)
-        again[instance] = fit
-    return stacks, again
+    instance, masks, fit = asked
+    margin = BEHIND * measure_patch(fit.coefficients).length
+    others = {other: grid for other, grid in points.items() if other != instance}
+    hiding = hiding_pixels(masks, points[instance], others, margin=margin)
+    if errors or (hiding != masks.others).any():
+        masks = masks.with_others(hiding)
+        fit = fit_patch(masks, fit.coefficients, num_steps=NUM_WARM_STEPS, errors=errors)
+    return masks, fit
+
+
+def _jackknife(errors: MaskErrors | None, asked: tuple[MaskStack, PatchFit]) -> PatchFit:
+    masks, fit = asked
+    return replace(fit, covariance=jackknife_covariance(masks, fit, errors=errors))
 
 
 def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:

@@ -1,0 +1,157 @@
+"""Independent pieces of one job, spread over processes of this machine; the answers come in order.
+
+(A batch of scenes, in which one that dies must not stop the others, has workers of its own: `batch.local_workers`.)
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import threading
+import warnings
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager, suppress
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+import cv2
+import torch
+
+from mvseg.errors import InputError
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+AHEAD = 16  # items that wait for a worker: an early one that takes long stops nobody, and few lie in memory twice
+
+
+@contextmanager
+def start_workers(num_workers: int) -> Iterator[ProcessPoolExecutor | None]:
+    """Up to so many spawned processes, which start when there is work for them; None for one, the caller does it all.
+
+    They are gone afterwards; an exception, Ctrl-C among them, ends them at once.
+
+    A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes.
+
+    Raises:
+        InputError: fewer than one.
+    """
+    if num_workers < 1:
+        raise InputError(f"{num_workers} workers asked for, expected at least 1")
+    if num_workers == 1:
+        yield None
+        return
+    context = multiprocessing.get_context("spawn")
+    theirs, ours = context.Pipe(duplex=False)
+    pool = ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,))
+    try:
+        yield pool
+    except BaseException:
+        ours.close()
+        raise
+    finally:
+        pool.shutdown(cancel_futures=True)
+        ours.close()
+
+
+def default_workers() -> int:
+    """One for each core that this process may use, but at most four: each takes half a gigabyte of memory."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(4, cores)
+
+
+def spread(
+    work: Callable[[Item], Answer], items: Iterable[Item], workers: ProcessPoolExecutor | None
+) -> Iterator[Answer]:
+    """`map(work, items)`, in processes of the pool if there is one; their warnings are given here.
+
+    Args:
+        work: what a module holds, or `partial` of it.
+        items: what can be pickled.
+        workers: as `start_workers` gives them.
+
+    Raises:
+        InputError: a process was killed.
+    """
+    if workers is None:
+        yield from map(work, items)
+        return
+    asked: deque[Future[tuple[Answer, list[Warning]]]] = deque()
+    try:
+        for item in items:
+            with one_thread():
+                # pickled here: multiprocessing would move tensors into shared memory, which containers have little of
+                asked.append(workers.submit(_answer, pickle.dumps((work, item))))
+            if len(asked) > AHEAD:
+                yield _receive(asked.popleft())
+        while asked:
+            yield _receive(asked.popleft())
+    except BrokenProcessPool as error:
+        message = "a worker process was killed, as systems do when memory runs out: expected fewer workers"
+        raise InputError(message) from error
+    finally:
+        for each in asked:
+            each.cancel()
+
+
+def run_all(work: Callable[[Item], Answer], items: Iterable[Item], num_workers: int) -> Iterator[Answer]:
+    """The answers of `work` for each item in order, from this process or from spawned ones."""
+    with start_workers(num_workers) as workers:
+        yield from spread(work, items, workers)
+
+
+def _start_worker(parent: Connection) -> None:
+    """Prepare a process of the pool: OpenCV and torch on one thread, an end as soon as the parent closes its end of the
+    pipe or is gone, and one without a word on SIGTERM (pycolmap's handler would print a trace).
+
+    Ctrl-C is for the parent to hear. A worker that outlives a killed parent would go on with the items in its queue and
+    get in the way of the next run.
+    """
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    cv2.setNumThreads(1)
+    torch.set_num_threads(1)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Processes that are started here compute on one thread: libraries look when they are loaded."""
+    earlier = {name: os.environ.get(name) for name in THREADS}
+    os.environ.update(dict.fromkeys(THREADS, "1"))
+    try:
+        yield
+    finally:
+        for name, value in earlier.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+
+
+def _end_with(parent: Connection) -> None:
+    with suppress(EOFError, OSError):
+        parent.recv_bytes()
+    os._exit(1)
+
+
+def _answer(pickled: bytes) -> tuple[Any, list[Warning]]:
+    """In a worker: what `work` returns for the item, and what it warns of."""
+    work, item = pickle.loads(pickled)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        answer = work(item)
+    return answer, [each.message for each in said if isinstance(each.message, Warning)]
+
+
+def _receive(asked: Future[tuple[Answer, list[Warning]]]) -> Answer:
+    """The answer; what the worker warned of is warned of here."""
+    answer, said = asked.result()
+    for each in said:
+        warnings.warn(each, stacklevel=4)
+    return answer
