@@ -153,6 +153,7 @@ def test_importing_the_package_is_cheap() -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
+@pytest.mark.slow
 def test_the_readmes_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     examples = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
     assert len(examples) == 2
@@ -205,6 +206,7 @@ def test_text_of_the_benchmarks_page_is_that_of_its_sources() -> None:
     assert [text.strip()[:60] for text in texts if text.strip() not in page] == []
 
 
+@pytest.mark.slow
 def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     subprocess.run(
         [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)],

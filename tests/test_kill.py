@@ -215,6 +215,7 @@ def test_a_resumed_training_run_ends_as_one_that_was_never_killed(
     assert (killed / "model.safetensors").read_bytes() == (whole / "model.safetensors").read_bytes()
 
 
+@pytest.mark.slow
 def test_a_data_set_that_was_killed_ends_as_one_that_was_not(runs: Runs, tmp_path: Path) -> None:
     seconds = runs(["simulate", "tiny", "--out", str(tmp_path / "whole")])["seconds"]
     whole = read_tree(tmp_path / "whole")

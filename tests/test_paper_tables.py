@@ -61,6 +61,7 @@ def run(cache: Path, *words: str) -> tuple[str, dict[str, Any]]:
     return text, json.loads((cache / "docs" / "benchmarks.json").read_text(encoding="utf-8"))
 
 
+@pytest.mark.slow
 def test_the_whole_run_is_written_up_and_goes_on_where_it_stopped(
     cache: Path, cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -47,6 +47,7 @@ def distance_to(points: torch.Tensor, targets: torch.Tensor) -> np.ndarray:
     return np.asarray(cKDTree(points.numpy()).query(targets.numpy())[0])
 
 
+@pytest.mark.slow
 def test_sgbm_finds_surfaces_and_matches_the_leaves(leafy: LeafyScene) -> None:
     """On an easy scene, so that its failures on a hard one are the method's."""
     points = sgbm_points(leafy.scene)

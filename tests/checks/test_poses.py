@@ -131,6 +131,7 @@ def test_order_and_world_do_not_matter() -> None:
     assert np.nanmax(there.offset) == np.nanmax(here.offset) == 0
 
 
+@pytest.mark.slow
 def test_large_photos_are_judged_by_their_size() -> None:
     scene = ball_scene(6, 4, focal=2000.0, width=1600, height=1200)
     agreement = pairwise_agreement(scene.regions, scene.cameras)

@@ -29,6 +29,7 @@ def two_views(demo_scene: Scene, demo_regions: Regions) -> tuple[Regions, Scene]
     return regions, Scene("two", views, cameras)
 
 
+@pytest.mark.slow
 def test_agrees_with_drawn_lines_better_than_two_samplings_do(two_views: tuple[Regions, Scene]) -> None:
     """The whole shipped scene is compared by benchmarks/affinity_agreement.py."""
     regions, scene = two_views

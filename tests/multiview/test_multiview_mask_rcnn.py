@@ -3,6 +3,7 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -50,8 +51,8 @@ def tiny_detector() -> MaskRCNN:
         max_size=128,
         rpn_anchor_generator=AnchorGenerator(((24, 48),), ((0.5, 1.0, 2.0),)),
         box_score_thresh=0.05,
-        box_detections_per_img=20,
-        rpn_post_nms_top_n_test=60,
+        box_detections_per_img=12,
+        rpn_post_nms_top_n_test=25,
         box_roi_pool=_align(7),
         mask_roi_pool=_align(14),
     )
@@ -128,6 +129,7 @@ def test_with_cameras_the_usual_dicts_and_ids() -> None:
     assert all(len(labels) == 1 for instance, labels in classes.items() if instance > 0)
 
 
+@pytest.mark.slow
 def test_poses_are_refined_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
     better = small_cameras().scale(2)
 
@@ -326,6 +328,18 @@ def test_the_other_views_are_heard_where_that_is_asked_for(tmp_path: Path, monke
     wrapped = MultiViewMaskRCNN(tiny_detector(), witnesses=True)
     monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: (found, matching))
     images, cameras = load_photos(leafy.scene), leafy.scene.cameras
+    heard = hear_witnesses(found, matching, cameras=cameras, photos=partial(read_photo, leafy.scene))
+    said: list[Matching] = []
+
+    def hear(proposals: Proposals, matching: Matching, **given: Any) -> Any:
+        """What it says takes seconds; what it is asked is checked."""
+        assert proposals is found
+        assert given["cameras"] is cameras
+        assert all((given["photos"](view) == read_photo(leafy.scene, view)).all() for view in range(5))
+        said.append(matching)
+        return heard
+
+    monkeypatch.setattr(mvseg.multiview.mask_rcnn, "hear_witnesses", hear)
     results = wrapped(images, cameras=cameras)
     assert [result["from_views"].tolist() for result in results].count([False, False]) == 4
     assert sorted(results[2]["from_views"].tolist()) == [False, True]
@@ -335,8 +349,8 @@ def test_the_other_views_are_heard_where_that_is_asked_for(tmp_path: Path, monke
     corrected, rematched = wrapped.find_regions(iter(images), cameras)
     by_view = torch.cat([result["instance_ids"].sort().values for result in results])
     assert torch.equal(rematched.instance_ids, by_view)
-    expected, *_ = hear_witnesses(found, matching, cameras=cameras, photos=partial(read_photo, leafy.scene))
-    assert torch.equal(corrected.regions.crops, expected.regions.crops)
+    assert corrected is heard[0]
+    assert len(said) == 2
     assert {key: (value.dtype, value.shape[1:]) for key, value in results[0].items()} == {
         "boxes": (torch.float32, (4,)),
         "labels": (torch.int64, ()),
@@ -348,6 +362,7 @@ def test_the_other_views_are_heard_where_that_is_asked_for(tmp_path: Path, monke
     }
 
 
+@pytest.mark.slow
 def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
     wrapped = MultiViewMaskRCNN(tiny_detector())
     with torch.autocast("cpu", torch.bfloat16):

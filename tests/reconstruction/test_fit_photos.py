@@ -106,6 +106,7 @@ def test_without_texture_nothing_changes(outlined: LeafSurface, noise: float) ->
     assert torch.equal(fit(DOME.masks, photos).coefficients, outlined.coefficients)
 
 
+@pytest.mark.slow
 def test_views_that_do_not_agree_change_nothing(outlined: LeafSurface) -> None:
     photos = [photograph(CAMERAS, texture(10 + view)).photos[view] for view in range(len(CAMERAS))]
     assert torch.equal(fit(DOME.masks, photos).coefficients, outlined.coefficients)
@@ -117,6 +118,7 @@ def test_gain_and_offset_of_each_view_do_not_matter(textured: LeafSurface) -> No
     assert middle(fit(DOME.masks, photos)) == pytest.approx(middle(textured), abs=0.05)
 
 
+@pytest.mark.slow
 def test_the_two_sides_are_not_compared() -> None:
     cameras = Cameras(*(torch.cat([getattr(CAMERAS, n), getattr(BELOW, n)]) for n in ("K", "R", "t", "sizes")))
     upper, lower = photograph(cameras, PAINT), photograph(cameras, texture(5))

@@ -42,6 +42,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_the_number_of_workers_changes_no_byte(tiny: Path, tmp_path: Path) -> None:
     write_dataset(TINY, tmp_path, seed=1, num_workers=2)
     assert read_tree(tmp_path) == read_tree(tiny)

@@ -152,6 +152,7 @@ def test_two_processes_do_what_one_does(leaves: Path, tmp_path: Path, finished: 
         assert ours == pytest.approx(theirs, rel=1e-4)
 
 
+@pytest.mark.slow
 def test_a_killed_run_ends_with_the_same_bits(leaves: Path, tmp_path: Path, finished: Path) -> None:
     """SIGKILL between checkpoints, while one is half written, and in an evaluation; with and without workers."""
     out = tmp_path / "out"
