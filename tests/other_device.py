@@ -1,0 +1,106 @@
+"""A second device for machines that have only one: its tensors say "meta", and are computed on the CPU all the same.
+
+What a GPU refuses is refused here: operands on two devices, and NumPy views of what is not on the CPU.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.overrides import TorchFunctionMode
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_leaves, tree_map
+
+DEVICE = torch.device("meta")  # of those that torch knows everywhere; "cuda" looks for a driver
+aten = torch.ops.aten
+MOVES = {aten._to_copy.default, aten.copy_.default}
+# GPUs take indices from the CPU, too
+INDEXING = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._unsafe_index.Tensor}
+
+
+class OtherTensor(Tensor):
+    """A tensor of the other device; `inner` holds its values on the CPU."""
+
+    inner: Tensor
+
+    @staticmethod
+    def __new__(cls, inner: Tensor) -> OtherTensor:
+        made = Tensor._make_wrapper_subclass(
+            cls, inner.shape, strides=inner.stride(), dtype=inner.dtype, device=DEVICE
+        )
+        made.inner = inner
+        return made
+
+    @classmethod
+    def __torch_function__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        if func in (Tensor.numpy, Tensor.__array__):
+            raise TypeError(f"can't convert a tensor on {DEVICE} to NumPy, expected .cpu() before")
+        if func in (Tensor.tolist, Tensor.__repr__):
+            return func(args[0].inner)
+        if func in (Tensor.__getitem__, Tensor.__setitem__):  # torch would make tensors without data of lists
+            args = (args[0], tree_map(_list_to_tensor, args[1], is_leaf=_is_list), *args[2:])
+        with torch._C.DisableTorchFunctionSubclass():
+            return func(*args, **(kwargs or {}))
+
+    @classmethod
+    def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        with _Compute():
+            return func(*args, **(kwargs or {}))
+
+
+class _Compute(TorchDispatchMode):
+    """Every operation is done on the CPU, and its results are where a GPU would leave them."""
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
+        is_there = [isinstance(each, OtherTensor) for each in tensors]
+        strangers = [each for each, other in zip(tensors, is_there, strict=True) if not other and each.ndim]
+        if any(is_there) and strangers and func not in MOVES and not (func in INDEXING and is_there[0]):
+            raise RuntimeError(f"{func}: expected all tensors on the same device, found {DEVICE} and cpu")
+        target = kwargs.get("device")
+        plain_args, plain_kwargs = tree_map(_to_inner, (args, kwargs))
+        if target is not None:
+            plain_kwargs["device"] = torch.device("cpu")
+        answer = func(*plain_args, **plain_kwargs)
+        if func.__name__.split(".")[0].endswith("_"):  # in place
+            return args[0]
+        goes_there = any(is_there) if target is None else torch.device(target) == DEVICE
+        return tree_map(_to_other, answer) if goes_there else answer
+
+
+class _Create(TorchFunctionMode):
+    """`torch.tensor(data, device=...)` would make a tensor without data."""
+
+    def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = dict(kwargs or {})
+        if func in (torch.tensor, torch.as_tensor) and kwargs.get("device") is not None:
+            return func(*args, **kwargs | {"device": None}).to(kwargs["device"])
+        return func(*args, **kwargs)
+
+
+@contextmanager
+def other_device() -> Iterator[torch.device]:
+    """While this lasts, tensors can be made on the other device and moved to it."""
+    with _Create(), _Compute():
+        yield DEVICE
+
+
+def _is_list(value: Any) -> bool:
+    return isinstance(value, list)
+
+
+def _list_to_tensor(value: Any) -> Any:
+    return torch.tensor(value) if isinstance(value, list) else value
+
+
+def _to_inner(value: Any) -> Any:
+    return value.inner if isinstance(value, OtherTensor) else value
+
+
+def _to_other(value: Any) -> Any:
+    return OtherTensor(value) if isinstance(value, Tensor) else value
