@@ -2,7 +2,8 @@
 
 Rays and epipolar lines know nothing of shape. A surface that is fitted to an instance's masks in all views says what
 each view must show of it. So it recognises its masks where they were matched to another instance, and the pieces of
-its leaf where leaves that cross it made several masks of one.
+its leaf where leaves that cross it made several masks of one. And where two instances are halves of one leaf, one
+surface explains the masks of both.
 """
 
 from __future__ import annotations
@@ -13,9 +14,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mvseg.matching.result import Matching, count_sure_views
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.visible_leaves import visible_leaves
 from mvseg.regions import Regions
@@ -29,6 +34,7 @@ FITS = 0.5  # IoU of a mask with what its view shows of a surface, from which it
 FEW_VIEWS = 0.75  # instances that at most this share of the views shows may be made of pieces
 INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
 MOST_PIECES = 0.5  # an instance is made of pieces when more than this share of its masks are pieces
+TOUCHES = 0.02  # of a surface's length, to the nearest point of one that may be the rest of its leaf
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +62,9 @@ class CheckedIds:
 def check_ids(regions: Regions, matching: Matching, surfaces: Surfaces, *, cameras: Cameras) -> CheckedIds:
     """Move masks to the instances whose surfaces they show.
 
-    First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`). No mask
-    loses its id without getting another; masks that fit nothing stay where they are. An instance may have several masks
-    in a view afterwards: they show it together.
+    First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
+    halves of leaves (`join_halves`). No mask loses its id without getting another; masks that fit nothing stay where
+    they are. An instance may have several masks in a view afterwards: they show it together.
 
     Args:
         regions: D regions.
@@ -71,6 +77,7 @@ def check_ids(regions: Regions, matching: Matching, surfaces: Surfaces, *, camer
     ids = move_pieces(on_cpu, old, surfaces, cameras=cameras)
     left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
     ids = move_misfits(on_cpu, ids, left, cameras=cameras)
+    ids = join_halves(on_cpu, ids, left, cameras=cameras)
     is_moved = ids != old
     scores = matching.match_scores.clone()
     for instance in np.unique(ids[is_moved]).tolist():
@@ -114,9 +121,7 @@ def move_pieces(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     Returns:
         (D,) ids.
     """
-    view_index = regions.view_index.numpy()
-    most = FEW_VIEWS * regions.num_views
-    few = [number for number in np.unique(ids[ids > 0]).tolist() if len(np.unique(view_index[ids == number])) <= most]
+    few = _seen_rarely(regions, ids)
     leaves = {instance: surface for instance, surface in surfaces.items() if instance not in few}
     if not few or not leaves:
         return ids
@@ -149,6 +154,59 @@ def move_misfits(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Ca
         if not (ious[rivals, best[region]] >= best_iou[region]).any():
             revised[region] = best[region]
     return revised
+
+
+def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
+    """Instances that are parts of one leaf become one; for the arguments see `move_pieces`.
+
+    Where something crosses a leaf, masks on either side may form an instance each, and neither lies in the other's
+    surface. So a credible surface of an instance that few views show is doubted where it touches another one. If one
+    surface that is fitted to the masks of both fits no worse than each alone, in the views of each, they are the same
+    leaf. All join the one of them that has most masks.
+    """
+    shown = {instance: each for instance, each in surfaces.items() if each.exists and (ids == instance).any()}
+    pairs = set()
+    for part in _seen_rarely(regions, ids):
+        if part in shown and shown[part].is_credible:
+            whole = touched_surface(part, shown)
+            if whole and _is_one_leaf(regions, ids, (part, whole), surfaces=shown, cameras=cameras):
+                pairs.add((part, whole))
+    if not pairs:
+        return ids
+    part, whole = np.array(sorted(pairs)).T
+    size = int(ids.max()) + 1
+    _, leaf = connected_components(coo_array((np.ones(len(part)), (part, whole)), shape=(size, size)), directed=False)
+    num_masks = np.bincount(ids[ids > 0], minlength=size)
+    largest = np.array([np.where(leaf == number, num_masks, -1).argmax() for number in range(leaf.max() + 1)])
+    return np.where(ids > 0, largest[leaf[ids]], ids)
+
+
+def _seen_rarely(regions: Regions, ids: Ints) -> list[int]:
+    """The instances that at most `FEW_VIEWS` of the views show, in ascending order."""
+    views, most = regions.view_index.numpy(), FEW_VIEWS * regions.num_views
+    return [number for number in np.unique(ids[ids > 0]).tolist() if len(np.unique(views[ids == number])) <= most]
+
+
+def touched_surface(part: int, surfaces: Surfaces) -> int | None:
+    """The nearest of the other surfaces, if it touches this one."""
+    points = {instance: surface.points().reshape(-1, 3).numpy() for instance, surface in surfaces.items()}
+    tree = cKDTree(points.pop(part))
+    gaps = {instance: float(tree.query(there)[0].min()) for instance, there in points.items()}
+    nearest = min(gaps, key=lambda instance: gaps[instance], default=None)
+    return nearest if nearest is not None and gaps[nearest] <= TOUCHES * surfaces[part].length else None
+
+
+def _is_one_leaf(
+    regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras
+) -> bool:
+    """Does one surface fit the masks of two instances no worse than their own surfaces do, in the views of each?"""
+    joint = fit_surfaces(regions, torch.from_numpy(np.where(np.isin(ids, pair), 1, -1)), cameras)[1]
+    for instance in pair:
+        is_seen = torch.isin(joint.views, regions.view_index[torch.from_numpy(ids == instance)])
+        fits_alone = surfaces[instance].iou.median()
+        if not is_seen.any() or not joint.iou[is_seen].median() >= fits_alone:
+            return False
+    return True
 
 
 def match_surfaces(regions: Regions, surfaces: Surfaces, *, cameras: Cameras) -> tuple[Floats, Floats]:

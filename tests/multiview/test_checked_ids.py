@@ -9,32 +9,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from blade_scene import SIZE, as_regions, ring_cameras
+from blade_scene import SIZE, as_regions
 from known_leaves import flat_leaf
 from mvseg.matching.result import Matching, MergedMask
-from mvseg.multiview.checked_ids import CheckedIds, check_ids, match_surfaces
+from mvseg.multiview.checked_ids import CheckedIds, check_ids, match_surfaces, touched_surface
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.surface.visible_leaves import visible_leaves
 from mvseg.regions import Regions
-
-CAMERAS = ring_cameras(6, elevations_deg=(35, 60, 45))
-LEAVES = {  # the first hides a part of the second from above
-    1: flat_leaf(length=1.6, half_width=0.35, at=(-0.8, -0.3, 0.4)),
-    2: flat_leaf(length=1.6, half_width=0.4, at=(-0.6, 0.2, 0.0)),
-    3: flat_leaf(length=0.8, half_width=0.3, at=(0.4, -0.9, -0.2)),
-}
-
-
-def true_maps(leaves: dict[int, LeafSurface] = LEAVES) -> list[np.ndarray]:
-    """V label maps of the leaves."""
-    maps = []
-    for view in range(len(CAMERAS)):
-        labels = np.zeros((SIZE, SIZE), np.int64)
-        for leaf in visible_leaves(leaves, CAMERAS, view):
-            x1, y1, x2, y2 = leaf.box
-            labels[y1:y2, x1:x2][leaf.mask] = leaf.instance
-        maps.append(labels)
-    return maps
+from three_leaves import CAMERAS, LEAVES, true_maps
 
 
 def match_all(ids: Tensor, view_index: Tensor, scores: Tensor | None = None) -> Matching:
@@ -189,3 +171,39 @@ def test_without_surfaces_or_masks_nothing_happens(scene: tuple[Regions, Tensor]
     matching = Matching(instance_ids=nothing, match_scores=torch.zeros(0), num_instances=0, method="nview")
     checked = check_ids(empty, matching, {}, cameras=CAMERAS)
     assert checked.matching.num_instances == len(checked.is_moved) == len(checked.old_ids) == 0
+
+
+def halved_maps(views: tuple[int, ...]) -> list[np.ndarray]:
+    """Something crosses leaf 1, here or there: what lies right of it is 11 in these views, and nothing in others."""
+    maps = true_maps()
+    v, u = np.mgrid[:SIZE, :SIZE] + 0.5
+    for view, labels in enumerate(maps):
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ CAMERAS.world_from_px[view].numpy().T
+        x, _, z = CAMERAS.centers[view].tolist()
+        on_leaf = x + rays[..., 0] * (0.4 - z) / rays[..., 2]  # where the ray meets the leaf's plane
+        is_right = (labels == 1) & (on_leaf > 0.1 * (view % 3 - 1))
+        labels[is_right] = 11 if view in views else 0
+    return maps
+
+
+@pytest.mark.slow
+def test_halves_of_a_leaf_become_one() -> None:
+    regions, numbers = as_regions(halved_maps((0, 1, 2, 3)))
+    ids = torch.where(numbers == 11, 4, numbers)
+    surfaces = fit_surfaces(regions, ids, CAMERAS)
+    checked = check(regions, ids, surfaces)
+    assert torch.equal(checked.matching.instance_ids, numbers % 10)
+    assert checked.is_moved.tolist() == (numbers == 11).tolist()
+    assert checked.old_ids.tolist() == [1, 2, 3]
+    assert checked.is_changed.tolist() == [True, False, False]
+
+
+@pytest.mark.slow
+def test_leaves_that_touch_stay_apart() -> None:
+    """Two leaves from one place, one of which four views show."""
+    leaves = {1: LEAVES[1], 2: LEAVES[2], 3: flat_leaf(length=0.9, half_width=0.2, at=(0.75, -0.3, 0.4))}
+    maps = [np.where((labels == 3) & (view > 3), 0, labels) for view, labels in enumerate(true_maps(leaves))]
+    regions, ids = as_regions(maps)
+    surfaces = fit_surfaces(regions, ids, CAMERAS)
+    assert touched_surface(3, surfaces) == 1
+    assert torch.equal(check(regions, ids, surfaces).matching.instance_ids, ids)

@@ -8,34 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from blade_scene import SIZE, as_regions, ring_cameras
-from known_leaves import flat_leaf
+from blade_scene import SIZE, as_regions
 from mvseg.matching.result import Matching
 from mvseg.multiview.witnesses import Revised, revise_masks
-from mvseg.reconstruction.surface.visible_leaves import visible_leaves
 from mvseg.regions import Regions
+from three_leaves import CAMERAS, LEAVES, true_maps
 
-CAMERAS = ring_cameras(6, elevations_deg=(35, 60, 45))
-LEAVES = {  # the first hides a part of the second from above
-    1: flat_leaf(length=1.6, half_width=0.35, at=(-0.8, -0.3, 0.4)),
-    2: flat_leaf(length=1.6, half_width=0.4, at=(-0.6, 0.2, 0.0)),
-    3: flat_leaf(length=0.8, half_width=0.3, at=(0.4, -0.9, -0.2)),
-}
 GREEN, BROWN = (70, 150, 50), (120, 90, 60)
-
-
-def true_maps() -> list[np.ndarray]:
-    """V label maps of the leaves."""
-    maps = []
-    for view in range(len(CAMERAS)):
-        labels = np.zeros((SIZE, SIZE), np.int64)
-        for leaf in visible_leaves(LEAVES, CAMERAS, view):
-            x1, y1, x2, y2 = leaf.box
-            labels[y1:y2, x1:x2][leaf.mask] = leaf.instance
-        maps.append(labels)
-    return maps
-
-
 TRUE = true_maps()
 
 

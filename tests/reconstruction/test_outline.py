@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
+from mvseg.reconstruction.surface.fit_patch import NUM_WARM_STEPS, fit_patch
 from mvseg.reconstruction.surface.leaf_patch import COUNTS, MIDRIB, NUM_COEFFICIENTS, SIDE, Floats, patch_grid
 from mvseg.reconstruction.surface.mask_stack import FRAME, MaskStack, stack_masks
 from mvseg.reconstruction.surface.outline import outline_distances, outline_samples
@@ -227,3 +228,14 @@ def test_selected_views_are_those_of_a_stack_of_their_own() -> None:
     selected = every.select(np.array([False, True, False, True]))
     for field in fields(MaskStack):
         assert np.array_equal(getattr(selected, field.name), getattr(few, field.name)), field.name
+
+
+def test_a_patch_that_no_mask_is_near_is_fitted_to_nothing() -> None:
+    """Masks of several leaves under one id can make such a start."""
+    far = ellipse()
+    far[MIDRIB] += (100, 0, 0)
+    assert outline_distances(stack(), GRID, far, reach=6.0, is_imaged=True).jacobian.shape == (0, 3 * NUM_COEFFICIENTS)
+    fit = fit_patch(stack(), far, num_steps=NUM_WARM_STEPS)
+    assert np.isfinite(fit.coefficients).all()
+    assert np.isnan(fit.residual_px).all()
+    assert np.isnan(fit.offsets_px).all()

@@ -163,7 +163,7 @@ class Distances:
     @property
     def jacobian(self) -> Floats:
         """(N, 78) change along the normal per coefficient."""
-        return (self.basis[:, :, None] * self.gradient[:, None, :]).reshape(len(self.px), -1)
+        return (self.basis[:, :, None] * self.gradient[:, None, :]).reshape(len(self.px), 3 * self.basis.shape[1])
 
 
 def outline_distances(
