@@ -24,7 +24,7 @@ from tiny_training import build_tiny, make_config, parse_config, write_photos
 
 
 ROOT = Path(__file__).parents[2]
-RECIPES = [*(ROOT / "configs" / "train").glob("*.yaml"), *(ROOT / "models").glob("*/recipe/leaf-slim*.yaml")]
+RECIPES = [*(ROOT / "configs" / "train").glob("*.yaml"), *(ROOT / "models").glob("*/recipe/leaf-*.yaml")]
 
 
 @pytest.mark.parametrize("path", sorted(RECIPES), ids=lambda path: path.name)
