@@ -79,7 +79,7 @@ def run_locally(
                 if key is not None:
                     yield key, answer
                 if not has_died:
-                    _hand_out(worker, todo, workers, started)
+                    _hand_out(worker, todo, workers, started=started)
                 elif todo and worker.has_started:
                     workers.append(_start_worker(work))
                 elif todo and not workers:
@@ -89,7 +89,7 @@ def run_locally(
 
 
 def _hand_out(
-    worker: _Worker, todo: dict[int, Any], workers: list[_Worker], started: Callable[[int], object]
+    worker: _Worker, todo: dict[int, Any], workers: list[_Worker], *, started: Callable[[int], object]
 ) -> None:
     """Give a worker its next item, or send it home. One that has just died is noticed when its answer is read."""
     if not todo:

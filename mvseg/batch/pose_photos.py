@@ -80,7 +80,7 @@ def pose_photos(
     for message in messages:
         print(f"mvseg: warning: {message}", file=sys.stderr)
     if not quiet:
-        print(describe_result(out, structure, placement, scene))
+        print(describe_result(out, structure, placement=placement, scene=scene))
     return scene
 
 
@@ -117,7 +117,7 @@ def describe_poses(structure: Structure, placement: Placement, files: Sequence[P
     }
 
 
-def describe_result(out: Path, structure: Structure, placement: Placement, scene: Scene) -> str:
+def describe_result(out: Path, structure: Structure, *, placement: Placement, scene: Scene) -> str:
     """The lines that a run ends with."""
     found, lost = len(structure.registered), len(structure.left_out)
     points = structure.model.num_points3D()

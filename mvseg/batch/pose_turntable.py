@@ -105,7 +105,7 @@ def pose_turntable_photos(
         run: dict[str, Any] = {"photos": len(files), "turntable": str(turntable), "unit": unit}
         if refine:
             used = {name: cameras[name] for name in cameras if name in camera_of}
-            found, distinct = _refine(folder, files, used, camera_of, angle_of, quiet=quiet)
+            found, distinct = _refine(folder, files, used, camera_of=camera_of, angle_of=angle_of, quiet=quiet)
             run["refinement"] = _describe_refinement(found)
             if found.is_taken:
                 refined = zip(used, found.table.cameras, strict=True)
@@ -186,9 +186,9 @@ def _refine(
     folder: Path,
     files: Sequence[PhotoFile],
     cameras: dict[str, dict[str, Any]],
+    *,
     camera_of: Sequence[str],
     angle_of: Sequence[float],
-    *,
     quiet: bool,
 ) -> tuple[Refinement, list[float]]:
     """What becomes of the cameras, in their order, and of the distinct angles, which are the second."""

@@ -57,7 +57,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
         earlier = read_status(folder)
         try:
             masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
-            key, inputs = _key_of(scene, masks, config, earlier)
+            key, inputs = _key_of(scene, masks, config, earlier=earlier)
             if earlier is not None and earlier.key == key and _is_done(earlier, scene_result(out, scene.name)):
                 return Finished(earlier, is_kept=True)
             write_status(folder, Status(state="running", scene=str(scene.folder), key=key, inputs=inputs))
@@ -72,7 +72,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
 
 
 def _key_of(
-    scene: BatchScene, masks: Path | None, config: RunConfig, earlier: Status | None
+    scene: BatchScene, masks: Path | None, config: RunConfig, *, earlier: Status | None
 ) -> tuple[str, dict[str, FileHash]]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # the run itself gives them

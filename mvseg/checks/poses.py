@@ -32,8 +32,6 @@ MOST_PARTNERS = 20  # views that each view is compared with
 UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit of offset: masks of large photos are drawn less exactly
 MOST_OFFSET = 40  # units, tried in both directions
 SHARPNESS = 2.0  # units, of the vote for an offset
-# Of the 96 development scenes (48 plants, true and degraded masks), see `view_is_off`.
-CHANCE, OFF = 0.22, 3.0
 # Chosen on 96 development scenes (48 simulated plants with true and with degraded masks) with eight faults in each: no
 # sound view was off, see docs/check.md.
 CHANCE, OFFSET = 0.22, 1.5  # fitting share, units

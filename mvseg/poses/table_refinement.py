@@ -117,7 +117,7 @@ def refine_table(table: Table, shots: Shots, tracks: Tracks) -> Refinement:
     found, before = table, _median_error(table, shots, apart)
     for _ in range(NUM_ROUNDS):
         part = _drop_wrong(found, shots, part)
-        missing = _too_few(table, shots, part, apart)
+        missing = _too_few(table, shots, part=part, apart=apart)
         if missing:
             return Refinement(table, is_taken=False, reason=f"{missing}: kept", num_points=part.num_points)
         found = _keep_world(_adjust(found, shots, part), table)
@@ -191,7 +191,7 @@ def _undistort(px: Floats, camera: TableCamera) -> Floats:
     return np.asarray(rays @ camera.K[:2, :2].T + camera.K[:2, 2])
 
 
-def _too_few(table: Table, shots: Shots, part: Tracks, apart: Tracks) -> str:
+def _too_few(table: Table, shots: Shots, *, part: Tracks, apart: Tracks) -> str:
     """Why there are not enough features, or nothing."""
     least = min(part.num_points, apart.num_points * 3)
     if least < LEAST_POINTS:

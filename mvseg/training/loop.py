@@ -250,7 +250,7 @@ def try_precision(run: Run, state: TrainingState) -> bool:
     """Whether this run is to be in bfloat16, by a forward pass of its own."""
     samples = augmented_samples(run)
     photos, targets, _ = collate([samples[0, index % len(samples)] for index in range(run.config.images_per_forward)])
-    return choose_bf16(run.config, state.model, photos, targets)
+    return choose_bf16(run.config, state.model, photos=photos, targets=targets)
 
 
 def augmented_samples(run: Run) -> AugmentedSamples:

@@ -21,7 +21,9 @@ logger = logging.getLogger(__name__)
 WORTHWHILE = 0.9  # of float32's time; for less, its precision is not given up
 
 
-def choose_bf16(config: TrainConfig, model: nn.Module, photos: list[Tensor], targets: list[Target]) -> bool:
+def choose_bf16(
+    config: TrainConfig, model: nn.Module, *, photos: list[Tensor], targets: list[Target]
+) -> bool:
     """Whether the forward pass of a run is to be under bfloat16 autocast, see `TrainConfig.precision`.
 
     Args:

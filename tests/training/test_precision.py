@@ -17,10 +17,10 @@ from mvseg.training.precision import choose_bf16, time_passes
 from tiny_training import build_tiny, make_config, write_photos
 
 
-def one_pass() -> tuple[list[torch.Tensor], list[dict[str, torch.Tensor]]]:
+def one_pass() -> dict[str, Any]:
     box = torch.tensor([[10.0, 10.0, 40.0, 50.0]])
     target = {"boxes": box, "labels": torch.tensor([1]), "masks": torch.ones((1, 64, 64), dtype=torch.uint8)}
-    return [torch.rand(3, 64, 64)], [target]
+    return {"photos": [torch.rand(3, 64, 64)], "targets": [target]}
 
 
 def set_times(monkeypatch: pytest.MonkeyPatch, *, fp32: float, bf16: float) -> None:
@@ -37,7 +37,7 @@ def test_auto_takes_what_is_clearly_faster(
     set_times(monkeypatch, fp32=fp32, bf16=bf16)
     config = make_config(Path(), Path(), precision="auto")
     with caplog.at_level(logging.INFO):
-        assert choose_bf16(config, build_tiny(), *one_pass()) == chosen
+        assert choose_bf16(config, build_tiny(), **one_pass()) == chosen
     assert f"{fp32:.2f} s of CPU in fp32 and {bf16:.2f} s in bf16" in caplog.text
     assert f"training in {'bf16' if chosen else 'fp32'}" in caplog.text
 
@@ -47,16 +47,17 @@ def test_a_precision_that_is_said_is_not_measured(
     precision: str, chosen: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delattr(mvseg.training.precision, "time_passes")
-    assert choose_bf16(make_config(Path(), Path(), precision=precision), build_tiny(), *one_pass()) == chosen
+    assert choose_bf16(make_config(Path(), Path(), precision=precision), build_tiny(), **one_pass()) == chosen
 
 
 def test_measuring_changes_nothing() -> None:
-    model, (photos, targets) = build_tiny().train(), one_pass()
+    model, given = build_tiny().train(), one_pass()
+    photos, targets = given["photos"], given["targets"]
     before, photo = {name: value.clone() for name, value in model.state_dict().items()}, photos[0].clone()
     torch.manual_seed(5)
     expected = torch.rand(3)
     torch.manual_seed(5)
-    choose_bf16(make_config(Path(), Path(), precision="auto"), model, photos, targets)
+    choose_bf16(make_config(Path(), Path(), precision="auto"), model, **given)
     assert torch.equal(torch.rand(3), expected)
     assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
     assert all(parameter.grad is None for parameter in model.parameters())
@@ -67,7 +68,7 @@ def test_measuring_changes_nothing() -> None:
 def test_each_precision_is_timed_as_it_is_trained(monkeypatch: pytest.MonkeyPatch) -> None:
     seen, model = [], build_tiny().train()
     model.backbone.register_forward_hook(lambda module, inputs, output: seen.append(output.dtype))
-    assert all(time_passes(model, *one_pass(), is_bf16=is_bf16) > 0 for is_bf16 in (False, True))
+    assert all(time_passes(model, **one_pass(), is_bf16=is_bf16) > 0 for is_bf16 in (False, True))
     assert seen == [torch.float32, torch.float32, torch.bfloat16, torch.bfloat16]
 
 
