@@ -7,6 +7,9 @@ PYTHON := $(VENV)/bin/python
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
 
+# two processes, one thread each: libraries that start more get in each other's way
+test slow: export OMP_NUM_THREADS := 1
+
 test: $(VENV)/installed
 	$(PYTHON) -m pytest -n 2
 
