@@ -31,6 +31,7 @@ from mvseg.training.config import TrainConfig
 from mvseg.training.loop import train
 
 SCALES = (0.7, 1.4)  # training samples against the size of the detection
+LEAST_KEPT = 0.5  # of the masks found, by the other views: where they keep fewer, labels are wrong too often
 
 
 @dataclass(frozen=True)
@@ -82,8 +83,8 @@ def adapt_detector(
         progress: show progress bars.
 
     Returns:
-        How far the views agree with the old and the new weights. Where they agree less with the new ones, that is an
-        InputWarning, too.
+        How far the views agree with the old and the new weights. InputWarnings say so where they keep less than half of
+        what the old ones find (labels are wrong then), and where they agree less with the new ones.
 
     Raises:
         InputError: a scene without photos, weights for several categories, no confirmed mask at all, or what `train`
@@ -105,6 +106,10 @@ def adapt_detector(
         if not before.num_labels:
             least = f"in {config.min_views} views with a match score of {config.min_match_score:g}"
             raise InputError(f"none of the {before.num_found} masks found is confirmed {least}: nothing to learn from")
+        if before.num_kept < LEAST_KEPT * before.num_found:
+            message = f"the other views keep only {before.num_kept} of the {before.num_found} masks found"
+            message = f"{message}: expect wrong labels, and worse weights; look at {out / 'labels'}"
+            warnings.warn(message, InputWarning, stacklevel=2)
         if not (out / "training" / "config.yaml").is_file():
             write_labels(found, out / "labels", longest_side=math.ceil(SCALES[1] * size), progress=progress)
         train(

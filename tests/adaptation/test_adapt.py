@@ -26,6 +26,7 @@ from scene_folders import write_scene
 
 MODULE = "mvseg.adaptation.adapt"
 FOUND_BY_NEW = 3  # balls
+NUM_ADDED = 0  # masks that only the other views show
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +54,7 @@ def trained(plant: Path, monkeypatch: pytest.MonkeyPatch) -> list[TrainConfig]:
         return Proposals(regions=regions, boxes=regions.boxes.float(), scores=ones, classes=ones.long()), matching
 
     def hear(found: Proposals, matching: Matching, **_: object) -> tuple[Proposals, Matching, dict[int, LeafSurface]]:
-        return replace(found, from_views=torch.zeros(len(found.regions), dtype=torch.bool)), matching, {}
+        return replace(found, from_views=torch.arange(len(found.regions)) < NUM_ADDED), matching, {}
 
     def train(config: TrainConfig) -> None:
         asked.append(config)
@@ -88,6 +89,13 @@ def test_less_agreement_warns(
     monkeypatch.setitem(globals(), "FOUND_BY_NEW", 2)
     with pytest.warns(InputWarning, match="kept 12 of 12 masks before and keep 8 of 8 now: the old weights may be"):
         adapt_detector([plant], tmp_path / "out")
+
+
+@pytest.mark.usefixtures("trained")
+def test_views_that_keep_little_warn(plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(globals(), "NUM_ADDED", 7)
+    with pytest.warns(InputWarning, match="keep only 5 of the 12 masks found: expect wrong labels.*; look at .*labels"):
+        adapt_detector([plant], tmp_path / "out", AdaptConfig(num_samples=10, image_size=60))
 
 
 def test_a_second_run_goes_on(plant: Path, trained: list[TrainConfig], tmp_path: Path) -> None:
