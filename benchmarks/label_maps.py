@@ -143,8 +143,9 @@ def add_scene_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--cache", type=Path, required=True, help="folder for rendered label maps")
     parser.add_argument("--split", choices=("dev", "test"), default="dev")
     parser.add_argument("--seed", type=int, default=0, help="of the plants; another one gives plants never seen before")
-    parser.add_argument("--leaves", nargs="+", type=int, default=PRESETS["paper-eval"].leaves)
-    parser.add_argument("--views", nargs="+", type=int, default=PRESETS["paper-eval"].views)
+    preset = PRESETS["paper-eval"]
+    parser.add_argument("--leaves", nargs="+", type=int, choices=preset.leaves, default=preset.leaves)
+    parser.add_argument("--views", nargs="+", type=int, choices=preset.views, default=preset.views)
     parser.add_argument("--plants", type=int, default=6, help="at most this many per number of leaves")
     parser.add_argument("--workers", type=int, default=2, help="scenes at once")
 

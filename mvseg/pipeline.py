@@ -102,12 +102,14 @@ def run_scene(
         with _timed(seconds, "match"):
             matching = match_regions(regions, scene.cameras, config.match, progress=progress)
             scene = pose_scene(scene, matching)
-    if config.split_merged:
+    shapes = config.reconstruct
+    is_checked = shapes is not None and shapes.check_ids and shapes.shape != "voxels" and from_views is None
+    if config.split_merged and not is_checked:
         regions, matching, source = split_merged(regions, matching)
         scores = None if scores is None else scores[source]
         from_views = None if from_views is None else from_views[source]
     kind = "" if found is None else found.kind
-    if config.reconstruct is None:
+    if shapes is None:
         return Result(
             scene=scene,
             regions=regions,
@@ -123,21 +125,26 @@ def run_scene(
 
         reconstruct = partial(
             reconstruct_shapes,
-            regions,
             cameras=scene.cameras,
-            config=config.reconstruct,
+            config=shapes,
             photos=partial(read_photo, scene) if scene.views[0].path.is_file() else None,
             workers=workers,
             progress=progress,
         )
-        surfaces, voxels = reconstruct(matching.instance_ids, starts=starts)
-        if config.reconstruct.check_ids and surfaces is not None and from_views is None:
+        surfaces, voxels = reconstruct(regions, matching.instance_ids, starts=starts)
+        if is_checked and surfaces is not None:
             from mvseg.multiview.checked_ids import check_ids
 
             checked = check_ids(regions, matching, surfaces, cameras=scene.cameras)
-            matching, moved = checked.matching, int(checked.is_moved.sum())
-            if moved:
-                surfaces, voxels = reconstruct(matching.instance_ids, known=checked.unchanged(surfaces))
+            matching, moved, known = checked.matching, int(checked.is_moved.sum()), checked.unchanged(surfaces)
+            cut: set[int] = set()
+            if config.split_merged:
+                cut = {instance for mask in matching.merged for instance in (mask.own, mask.other)}
+                known = {instance: surface for instance, surface in known.items() if instance not in cut}
+                regions, matching, source = split_merged(regions, matching)
+                scores = None if scores is None else scores[source]
+            if moved or cut:
+                surfaces, voxels = reconstruct(regions, matching.instance_ids, known=known)
     with _timed(seconds, "measure"):
         from mvseg.traits.measure import measure_plant
 

@@ -34,7 +34,7 @@ from mvseg import (
 )
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import read_photo
-from mvseg.matching.result import Matching, RefinedPoses
+from mvseg.matching.result import Matching, MergedMask, RefinedPoses
 from mvseg.multiview.checked_ids import CheckedIds
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.plant_box import crop_cameras, place_crops, plant_boxes
@@ -43,6 +43,7 @@ from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.pipeline import detect_regions
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
+from mvseg.regions import Regions
 from mvseg.results.folder import save_result
 from mvseg.results.provenance import describe_run
 from mvseg.results.result import Result
@@ -239,6 +240,44 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
         assert len(fits[1][1]) == 1
         assert sum(a != b for a, b in zip(fits[0][0], fits[1][0], strict=True)) == 1
         assert result.voxels is not None
+
+
+@pytest.mark.parametrize("is_checked", [True, False])
+def test_masks_are_cut_once_the_surfaces_were_heard_and_both_leaves_are_fitted_again(
+    plant: Path, monkeypatch: pytest.MonkeyPatch, is_checked: bool
+) -> None:
+    fits: list[tuple[list[int], list[int]]] = []
+
+    def fit(_: object, ids: torch.Tensor, *__: object, known: Any, **___: object) -> dict[int, LeafSurface]:
+        fits.append((ids.tolist(), list(known)))
+        return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
+
+    def list_first(regions: Regions, matching: Matching, *_: object) -> Matching:
+        """The left half of the first mask shows the next leaf."""
+        own, part = int(matching.instance_ids[0]), regions.crop(0).clone()
+        part[:, part.shape[1] // 2 :] = False
+        return replace(matching, merged=(MergedMask(region=0, own=own, other=own % 3 + 1, part=part),))
+
+    def check(regions: Regions, matching: Matching, *_: object, **__: object) -> CheckedIds:
+        none = torch.zeros(len(regions), dtype=torch.bool)
+        listed = list_first(regions, matching)
+        return CheckedIds(matching=listed, is_moved=none, old_ids=torch.arange(1, 4), is_changed=none[:3])
+
+    def match(regions: Regions, *args: Any, **kwargs: Any) -> Matching:
+        return list_first(regions, match_regions(regions, *args, **kwargs))
+
+    monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.multiview.checked_ids.check_ids", check)
+    monkeypatch.setattr("mvseg.pipeline.match_regions", match)
+    config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
+    result = run_scene(plant, plant / "masks", config)
+    ids = result.matching.instance_ids.tolist()
+    assert result.matching.merged == ()
+    assert ids[1] == ids[0] % 3 + 1
+    assert len(result.regions) == len(ids)
+    whole = [ids[0], *ids[2:]]
+    left = [number for number in (1, 2, 3) if number not in ids[:2]]
+    assert fits == ([(whole, []), (ids, left)] if is_checked else [(ids, [])])
 
 
 def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:

@@ -62,7 +62,7 @@ class Matching:
         support: (K,) int64, number of views in which each instance, from id 1 on, has a region with a match score of at
             least 0.5; None where the match scores are not probabilities.
         merged: masks that seem to cover two instances. The masks themselves are unchanged (`split_merged` cuts them).
-            Only "nview" looks for them.
+            "nview" looks for them, and `mvseg infer` asks the surfaces, see docs/matching.md.
         residual_px: reprojection error of the matched regions, in pixels; None where it was not estimated.
         explained: mean score of the matched regions in their clusters; 1 = every pixel is seen in all other views. None
             where it was not estimated.

@@ -3,23 +3,24 @@
 Rays and epipolar lines know nothing of shape. A surface that is fitted to an instance's masks in all views says what
 each view must show of it. So it recognises its masks where they were matched to another instance, and the pieces of
 its leaf where leaves that cross it made several masks of one. And where two instances are halves of one leaf, one
-surface explains the masks of both.
+surface explains the masks of both. Where two surfaces explain one mask in disjoint parts, it shows two leaves.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mvseg.matching.result import Matching, count_sure_views
+from mvseg.matching.result import Matching, MergedMask, count_sure_views
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.visible_leaves import visible_leaves
@@ -35,6 +36,8 @@ FEW_VIEWS = 0.75  # instances that at most this share of the views shows may be 
 INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
 MOST_PIECES = 0.5  # an instance is made of pieces when more than this share of its masks are pieces
 TOUCHES = 0.02  # of a surface's length, to the nearest point of one that may be the rest of its leaf
+EACH, BOTH = 0.2, 0.7  # of a merged mask, that shows either of its two surfaces, and both together
+MOST = 0.5  # of what its view shows of the second one, that lies in the mask
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,11 +67,12 @@ def check_ids(regions: Regions, matching: Matching, surfaces: Surfaces, *, camer
 
     First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
     halves of leaves (`join_halves`). No mask loses its id without getting another; masks that fit nothing stay where
-    they are. An instance may have several masks in a view afterwards: they show it together.
+    they are. An instance may have several masks in a view afterwards: they show it together. Last, the masks that show
+    two surfaces are listed as merged (`find_shared`).
 
     Args:
         regions: D regions.
-        matching: of these; "merged" masks that move are forgotten.
+        matching: of these; "merged" masks that move are forgotten, unless they show two surfaces.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         cameras: V cameras.
     """
@@ -89,8 +93,11 @@ def check_ids(regions: Regions, matching: Matching, surfaces: Surfaces, *, camer
     is_gone = np.isin(every, old) & ~np.isin(every, ids)
     numbers = np.where(is_gone, -1, np.cumsum(~is_gone))
     moved_ids = torch.from_numpy(ids).to(matching.instance_ids)
-    merged = tuple(mask for mask in matching.merged if not is_moved[mask.region])
-    checked = replace(matching, instance_ids=moved_ids, match_scores=scores, merged=merged)
+    merged = {mask.region: mask for mask in matching.merged if not is_moved[mask.region]}
+    shared = find_shared(on_cpu, ids, left, cameras=cameras, named=list(merged.values()))
+    merged |= {mask.region: mask for mask in shared}
+    by_region = tuple(mask for _, mask in sorted(merged.items()))
+    checked = replace(matching, instance_ids=moved_ids, match_scores=scores, merged=by_region)
     checked = checked.relabel(torch.from_numpy(numbers))
     if matching.support is not None and is_moved.any():
         checked = replace(checked, support=count_sure_views(checked, regions.view_index))
@@ -209,6 +216,39 @@ def _is_one_leaf(
     return True
 
 
+def find_shared(
+    regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras, named: Iterable[MergedMask] = ()
+) -> list[MergedMask]:
+    """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
+
+    Half of what the view shows of the second one must lie in the mask, or the matcher must have `named` the two: a
+    mask that is drawn too large, or a surface that is drawn over another by mistake, shows a strip of it only. The
+    second part is what is nearer to what is seen of the second surface than to what is seen of the first. For the other
+    arguments see `move_pieces`.
+    """
+    inside, every = match_surfaces(regions, surfaces, cameras=cameras)[1], np.arange(len(ids))
+    own = np.where(np.isin(ids, list(surfaces)), ids, 0)
+    by_own = inside[every, own]
+    inside[every, own] = 0
+    second, by_second = inside.argmax(1), inside.max(1)
+    is_explained = (by_own >= EACH) & (by_second >= EACH) & (by_own + by_second >= BOTH)
+    pairs = {(mask.region, mask.own, mask.other) for mask in named}
+    shared = []
+    views = regions.view_index.numpy()
+    for view in np.unique(views[is_explained]).tolist():
+        shown = _draw(surfaces, cameras, view)
+        for region in np.flatnonzero(is_explained & (views == view)).tolist():
+            pair = int(own[region]), int(second[region])
+            x1, y1, x2, y2 = regions.boxes[region].tolist()
+            mask = regions.crop(region).numpy()
+            seen = np.where(mask, shown[y1:y2, x1:x2], 0)
+            if (region, *pair) in pairs or (seen == pair[1]).sum() >= MOST * (shown == pair[1]).sum():
+                to_first, to_second = (distance_transform_edt(seen != instance) for instance in pair)
+                part = torch.from_numpy(mask & (to_second < to_first))
+                shared.append(MergedMask(region=region, own=pair[0], other=pair[1], part=part))
+    return shared
+
+
 def match_surfaces(regions: Regions, surfaces: Surfaces, *, cameras: Cameras) -> tuple[Floats, Floats]:
     """How well masks fit surfaces.
 
@@ -220,11 +260,8 @@ def match_surfaces(regions: Regions, surfaces: Surfaces, *, cameras: Cameras) ->
     """
     columns = max(surfaces, default=0) + 1
     ious, inside = np.zeros((len(regions), columns)), np.zeros((len(regions), columns))
-    for view, (width, height) in enumerate(cameras.sizes.tolist()):
-        shown = np.zeros((height, width), np.int64)
-        for leaf in visible_leaves(surfaces, cameras, view):
-            x1, y1, x2, y2 = leaf.box
-            shown[y1:y2, x1:x2][leaf.mask] = leaf.instance
+    for view in range(len(cameras)):
+        shown = _draw(surfaces, cameras, view)
         sizes = np.bincount(shown.ravel(), minlength=columns)
         for region in (regions.view_index == view).nonzero()[:, 0].tolist():
             x1, y1, x2, y2 = regions.boxes[region].tolist()
@@ -234,3 +271,13 @@ def match_surfaces(regions: Regions, surfaces: Surfaces, *, cameras: Cameras) ->
             inside[region] = common / max(len(covered), 1)
     ious[:, 0] = inside[:, 0] = 0
     return ious, inside
+
+
+def _draw(surfaces: Surfaces, cameras: Cameras, view: int) -> Ints:
+    """(H, W) the instance whose surface each pixel of a view shows, 0 = none."""
+    width, height = cameras.sizes[view].tolist()
+    shown = np.zeros((height, width), np.int64)
+    for leaf in visible_leaves(surfaces, cameras, view):
+        x1, y1, x2, y2 = leaf.box
+        shown[y1:y2, x1:x2][leaf.mask] = leaf.instance
+    return shown

@@ -27,9 +27,9 @@ class ReconstructConfig:
         photos: let the texture of the leaves in the photos improve surfaces between their outlines; photos that are
             missing are done without.
         jackknife: standard deviations of surfaces from fits without each view in turn; takes many times longer.
-        check_ids: masks that show another instance's surface than their own get its id, and surfaces that lost or won
-            masks are fitted again, see docs/matching.md; not where witnesses were heard (`detect.witnesses`), nor
-            without surfaces.
+        check_ids: masks that show another instance's surface than their own get its id, surfaces that lost or won masks
+            are fitted again, and masks that show two surfaces are listed, see docs/matching.md; not where witnesses
+            were heard (`detect.witnesses`), nor without surfaces.
     """
 
     shape: Literal["surface", "voxels", "both"] = "surface"

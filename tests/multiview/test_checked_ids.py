@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from scipy.ndimage import distance_transform_edt
 from torch import Tensor
 
 from blade_scene import SIZE, as_regions
@@ -75,6 +76,54 @@ def test_two_masks_with_each_others_ids_are_swapped(scene: tuple[Regions, Tensor
     assert checked.unchanged(LEAVES) == {3: LEAVES[3]}
     assert checked.matching.match_scores.tolist() == pytest.approx([0.9] * len(ids))  # of those that had the id before
     assert checked.matching.merged == ()
+
+
+def merged_maps(view: int, share: float) -> list[np.ndarray]:
+    """In this view, the mask of leaf 1 covers this share of leaf 2 as well, what is nearest, and leaf 2 has none."""
+    maps = true_maps()
+    gap = distance_transform_edt(maps[view] != 1)
+    is_second = maps[view] == 2
+    is_near = is_second & (gap <= np.quantile(gap[is_second], share))
+    maps[view][is_second] = 0
+    maps[view][is_near] = 1
+    return maps
+
+
+@pytest.mark.parametrize(
+    ("share", "is_named", "is_listed"), [(1, False, True), (0.49, False, False), (0.49, True, True)]
+)
+def test_a_mask_that_shows_two_surfaces_is_listed(share: float, is_named: bool, is_listed: bool) -> None:
+    """By most of what its view shows of the second one, or where the matcher says so; its cut is that of surfaces."""
+    regions, ids = as_regions(merged_maps(3, share))
+    region = place_of(regions, ids, 3, 1)
+    named = MergedMask(region=region, own=1, other=2, part=torch.zeros_like(regions.crop(region)))
+    matching = replace(match_all(ids, regions.view_index), merged=(named,) if is_named else ())
+    checked = check_ids(regions, matching, LEAVES, cameras=CAMERAS)
+    assert torch.equal(checked.matching.instance_ids, ids)
+    assert not checked.is_changed.any()
+    assert [(mask.region, mask.own, mask.other) for mask in checked.matching.merged] == [(region, 1, 2)] * is_listed
+    x1, y1, x2, y2 = regions.boxes[region].tolist()
+    is_second = torch.from_numpy(true_maps()[3][y1:y2, x1:x2] == 2) & regions.crop(region)
+    assert is_second.sum() > 0.2 * regions.areas[region]
+    for mask in checked.matching.merged:
+        assert torch.equal(mask.part, is_second)
+
+
+def test_what_no_surface_explains_goes_to_the_nearest_part() -> None:
+    """A merged mask that is drawn three pixels too large; and what the matcher alone calls merged stays on the list."""
+    maps = merged_maps(3, 1)
+    maps[3] = np.where(distance_transform_edt(maps[3] != 1) <= 3, 1, maps[3])
+    regions, ids = as_regions(maps)
+    region, alone = place_of(regions, ids, 3, 1), place_of(regions, ids, 0, 3)
+    named = MergedMask(region=alone, own=3, other=1, part=regions.crop(alone))
+    matching = replace(match_all(ids, regions.view_index), merged=(named,))
+    merged = check_ids(regions, matching, LEAVES, cameras=CAMERAS).matching.merged
+    assert [mask.region for mask in merged] == sorted([alone, region])
+    part = next(mask.part for mask in merged if mask.region == region)
+    x1, y1, x2, y2 = regions.boxes[region].tolist()
+    true = true_maps()[3]
+    nearest = [distance_transform_edt(true != leaf)[y1:y2, x1:x2] for leaf in (1, 2)]
+    assert torch.equal(part, regions.crop(region) & torch.from_numpy(nearest[1] < nearest[0]))
 
 
 def test_a_mask_without_an_id_gets_one_and_what_shows_no_surface_keeps_its_own(scene: tuple[Regions, Tensor]) -> None:
