@@ -13,7 +13,7 @@ test slow: export OMP_NUM_THREADS := 1
 test: $(VENV)/installed
 	$(PYTHON) -m pytest -n 2
 
-# whole commands, killed workers, notebooks: about two minutes
+# whole commands, killed workers, notebooks: about three minutes
 slow: $(VENV)/installed
 	$(PYTHON) -m pytest -n 2 -m slow
 
