@@ -31,6 +31,7 @@ from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
 from mvseg.multiview.config import DetectConfig
+from mvseg.worker_pool import default_workers
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent
@@ -907,3 +908,20 @@ def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.Capt
     assert first != second
     assert np.mean(labels[true == 1] == first) > 0.8
     assert np.mean(labels[true == 10] == second) > 0.8
+
+
+@pytest.mark.parametrize(("given", "expected"), [(["--num_workers", "3"], 3), ([], default_workers())])
+def test_infer_fits_in_so_many_processes(
+    given: list[str], expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[int] = []
+    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", lambda *_, num_workers, **__: asked.append(num_workers))
+    assert main(["infer", str(tmp_path), *given]) == 0
+    assert asked == [expected]
+
+
+def test_infer_without_processes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plant = write_scene(tmp_path / "plant", 2)
+    assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--num_workers", "0"]) == 2
+    assert "0 workers asked for, expected at least 1" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
