@@ -21,7 +21,7 @@ from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.masks.recognise import recognise_masks
-from mvseg.formats.photos import check_photos, read_photo
+from mvseg.formats.photos import check_photos, describe_folder, read_photo
 from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.matching.match import check_baselines, match_regions
 from mvseg.matching.result import Matching
@@ -80,7 +80,9 @@ def run_scene(
         found = None if masks is None else recognise_masks(scene, masks)
         regions = None if found is None else read_masks(scene, found, crowd=config.coco_crowd, categories=wanted)
     if masks is None and not scene.views[0].path.is_file():
-        raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them")
+        beside = describe_folder(scene.views[0].path.parent)
+        end = f"; {beside}" if beside else ""
+        raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them{end}")
     if regions is None:
         with _timed(seconds, "detect"):
             detections, matching = detect_regions(scene, config, keep=keep, prune=True, progress=progress)

@@ -657,10 +657,16 @@ def test_scene_or_masks_that_are_not_there(plant: Path, tmp_path: Path, capsys: 
     assert main(["infer", str(tmp_path / "absent"), "--masks", "masks", *out]) == 2
     assert complaint(capsys) == f"{tmp_path / 'absent'}: no such scene folder"
     assert main(["infer", str(plant), "--masks", "absent", *out]) == 2
-    assert complaint(capsys).startswith("absent: no such masks")
+    there = f"in {plant}, which holds cameras.json, images, masks and 1 more, nor in {Path.cwd()}"
+    assert complaint(capsys) == f"absent: no such masks {there}; --masks says where they are"
+    for photo in (plant / "images").iterdir():
+        photo.rename(photo.with_suffix(".HEIC"))
+    assert main(["infer", str(plant), *out]) == 2
+    neither = f"{plant}: there are neither photos nor masks (--masks), expected one of them"
+    assert complaint(capsys).startswith(f"{neither}; 000.HEIC is a HEIC file: convert it to JPEG or PNG")
     shutil.rmtree(plant / "images")
     assert main(["infer", str(plant), *out]) == 2
-    assert complaint(capsys) == f"{plant}: there are neither photos nor masks (--masks), expected one of them"
+    assert complaint(capsys) == neither
     assert main(["eval", str(plant), "--truth", str(plant / "truth")]) == 2
     assert complaint(capsys) == f"{plant / 'instances.json'}: is missing, expected a result folder"
     assert not (tmp_path / "out").exists()

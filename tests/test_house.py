@@ -196,6 +196,14 @@ def test_every_promise_names_tests_that_exist() -> None:
         assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}, (file, name)
 
 
+def test_every_format_names_a_test() -> None:
+    lines = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8").splitlines()
+    tables = "\n".join(line if line.startswith("|") else "" for line in lines).split("\n\n")
+    rows = [row for table in tables if "tested with" in table for row in table.strip().splitlines()[2:]]
+    assert len(rows) > 15
+    assert [row for row in rows if not re.search(r"\((`tests/[\w/]+\.py`(, )?)+\) \|$", row)] == []
+
+
 def test_text_of_the_benchmarks_page_is_that_of_its_sources() -> None:
     """Without the records nobody can regenerate the page, so its text is edited twice by hand."""
     page = (ROOT / "docs" / "benchmarks.md").read_text(encoding="utf-8")

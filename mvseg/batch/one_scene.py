@@ -93,7 +93,13 @@ def save_scene(
 
 def find_masks(scene: Path, masks: Path, beside: Path = Path()) -> Path:
     """A relative path may start at the scene folder or at `beside`, as long as only one of the two exists."""
+    from mvseg.formats.find_views import list_some
+
     inside, outside = scene / masks, beside / masks
     if inside.exists() and outside.exists() and not inside.samefile(outside):
         raise InputError(f"both {inside} and {outside.resolve()} exist, expected --masks with the full path of one")
+    if scene.is_dir() and not inside.exists() and not outside.exists() and not masks.is_absolute():
+        found = list_some(sorted(path.name for path in scene.iterdir()))
+        places = f"in {scene}, which holds {found}, nor in {beside.resolve()}"
+        raise InputError(f"{masks}: no such masks {places}; --masks says where they are")
     return inside if inside.exists() else outside

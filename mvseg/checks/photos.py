@@ -13,6 +13,7 @@ from tqdm import tqdm
 from mvseg.checks.finding import Finding, name_views
 from mvseg.errors import InputError
 from mvseg.formats.image_file import is_turned, read_image_size, read_rgb
+from mvseg.formats.photos import describe_folder
 from mvseg.scene import Scene
 
 BLANK = 4.0  # grey levels: standard deviation of a photo of nothing
@@ -62,14 +63,15 @@ def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) ->
     missing = tuple(view for view, each in enumerate(facts) if each.size is None and not each.problem)
     if len(missing) == len(facts):
         if has_masks:
-            what = "there are no photos: traits have no colours, and overlays are black"
+            what = "there are no photos: traits have no colours, and overlays are grey"
             return [Finding(where="photos", what=what, level="note")]
         what = f"there are neither photos nor masks: add {scene.views[0].path} and the others, or give --masks"
-        return [Finding(where="photos", what=what, level="error")]
+        return [Finding(where="photos", what=f"{what}{_beside(scene, 0)}", level="error")]
     findings = []
     if missing:
         what = f"{name_views(missing, names)}: no photo, the first is {scene.views[missing[0]].path}; add it, or take "
-        findings.append(Finding(where="photos", what=f"{what}its camera out", level="error", views=missing))
+        what = f"{what}its camera out{_beside(scene, missing[0])}"
+        findings.append(Finding(where="photos", what=what, level="error", views=missing))
     for view, each in enumerate(facts):
         if each.problem:
             what = f"the photo of {name_views((view,), names)} cannot be read ({each.problem}): export it again"
@@ -120,6 +122,12 @@ def _content_findings(facts: list[PhotoFacts], names: tuple[str, ...]) -> list[F
             what = f"{name_views(tuple(twins), names)} are the same photo: check which one belongs to which camera"
             findings.append(Finding(where="photos", what=what, level="error", views=tuple(twins)))
     return findings
+
+
+def _beside(scene: Scene, view: int) -> str:
+    """What lies where the photo of a view is missing, as the end of a sentence."""
+    beside = describe_folder(scene.views[view].path.parent)
+    return f"; {beside}" if beside else ""
 
 
 def _read_facts(path: Path) -> PhotoFacts:

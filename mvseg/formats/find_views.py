@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.image_file import PHOTO_SUFFIXES
+from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
 from mvseg.scene import Scene
 
 SHOWN = 3  # names in a message
@@ -52,7 +52,7 @@ def base_name(name: str) -> str:
     """A file name without folders, the suffix of an image and Roboflow's ending, in small letters."""
     last = name.replace("\\", "/").rsplit("/", 1)[-1]
     stem, dot, suffix = last.rpartition(".")
-    if dot and f".{suffix.lower()}" in (*PHOTO_SUFFIXES, ".heic", ".heif"):
+    if dot and f".{suffix.lower()}" in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES):
         last = stem
     return ROBOFLOW.sub("", last).lower()
 

@@ -28,6 +28,7 @@ from PIL.WebPImagePlugin import WebPImageFile
 from mvseg.errors import InputError
 
 PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
+PHONE_SUFFIXES = (".heic", ".heif")  # known by name, to say what to do with them
 MAX_SIDE = 1 << 20  # pixels
 MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
 ORIENTATION = 0x0112  # EXIF tag

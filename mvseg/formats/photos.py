@@ -16,6 +16,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.image_file import (
     MAX_PIXELS,
     MAX_SIDE,
+    PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
     WrongSize,
     file_name_problem,
@@ -179,14 +180,14 @@ def check_photos(scene: Scene) -> None:
     paths = [view.path for view in scene.views]
     present = [path.is_file() for path in paths]
     if not any(present):
-        beside = _describe_folder(paths[0].parent)
+        beside = describe_folder(paths[0].parent)
         if beside:
             message = f"{paths[0]}: this photo and all others are missing; {beside}"
             warnings.warn(message, InputWarning, stacklevel=2)
         return
     if not all(present):
         missing = present.index(False)
-        beside = _describe_folder(paths[missing].parent)
+        beside = describe_folder(paths[missing].parent)
         raise InputError(f"{paths[missing]}: the image of view {missing} is missing{beside and '; ' + beside}")
     turned = [path for path in paths if is_turned(path)]
     if turned:
@@ -206,26 +207,26 @@ def describe_turn(path: Path) -> str:
     return f"EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
 
 
+def describe_folder(folder: Path) -> str:
+    """What is in the folder where a photo is missing, as the end of a sentence; "" if nothing is."""
+    try:
+        names = sorted(path.name for path in folder.iterdir() if path.is_file())
+    except OSError:
+        return ""
+    phone = [name for name in names if name.lower().endswith(PHONE_SUFFIXES)]
+    if phone:
+        return f"{phone[0]} is a HEIC file: convert it to JPEG or PNG without turning or scaling it"
+    pictures = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
+    more = f" and {len(pictures) - 3} more" if len(pictures) > 3 else ""
+    return f"found {', '.join(pictures[:3])}{more}" if pictures else ""
+
+
 def _known_bits(path: Path, size: tuple[int, int]) -> int:
     """As `sensor_bits`; 8 for a photo that cannot be read or has another size, which `read_photo` will name."""
     try:
         return sensor_bits(path, size)
     except (InputError, OSError):
         return 8
-
-
-def _describe_folder(folder: Path) -> str:
-    """What is in the place where a photo is missing, as the end of a sentence; "" if nothing is."""
-    try:
-        names = sorted(path.name for path in folder.iterdir() if path.is_file())
-    except OSError:
-        return ""
-    phone = [name for name in names if name.lower().endswith((".heic", ".heif"))]
-    if phone:
-        return f"{phone[0]} is a HEIC file: convert it to JPEG or PNG without turning or scaling it"
-    pictures = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
-    more = f" and {len(pictures) - 3} more" if len(pictures) > 3 else ""
-    return f"found {', '.join(pictures[:3])}{more}" if pictures else ""
 
 
 def load_photos(scene: Scene) -> list[torch.Tensor]:

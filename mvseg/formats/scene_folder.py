@@ -13,7 +13,7 @@ from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
 from mvseg.formats.find_views import list_some
-from mvseg.formats.image_file import PHOTO_SUFFIXES
+from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
 from mvseg.formats.masks.read_views import read_views
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
 from mvseg.formats.masks.view_regions import stack_views
@@ -64,10 +64,14 @@ def load_scene(folder: Path | str) -> Scene:
 
 def _describe(folder: Path) -> str:
     """What a folder without cameras holds, and what to do with it, as the end of a sentence."""
-    photos = [path for path in sorted(folder.rglob("*")) if path.suffix.lower() in (*PHOTO_SUFFIXES, ".heic", ".heif")]
+    files = sorted(folder.rglob("*"))
+    photos = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
     if photos:
-        first = photos[0].relative_to(folder).as_posix()
-        return f"found {len(photos)} photos ({first}, ...): mvseg pose {folder} --out SCENE estimates their cameras"
+        return f"found {len(photos)} photos ({photos[0]}, ...): mvseg pose {folder} --out SCENE estimates their cameras"
+    phone = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHONE_SUFFIXES]
+    if phone:
+        next_step = "convert them to JPEG; mvseg pose estimates the cameras of photos"
+        return f"found {len(phone)} HEIC files ({phone[0]}, ...): {next_step}"
     names = sorted(path.name for path in folder.iterdir())
     return f"found {list_some(names)}"
 

@@ -13,7 +13,15 @@ from PIL import Image, ImageOps
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.formats.image_file import PHOTO_SUFFIXES, is_turned, read_image, read_rgb, sensor_bits, write_png
+from mvseg.formats.image_file import (
+    PHONE_SUFFIXES,
+    PHOTO_SUFFIXES,
+    is_turned,
+    read_image,
+    read_rgb,
+    sensor_bits,
+    write_png,
+)
 
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, CAMERA_MODEL, EXIF_BLOCK = 0x920A, 0xA405, 0x0110, 0x8769  # EXIF tags
 QUALITY = 95  # of a JPEG that is written anew, upright
@@ -63,7 +71,7 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
     if not _are_photos(files):
         folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
         files += [path for each in folders for path in _files_in(each)]
-    phone = [path.name for path in files if path.suffix.lower() in (".heic", ".heif")]
+    phone = [path.name for path in files if path.suffix.lower() in PHONE_SUFFIXES]
     if phone:
         raise InputError(f"{folder}: {phone[0]} is a HEIC file ({len(phone)} in all), expected JPEG: convert them")
     photos = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
@@ -83,7 +91,7 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 def _are_photos(files: Sequence[Path]) -> bool:
-    return any(path.suffix.lower() in (*PHOTO_SUFFIXES, ".heic", ".heif") for path in files)
+    return any(path.suffix.lower() in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES) for path in files)
 
 
 def natural_order(name: str) -> list[tuple[int, int | str]]:

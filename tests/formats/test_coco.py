@@ -293,8 +293,10 @@ def test_categories_are_selected_or_named(scene: Scene, tmp_path: Path) -> None:
     path.write_text(json.dumps(content))
     with pytest.warns(InputWarning, match=r"masks of 3 categories are taken alike \(2 leaf, 1 pot, 1 9\); --"):
         assert len(read_all(path, scene)[0]) == 4
-    for wanted, numbers in ((["leaf"], [1, 3]), (["pot", "9"], [2, 4]), (["stem"], [])):
+    for wanted, numbers in ((["leaf"], [1, 3]), (["pot", "9"], [2, 4])):
         assert [number for number, _ in read_all(path, scene, categories=wanted)[0]] == numbers
+    with pytest.warns(InputWarning, match=r"none of the masks is of the category stem, but 2 leaf, 1 pot, 1 9$"):
+        assert read_all(path, scene, categories=["stem"]) == [[], []]
     with pytest.raises(InputError, match=r"there is no category 'leaves', expected of these: leaf, pot, stem, 9"):
         read_all(path, scene, categories=["leaves"])
 

@@ -32,7 +32,7 @@ class FoundMask:
 def check_categories(
     counts: Mapping[str, int], wanted: Collection[str], *, known: Collection[str] = (), source: Path
 ) -> None:
-    """Warn (InputWarning) of masks of several categories that are taken alike.
+    """Warn (InputWarning) of masks of several categories that are taken alike, and where no mask is of a wanted one.
 
     Args:
         counts: how many masks each category has.
@@ -49,11 +49,19 @@ def check_categories(
         there = ", ".join(present) or "none"
         raise InputError(f"{source}: there is no category '{missing[0]}', expected of these: {there}")
     several = [name for name in counts if name and counts[name]]
-    if len(several) > 1 and not wanted:
-        shown = ", ".join(f"{counts[name]} {name}" for name in several[:SHOWN])
-        more = f" and {len(several) - SHOWN} more" if len(several) > SHOWN else ""
-        message = f"masks of {len(several)} categories are taken alike ({shown}{more}); --categories selects some"
+    if several and wanted and not set(several) & set(wanted):
+        message = f"none of the masks is of the category {' or '.join(wanted)}, but {_describe(counts, several)}"
         warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
+    if len(several) > 1 and not wanted:
+        shown = _describe(counts, several)
+        message = f"masks of {len(several)} categories are taken alike ({shown}); --categories selects some"
+        warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
+
+
+def _describe(counts: Mapping[str, int], names: Sequence[str]) -> str:
+    """The first categories with their numbers of masks: "12 leaf, 1 pot"."""
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(f"{counts[name]} {name}" for name in names[:SHOWN]) + more
 
 
 def select_masks(masks: Sequence[FoundMask], wanted: Collection[str]) -> tuple[list[FoundMask], Counter[str]]:
