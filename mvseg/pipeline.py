@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 from dataclasses import asdict, replace
@@ -110,47 +110,44 @@ def run_scene(
         regions, matching, source = split_merged(regions, matching)
         scores = None if scores is None else scores[source]
         from_views = None if from_views is None else from_views[source]
-    kind = "" if found is None else found.kind
-    if shapes is None:
-        return Result(
-            scene=scene,
-            regions=regions,
-            matching=matching,
-            seconds=seconds,
-            detection_scores=scores,
-            from_other_views=from_views,
-            mask_kind=kind,
+    surfaces: Mapping[int, LeafSurface] | None = None
+    voxels = traits = moved = None
+    if shapes is not None:
+        with _timed(seconds, "reconstruct"):
+            from mvseg.reconstruction.shapes import reconstruct_shapes
+
+            reconstruct = partial(
+                reconstruct_shapes,
+                cameras=scene.cameras,
+                config=shapes,
+                photos=partial(read_photo, scene) if scene.views[0].path.is_file() else None,
+                workers=workers,
+                progress=progress,
+            )
+            surfaces, voxels = reconstruct(regions, matching.instance_ids, starts=starts)
+            if is_checked and surfaces is not None:
+                from mvseg.multiview.checked_ids import check_ids
+
+                checked = check_ids(regions, matching, surfaces, cameras=scene.cameras)
+                matching, moved, known = checked.matching, int(checked.is_moved.sum()), checked.unchanged(surfaces)
+                cut: set[int] = set()
+                if config.split_merged:
+                    cut = {instance for mask in matching.merged for instance in (mask.own, mask.other)}
+                    known = {instance: surface for instance, surface in known.items() if instance not in cut}
+                    regions, matching, source = split_merged(regions, matching)
+                    scores = None if scores is None else scores[source]
+                if moved or cut:
+                    surfaces, voxels = reconstruct(regions, matching.instance_ids, known=known)
+        with _timed(seconds, "measure"):
+            from mvseg.traits.measure import measure_plant
+
+            traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels, config=config.traits)
+    if from_views is not None:
+        from mvseg.multiview.recut import recut_masks
+
+        regions = recut_masks(
+            regions, matching.instance_ids, surfaces or starts, cameras=scene.cameras, is_found=~from_views
         )
-    moved: int | None = None
-    with _timed(seconds, "reconstruct"):
-        from mvseg.reconstruction.shapes import reconstruct_shapes
-
-        reconstruct = partial(
-            reconstruct_shapes,
-            cameras=scene.cameras,
-            config=shapes,
-            photos=partial(read_photo, scene) if scene.views[0].path.is_file() else None,
-            workers=workers,
-            progress=progress,
-        )
-        surfaces, voxels = reconstruct(regions, matching.instance_ids, starts=starts)
-        if is_checked and surfaces is not None:
-            from mvseg.multiview.checked_ids import check_ids
-
-            checked = check_ids(regions, matching, surfaces, cameras=scene.cameras)
-            matching, moved, known = checked.matching, int(checked.is_moved.sum()), checked.unchanged(surfaces)
-            cut: set[int] = set()
-            if config.split_merged:
-                cut = {instance for mask in matching.merged for instance in (mask.own, mask.other)}
-                known = {instance: surface for instance, surface in known.items() if instance not in cut}
-                regions, matching, source = split_merged(regions, matching)
-                scores = None if scores is None else scores[source]
-            if moved or cut:
-                surfaces, voxels = reconstruct(regions, matching.instance_ids, known=known)
-    with _timed(seconds, "measure"):
-        from mvseg.traits.measure import measure_plant
-
-        traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels, config=config.traits)
     return Result(
         scene=scene,
         regions=regions,
@@ -161,7 +158,7 @@ def run_scene(
         seconds=seconds,
         detection_scores=scores,
         from_other_views=from_views,
-        mask_kind=kind,
+        mask_kind="" if found is None else found.kind,
         num_moved=moved,
     )
 

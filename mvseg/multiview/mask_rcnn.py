@@ -17,6 +17,7 @@ from mvseg.matching.refine_poses import match_refined
 from mvseg.matching.result import Matching
 from mvseg.multiview.loop import match_proposals
 from mvseg.multiview.proposals import Proposals, gather_proposals
+from mvseg.multiview.recut import recut_masks
 from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.scene import Cameras
 
@@ -149,9 +150,14 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         proposals, matching = self.match_detections(detections, cameras, progress=progress)
         if self.witnesses:
             cameras = cameras if matching.poses is None else matching.poses.cameras
-            proposals, matching, _ = hear_witnesses(
+            proposals, matching, surfaces = hear_witnesses(
                 proposals, matching, cameras=cameras, photos=photos.__getitem__, progress=progress
             )
+            assert proposals.from_views is not None
+            regions = recut_masks(
+                proposals.regions, matching.instance_ids, surfaces, cameras=cameras, is_found=~proposals.from_views
+            )
+            proposals = replace(proposals, regions=regions, boxes=regions.boxes.float())
         return proposals, matching
 
     @torch.no_grad()

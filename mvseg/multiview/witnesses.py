@@ -7,6 +7,7 @@ photo can by itself: which piece of a leaf is the leaf, which mask is none, and 
 from __future__ import annotations
 
 import warnings
+from collections import Counter
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -22,6 +23,7 @@ from mvseg.matching.result import SURE, Matching, count_sure_views
 from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.multiview.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 from mvseg.multiview.proposals import Proposals
+from mvseg.multiview.recut import AGREES, agreement
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.visible_leaves import VisibleLeaf, visible_leaves
@@ -32,10 +34,10 @@ Photos = Callable[[int], NDArray[np.uint8]]
 Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
 
-AGREES = 0.5  # IoU of a mask with what its surface shows, from which it stays as it is
 LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for that part to become a mask
 LEAST_PIXELS = 64  # of that part
 LEAST_COLORED = 0.8  # of it, that have the colour of leaves
+LEAST_FOUND = 1 / 3  # of an instance's masks, that a detector found and its surface agrees with
 ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
 SURE_VIEWS = 4  # of an instance whose masks tell that colour
 
@@ -138,7 +140,9 @@ def revise_masks(
     - otherwise it has none.
 
     Instances without a credible surface go, and those with masks in one view only; so do masks that are matched to
-    nothing. A leaf that only one photo shows is lost with the false ones.
+    nothing. A leaf that only one photo shows is lost with the false ones. And those go that stayed in fewer than
+    `LEAST_FOUND` of the views that then show them: what is seen openly from all sides, and taken for a leaf from a few,
+    is a stem or the like.
 
     Args:
         regions: D masks, as a detector found them.
@@ -163,11 +167,11 @@ def revise_masks(
             x1, y1, x2, y2 = leaf.box
             colored_here = colored[y1:y2, x1:x2]
             box, own = regions.union(members) if members else (leaf.box, torch.zeros(leaf.mask.shape, dtype=torch.bool))
-            if _iou(box, own.numpy(), leaf) >= AGREES:
+            if agreement(box, own.numpy(), leaf) >= AGREES:
                 found.append(_found(view, leaf, members, (box, own.numpy()), is_own=True))
             elif _is_leaf(leaf, colored_here):
                 found.append(_found(view, leaf, members, (leaf.box, leaf.mask & colored_here), is_own=False))
-    found = _seen_twice(found)
+    found = _borne_out(found)
     number = {instance: place for place, instance in enumerate(sorted({each.instance for each in found}), start=1)}
     revised = stack_regions(
         [each.view for each in found],
@@ -199,22 +203,6 @@ def _colors_of_leaves(regions: Regions, matching: Matching, photos: Photos) -> N
     return leaf_colors(counts)
 
 
-def _iou(box: Box, mask: Mask, leaf: VisibleLeaf) -> float:
-    """IoU of a mask in its box with a leaf in its own."""
-    x1, y1 = max(box[0], leaf.box[0]), max(box[1], leaf.box[1])
-    x2, y2 = min(box[2], leaf.box[2]), min(box[3], leaf.box[3])
-    if x1 >= x2 or y1 >= y2:
-        return 0.0
-    common = (x1, y1, x2, y2)
-    both = int((_cut(box, mask, common) & _cut(leaf.box, leaf.mask, common)).sum())
-    return float(both / max(int(mask.sum()) + int(leaf.mask.sum()) - both, 1))
-
-
-def _cut(box: Box, mask: Mask, inner: Box) -> Mask:
-    """The part of a mask in its box that lies in a box within that."""
-    return mask[inner[1] - box[1] : inner[3] - box[1], inner[0] - box[0] : inner[2] - box[0]]
-
-
 def _is_leaf(leaf: VisibleLeaf, colored: Mask) -> bool:
     """Whether the photo can show a leaf where the other views say that there is one; `colored` is of its box."""
     size, num_colored = int(leaf.mask.sum()), int((leaf.mask & colored).sum())
@@ -231,10 +219,14 @@ def _found(
     return _Found(view=view, instance=leaf.instance, members=members, is_own=is_own, box=box, crop=crop)
 
 
-def _seen_twice(found: list[_Found]) -> list[_Found]:
-    """Without the instances that have a mask in one view only."""
-    instances = [each.instance for each in found]
-    return [each for each in found if instances.count(each.instance) > 1]
+def _borne_out(found: list[_Found]) -> list[_Found]:
+    """Without the instances that have a mask in one view only, or that the detector found in too few of their views."""
+    shown = Counter(each.instance for each in found)
+    seen = Counter(each.instance for each in found if each.is_own)
+    return [
+        each for each in found
+        if shown[each.instance] > 1 and seen[each.instance] >= LEAST_FOUND * shown[each.instance]
+    ]  # fmt: skip
 
 
 def _rematch(matching: Matching, found: list[_Found], number: Mapping[int, int]) -> Matching:

@@ -115,6 +115,14 @@ def test_leaves_without_a_credible_surface_go_and_ids_close_up() -> None:
     assert sorted(revised.matching.instance_ids.unique().tolist()) == [1, 2]
 
 
+@pytest.mark.parametrize(("num_found", "left"), [(2, [1, 2, 3]), (1, [1, 2])])
+def test_what_is_found_in_too_few_of_the_views_that_show_it_goes(num_found: int, left: list[int]) -> None:
+    maps = [labels.copy() for labels in TRUE]
+    for labels in maps[num_found:]:
+        labels[labels == 3] = 0
+    assert revise(maps).old_ids.tolist() == left  # leaf 3 is seen by all six
+
+
 def test_the_order_of_masks_does_not_matter() -> None:
     maps = [labels.copy() for labels in TRUE]
     maps[2][maps[2] == 1] = 0
