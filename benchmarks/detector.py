@@ -23,7 +23,6 @@ import sys
 import time
 from collections import Counter
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,12 +43,11 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import undistort
-from mvseg.formats.photos import load_photos, read_photo
+from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.multiview.config import DetectConfig
 from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.multiview.proposals import Proposals
-from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.data import SampleList, list_samples, read_sample
@@ -111,9 +109,14 @@ def build_model(args: argparse.Namespace, row: str) -> MultiViewMaskRCNN:
     """The model of a row of the table: "plain 0.5" is NMS without clusters, a number is that many iterations, and with
     "witnesses" behind it the other views correct what they leave."""
     detector = load_detector(args.weights, image_size=args.image_size, min_score=args.min_score)
-    if row.startswith("plain"):
-        return MultiViewMaskRCNN(detector, num_iterations=0, cluster_iou=float(row.split()[1]), scales=args.scales)
-    return MultiViewMaskRCNN(detector, num_iterations=int(row.split()[0]), cluster_iou=0.3, scales=args.scales)
+    is_plain, number = row.startswith("plain"), row.removeprefix("plain").split()[0]
+    return MultiViewMaskRCNN(
+        detector,
+        num_iterations=0 if is_plain else int(number),
+        cluster_iou=float(number) if is_plain else 0.3,
+        scales=args.scales,
+        witnesses=row.endswith("witnesses"),
+    )
 
 
 def read_truth(folder: Path, scene: Scene) -> SceneTruth:
@@ -162,10 +165,6 @@ def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dic
             truths += annotate_truth(read_sample(by_name[Path(name).stem]), num_images + view, 1)
         for row in rows:
             proposals, matching = build_model(args, row).find_regions(photos, scene.cameras)
-            if row.endswith("witnesses"):
-                proposals, matching, _ = hear_witnesses(
-                    proposals, matching, cameras=scene.cameras, photos=partial(read_photo, scene)
-                )
             detections[row] += annotate(proposals, scene.cameras.sizes.tolist(), num_images)
             totals[row].update(count_found(proposals, matching.instance_ids, truth))
         num_images += len(photos)

@@ -1,25 +1,33 @@
 """A second device for machines that have only one: its tensors say "meta", and are computed on the CPU all the same.
 
-What a GPU refuses is refused here: operands on two devices, and NumPy views of what is not on the CPU.
+What a GPU refuses is refused here: operands on two devices, and NumPy views of what is not on the CPU. Modules are
+moved as always, `module.to(device)`, and autocast does to convolutions and products what it does on a GPU.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
+from unittest import mock
 
 import torch
+import torchvision  # noqa: F401  # registers torch.ops.torchvision
 from torch import Tensor
 from torch.overrides import TorchFunctionMode
 from torch.utils._python_dispatch import TorchDispatchMode
 from torch.utils._pytree import tree_leaves, tree_map
 
+autocast = torch.autocast  # torch's own
 DEVICE = torch.device("meta")  # of those that torch knows everywhere; "cuda" looks for a driver
 aten = torch.ops.aten
 MOVES = {aten._to_copy.default, aten.copy_.default}
 # GPUs take indices from the CPU, too
 INDEXING = {aten.index.Tensor, aten.index_put.default, aten.index_put_.default, aten._unsafe_index.Tensor}
+# what autocast computes in lower precision, and in float32, of what detectors use
+LOWERED = {torch.conv2d, torch.conv_transpose2d, torch.nn.functional.linear}
+SINGLE = {torch.ops.torchvision.roi_align, torch.ops.torchvision.nms}
 
 
 class OtherTensor(Tensor):
@@ -59,8 +67,11 @@ class _Compute(TorchDispatchMode):
         kwargs = kwargs or {}
         tensors = [each for each in tree_leaves((args, kwargs)) if isinstance(each, Tensor)]
         is_there = [isinstance(each, OtherTensor) for each in tensors]
-        strangers = [each for each, other in zip(tensors, is_there, strict=True) if not other and each.ndim]
-        if any(is_there) and strangers and func not in MOVES and not (func in INDEXING and is_there[0]):
+        checked = tree_leaves((args[0], args[2:])) if func in INDEXING else tensors
+        strangers = [
+            each for each in checked if isinstance(each, Tensor) and not isinstance(each, OtherTensor) and each.ndim
+        ]
+        if any(is_there) and strangers and func not in MOVES:
             raise RuntimeError(f"{func}: expected all tensors on the same device, found {DEVICE} and cpu")
         target = kwargs.get("device")
         plain_args, plain_kwargs = tree_map(_to_inner, (args, kwargs))
@@ -74,20 +85,47 @@ class _Compute(TorchDispatchMode):
 
 
 class _Create(TorchFunctionMode):
-    """`torch.tensor(data, device=...)` would make a tensor without data."""
+    """`torch.tensor(data, device=...)` would make a tensor without data, and torch has no autocast for "meta"."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lower: torch.dtype | None = None  # while autocast is on, what it casts to
 
     def __torch_function__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = dict(kwargs or {})
         if func in (torch.tensor, torch.as_tensor) and kwargs.get("device") is not None:
             return func(*args, **kwargs | {"device": None}).to(kwargs["device"])
+        if self.lower is not None and func in LOWERED | SINGLE:
+            cast = partial(_cast, dtype=self.lower if func in LOWERED else torch.float32)
+            args, kwargs = tree_map(cast, (args, kwargs))
         return func(*args, **kwargs)
+
+    @contextmanager
+    def autocast(
+        self, device_type: str, dtype: torch.dtype | None = None, enabled: bool = True, **options: Any
+    ) -> Iterator[None]:
+        if device_type != DEVICE.type:
+            with autocast(device_type, dtype, enabled, **options):
+                yield
+            return
+        before, self.lower = self.lower, (dtype or torch.float16) if enabled else None
+        try:
+            yield
+        finally:
+            self.lower = before
 
 
 @contextmanager
 def other_device() -> Iterator[torch.device]:
     """While this lasts, tensors can be made on the other device and moved to it."""
-    with _Create(), _Compute():
+    create = _Create()
+    with mock.patch.object(torch, "autocast", create.autocast), create, _Compute():
         yield DEVICE
+
+
+def _cast(value: Any, dtype: torch.dtype) -> Any:
+    is_cast = isinstance(value, OtherTensor) and value.is_floating_point() and value.dtype != torch.float64
+    return value.to(dtype) if is_cast else value
 
 
 def _is_list(value: Any) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -58,16 +59,50 @@ def test_the_answer_is_there_and_the_same(step: Callable[[Regions, Cameras, Tens
         torch.testing.assert_close(answer.cpu(), expected)
 
 
+def test_poses_are_refined_there() -> None:
+    noise = torch.randn(SCENE.cameras.t.shape, generator=torch.Generator().manual_seed(0))
+    cameras = replace(SCENE.cameras, t=SCENE.cameras.t + 0.05 * noise)
+    expected = match_regions(SCENE.regions, cameras, MatchConfig(refine_poses=True)).poses
+    with other_device() as device:
+        poses = match_regions(SCENE.regions.to(device), cameras.to(device), MatchConfig(refine_poses=True)).poses
+        assert poses is not None
+        assert expected is not None
+        assert poses.is_refined
+        assert poses.cameras.device == device
+        torch.testing.assert_close(poses.cameras.t.cpu(), expected.cameras.t)
+
+
 def test_the_other_device_refuses_what_a_gpu_refuses() -> None:
     here = torch.arange(6.0).reshape(2, 3)
     with other_device() as device:
         there = here.to(device)
         with pytest.raises(RuntimeError, match="expected all tensors on the same device"):
             there + here
+        with pytest.raises(RuntimeError, match="expected all tensors on the same device"):
+            there[[0, 1]] = here
+        with pytest.raises(RuntimeError, match="expected all tensors on the same device"):
+            here[there[0].long()]
         with pytest.raises(TypeError, match="to NumPy"):
             there.numpy()
-        there[[1]] += 1
+        there[torch.tensor([1])] += 1
         assert (there + 1).device == device
         assert there.tolist() == [[0, 1, 2], [4, 5, 6]]
         assert torch.zeros_like(there).cpu().device == here.device
         assert torch.tensor([1.5], device=device).item() == 1.5
+
+
+def test_autocast_there_is_that_of_a_gpu() -> None:
+    """Convolutions and products are cast; what is single by name, and what is outside, is not."""
+    layer, ones = torch.nn.Linear(2, 2), torch.ones(1, 2)
+    with other_device() as device:
+        layer, ones = layer.to(device), ones.to(device)
+        with torch.autocast(device.type):
+            assert layer(ones).dtype == torch.float16
+            assert (ones + ones).dtype == torch.float32
+            with torch.autocast(device.type, enabled=False):
+                assert layer(ones).dtype == torch.float32
+            assert layer(ones).dtype == torch.float16
+        with torch.autocast("cpu", torch.bfloat16):
+            assert layer(ones).dtype == torch.float32
+            assert (torch.ones(1, 2) @ torch.ones(2, 1)).dtype == torch.bfloat16
+        assert layer(ones).dtype == torch.float32

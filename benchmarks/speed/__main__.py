@@ -1,12 +1,15 @@
 """Speed of every stage, and how it grows: `make bench`, or `python -m benchmarks.speed [--full] [--previous DIR]`
 
-Writes performance.json and performance.png into a folder, and its tables between two marks of the performance.md that
-lies there.
+Writes performance.json and performance.png into a folder, and its two tables between their marks in the performance.md
+that lies there.
 
-Simulated plants with a segmenter's faults, one axis at a time: views, leaves, megapixels. Each scene runs in a process
-of its own, one thread, and with --previous the two versions of mvseg take turns. Figures are medians of CPU seconds,
-which others on the machine change least; wall seconds are in the JSON. Slopes are fitted: log cost against log (pairs
-of views x labelled pixels) for the affinity, against log (masks x views) for the rest; 1 = grows in proportion.
+Growth: simulated plants with a segmenter's faults, one axis at a time: views, leaves, megapixels. Each scene runs in a
+process of its own, one thread, and with --previous the two versions of mvseg take turns. Figures are medians of CPU
+seconds, which others on the machine change least; wall seconds are in the JSON. Slopes are fitted: log cost against log
+(pairs of views x labelled pixels) for the affinity, against log (masks x views) for the rest; 1 = grows in proportion.
+
+Threads: all stages of the base scene, and the commands on the shipped plant, with one and with two threads in turns.
+`--threads_only` measures nothing else, and leaves the growth as it stands.
 """
 
 from __future__ import annotations
@@ -19,6 +22,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +31,7 @@ import torch
 
 from benchmarks.label_maps import visible_ids
 from benchmarks.speed.rivals import measure_rivals
-from benchmarks.speed.write_up import draw_plot, fit_slopes, table_lines, write_between
+from benchmarks.speed.write_up import write_all
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
@@ -36,8 +40,7 @@ from mvseg.simulation.growth import grow_plant
 
 ROOT = Path(__file__).parents[2]
 Cell = tuple[int, int, float]  # views, leaves, megapixels
-PROPOSALS = 100  # of each view, for the loop in the base scene
-STAGES = ("load", "bytes", "affinity", "matching", "gather", "loop", "shapes", "pictures")
+THREADS = (1, 2)
 BASE: Cell = (10, 16, 0.3)
 QUICK = {"views": (5, 20, 40), "leaves": (4, 32), "megapixels": (1.2, 4.8)}
 FULL = {"views": (5, 20, 40, 80), "leaves": (4, 8, 32, 64), "megapixels": (1.2, 4.8, 12.0, 24.0)}
@@ -66,10 +69,17 @@ def make_scene(cell: Cell, folder: Path) -> Path:
     return path
 
 
-def run_cell(scene: Path, checkout: Path, options: list[str]) -> dict[str, Any]:
+def make_environment(checkout: Path, threads: int) -> dict[str, str]:
+    """For a process that uses the mvseg of a checkout, and so many threads, which sleep when idle (as `mvseg` does)."""
+    limits = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), str(threads))
+    return os.environ | limits | {"PYTHONPATH": str(checkout), "OMP_WAIT_POLICY": "passive"}
+
+
+def run_cell(scene: Path, checkout: Path, *, threads: int = 1, every: bool = False) -> dict[str, Any]:
     """One run of stages.py with the mvseg of a checkout."""
-    environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(Path(__file__).with_name("stages.py")), str(scene), *options]
+    command = [sys.executable, str(Path(__file__).with_name("stages.py")), str(scene), "--threads", str(threads)]
+    command += ["--every"] if every else []
+    environment = make_environment(checkout, threads)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(f"{scene.stem}: {done.stderr[-2000:]}")
@@ -77,11 +87,13 @@ def run_cell(scene: Path, checkout: Path, options: list[str]) -> dict[str, Any]:
     return record
 
 
-def run_shell(verb: str, checkout: Path) -> tuple[float, float]:
-    """Wall and CPU seconds of `mvseg VERB` on the shipped plant."""
-    environment = os.environ | {"PYTHONPATH": str(checkout), "OMP_NUM_THREADS": "1"}
+def run_shell(verb: str, checkout: Path, *, threads: int) -> tuple[float, float]:
+    """Wall and CPU seconds of `mvseg VERB` on the shipped plant; surfaces in as many processes as threads."""
+    environment = make_environment(checkout, threads)
     program = "import sys; from mvseg.cli import main; sys.exit(main())"
     command = [sys.executable, "-P", "-c", program, verb, str(checkout / "mvseg" / "demo_plant"), "--quiet"]
+    if verb == "infer" and (checkout / "mvseg" / "worker_pool.py").exists():  # earlier versions have one process only
+        command += ["--num_workers", str(threads)]
     with tempfile.TemporaryDirectory() as out:
         before, start = resource.getrusage(resource.RUSAGE_CHILDREN), time.perf_counter()
         done = subprocess.run(
@@ -93,42 +105,52 @@ def run_shell(verb: str, checkout: Path) -> tuple[float, float]:
     return wall, after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def measure(args: argparse.Namespace, cache: Path) -> list[dict[str, Any]]:
-    """One record per cell and version: medians over the rounds."""
-    versions = {"now": ROOT} | ({"previous": args.previous.resolve()} if args.previous else {})
+def take_medians(runs: Sequence[dict[str, Any]]) -> dict[str, list[float]]:
+    """Median wall and CPU seconds of each stage over the rounds."""
+    return {
+        stage: np.median([run["seconds"][stage] for run in runs], 0).round(4).tolist() for stage in runs[0]["seconds"]
+    }
+
+
+def measure_growth(
+    cells: Sequence[Cell], versions: dict[str, Path], *, rounds: int, cache: Path
+) -> list[dict[str, Any]]:
+    """One record per cell and version."""
     runs: dict[tuple[Cell, str], list[dict[str, Any]]] = {}
-    cells = list_cells(FULL if args.full else QUICK)
-    for _ in range(args.rounds):
+    for _ in range(rounds):
         for cell in cells:
-            options = ["--shapes", "--proposals", str(PROPOSALS)] if cell == BASE else []
             for name, checkout in versions.items():
-                runs.setdefault((cell, name), []).append(run_cell(make_scene(cell, cache), checkout, options))
+                runs.setdefault((cell, name), []).append(run_cell(make_scene(cell, cache), checkout))
                 print(f"{cell} {name}", file=sys.stderr)
-    records = []
-    for (cell, name), of_cell in runs.items():
-        seconds = {
-            stage: np.median([run["seconds"][stage] for run in of_cell], 0).round(4).tolist()
-            for stage in STAGES
-            if stage in of_cell[0]["seconds"]
-        }
-        records.append(of_cell[0] | {"cell": cell, "version": name, "seconds": seconds})
-    base_runs = [record for record in records if tuple(record["cell"]) == BASE]
-    shell: dict[tuple[str, str], list[tuple[float, float]]] = {}
-    for _ in range(args.rounds):
+    return [
+        of_cell[0] | {"cell": cell, "version": name, "seconds": take_medians(of_cell)}
+        for (cell, name), of_cell in runs.items()
+    ]
+
+
+def measure_threads(versions: dict[str, Path], *, rounds: int, cache: Path) -> list[dict[str, Any]]:
+    """One record per version and number of threads; of the previous version one thread only."""
+    kinds = [("now", threads) for threads in THREADS] + [("previous", 1)] * ("previous" in versions)
+    runs: dict[tuple[str, int], list[dict[str, Any]]] = {kind: [] for kind in kinds}
+    for _ in range(rounds):
+        for (name, threads), so_far in runs.items():
+            so_far.append(run_cell(make_scene(BASE, cache), versions[name], threads=threads, every=True))
+            print(f"stages, {name}, {threads} threads", file=sys.stderr)
         for verb in ("match", "infer"):
-            for name, checkout in versions.items():
-                shell.setdefault((name, verb), []).append(run_shell(verb, checkout))
-                print(f"mvseg {verb} {name}", file=sys.stderr)
-    for record in base_runs:
-        for verb in ("match", "infer"):
-            record["seconds"][f"mvseg {verb}"] = np.median(shell[record["version"], verb], 0).round(3).tolist()
-    return records
+            for (name, threads), so_far in runs.items():
+                so_far[-1]["seconds"][f"mvseg {verb}"] = run_shell(verb, versions[name], threads=threads)
+                print(f"mvseg {verb}, {name}, {threads} threads", file=sys.stderr)
+    return [
+        so_far[0] | {"cell": BASE, "version": name, "threads": threads, "seconds": take_medians(so_far)}
+        for (name, threads), so_far in runs.items()
+    ]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--full", action="store_true", help="5 to 80 views, 4 to 64 leaves, up to 24 megapixels")
     parser.add_argument("--previous", type=Path, help="another checkout of mvseg, which takes turns with this one")
+    parser.add_argument("--threads_only", action="store_true", help="the base scene alone; the other table stays")
     parser.add_argument("--rounds", type=int, default=2, help="of all scenes; the figures are medians")
     parser.add_argument("--cache", type=Path, help="folder for the rendered scenes")
     parser.add_argument("--into", type=Path, default=Path("results/speed"), help="folder for what is written")
@@ -137,21 +159,15 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         cache = args.cache or Path(scratch)
         cache.mkdir(parents=True, exist_ok=True)
-        records = measure(args, cache)
+        versions = {"now": ROOT} | ({"previous": args.previous.resolve()} if args.previous else {})
+        cells = [] if args.threads_only else list_cells(FULL if args.full else QUICK)
+        records = measure_growth(cells, versions, rounds=args.rounds, cache=cache)
+        threads = measure_threads(versions, rounds=args.rounds, cache=cache)
         with np.load(make_scene(BASE, cache)) as saved:
             cameras = Cameras(**{name: torch.from_numpy(saved[name]) for name in ("K", "R", "t", "sizes")})
             rivals = measure_rivals(regions_from_label_maps(list(saved["true"])), cameras)
-    versions = {record["version"] for record in records}
-    slopes = {name: fit_slopes([record for record in records if record["version"] == name]) for name in versions}
     args.into.mkdir(parents=True, exist_ok=True)
-    report = json.dumps({"cells": records, "rivals": rivals, "slopes": slopes}, indent=1)
-    (args.into / "performance.json").write_text(report + "\n", encoding="utf-8")
-    lines = table_lines(records, rivals, slopes)
-    print("\n".join(lines))
-    draw_plot(records, args.into / "performance.png")
-    page = args.into / "performance.md"
-    if page.is_file():
-        page.write_text(write_between(page.read_text(encoding="utf-8"), lines), encoding="utf-8")
+    write_all(args.into, records, threads, rivals)
 
 
 if __name__ == "__main__":

@@ -2,14 +2,38 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-BEGIN, END = "<!-- begin: benchmarks.speed -->", "<!-- end: benchmarks.speed -->"
 SHOWN = ("load", "affinity", "matching", "pictures")
+
+
+def write_all(
+    into: Path, records: list[dict[str, Any]], threads: list[dict[str, Any]], rivals: dict[str, float]
+) -> None:
+    """The JSON, the plot and the tables; without records of the growth, what is there of it stays."""
+    report, tables = {"threads": threads, "rivals": rivals}, {"threads": threads_lines(threads, rivals)}
+    if records:
+        versions = sorted({record["version"] for record in records})
+        slopes = {name: fit_slopes([record for record in records if record["version"] == name]) for name in versions}
+        report |= {"cells": records, "slopes": slopes}
+        tables["growth"] = growth_lines(records, slopes)
+        draw_plot(records, into / "performance.png")
+    earlier = into / "performance.json"
+    if earlier.is_file():
+        report = json.loads(earlier.read_text(encoding="utf-8")) | report
+    earlier.write_text(json.dumps(report, indent=1) + "\n", encoding="utf-8")
+    page = into / "performance.md"
+    text = page.read_text(encoding="utf-8") if page.is_file() else ""
+    for name, lines in tables.items():
+        print("\n".join([*lines, ""]))
+        text = write_between(text, lines, name=name) if text else ""
+    if text:
+        page.write_text(text, encoding="utf-8")
 
 
 def fit_slopes(records: list[dict[str, Any]]) -> dict[str, float]:
@@ -23,11 +47,8 @@ def fit_slopes(records: list[dict[str, Any]]) -> dict[str, float]:
     return slopes
 
 
-def table_lines(
-    records: list[dict[str, Any]], rivals: dict[str, float], slopes: dict[str, dict[str, float]]
-) -> list[str]:
-    """Markdown: one row per cell, CPU seconds; the base scene in full, with the rivals; the slopes. "a / b" is now /
-    previous."""
+def growth_lines(records: list[dict[str, Any]], slopes: dict[str, dict[str, float]]) -> list[str]:
+    """Markdown: one row per cell, CPU seconds; the slopes. "a / b" is now / previous."""
     cells = list(dict.fromkeys(tuple(record["cell"]) for record in records))
     of = {(tuple(record["cell"]), record["version"]): record for record in records}
     lines = ["| views | leaves | Mpx | masks | " + " | ".join(SHOWN) + " | GB | ids |", "|---" * (6 + len(SHOWN)) + "|"]
@@ -41,13 +62,6 @@ def table_lines(
         ids = "" if previous is None else "same" if now["ids"] == previous["ids"] else "differ"
         row = [*map(str, cell), str(now["masks"]), *figures, memory, ids]
         lines.append(f"| {' | '.join(row)} |")
-    cell = _base_cell(records)
-    base = [of[cell, name] for name in ("now", "previous") if (cell, name) in of]
-    lines += ["", f"| {cell[0]} views, {cell[1]} leaves, {cell[2]} Mpx | CPU s | wall s |", "|---|---|---|"]
-    for stage in base[0]["seconds"]:
-        wall, cpu = (" / ".join(f"{record['seconds'][stage][n]:.3g}" for record in base) for n in (0, 1))
-        lines.append(f"| {stage} | {cpu} | {wall} |")
-    lines += [f"| {name} | {seconds:.3g} | |" for name, seconds in rivals.items()]
     lines.append("")
     for version, exponents in sorted(slopes.items()):
         growth = ", ".join(f"{stage} {exponent:g}" for stage, exponent in exponents.items())
@@ -55,16 +69,30 @@ def table_lines(
     return lines
 
 
-def write_between(page: str, lines: list[str]) -> str:
-    """The page with these lines between its two marks, BEGIN and END.
+def threads_lines(records: list[dict[str, Any]], rivals: dict[str, float]) -> list[str]:
+    """Markdown: one row per stage, with one and with two threads, and the rivals. "a / b" is now / previous."""
+    of = {(record["version"], record["threads"]): record for record in records}
+    views, leaves, megapixels = records[0]["cell"]
+    base = f"{views} views, {leaves} leaves, {megapixels} Mpx"
+    lines = [f"| {base} | CPU s, one thread | wall s, one thread | wall s, two threads |", "|---|---|---|---|"]
+    one = [of[version, 1] for version in ("now", "previous") if (version, 1) in of]
+    for stage, (two, _) in of["now", 2]["seconds"].items():
+        wall, cpu = (" / ".join(f"{record['seconds'][stage][n]:.3g}" for record in one) for n in (0, 1))
+        lines.append(f"| {stage} | {cpu} | {wall} | {two:.3g} |")
+    return lines + [f"| {name} | {seconds:.3g} | | |" for name, seconds in rivals.items()]
+
+
+def write_between(page: str, lines: list[str], *, name: str) -> str:
+    """The page with these lines between its two marks of that name.
 
     Raises:
         ValueError: the page does not have each mark once.
     """
-    if page.count(BEGIN) != 1 or page.count(END) != 1:
-        raise ValueError(f"expected '{BEGIN}' and '{END}' once each on the page")
-    head, rest = page.split(BEGIN)
-    return "\n".join((head + BEGIN, "", *lines, "", END)) + rest.split(END)[1]
+    begin, end = (f"<!-- {side}: benchmarks.speed, {name} -->" for side in ("begin", "end"))
+    if page.count(begin) != 1 or page.count(end) != 1:
+        raise ValueError(f"expected '{begin}' and '{end}' once each on the page")
+    head, rest = page.split(begin)
+    return "\n".join((head + begin, "", *lines, "", end)) + rest.split(end)[1]
 
 
 def _base_cell(records: list[dict[str, Any]]) -> tuple[Any, ...]:

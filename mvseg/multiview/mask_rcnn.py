@@ -149,13 +149,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         _check_cameras(cameras, sizes)
         proposals, matching = self.match_detections(detections, cameras, progress=progress)
         if self.witnesses:
-            cameras = cameras if matching.poses is None else matching.poses.cameras
+            posed = (cameras if matching.poses is None else matching.poses.cameras).to("cpu")
             proposals, matching, surfaces = hear_witnesses(
-                proposals, matching, cameras=cameras, photos=photos.__getitem__, progress=progress
+                proposals, matching, cameras=posed, photos=photos.__getitem__, progress=progress
             )
             assert proposals.from_views is not None
             regions = recut_masks(
-                proposals.regions, matching.instance_ids, surfaces, cameras=cameras, is_found=~proposals.from_views
+                proposals.regions, matching.instance_ids, surfaces, cameras=posed, is_found=~proposals.from_views
             )
             proposals = replace(proposals, regions=regions, boxes=regions.boxes.float())
         return proposals, matching

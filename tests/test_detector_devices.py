@@ -1,0 +1,199 @@
+"""Whatever device a detector is on: the same detections there as on the CPU, with the same types."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+from torchvision.models.detection import MaskRCNN
+
+from mvseg import MultiViewMaskRCNN
+from mvseg.detectors.mask_cut import decide_masks
+from mvseg.detectors.mask_rcnn import build_detector
+from mvseg.detectors.run import detect, leave_autocast, run_heads
+from mvseg.detectors.scales import look, run_scales
+from mvseg.detectors.small import SMALL_ARCHITECTURES
+from mvseg.matching.result import Matching
+from mvseg.multiview.proposals import Proposals
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from other_device import other_device
+from synthetic import arc_positions, cameras_at
+from tiny_training import build_tiny
+
+# what an untrained detector finds in noise does not agree across views
+pytestmark = pytest.mark.filterwarnings("ignore:the views hardly agree")
+
+WIDTH, HEIGHT = 80, 60
+CAMERAS = cameras_at(arc_positions(3), focal=100.0, width=WIDTH, height=HEIGHT)
+FLOATS, WHOLE = ("boxes", "scores", "masks", "match_scores"), ("labels", "instance_ids", "frame", "scale")
+
+
+@pytest.fixture
+def model() -> MaskRCNN:
+    model = build_tiny(3).eval()
+    model.transform.min_size, model.transform.max_size = (64,), 64
+    return model
+
+
+@pytest.fixture
+def photos() -> list[Tensor]:
+    return list(torch.rand((3, 3, HEIGHT, WIDTH), generator=torch.Generator().manual_seed(1)))
+
+
+@pytest.fixture
+def device() -> Iterator[torch.device]:
+    with other_device() as device:
+        yield device
+
+
+def there(module: Any, device: torch.device) -> Any:
+    """A copy of a module, moved."""
+    return copy.deepcopy(module).to(device)
+
+
+def check(answer: dict[str, Tensor], expected: dict[str, Tensor], device: torch.device) -> None:
+    """The same there as here, but for the size of the frame, which is never on a device."""
+    assert answer.keys() == expected.keys()
+    assert len(expected["scores"]) > 2
+    for key, value in answer.items():
+        assert value.device == (torch.device("cpu") if key == "frame" else device), key
+        assert value.dtype == torch.float32 if key in FLOATS else torch.int64 if key in WHOLE else torch.bool, key
+        torch.testing.assert_close(value.cpu(), expected[key])
+
+
+@torch.no_grad()
+@pytest.mark.parametrize("arch", SMALL_ARCHITECTURES)
+def test_each_small_detector(arch: str, device: torch.device) -> None:
+    torch.manual_seed(0)
+    model = build_detector(arch, 2, image_size=64).eval()
+    photo = torch.rand((3, 48, 64), generator=torch.Generator().manual_seed(1))
+    limits = {"detections_per_img": 5, "score_thresh": 0.0}
+    check(run_heads(there(model, device), photo.to(device), **limits), run_heads(model, photo, **limits), device)
+
+
+@torch.no_grad()
+def test_one_photo_at_one_scale_and_at_several(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+    moved, photo = there(model, device), photos[0]
+    check(run_scales(moved, photo.to(device), (0.5, 1.0)), run_scales(model, photo, (0.5, 1.0)), device)
+    check(look(moved, photo.to(device), 1, side=48), look(model, photo, 1, side=48), device)
+    found, masks = detect(moved, photo.to(device))
+    expected, pasted = detect(model, photo)
+    check(found | {"masks": torch.stack(list(masks))}, expected | {"masks": torch.stack(list(pasted))}, device)
+
+
+@torch.no_grad()
+def test_nothing_found(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+    model.roi_heads.score_thresh = 1.0
+    found, masks = detect(there(model, device), photos[0].to(device))
+    assert {key: (value.device, value.dtype, tuple(value.shape)) for key, value in found.items()} == {
+        "boxes": (device, torch.float32, (0, 4)),
+        "labels": (device, torch.int64, (0,)),
+        "scores": (device, torch.float32, (0,)),
+    }
+    assert list(masks) == []
+    results = MultiViewMaskRCNN(there(model, device))([each.to(device) for each in photos], cameras=CAMERAS)
+    assert [result["instance_ids"].device for result in results] == [device] * 3
+    assert {len(value) for result in results for value in result.values()} == {0}
+
+
+@torch.no_grad()
+def test_double_detectors_answer_in_single(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+    single = run_heads(model, photos[0])
+    check(run_heads(there(model.double(), device), photos[0].to(device).double()), single, device)
+    for dtype in (torch.float16, torch.float32, torch.float64):
+        raw = {"masks": single["masks"].to(dtype), "scores": single["scores"].to(dtype)}
+        answer = decide_masks({key: value.to(device) for key, value in raw.items()})
+        for key, expected in decide_masks(raw).items():
+            assert (answer[key].device, answer[key].dtype) == (device, dtype)
+            torch.testing.assert_close(answer[key].cpu(), expected)
+
+
+def test_all_views_with_cameras_and_without(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8)
+    moved, images = there(wrapped, device), [photo.to(device) for photo in photos]
+    expected = wrapped(photos, cameras=CAMERAS)
+    assert max(int(result["instance_ids"].max()) for result in expected) >= 1
+    for answer, result in zip(moved(images, cameras=CAMERAS.to(device)), expected, strict=True):
+        check(answer, result, device)
+    with torch.no_grad():
+        for answer, result in zip(moved(images), wrapped(photos), strict=True):
+            check(answer, result, device)
+
+
+def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8)
+    images = (photo.to(device) for photo in photos)
+    found, matching = there(wrapped, device).find_regions(images, CAMERAS.to(device))
+    expected, rematched = wrapped.find_regions(photos, CAMERAS)
+    assert (found.boxes.dtype, found.scores.dtype, found.classes.dtype) == (torch.float32, torch.float32, torch.int64)
+    for name in ("boxes", "scores", "classes"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name))
+    assert torch.equal(found.regions.crops, expected.regions.crops)
+    assert torch.equal(matching.instance_ids, rematched.instance_ids)
+    torch.testing.assert_close(matching.match_scores, rematched.match_scores)
+
+
+def test_witnesses_are_heard_on_the_cpu(
+    model: MaskRCNN, photos: list[Tensor], device: torch.device, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And their answer is where the images are."""
+    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, witnesses=True)
+
+    def hear(
+        proposals: Proposals, matching: Matching, **given: Any
+    ) -> tuple[Proposals, Matching, dict[int, LeafSurface]]:
+        assert given["cameras"].K.device.type == proposals.boxes.device.type == "cpu"
+        assert given["photos"](2).shape == (HEIGHT, WIDTH, 3)
+        return replace(proposals, from_views=proposals.scores > 0.4), matching, {}
+
+    monkeypatch.setattr("mvseg.multiview.mask_rcnn.hear_witnesses", hear)
+    answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
+    for answer, expected in zip(answers, wrapped(photos, cameras=CAMERAS), strict=True):
+        check(answer, expected, device)
+
+
+def test_autocast_there_reaches_the_backbone_and_no_boxes(
+    model: MaskRCNN, photos: list[Tensor], device: torch.device
+) -> None:
+    """The cameras may have stayed on the CPU."""
+    wrapped, seen = there(MultiViewMaskRCNN(model, proposals_per_view=8), device), []
+    wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(output.dtype))
+    wrapped.rpn.head.register_forward_hook(lambda module, inputs, output: seen.append(output[0][0].dtype))
+    with torch.autocast(device.type, torch.bfloat16):
+        results = wrapped([photo.to(device) for photo in photos], cameras=CAMERAS)
+    assert seen == [torch.bfloat16, torch.float32] * 3
+    for result in results:
+        check(result, {key: value.cpu() for key, value in result.items()}, device)
+        assert not torch.equal(result["boxes"], result["boxes"].bfloat16().float())
+
+
+@pytest.mark.parametrize("lower", [False, True])
+def test_losses_and_gradients(lower: bool, model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+    """In half precision they are nearly the same, with the hook that training sets."""
+    wrapped = MultiViewMaskRCNN(model.train())
+    target = {
+        "boxes": torch.tensor([[10.0, 10, 45, 40], [50, 5, 53, 40]]),
+        "labels": torch.tensor([1, 2]),
+        "masks": torch.ones(2, HEIGHT, WIDTH, dtype=torch.uint8),
+    }
+    moved = there(wrapped, device)
+    moved.rpn.head.register_forward_hook(leave_autocast)
+    torch.manual_seed(5)
+    expected = wrapped(photos[:1], [target])
+    torch.manual_seed(5)
+    with torch.autocast(device.type, torch.bfloat16, enabled=lower):
+        losses = moved([photos[0].to(device)], [{key: value.to(device) for key, value in target.items()}])
+    assert losses.keys() == expected.keys()
+    for key, loss in losses.items():
+        assert loss.device == device
+        assert loss.isfinite()
+        torch.testing.assert_close(loss.float().cpu(), expected[key], rtol=0.2 if lower else 1e-5, atol=1e-5)
+    sum(losses.values()).backward()
+    gradient = moved.backbone[0].weight.grad
+    assert (gradient.device, gradient.dtype) == (device, torch.float32)
+    assert gradient.abs().sum() > 0
