@@ -23,7 +23,7 @@ from mvseg.matching.result import SURE, Matching, count_sure_views
 from mvseg.multiview.confirmed_masks import confirmed_masks
 from mvseg.multiview.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 from mvseg.multiview.proposals import Proposals
-from mvseg.multiview.recut import AGREES, agreement
+from mvseg.multiview.recut import AGREES, Box, Mask, agreement
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.visible_leaves import VisibleLeaf, visible_leaves
@@ -31,8 +31,6 @@ from mvseg.regions import Regions, mask_box, stack_regions
 from mvseg.scene import Cameras
 
 Photos = Callable[[int], NDArray[np.uint8]]
-Mask = NDArray[np.bool_]
-Box = tuple[int, int, int, int]
 
 LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for that part to become a mask
 LEAST_PIXELS = 64  # of that part
