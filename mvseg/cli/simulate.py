@@ -13,7 +13,8 @@ from mvseg.errors import InputError
 def add(verbs: Any) -> None:
     """Add the verb to the parser's sub-commands."""
     parser = ArgumentParser(exit_on_error=False, description="Render plants with known answers.")
-    parser.add_argument("preset", help="paper-eval (144 scenes of 3 to 20 photos) or train (888 of 9 photos)")
+    presets = "paper-eval (144 scenes of 3 to 20 photos), train (888 of 9 photos) or wild (108 of 9 photos)"
+    parser.add_argument("preset", help=presets)
     parser.add_argument("--out", type=Path, required=True, help="folder for the scenes; finished ones are kept")
     parser.add_argument("--seed", type=int, default=0, help="for everything that is random")
     parser.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")

@@ -29,6 +29,7 @@ class Leaf:
         length: along the midrib, mm.
         width: from edge to edge along the surface, where the blade is widest, mm (the flattened blade's width).
         area: one-sided area of the mesh, mm^2.
+        dryness: 0 fresh, 0.5 yellow, 1 brown.
     """
 
     leaf_id: int
@@ -38,6 +39,7 @@ class Leaf:
     length: float
     width: float
     area: float
+    dryness: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.scene_writer import write_scene, write_table
+from mvseg.simulation.wild import make_wild
 from mvseg.worker_pool import run_all
 
 Photo = tuple[dict[str, Any], list[dict[str, Any]]]  # COCO image and its annotations, still without ids
@@ -41,6 +42,8 @@ class Preset:
         families: the plants of a number of leaves take these in turn, each number starting one further on.
         has_free_cameras: cameras all around the plant, at any height and zoom, instead of the 200 degree arc.
         has_coco: write `<split>.json` with the leaves of all photos, category "leaf".
+        is_wild: all plants are as real ones are at home and outdoors, see `wild.make_wild`; cotyledons come on top of
+            the number of leaves.
     """
 
     plants: tuple[tuple[str, int], ...]
@@ -50,6 +53,7 @@ class Preset:
     families: tuple[str, ...] = EVALUATED_FAMILIES
     has_free_cameras: bool = False
     has_coco: bool = False
+    is_wild: bool = False
 
 
 PRESETS = {
@@ -61,6 +65,16 @@ PRESETS = {
         families=EVALUATED_FAMILIES * 10 + ("leggy",) * 10,  # to learn that bare stems are not leaves
         has_free_cameras=True,
         has_coco=True,
+    ),
+    "wild": Preset(
+        plants=(("train", 8), ("val", 1)),
+        leaves=(2, 4, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48),
+        views=(9,),
+        size=(512, 512),
+        families=(*EVALUATED_FAMILIES, "leggy"),
+        has_free_cameras=True,
+        has_coco=True,
+        is_wild=True,
     ),
 }
 
@@ -168,6 +182,7 @@ def finish_scene(dataset: Path, preset: Preset, scene: SceneSpec) -> list[Photo]
     folder = dataset / scene.folder
     if not folder.exists():
         plant = grow_plant(scene.family, scene.num_leaves, scene.seed)
+        plant = make_wild(plant, scene.seed) if preset.is_wild else plant
         write_scene(folder, plant, scene_cameras(scene, plant, preset), seed=scene.seed)
     if not preset.has_coco:
         return []

@@ -27,11 +27,20 @@ CLEARANCE = 6.0  # mm; blades that come closer than this crowd each other
 
 @dataclass(frozen=True, eq=False)
 class Plant:
-    """A grown plant: its leaves in the order of their ids 1..len(leaves), and everything else that a camera sees."""
+    """A grown plant: its leaves in the order of their ids 1..len(leaves), and everything else that a camera sees.
+
+    Attributes:
+        family: a key of `FAMILIES`.
+        leaves, parts: meshes; the first `len(stems)` parts are the stems.
+        stems: (n, 3) points of each stem, from the foot to the tip, mm.
+        is_wild: see `wild.make_wild`; its surroundings are those of homes and gardens, too.
+    """
 
     family: str
     leaves: tuple[Leaf, ...]
     parts: tuple[Part, ...]
+    stems: tuple[Floats, ...] = ()
+    is_wild: bool = False
     unit: str = "mm"
 
 
@@ -90,7 +99,7 @@ def grow_plant(family: str, num_leaves: int, seed: int) -> Plant:
         foot = np.append(rng.uniform(-0.4, 0.4, 2) * ranges.pot_radius, -1.0)
         top = foot + np.array([rng.normal(0, 10), rng.normal(0, 10), rng.uniform(60, 200)])
         tubes.append(make_tube("stake", np.linspace(foot, top, 8), radius=rng.uniform(1.5, 4), taper=1.0))
-    return Plant(family=family, leaves=leaves, parts=(*tubes, *pot_parts(pot, rng)))
+    return Plant(family=family, leaves=leaves, parts=(*tubes, *pot_parts(pot, rng)), stems=tuple(stems))
 
 
 # --- fronds

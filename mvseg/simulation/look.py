@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import colorsys
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -87,6 +87,56 @@ def draw_look(rng: np.random.Generator) -> Look:
         noise=rng.uniform(0.004, 0.025),
         vignette=rng.uniform(0, 0.35),
     )
+
+
+def draw_wild_look(look: Look, rng: np.random.Generator) -> Look:
+    """The look with some of what photos from homes and gardens have: stems as green as leaves, green pots and mats,
+    waxy or wet leaves, overexposure, and black studios, windows or other plants behind."""
+    plain, backdrop = look.plain.copy(), look.backdrop
+    if rng.random() < 0.4:
+        plain[0] = look.leaf * rng.uniform(0.6, 1.6)
+    if rng.random() < 0.25:
+        plain[1] = hue_color(rng.uniform(0.2, 0.45), rng.uniform(0.3, 0.9), rng.choice([0.05, 0.15, 0.4]))
+    if rng.random() < 0.15:
+        plain[3] = hue_color(rng.uniform(0.2, 0.45), rng.uniform(0.2, 0.8), rng.choice([0.05, 0.15, 0.4]))
+    behind = rng.choice(["as it is", "studio", "window", "plants"])
+    if behind == "studio":
+        backdrop, plain[3] = backdrop * np.float32(0.02), plain[3] * np.float32(0.1)
+    elif behind == "window":
+        backdrop = add_windows(backdrop, rng)
+    elif behind == "plants":
+        backdrop = add_plants(backdrop, rng, color=look.leaf)
+    return replace(
+        look,
+        plain=plain,
+        backdrop=backdrop,
+        gloss=look.gloss * (rng.uniform(1.5, 3) if rng.random() < 0.2 else 1),
+        drops=rng.uniform(0.4, 1.0) if rng.random() < 0.2 else look.drops,
+        sun_blur=0.001 if rng.random() < 0.2 else look.sun_blur,
+        exposure=look.exposure * np.float32(rng.uniform(1.3, 2.2) if rng.random() < 0.25 else 1),
+    )
+
+
+def add_windows(backdrop: Floats, rng: np.random.Generator) -> Floats:
+    """The backdrop (h, w, 3) with one to three windows, much brighter than the room, and their bars."""
+    image = backdrop.copy()
+    for _ in range(rng.integers(1, 4)):
+        x, y, w, h = rng.integers(0, 256), rng.integers(20, 55), rng.integers(10, 45), rng.integers(15, 45)
+        panes = np.full((h, w, 3), image.mean() * rng.uniform(3, 10), np.float32)
+        panes[:, :: max(4, w // 2)], panes[:: max(4, h // 2)] = image.mean(), image.mean()
+        image[y : y + h, np.arange(x, x + w) % 256] = panes
+    return image
+
+
+def add_plants(backdrop: Floats, rng: np.random.Generator, *, color: Floats) -> Floats:
+    """The backdrop (h, w, 3) with other plants out of focus: leaves of about the colour given, some of them lit."""
+    image, light = backdrop.copy(), 6 * backdrop.mean()
+    for _ in range(rng.integers(40, 300)):
+        middle = (int(rng.integers(0, 256)), int(rng.normal(66, 14)))
+        axes = (int(rng.integers(2, 9)), int(rng.integers(1, 4)))
+        shade = light * rng.uniform(0.2, 1.5) * color * np.exp(rng.normal(0, 0.15, 3))
+        cv2.ellipse(image, middle, axes, float(rng.uniform(0, 180)), 0, 360, tuple(map(float, shade)), -1, cv2.LINE_AA)
+    return cv2.GaussianBlur(image, (0, 0), rng.uniform(0.4, 1.5)).astype(np.float32)
 
 
 def hue_color(hue: float, saturation: float, value: float) -> Floats:

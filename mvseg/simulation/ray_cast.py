@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from mvseg.scene import Cameras
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import Plant
-from mvseg.simulation.look import Floats, Look, draw_look
+from mvseg.simulation.look import Floats, Look, draw_look, draw_wild_look
 from mvseg.simulation.shading import GROUND, MATERIALS, Hits, backdrop_color, develop, dot, shade, unit
 
 Doubles = NDArray[np.float64]
@@ -53,6 +53,7 @@ class Mesh:
     uv: Doubles  # (P, 2) as in `Leaf.uv`; 0 for parts
     owner: NDArray[np.uint16]  # (F,) leaf id, 0 for parts
     material: NDArray[np.uint8]  # (F,) an index of MATERIALS
+    dryness: Floats  # (F,) as in `Leaf.dryness`, 0 for parts
 
 
 @dataclass(frozen=True, eq=False)
@@ -148,6 +149,7 @@ def trace(
         view=view[hit],
         material=stage.mesh.material[face_hit],
         leaf_id=stage.mesh.owner[face_hit],
+        dryness=stage.mesh.dryness[face_hit],
         face_normal=face_normal,
         normal=values[:, :3],
         along=stage.along[face_hit],
@@ -185,6 +187,8 @@ def build_stage(plant: Plant, *, seed: int) -> Stage:
     normals = unit(np.stack([np.bincount(faces.ravel(), np.repeat(n, 3), len(vertices)) for n in across.T], 1))
     bvh = build_bvh(mesh)
     look = draw_look(np.random.default_rng(seed))
+    if plant.is_wild:
+        look = draw_wild_look(look, np.random.default_rng([seed, 1]))
     upper, lower = gather_skylight(bvh, look, vertices=vertices.astype(np.float32), normals=normals)
     return Stage(
         mesh=mesh,
@@ -199,10 +203,11 @@ def build_stage(plant: Plant, *, seed: int) -> Stage:
 
 def merge_meshes(plant: Plant) -> Mesh:
     """The leaves, and after them the parts, as one mesh."""
-    meshes = [(leaf.vertices, leaf.faces, MATERIALS.index("leaf"), leaf.leaf_id) for leaf in plant.leaves]
-    meshes += [(part.vertices, part.faces, MATERIALS.index(part.material), 0) for part in plant.parts]
-    counts = [len(faces) for _, faces, _, _ in meshes]
-    starts = np.cumsum([0] + [len(vertices) for vertices, _, _, _ in meshes])
+    leaf_material = MATERIALS.index("leaf")
+    meshes = [(leaf.vertices, leaf.faces, leaf_material, leaf.leaf_id, leaf.dryness) for leaf in plant.leaves]
+    meshes += [(part.vertices, part.faces, MATERIALS.index(part.material), 0, 0.0) for part in plant.parts]
+    counts = [len(mesh[1]) for mesh in meshes]
+    starts = np.cumsum([0] + [len(mesh[0]) for mesh in meshes])
     faces = np.concatenate([mesh[1] + start for mesh, start in zip(meshes, starts[:-1], strict=True)]).astype(np.int32)
     uv = np.zeros((starts[-1], 2))
     uv[: starts[len(plant.leaves)]] = np.concatenate([np.zeros((0, 2)), *(leaf.uv for leaf in plant.leaves)])
@@ -212,6 +217,7 @@ def merge_meshes(plant: Plant) -> Mesh:
         uv=uv,
         owner=np.repeat(np.array([mesh[3] for mesh in meshes], np.uint16), counts),
         material=np.repeat(np.array([mesh[2] for mesh in meshes], np.uint8), counts),
+        dryness=np.repeat(np.array([mesh[4] for mesh in meshes], np.float32), counts),
     )
 
 

@@ -15,6 +15,8 @@ MATERIALS = ("leaf", "stem", "pot", "soil", "ground", "stake")
 LEAF, SOIL, GROUND = 0, 3, 4
 VEIN_TINT = np.array([0.8, 0.5, 0.6], np.float32)
 SICK = np.array([0.20, 0.13, 0.05], np.float32)
+YELLOW = np.array([0.33, 0.26, 0.04], np.float32)
+BROWN = np.array([0.17, 0.09, 0.035], np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +28,7 @@ class Hits:
         view: (n, 3) unit direction of the ray, away from the camera.
         material: (n,) index of MATERIALS.
         leaf_id: (n,), 0 for what is not a leaf.
+        dryness: (n,) as in `Leaf.dryness`.
         face_normal: (n, 3) unit normal of the triangle.
         normal: (n, 3) normal, smooth from vertex to vertex, of any length.
         along: (n, 3) unit direction from the base of the leaf to its tip.
@@ -38,6 +41,7 @@ class Hits:
     view: Floats
     material: NDArray[np.uint8]
     leaf_id: NDArray[np.uint16]
+    dryness: Floats
     face_normal: Floats
     normal: Floats
     along: Floats
@@ -54,7 +58,7 @@ def shade(look: Look, hits: Hits, *, has_parallel_veins: bool) -> Floats:
     albedo, through, normal = np.zeros_like(hits.points), np.zeros_like(hits.points), hits.face_normal.copy()
     albedo[rest] = part_color(look, hits.material[rest], hits.points[rest])
     albedo[leaf], through[leaf], slope = leaf_color(
-        look, hits.leaf_id[leaf], leaf_uv, has_parallel_veins=has_parallel_veins
+        look, hits.leaf_id[leaf], leaf_uv, dryness=hits.dryness[leaf], has_parallel_veins=has_parallel_veins
     )
     normal[leaf] = unit(hits.normal[leaf] + slope[:, None] * hits.along[leaf])
     is_upper = (dot(normal, hits.view) < 0)[:, None]
@@ -65,9 +69,8 @@ def shade(look: Look, hits: Hits, *, has_parallel_veins: bool) -> Floats:
     facing = dot(normal, look.to_sun)[:, None]
     color = albedo * (front + direct * np.maximum(facing, 0))
     color += through * (back + direct * np.maximum(-facing, 0))
-    color[leaf] += highlight(
-        look, leaf_uv, normal=normal[leaf], view=hits.view[leaf], direct=direct[leaf], sky=front[leaf]
-    )
+    shine = highlight(look, leaf_uv, normal=normal[leaf], view=hits.view[leaf], direct=direct[leaf], sky=front[leaf])
+    color[leaf] += shine * (1 - 0.8 * hits.dryness[leaf, None])
     return color
 
 
@@ -84,9 +87,9 @@ def highlight(look: Look, uv: Floats, *, normal: Floats, view: Floats, direct: F
 
 
 def leaf_color(
-    look: Look, leaf_id: NDArray[np.uint16], uv: Floats, *, has_parallel_veins: bool
+    look: Look, leaf_id: NDArray[np.uint16], uv: Floats, *, dryness: Floats, has_parallel_veins: bool
 ) -> tuple[Floats, Floats, Floats]:
-    """What leaves look like at (n, 2) positions `uv` on them.
+    """What leaves of some dryness (n,) look like at (n, 2) positions `uv` on them.
 
     Returns:
         Albedo (n, 3); colour (n, 3) of the light that passes through; slope (n,) of the surface towards the tip.
@@ -105,7 +108,10 @@ def leaf_color(
     sick = np.clip(sick, 0, 1)[:, None]
     albedo = look.leaf * np.exp(tint + 0.08 * blotch[:, None] + vein * VEIN_TINT)
     albedo += sick * (SICK - albedo)
-    through = look.through * np.exp(tint) * (1 - 0.6 * vein) * (1 - 0.8 * sick)
+    grain = np.exp(0.15 * blotch[:, None])
+    albedo += np.clip(2 * dryness, 0, 1)[:, None] * (YELLOW * grain - albedo)
+    albedo += np.clip(2 * dryness - 1, 0, 1)[:, None] * (BROWN * grain**2 - albedo)
+    through = look.through * np.exp(tint) * (1 - 0.6 * vein) * (1 - 0.8 * sick) * (1 - 0.9 * dryness[:, None])
     bulge = look.quilting * (np.sin(2 * np.pi * phase) + 0.5 * blotch) * along_vein
     return albedo, through, np.zeros_like(bulge) if has_parallel_veins else bulge
 

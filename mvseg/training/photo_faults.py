@@ -12,6 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+SKIN = (225.0, 175.0, 145.0)  # RGB
+
 
 def light_unevenly(photo: Tensor) -> Tensor:
     """Put patches of shadow, or of glare up to overexposure, on a photo (3, H, W) uint8; their edges are sharp or soft.
@@ -62,8 +64,8 @@ def blur_motion(photo: Tensor, *, length: float, angle: float) -> Tensor:
 
 
 def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
-    """Put one to three things in front that are no leaves: tapes, labels, sticks and discs, every other one in a colour
-    of the photo itself, so that green alone makes no leaf.
+    """Put one to three things in front that are no leaves: tapes, labels, sticks, discs and hands. Of all but hands,
+    every other one has a colour of the photo itself, so that green alone makes no leaf.
 
     Args:
         photo: (3, H, W) uint8.
@@ -81,16 +83,31 @@ def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
         row, column, angle = draw(0, height), draw(0, width), draw(0, math.pi)
         along = (math.cos(angle) * (columns - column) + math.sin(angle) * (rows - row)) / half_length
         across = (math.cos(angle) * (rows - row) - math.sin(angle) * (columns - column)) / half_width
-        is_round = draw(0, 1) < 0.3
-        shape = along.square() + across.square() < 1 if is_round else torch.maximum(along.abs(), across.abs()) < 1
+        kind = draw(0, 1)
         of_photo = photo[:, int(torch.randint(height, ())), int(torch.randint(width, ()))].float()
         color = of_photo if draw(0, 1) < 0.5 else 255 * torch.rand(3)
+        if kind < 0.1:
+            shape, color = is_hand(along, across * half_width / half_length), draw(0.3, 1.1) * torch.tensor(SKIN)
+        elif kind < 0.35:
+            shape = along.square() + across.square() < 1
+        else:
+            shape = torch.maximum(along.abs(), across.abs()) < 1
         shading = 1 + draw(-0.3, 0.3) * along + draw(-0.3, 0.3) * across
         grain = 1 + draw(0, 0.1) * torch.randn(height, width)
         thing = (color[:, None, None] * shading * grain).clamp(0, 255).to(photo.dtype)
         photo = torch.where(shape, thing, photo)
         layers = layers.masked_fill(shape, 0)
     return photo, layers
+
+
+def is_hand(along: Tensor, across: Tensor) -> Tensor:
+    """(H, W) bool, where a palm with an arm behind and four fingers ahead is; in units of half a hand."""
+    shape = (along / 0.42).square() + (across / 0.4).square() < 1
+    shape |= (along < 0) & (across.abs() < 0.25)
+    for finger in range(4):
+        bend = across - 0.24 * (finger - 1.5) * (1 + along)
+        shape |= ((along - 0.5) / draw(0.3, 0.5)).square() + (bend / 0.13).square() < 1
+    return shape
 
 
 def draw(low: float, high: float) -> float:

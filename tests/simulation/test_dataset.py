@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -149,6 +150,20 @@ def test_train_is_large_and_has_all_families() -> None:
     assert {scene.family for scene in scenes} == set(FAMILIES)
     assert sum(scene.family == "leggy" for scene in scenes) == len(scenes) / 7
     assert len({scene.folder for scene in scenes}) == len(scenes)
+
+
+def test_wild_scenes_show_wild_plants(tmp_path: Path) -> None:
+    scenes = list_scenes(PRESETS["wild"], seed=0)
+    assert len(scenes) == 108
+    assert {scene.family for scene in scenes if scene.split == "train"} == set(FAMILIES)
+    small = replace(PRESETS["wild"], plants=(("train", 1),), leaves=(2,), views=(2,), size=(48, 48))
+    tame = replace(small, is_wild=False)
+    write_dataset(small, tmp_path / "wild", seed=5)
+    write_dataset(tame, tmp_path / "tame", seed=5)
+    photos = [next(folder.glob("train/*/images/000.jpg")).read_bytes() for folder in sorted(tmp_path.iterdir())]
+    assert photos[0] != photos[1]
+    listed = [json.loads((tmp_path / name / "train.json").read_text())["images"] for name in ("wild", "tame")]
+    assert listed[0] == listed[1]
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from mvseg.training.photo_faults import add_clutter, blur_motion, compress, light_unevenly, spoil
+from mvseg.training.photo_faults import add_clutter, blur_motion, compress, is_hand, light_unevenly, spoil
 
 
 def noisy_photo(height: int = 48, width: int = 64) -> torch.Tensor:
@@ -76,3 +76,14 @@ def test_clutter_hides_what_is_behind_it() -> None:
         shares.append(float(is_hidden.float().mean()))
     assert 0.005 < sum(shares) / len(shares) < 0.3
     assert max(shares) < 0.6
+
+
+def test_a_hand_has_four_fingers_and_an_arm() -> None:
+    torch.manual_seed(0)
+    axis = torch.linspace(-1.5, 1.5, 301)
+    hand = is_hand(axis[None], axis[:, None])
+    through_the_fingers = hand[:, 220].int()
+    assert int((through_the_fingers.diff() == 1).sum()) == 4
+    assert bool(hand[150, 0])  # the arm reaches out of the photo
+    assert not bool(hand[150, -1])
+    assert 0.05 < float(hand.float().mean()) < 0.3
