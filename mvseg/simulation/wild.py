@@ -61,7 +61,7 @@ def wither(leaf: Leaf, rng: np.random.Generator) -> Leaf:
 
 
 def roll_up(vertices: Floats, turn: float) -> Floats:
-    """(P, 3) the blade with both halves rolled upwards around the midrib, their edges by `turn` (if negative, downwards).
+    """(P, 3) the blade with both halves rolled upwards around the midrib, their edges by `turn`; downwards if negative.
 
     The midrib stays in place, and distances across the blade stay what they are.
     """
