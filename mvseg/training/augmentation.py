@@ -20,7 +20,7 @@ from mvseg.formats.labelled_photo import LabelledPhoto
 from mvseg.regions import masks_to_boxes
 from mvseg.training.config import Orientation
 from mvseg.training.data import SampleList, read_sample
-from mvseg.training.photo_faults import add_clutter, light_unevenly, spoil
+from mvseg.training.photo_faults import add_clutter, light_unevenly, spoil, tint_leaves
 
 MEAN_COLOR = (124, 116, 104)  # RGB; what the detectors' normalisation maps to zero
 MIN_INSTANCE_PX = 16  # smaller remains of an instance at the edge of a crop are noise
@@ -43,6 +43,7 @@ class Augmentation:
         light_probability: share of the samples that are lit unevenly, see `light_unevenly`.
         fault_probability: share of the samples with a fault of real photos, see `spoil`.
         clutter_probability: share of the samples with things in front that are no leaves, see `add_clutter`.
+        tint_probability: share of the samples whose leaves get another colour, see `tint_leaves`.
     """
 
     image_size: int
@@ -53,6 +54,7 @@ class Augmentation:
     light_probability: float = 0.0
     fault_probability: float = 0.0
     clutter_probability: float = 0.0
+    tint_probability: float = 0.0
 
 
 class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
@@ -94,6 +96,8 @@ def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> t
         torch.default_generator.manual_seed(seed)
         photo, layers = orient(photo, labelled.layers, augmentation.orientation)
         photo, layers = rescale(photo, layers, augmentation)
+        if happens(augmentation.tint_probability):
+            photo = tint_leaves(photo, layers)
         if happens(augmentation.clutter_probability):
             photo, layers = add_clutter(photo, layers)
         if happens(augmentation.light_probability):

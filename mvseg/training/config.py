@@ -50,7 +50,8 @@ class TrainConfig:
         blur_probability: share of the samples that are blurred.
         light_probability: share of the samples that are lit unevenly: patches of cast shadow or of glare.
         fault_probability: share of the samples with motion blur, compression, noise, overexposure or no colour.
-        clutter_probability: share of the samples with things in front that are no leaves: tapes, labels, sticks.
+        clutter_probability: share of the samples with things in front that are no leaves: tapes, labels, sticks, hands.
+        tint_probability: share of the samples whose leaves get another colour: red, purple, yellow, silver.
         epochs: passes over the training samples; each ends with an evaluation.
         batch_size: samples per optimisation step, over all processes.
         images_per_forward: samples per forward pass of one process, what its memory allows; divides batch_size. The
@@ -92,6 +93,7 @@ class TrainConfig:
     light_probability: float = 0.0
     fault_probability: float = 0.0
     clutter_probability: float = 0.0
+    tint_probability: float = 0.0
     epochs: int = 20
     batch_size: int = 4
     images_per_forward: int = 2
@@ -124,8 +126,8 @@ class TrainConfig:
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= bound):
                 raise InputError(f"{name} is {value}, expected at least {bound}")
-        shares = ("color_jitter", "blur_probability", "light_probability", "fault_probability", "clutter_probability")
-        for name in (*shares, "ema_decay"):
+        causes = ("blur", "light", "fault", "clutter", "tint")
+        for name in ("color_jitter", *(f"{cause}_probability" for cause in causes), "ema_decay"):
             value = getattr(self, name)
             if not 0 <= value <= 1:
                 raise InputError(f"{name} is {value}, expected a number from 0 to 1")

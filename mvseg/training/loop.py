@@ -264,6 +264,7 @@ def augmented_samples(run: Run) -> AugmentedSamples:
         light_probability=config.light_probability,
         fault_probability=config.fault_probability,
         clutter_probability=config.clutter_probability,
+        tint_probability=config.tint_probability,
     )
     return AugmentedSamples(run.samples, augmentation, config.seed)
 

@@ -1,10 +1,12 @@
-"""What real photos have and rendered ones lack: uneven light, the faults of cameras, things that are no leaves.
+"""What real photos have and rendered ones lack: uneven light, the faults of cameras, things that are no leaves, leaves
+that are not green.
 
 All of it is drawn from torch's global generator.
 """
 
 from __future__ import annotations
 
+import colorsys
 import math
 
 import cv2
@@ -13,6 +15,7 @@ import torch
 from torch import Tensor
 
 SKIN = (225.0, 175.0, 145.0)  # RGB
+LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
 
 
 def light_unevenly(photo: Tensor) -> Tensor:
@@ -98,6 +101,29 @@ def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
         photo = torch.where(shape, thing, photo)
         layers = layers.masked_fill(shape, 0)
     return photo, layers
+
+
+def tint_leaves(photo: Tensor, layers: Tensor) -> Tensor:
+    """Give the leaves another colour, as those of coleus, beet, red lettuce or a silvery sage have; stems keep theirs.
+
+    Every leaf of a photo (3, H, W) uint8 gets the same hue, but more or less of it; brightness stays, times one factor.
+
+    Args:
+        photo: (3, H, W) uint8, RGB.
+        layers: (L, H, W) int, k where instance k is.
+
+    Returns:
+        A new photo. A detector that has seen green leaves only takes a red plant's stems for its leaves.
+    """
+    hue, saturation, value = draw(0, 1), draw(0, 0.8), 1.0
+    color = torch.tensor(colorsys.hsv_to_rgb(hue, saturation, value))
+    color = draw(0.6, 1.3) * color / float((LUMINANCE * color).sum())
+    labels = layers.amax(0).long()
+    amount = draw(0.5, 1) * (1 - draw(0, 0.5) * torch.rand(int(labels.max()) + 1))
+    amount[0] = 0
+    grey = (LUMINANCE[:, None, None] * photo.float()).sum(0)
+    tinted = photo.float() + amount[labels] * (grey * color[:, None, None] - photo.float())
+    return tinted.round().clamp(0, 255).to(photo.dtype)
 
 
 def is_hand(along: Tensor, across: Tensor) -> Tensor:

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from mvseg.training.photo_faults import add_clutter, blur_motion, compress, is_hand, light_unevenly, spoil
+from mvseg.training.photo_faults import add_clutter, blur_motion, compress, is_hand, light_unevenly, spoil, tint_leaves
 
 
 def noisy_photo(height: int = 48, width: int = 64) -> torch.Tensor:
@@ -76,6 +76,28 @@ def test_clutter_hides_what_is_behind_it() -> None:
         shares.append(float(is_hidden.float().mean()))
     assert 0.005 < sum(shares) / len(shares) < 0.3
     assert max(shares) < 0.6
+
+
+def test_leaves_get_another_colour_and_all_else_stays() -> None:
+    photo = torch.full((3, 20, 30), 60, dtype=torch.uint8)
+    photo[1] = 140  # green
+    layers = torch.zeros((2, 20, 30), dtype=torch.int32)
+    layers[0, :10], layers[1, 5:15, :10] = 1, 2
+    is_leaf = (layers > 0).any(0)
+    before, ratios = photo.clone(), []
+    for seed in range(40):
+        torch.manual_seed(seed)
+        tinted = tint_leaves(photo, layers)
+        assert tinted.dtype == torch.uint8
+        assert torch.equal(tinted[:, ~is_leaf], photo[:, ~is_leaf])
+        red, green, _ = tinted[:, 0, 20].float()
+        ratios.append(float(red / green))
+        assert len(tinted[:, :5].flatten(1).unique(dim=1).T) == 1  # a leaf has one colour
+    assert torch.equal(photo, before)
+    assert min(ratios) < 0.5
+    assert max(ratios) > 1.3
+    torch.manual_seed(0)
+    assert torch.equal(tint_leaves(photo, torch.zeros_like(layers)), photo)
 
 
 def test_a_hand_has_four_fingers_and_an_arm() -> None:
