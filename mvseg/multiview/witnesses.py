@@ -32,10 +32,10 @@ from mvseg.scene import Cameras
 
 Photos = Callable[[int], NDArray[np.uint8]]
 
-LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for that part to become a mask
+LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for a view to show it openly
 LEAST_PIXELS = 64  # of that part
-LEAST_COLORED = 0.8  # of it, that have the colour of leaves
-LEAST_FOUND = 1 / 3  # of an instance's masks, that a detector found and its surface agrees with
+LEAST_COLORED = 0.8  # of it, that have the colour of leaves, for it to become a mask
+LEAST_FOUND = 0.3  # of the views that show an instance openly, where its surface agrees with what the detector found
 ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
 SURE_VIEWS = 4  # of an instance whose masks tell that colour
 
@@ -133,14 +133,14 @@ def revise_masks(
 
     - its masks there stay, as one, when their IoU with the visible part of the surface is at least `AGREES`;
     - otherwise, and where it has none, that part becomes its mask, as far as it has the colour of leaves
-      (`leaf_color`). It must be `LEAST_VISIBLE` of the surface, and `LEAST_COLORED` of it must have that colour: what a
-      stem or a pot hides, or a wrong surface shows, is no mask;
+      (`leaf_color`). It must be `LEAST_VISIBLE` of the surface, so that the view shows it openly, and `LEAST_COLORED`
+      of it must have that colour: what a stem or a pot hides, or a wrong surface shows, is no mask;
     - otherwise it has none.
 
     Instances without a credible surface go, and those with masks in one view only; so do masks that are matched to
-    nothing. A leaf that only one photo shows is lost with the false ones. And those go that stayed in fewer than
-    `LEAST_FOUND` of the views that then show them: what is seen openly from all sides, and taken for a leaf from a few,
-    is a stem or the like.
+    nothing. A leaf that only one photo shows is lost with the false ones. And those go whose masks stayed in fewer than
+    `LEAST_FOUND` of the views that show them openly: what is seen from all sides, and taken for a leaf from a few, is a
+    stem or the like.
 
     Args:
         regions: D masks, as a detector found them.
@@ -158,6 +158,7 @@ def revise_masks(
     regions, matching = regions.to("cpu"), replace(matching, instance_ids=ids, match_scores=scores)
     colors = _colors_of_leaves(regions, matching, photos)
     found: list[_Found] = []
+    shown_openly: Counter[int] = Counter()
     for view in tqdm(range(regions.num_views), "witnesses", unit="view", disable=not progress):
         colored = has_leaf_color(photos(view), colors)
         for leaf in visible_leaves(surfaces, cameras, view):
@@ -165,11 +166,13 @@ def revise_masks(
             x1, y1, x2, y2 = leaf.box
             colored_here = colored[y1:y2, x1:x2]
             box, own = regions.union(members) if members else (leaf.box, torch.zeros(leaf.mask.shape, dtype=torch.bool))
-            if agreement(box, own.numpy(), leaf) >= AGREES:
+            is_own = agreement(box, own.numpy(), leaf) >= AGREES
+            shown_openly[leaf.instance] += is_own or _is_open(leaf)
+            if is_own:
                 found.append(_found(view, leaf, members, (box, own.numpy()), is_own=True))
             elif _is_leaf(leaf, colored_here):
                 found.append(_found(view, leaf, members, (leaf.box, leaf.mask & colored_here), is_own=False))
-    found = _borne_out(found)
+    found = _borne_out(found, shown_openly)
     number = {instance: place for place, instance in enumerate(sorted({each.instance for each in found}), start=1)}
     revised = stack_regions(
         [each.view for each in found],
@@ -201,10 +204,14 @@ def _colors_of_leaves(regions: Regions, matching: Matching, photos: Photos) -> N
     return leaf_colors(counts)
 
 
+def _is_open(leaf: VisibleLeaf) -> bool:
+    """Whether a view shows enough of a surface to tell."""
+    return leaf.share >= LEAST_VISIBLE and int(leaf.mask.sum()) >= LEAST_PIXELS
+
+
 def _is_leaf(leaf: VisibleLeaf, colored: Mask) -> bool:
     """Whether the photo can show a leaf where the other views say that there is one; `colored` is of its box."""
-    size, num_colored = int(leaf.mask.sum()), int((leaf.mask & colored).sum())
-    return leaf.share >= LEAST_VISIBLE and size >= LEAST_PIXELS and num_colored >= LEAST_COLORED * size
+    return _is_open(leaf) and int((leaf.mask & colored).sum()) >= LEAST_COLORED * int(leaf.mask.sum())
 
 
 def _found(
@@ -217,13 +224,14 @@ def _found(
     return _Found(view=view, instance=leaf.instance, members=members, is_own=is_own, box=box, crop=crop)
 
 
-def _borne_out(found: list[_Found]) -> list[_Found]:
-    """Without the instances that have a mask in one view only, or that the detector found in too few of their views."""
-    shown = Counter(each.instance for each in found)
+def _borne_out(found: list[_Found], shown_openly: Mapping[int, int]) -> list[_Found]:
+    """Without the instances that have a mask in one view only, or that the detector found in too few of the views that
+    show them openly (`shown_openly`: how many these are)."""
+    masks = Counter(each.instance for each in found)
     seen = Counter(each.instance for each in found if each.is_own)
     return [
         each for each in found
-        if shown[each.instance] > 1 and seen[each.instance] >= LEAST_FOUND * shown[each.instance]
+        if masks[each.instance] > 1 and seen[each.instance] >= LEAST_FOUND * shown_openly[each.instance]
     ]  # fmt: skip
 
 

@@ -123,6 +123,17 @@ def test_what_is_found_in_too_few_of_the_views_that_show_it_goes(num_found: int,
     assert revise(maps).old_ids.tolist() == left  # leaf 3 is seen by all six
 
 
+def test_views_that_show_no_leaf_where_it_lies_open_count_against_it() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    for labels in maps[1:]:
+        labels[labels == 3] = 0
+
+    def brown_from_view_2(view: int) -> np.ndarray:
+        return np.where((TRUE[view] == 3)[..., None] & (view > 1), np.uint8(BROWN), photo(view))
+
+    assert revise(maps, photos=brown_from_view_2).old_ids.tolist() == [1, 2]  # found in one of six, green in two
+
+
 def test_the_order_of_masks_does_not_matter() -> None:
     maps = [labels.copy() for labels in TRUE]
     maps[2][maps[2] == 1] = 0
