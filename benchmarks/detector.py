@@ -188,7 +188,7 @@ def main() -> None:
     parser.add_argument("--photos", type=Path, help="in place of scenes: a folder of photos")
     parser.add_argument("--labels", type=Path, help="of --photos: a folder of label PNGs, or a COCO file")
     parser.add_argument("--every", type=int, default=1, help="every n-th of --photos only, see hold_out_every")
-    parser.add_argument("--weights", default="leaf-slim")
+    parser.add_argument("--weights", default=DetectConfig.weights)
     parser.add_argument("--image_size", type=int, help="longer side of scaled photos (default: as the weights say)")
     parser.add_argument("--scales", type=float, nargs="+", default=[1.0], help="factors of it, in the loop")
     parser.add_argument("--min_score", type=float, default=DetectConfig.min_score, help="of detections in the loop")

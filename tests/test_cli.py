@@ -150,7 +150,7 @@ def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert not any("source_label" in entry for entry in detections)
     run = json.loads((out / "run.json").read_text())
     assert run["config"]["masks"] is None
-    assert run["config"]["detect"]["weights"] == "leaf-slim"
+    assert run["config"]["detect"]["weights"] == DetectConfig().weights
     assert any(path.endswith("weights.safetensors") for path in run["inputs"])
     assert run["counts"]["regions"] == len(detections)
     capsys.readouterr()

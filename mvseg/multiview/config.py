@@ -31,7 +31,7 @@ class DetectConfig:
             for other things.
     """
 
-    weights: str = "leaf-slim"
+    weights: str = "leaf-lite"
     min_score: float = 0.3
     image_size: int | None = None
     scales: tuple[float, ...] = (1.0,)
