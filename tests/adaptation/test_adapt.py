@@ -74,12 +74,12 @@ def test_from_scenes_to_weights(plant: Path, trained: list[TrainConfig], tmp_pat
     before, after = adapt_detector([plant], out, AdaptConfig(num_samples=10, image_size=60), run=run)
     assert before == after == Agreement(num_found=12, num_kept=12, num_labels=12, num_photos=4)
     (config,) = trained
-    assert config.arch == "resnet18_fpn"
+    assert config.arch == "efficientnet_lite0"
     assert config.epochs == 3  # of four photos, for ten samples
     assert config.scale_range == pytest.approx((1.4, 2.8))  # 0.7 and 1.4 times 120, in windows of 60 pixels
     assert sorted(path.name for path in config.labels.iterdir()) == [f"plant-00{view}.png" for view in range(4)]
     _, description = read_weights(out / "weights.safetensors")
-    assert description == Description("resnet18_fpn", ("leaf",), 120)  # as large as leaves were detected
+    assert description == Description("efficientnet_lite0", ("leaf",), 120)  # as large as leaves were detected
     assert json.loads((out / "agreement.json").read_text())["after"]["num_kept"] == 12
 
 
