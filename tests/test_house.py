@@ -226,7 +226,7 @@ def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     names = zipfile.ZipFile(wheel).namelist()
     top = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert top == {"mvseg"}
-    assert {"mvseg/demo_plant/cameras.json", "mvseg/py.typed", "mvseg/zoo/leaf-slim/weights.safetensors"} <= set(names)
+    assert {"mvseg/demo_plant/cameras.json", "mvseg/py.typed", "mvseg/zoo/leaf-lite/weights.safetensors"} <= set(names)
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
     code = "from mvseg.cli.options import find_config as find; print(find('fine.yaml'), find('train/rosettes.yaml'))"
     where = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
