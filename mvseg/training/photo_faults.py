@@ -90,7 +90,7 @@ def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
         of_photo = photo[:, int(torch.randint(height, ())), int(torch.randint(width, ()))].float()
         color = of_photo if draw(0, 1) < 0.5 else 255 * torch.rand(3)
         if kind < 0.1:
-            shape, color = is_hand(along, across * half_width / half_length), draw(0.3, 1.1) * torch.tensor(SKIN)
+            shape, color = hand_shape(along, across * half_width / half_length), draw(0.3, 1.1) * torch.tensor(SKIN)
         elif kind < 0.35:
             shape = along.square() + across.square() < 1
         else:
@@ -115,8 +115,7 @@ def tint_leaves(photo: Tensor, layers: Tensor) -> Tensor:
     Returns:
         A new photo. A detector that has seen green leaves only takes a red plant's stems for its leaves.
     """
-    hue, saturation, value = draw(0, 1), draw(0, 0.8), 1.0
-    color = torch.tensor(colorsys.hsv_to_rgb(hue, saturation, value))
+    color = torch.tensor(colorsys.hsv_to_rgb(draw(0, 1), draw(0, 0.8), 1.0))
     color = draw(0.6, 1.3) * color / float((LUMINANCE * color).sum())
     labels = layers.amax(0).long()
     amount = draw(0.5, 1) * (1 - draw(0, 0.5) * torch.rand(int(labels.max()) + 1))
@@ -126,8 +125,8 @@ def tint_leaves(photo: Tensor, layers: Tensor) -> Tensor:
     return tinted.round().clamp(0, 255).to(photo.dtype)
 
 
-def is_hand(along: Tensor, across: Tensor) -> Tensor:
-    """(H, W) bool, where a palm with an arm behind and four fingers ahead is; in units of half a hand."""
+def hand_shape(along: Tensor, across: Tensor) -> Tensor:
+    """(H, W) bool, where a palm with an arm behind and four fingers ahead is, at coordinates in units of half a hand."""
     shape = (along / 0.42).square() + (across / 0.4).square() < 1
     shape |= (along < 0) & (across.abs() < 0.25)
     for finger in range(4):

@@ -113,7 +113,7 @@ def test_rotation_is_that_of_the_right_hand() -> None:
 
 
 def test_dry_leaves_are_brown_and_nothing_else_changes_its_colour() -> None:
-    plant = replace(grow_plant("ovate", 2, 4), is_wild=False)
+    plant = grow_plant("ovate", 2, 4)
     camera = arc_cameras(1, plant, elevations_deg=(60,), width=120, height=120)
     dry = replace(plant, leaves=(replace(plant.leaves[0], dryness=1.0), plant.leaves[1]))
     before, after = render_view(plant, camera, 0, seed=2), render_view(dry, camera, 0, seed=2)

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from mvseg.training.photo_faults import add_clutter, blur_motion, compress, is_hand, light_unevenly, spoil, tint_leaves
+from mvseg.training.photo_faults import add_clutter, blur_motion, compress, hand_shape, light_unevenly, spoil, tint_leaves
 
 
 def noisy_photo(height: int = 48, width: int = 64) -> torch.Tensor:
@@ -103,7 +103,7 @@ def test_leaves_get_another_colour_and_all_else_stays() -> None:
 def test_a_hand_has_four_fingers_and_an_arm() -> None:
     torch.manual_seed(0)
     axis = torch.linspace(-1.5, 1.5, 301)
-    hand = is_hand(axis[None], axis[:, None])
+    hand = hand_shape(axis[None], axis[:, None])
     through_the_fingers = hand[:, 220].int()
     assert int((through_the_fingers.diff() == 1).sum()) == 4
     assert bool(hand[150, 0])  # the arm reaches out of the photo
