@@ -126,7 +126,7 @@ def tint_leaves(photo: Tensor, layers: Tensor) -> Tensor:
 
 
 def hand_shape(along: Tensor, across: Tensor) -> Tensor:
-    """(H, W) bool, where a palm with an arm behind and four fingers ahead is, at coordinates in units of half a hand."""
+    """(H, W) bool, where a palm with an arm behind and four fingers ahead is; coordinates in units of half a hand."""
     shape = (along / 0.42).square() + (across / 0.4).square() < 1
     shape |= (along < 0) & (across.abs() < 0.25)
     for finger in range(4):

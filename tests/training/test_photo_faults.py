@@ -6,7 +6,15 @@ import math
 
 import torch
 
-from mvseg.training.photo_faults import add_clutter, blur_motion, compress, hand_shape, light_unevenly, spoil, tint_leaves
+from mvseg.training.photo_faults import (
+    add_clutter,
+    blur_motion,
+    compress,
+    hand_shape,
+    light_unevenly,
+    spoil,
+    tint_leaves,
+)
 
 
 def noisy_photo(height: int = 48, width: int = 64) -> torch.Tensor:
