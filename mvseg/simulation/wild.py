@@ -10,6 +10,7 @@ import math
 from dataclasses import replace
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from mvseg.simulation.blades import BLADE_COLUMNS, Arc, Blade, Floats, Leaf, arc_points, measure_leaf, place_blade
 from mvseg.simulation.families import FAMILIES
@@ -74,7 +75,8 @@ def roll_up(vertices: Floats, turn: float) -> Floats:
         for piece in range(middle):
             inner, outer = middle + side * piece, middle + side * (piece + 1)
             angle = side * turn * (piece + 0.5) / middle
-            rolled[:, outer] = rolled[:, inner] + rotate(grid[:, outer] - grid[:, inner], axis=along, angle=angle)
+            turned = Rotation.from_rotvec(angle * along).apply(grid[:, outer] - grid[:, inner])
+            rolled[:, outer] = rolled[:, inner] + turned
     return np.concatenate([vertices[:1], rolled.reshape(-1, 3), vertices[-1:]])
 
 
@@ -87,18 +89,11 @@ def hang(vertices: Floats, angle: float) -> Floats:
         return vertices
     to_straight_down = math.pi / 2 + math.atan2(ahead[2], length)
     for share in (1.0, 0.75, 0.5, 0.25):
-        down = -share * min(angle, to_straight_down)
-        turned = vertices[0] + rotate(vertices - vertices[0], axis=axis / length, angle=down)
+        down = Rotation.from_rotvec(-share * min(angle, to_straight_down) * axis / length)
+        turned: Floats = vertices[0] + down.apply(vertices - vertices[0])
         if turned[:, 2].min() > SOIL_CLEARANCE:
             return turned
     return vertices
-
-
-def rotate(vectors: Floats, *, axis: Floats, angle: float) -> Floats:
-    """(n, 3) vectors turned around unit axes (n, 3) or (3,), counter-clockwise for a viewer whom the axis points at."""
-    axis = np.broadcast_to(axis, vectors.shape)
-    along = (axis * vectors).sum(1, keepdims=True) * axis
-    return along + math.cos(angle) * (vectors - along) + math.sin(angle) * np.cross(axis, vectors)
 
 
 def grow_cotyledons(stem: Floats, rng: np.random.Generator) -> tuple[list[Floats], list[Part]]:

@@ -15,7 +15,7 @@ from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.look import draw_look, draw_wild_look
 from mvseg.simulation.ray_cast import render_view
-from mvseg.simulation.wild import SOIL_CLEARANCE, hang, make_wild, roll_up, rotate
+from mvseg.simulation.wild import SOIL_CLEARANCE, hang, make_wild, roll_up
 
 FLAT = place_blade(Blade(length=60, width=40, outline=(0.6, 0.8)), np.array([0.0, 0, 80]), azimuth=0.7, elevation=0.2)
 
@@ -105,11 +105,6 @@ def test_a_leaf_hangs_stiffly_down_to_the_vertical_and_above_the_soil() -> None:
     assert np.array_equal(hang(FLAT - [0, 0, 100], 3.0), FLAT - [0, 0, 100])
     upright = np.array([[0.0, 0, 5], [1, 0, 7], [0, 0, 9]])
     assert np.array_equal(hang(upright, 1.0), upright)  # there is no side to hang to
-
-
-def test_rotation_is_that_of_the_right_hand() -> None:
-    x, z = np.array([[1.0, 0, 0]]), np.array([0.0, 0, 1])
-    np.testing.assert_allclose(rotate(x, axis=z, angle=math.pi / 2), [[0, 1, 0]], atol=1e-15)
 
 
 def test_dry_leaves_are_brown_and_nothing_else_changes_its_colour() -> None:
