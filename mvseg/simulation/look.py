@@ -93,15 +93,16 @@ def draw_wild_look(look: Look, rng: np.random.Generator) -> Look:
     """The look with some of what photos from homes and gardens have: stems as green as leaves, green pots and mats,
     waxy or wet leaves, overexposure, and black studios, windows or other plants behind."""
     plain, backdrop = look.plain.copy(), look.backdrop
+    stem, pot, ground = 0, 1, 3
     if rng.random() < 0.4:
-        plain[0] = look.leaf * rng.uniform(0.6, 1.6)
+        plain[stem] = look.leaf * rng.uniform(0.6, 1.6)
     if rng.random() < 0.25:
-        plain[1] = hue_color(rng.uniform(0.2, 0.45), rng.uniform(0.3, 0.9), rng.choice([0.05, 0.15, 0.4]))
+        plain[pot] = hue_color(rng.uniform(0.2, 0.45), rng.uniform(0.3, 0.9), rng.choice([0.05, 0.15, 0.4]))
     if rng.random() < 0.15:
-        plain[3] = hue_color(rng.uniform(0.2, 0.45), rng.uniform(0.2, 0.8), rng.choice([0.05, 0.15, 0.4]))
+        plain[ground] = hue_color(rng.uniform(0.2, 0.45), rng.uniform(0.2, 0.8), rng.choice([0.05, 0.15, 0.4]))
     behind = rng.choice(["as it is", "studio", "window", "plants"])
     if behind == "studio":
-        backdrop, plain[3] = backdrop * np.float32(0.02), plain[3] * np.float32(0.1)
+        backdrop, plain[ground] = backdrop * np.float32(0.02), plain[ground] * np.float32(0.1)
     elif behind == "window":
         backdrop = add_windows(backdrop, rng)
     elif behind == "plants":
