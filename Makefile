@@ -7,16 +7,15 @@ PYTHON := $(VENV)/bin/python
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
 
-# two processes, one thread each: libraries that start more get in each other's way; worksteal leaves tests that share a
-# fixture in one process
+# two processes, one thread each: libraries that start more get in each other's way
 test slow: export OMP_NUM_THREADS := 1
 
 test: $(VENV)/installed
-	$(PYTHON) -m pytest -n 2 --dist worksteal
+	$(PYTHON) -m pytest -n 2
 
 # whole commands, killed workers, notebooks: about three minutes
 slow: $(VENV)/installed
-	$(PYTHON) -m pytest -n 2 --dist worksteal -m slow
+	$(PYTHON) -m pytest -n 2 -m slow
 
 # about ten minutes: broken files for every reader, and runs that are killed at random moments
 fuzz: $(VENV)/installed
