@@ -7,7 +7,8 @@ number of workers or processes, and however often it is interrupted.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ from mvseg.formats.labelled_photo import LabelledPhoto
 from mvseg.regions import masks_to_boxes
 from mvseg.training.config import Orientation
 from mvseg.training.data import SampleList, read_sample
+from mvseg.training.new_plants import draw_background, recolor, render_new_plant
 from mvseg.training.photo_faults import add_clutter, light_unevenly, spoil, tint_leaves
 
 MEAN_COLOR = (124, 116, 104)  # RGB; what the detectors' normalisation maps to zero
@@ -44,6 +46,8 @@ class Augmentation:
         fault_probability: share of the samples with a fault of real photos, see `spoil`.
         clutter_probability: share of the samples with things in front that are no leaves, see `add_clutter`.
         tint_probability: share of the samples whose leaves get another colour, see `tint_leaves`.
+        recolor: give leaves without colour one, see `mvseg.training.new_plants.recolor`.
+        backgrounds: photos without leaves, for `recolor` and for new plants.
     """
 
     image_size: int
@@ -55,30 +59,38 @@ class Augmentation:
     fault_probability: float = 0.0
     clutter_probability: float = 0.0
     tint_probability: float = 0.0
+    recolor: bool = False
+    backgrounds: tuple[Path, ...] = ()
 
 
 class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
     """Samples by (epoch, index), augmented: (3, S, S) float32 photo in [0, 1], target as `make_target`, index.
 
-    The same key gives the same bits in every process.
+    The same key gives the same bits in every process. Indices from len(samples) on are new plants, other ones in every
+    epoch.
 
     Raises:
         InputError: on access, when a sample broke since it was checked; see `read_sample`.
     """
 
-    def __init__(self, samples: SampleList, augmentation: Augmentation, seed: int) -> None:
+    def __init__(self, samples: SampleList, augmentation: Augmentation, *, seed: int, new_plants: int = 0) -> None:
         self.samples = samples
         self.augmentation = augmentation
         self.seed = seed
+        self.new_plants = new_plants
 
     def __len__(self) -> int:
-        return len(self.samples)
+        return len(self.samples) + self.new_plants
 
     def __getitem__(self, key: tuple[int, int]) -> tuple[Tensor, Target, int]:
         epoch, index = key
-        labelled = read_sample(self.samples.samples[index])
-        photo, target = augment(labelled, self.augmentation, mix_seed(self.seed, epoch, index))
-        return photo, target, index
+        seed, augmentation = mix_seed(self.seed, epoch, index), self.augmentation
+        if index < len(self.samples):
+            labelled = read_sample(self.samples.samples[index])
+        else:
+            labelled = render_new_plant(seed, augmentation.image_size, augmentation.backgrounds)
+            augmentation = replace(augmentation, orientation="fixed", scale_range=(1.0, 1.0), recolor=False)
+        return *augment(labelled, augmentation, seed), index
 
 
 def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> tuple[Tensor, Target]:
@@ -94,6 +106,8 @@ def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> t
     photo[:, labelled.ignore] = mean_color(photo)[:, None]
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
+        if augmentation.recolor:
+            photo = recolor(photo, labelled.layers, draw_background(augmentation.backgrounds, photo))
         photo, layers = orient(photo, labelled.layers, augmentation.orientation)
         photo, layers = rescale(photo, layers, augmentation)
         if happens(augmentation.tint_probability):

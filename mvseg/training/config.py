@@ -17,8 +17,8 @@ Orientation = Literal["any", "upright", "fixed"]
 
 # These may differ when a run is resumed: they do not change what is computed. (The names of the samples are compared
 # separately, so the data may have moved.)
-FREE_ON_RESUME = {"photos", "labels", "val_photos", "val_labels", "skip_broken", "output", "resume", "device",
-                  "num_workers", "checkpoint_every", "log_every"}  # fmt: skip
+FREE_ON_RESUME = {"photos", "labels", "val_photos", "val_labels", "backgrounds", "skip_broken", "output",
+                  "resume", "device", "num_workers", "checkpoint_every", "log_every"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,10 @@ class TrainConfig:
         fault_probability: share of the samples with motion blur, compression, noise, overexposure or no colour.
         clutter_probability: share of the samples with things in front that are no leaves: tapes, labels, sticks, hands.
         tint_probability: share of the samples whose leaves get another colour: red, purple, yellow, silver.
+        new_plants: photos of simulated plants that each epoch has on top of `photos`, rendered while the run goes and
+            never twice the same (`pip install mvseg[simulate]`); they are neither scaled nor turned.
+        backgrounds: folder of photos without leaves, to be seen behind new plants and behind recoloured leaves.
+        recolor: give the leaves of `photos` a colour and a background: for photos without colour, as of fluorescence.
         epochs: passes over the training samples; each ends with an evaluation.
         batch_size: samples per optimisation step, over all processes.
         images_per_forward: samples per forward pass of one process, what its memory allows; divides batch_size. The
@@ -60,7 +64,8 @@ class TrainConfig:
         lr: peak learning rate for a batch of 16; scaled linearly with batch_size for sgd, with its root for adamw.
         backbone_lr: the backbone's learning rate (its pyramid not included) as a factor of lr.
         weight_decay: of everything except biases and norms.
-        schedule: cosine (to 1 % of the peak), or multistep (a tenth after 60 % and after 85 % of the steps).
+        schedule: cosine (to 1 % of the peak), multistep (a tenth after 60 % and after 85 % of the steps), or constant,
+            for runs that end when there is no more time; `ema_decay` then does what the fall of the rate does.
         warmup_steps: steps of linear warm-up, at most a tenth of the run.
         clip_norm: gradients with a larger norm are scaled down to it; 0 for never.
         ema_decay: evaluate and export an exponential moving average of the weights with this decay (at step t at most
@@ -94,6 +99,9 @@ class TrainConfig:
     fault_probability: float = 0.0
     clutter_probability: float = 0.0
     tint_probability: float = 0.0
+    new_plants: int = 0
+    backgrounds: Path | None = None
+    recolor: bool = False
     epochs: int = 20
     batch_size: int = 4
     images_per_forward: int = 2
@@ -101,7 +109,7 @@ class TrainConfig:
     lr: float = 1e-3
     backbone_lr: float = 1.0
     weight_decay: float = 1e-4
-    schedule: Literal["cosine", "multistep"] = "cosine"
+    schedule: Literal["cosine", "multistep", "constant"] = "cosine"
     warmup_steps: int = 200
     clip_norm: float = 10.0
     ema_decay: float = 0.0
@@ -120,8 +128,8 @@ class TrainConfig:
             InputError: a number outside its range; the message names the field.
         """
         at_least = {"epochs": 1, "batch_size": 1, "images_per_forward": 1, "image_size": 32, "checkpoint_every": 1,
-                    "log_every": 1, "hold_out_every": 0, "warmup_steps": 0, "num_workers": 0, "seed": 0, "lr": 0.0,
-                    "backbone_lr": 0.0, "weight_decay": 0.0, "clip_norm": 0.0}  # fmt: skip
+                    "log_every": 1, "hold_out_every": 0, "warmup_steps": 0, "num_workers": 0, "seed": 0,
+                    "new_plants": 0, "lr": 0.0, "backbone_lr": 0.0, "weight_decay": 0.0, "clip_norm": 0.0}  # fmt: skip
         for name, bound in at_least.items():
             value = getattr(self, name)
             if not (math.isfinite(value) and value >= bound):
@@ -137,6 +145,8 @@ class TrainConfig:
             raise InputError(
                 f"batch_size {self.batch_size} is not a multiple of images_per_forward {self.images_per_forward}"
             )
+        if self.recolor and self.backgrounds is None:
+            raise InputError("recolor is set and backgrounds is not, expected a folder of photos without leaves")
         if self.hold_out_every == 1:
             raise InputError("hold_out_every is 1, which leaves nothing to train on; expected 0 or at least 2")
         if (self.val_photos is None) != (self.val_labels is None):

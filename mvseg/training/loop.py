@@ -52,6 +52,7 @@ from mvseg.training.files import (
     write_metrics,
     write_weights,
 )
+from mvseg.training.new_plants import list_backgrounds
 from mvseg.training.precision import choose_bf16
 from mvseg.training.processes import Processes, join_processes
 from mvseg.training.schedule import learning_rate
@@ -79,8 +80,13 @@ class Run:
     held_out: SampleList | None
 
     @property
+    def epoch_size(self) -> int:
+        """Samples of an epoch: the photos, then the new plants."""
+        return len(self.samples) + self.config.new_plants
+
+    @property
     def steps_per_epoch(self) -> int:
-        return math.ceil(len(self.samples) / self.config.batch_size)
+        return math.ceil(self.epoch_size / self.config.batch_size)
 
 
 def train(config: TrainConfig, model: MaskRCNN | None = None) -> None:
@@ -195,7 +201,7 @@ def train_epoch(
         rate = learning_rate(config, state.step, num_steps * config.epochs)
         losses = add_gradients(run, state, network=network, chunks=chunks)
         if not apply_gradients(config, state, rate):
-            batch = order_epoch(len(run.samples), config.batch_size, seed=config.seed, epoch=epoch)[step]
+            batch = order_epoch(run.epoch_size, config.batch_size, seed=config.seed, epoch=epoch)[step]
             raise not_finite(f"the gradient of {name_step(state)}", run, batch)
         for name, value in losses.items():
             state.loss_sums[name] = state.loss_sums.get(name, 0.0) + value
@@ -242,7 +248,8 @@ def name_step(state: TrainingState) -> str:
 
 
 def not_finite(what: str, run: Run, indices: list[int]) -> InputError:
-    names = ", ".join(run.samples.samples[index].name for index in indices)
+    photos = [sample.name for sample in run.samples.samples]
+    names = ", ".join(photos[index] if index < len(photos) else f"new plant {index}" for index in indices)
     return InputError(f"{what} is not finite on {names}: look at these photos, or lower lr, or set precision to fp32")
 
 
@@ -265,8 +272,10 @@ def augmented_samples(run: Run) -> AugmentedSamples:
         fault_probability=config.fault_probability,
         clutter_probability=config.clutter_probability,
         tint_probability=config.tint_probability,
+        recolor=config.recolor,
+        backgrounds=list_backgrounds(config.backgrounds),
     )
-    return AugmentedSamples(run.samples, augmentation, config.seed)
+    return AugmentedSamples(run.samples, augmentation, seed=config.seed, new_plants=config.new_plants)
 
 
 def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
@@ -274,7 +283,7 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
     config = run.config
     keys = []
     for epoch in range(first_step // run.steps_per_epoch, config.epochs):
-        batches = order_epoch(len(run.samples), config.batch_size, seed=config.seed, epoch=epoch)
+        batches = order_epoch(run.epoch_size, config.batch_size, seed=config.seed, epoch=epoch)
         for batch in batches[max(0, first_step - epoch * run.steps_per_epoch) :]:
             for number in range(run.processes.rank, config.num_chunks, run.processes.count):
                 chunk = batch[number * config.images_per_forward : (number + 1) * config.images_per_forward]
@@ -343,7 +352,7 @@ def close_epoch(run: Run, state: TrainingState, board: Any | None) -> None:
         "best": state.history[best],
         "finished": len(state.history) == config.epochs,
         "num_parameters": count_parameters(state.model),
-        "num_training_samples": len(run.samples),
+        "num_training_samples": run.epoch_size,
         "num_validation_samples": 0 if run.held_out is None else len(run.held_out),
         "epochs": state.history,
     }

@@ -1,4 +1,4 @@
-"""The learning rate of each step: linear warm-up, then cosine or multistep.
+"""The learning rate of each step: linear warm-up, then cosine, multistep or constant.
 
 A function of the step: unlike torch's schedulers it has no state that a checkpoint must hold.
 """
@@ -17,6 +17,8 @@ def learning_rate(config: TrainConfig, step: int, num_steps: int) -> float:
     warmup = min(config.warmup_steps, num_steps // 10)
     if step < warmup:
         return peak * (step + 1) / (warmup + 1)
+    if config.schedule == "constant":
+        return peak
     if config.schedule == "multistep":
         return peak * 0.1 ** sum(step >= share * num_steps for share in (0.6, 0.85))
     progress = (step - warmup) / (num_steps - warmup)

@@ -133,7 +133,7 @@ def test_empty_target() -> None:
 
 def test_samples_follow_from_seed_epoch_and_index(tmp_path: Path) -> None:
     samples = list_samples(*write_photos(tmp_path, 3))
-    ours, again, other = (AugmentedSamples(samples, Augmentation(64), seed) for seed in (1, 1, 2))
+    ours, again, other = (AugmentedSamples(samples, Augmentation(64), seed=seed) for seed in (1, 1, 2))
     torch.manual_seed(0)
     expected = torch.rand(2)
     torch.manual_seed(0)
