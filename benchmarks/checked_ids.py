@@ -1,9 +1,9 @@
 """What surfaces correct in the ids: `python benchmarks/checked_ids.py --cache DIR [--masks degraded true pieces]`
 
-For each scene: ARI and e_k of the ids found and of those that the surfaces correct (`mvseg.multiview.checked_ids`), how
-many masks are moved, how many of the moved were right before and are right afterwards, and CPU seconds of matching, of
-surfaces, of the check and of the surfaces that are fitted again. "degraded" and "true" are the masks of the evaluation
-scenes, "pieces" those of `straps.py`, 8 and 12 leaves whatever --leaves says.
+For each scene: ARI and e_k of the ids found and of those that the surfaces correct
+(`mvseg.verification.checked_ids`), how many masks are moved, how many of the moved were right before and are right
+afterwards, and CPU seconds of matching, of surfaces, of the check and of the surfaces that are fitted again.
+"degraded" and "true" are the masks of the evaluation scenes, "pieces" those of `straps.py`, 8 and 12 leaves whatever --leaves says.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.match import match_regions
-from mvseg.multiview.checked_ids import check_ids
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.growth import grow_plant
+from mvseg.verification.checked_ids import check_ids
 
 STRAPS = 8, 12  # leaves
 

@@ -44,11 +44,11 @@ from mvseg.matching.match import match_regions
 from mvseg.matching.nview.match_nview import find_clusters
 from mvseg.matching.nview.match_scores import collect_evidence, scene_features
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
-from mvseg.partition import drop_singletons, renumber, separate_unmatched
+from mvseg.matching.partition import drop_singletons, renumber, separate_unmatched
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import SceneSpec
-from mvseg.worker_pool import run_all
+from mvseg.system.worker_pool import run_all
 
 KINDS = ("true", "degraded", "detected")
 EDGES = (0.0, 0.3, 0.5, 0.7, 0.9, 0.97, 1.01)

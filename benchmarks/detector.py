@@ -35,6 +35,8 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.found_leaves import credit_masks, is_found
+from mvseg.detection.config import DetectConfig
+from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.average_precision import annotate_truth, average_precision, describe_mask
 from mvseg.evaluation.best_dice import count_and_dice
@@ -45,9 +47,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import undistort
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.multiview.config import DetectConfig
-from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
-from mvseg.multiview.proposals import Proposals
+from mvseg.masks import Proposals
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.data import SampleList, list_samples, read_sample

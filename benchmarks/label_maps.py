@@ -15,12 +15,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from mvseg.detection.config import DetectConfig
+from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.truth import shown_instances
-from mvseg.formats.atomic import write_whole
 from mvseg.formats.image_file import read_rgb
-from mvseg.multiview.config import DetectConfig
-from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index, scene_cameras
@@ -28,6 +27,7 @@ from mvseg.simulation.faults import Faults, degrade_labels
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.ray_cast import build_bvh, build_stage, merge_meshes, render_stage
 from mvseg.simulation.scene_writer import drop_small, write_jpeg
+from mvseg.system.atomic import write_whole
 
 MIN_PIXELS = 30
 KINDS = ("true", "degraded")

@@ -32,7 +32,7 @@ from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import SceneSpec
-from mvseg.worker_pool import run_all
+from mvseg.system.worker_pool import run_all
 
 Method = Callable[[Regions, Cameras, Affinity], torch.Tensor]
 

@@ -1,9 +1,9 @@
 """Which masks that cover two leaves are found, and how they are cut: `python benchmarks/merged_masks.py --cache DIR`
 
 Degraded masks. By the truth, a mask shows two leaves when a fifth of its pixels or more show either. The lists are
-those of the matcher (`Matching.merged`), and of the matcher and the surfaces (`mvseg.multiview.checked_ids`). Of each,
-for the masks that do show two leaves: the share of their pixels (of those that show a leaf) that the cut puts on the
-right one, and that one id for the whole mask does. An instance's leaf is the one that most of its masks show.
+those of the matcher (`Matching.merged`), and of the matcher and the surfaces (`mvseg.verification.checked_ids`). Of
+each, for the masks that do show two leaves: the share of their pixels (of those that show a leaf) that the cut puts
+on the right one, and that one id for the whole mask does. An instance's leaf is the one that most of its masks show.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from benchmarks.label_maps import add_scene_options, chosen_scenes, load_maps
 from mvseg.errors import InputWarning
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
-from mvseg.multiview.checked_ids import check_ids
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions
+from mvseg.verification.checked_ids import check_ids
 
 EACH = 0.2  # of a mask's pixels
 

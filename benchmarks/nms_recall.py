@@ -18,10 +18,10 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.found_leaves import credit_masks, is_found
+from mvseg.detection.loop import match_proposals
+from mvseg.detection.nms import cluster_aware_nms
+from mvseg.masks import Proposals
 from mvseg.matching.config import MatchConfig
-from mvseg.multiview.loop import match_proposals
-from mvseg.multiview.nms import cluster_aware_nms
-from mvseg.multiview.proposals import Proposals
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras

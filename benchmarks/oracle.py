@@ -31,9 +31,9 @@ from mvseg.matching.nview.label_rows import row_table
 from mvseg.matching.nview.search import refine, search
 from mvseg.matching.nview.soft_start import em_affinities
 from mvseg.matching.one_per_view import ViewGraph, link_average, one_per_view_clusters
-from mvseg.partition import renumber, separate_unmatched
+from mvseg.matching.partition import renumber, separate_unmatched
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes
-from mvseg.worker_pool import run_all
+from mvseg.system.worker_pool import run_all
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]

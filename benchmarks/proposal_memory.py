@@ -17,8 +17,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from mvseg.multiview.loop import match_proposals
-from mvseg.multiview.proposals import gather_proposals
+from mvseg.detection.loop import match_proposals
+from mvseg.detection.proposals import gather_proposals
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant

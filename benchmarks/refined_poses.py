@@ -37,7 +37,7 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import SceneSpec
 from mvseg.simulation.growth import Plant, grow_plant
-from mvseg.worker_pool import run_all
+from mvseg.system.worker_pool import run_all
 
 POINTS = 600  # of the plant
 MEASURES = ("ari", "e_k", "pose px", "score", "area %")

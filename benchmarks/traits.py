@@ -45,7 +45,7 @@ from mvseg.simulation.blades import Leaf
 from mvseg.simulation.dataset import EVALUATED_FAMILIES, Preset, SceneSpec, list_scenes
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import grow_plant
-from mvseg.worker_pool import run_all
+from mvseg.system.worker_pool import run_all
 
 MEASURES = ("area", "length", "width", "inclination", "distance")
 NUM_LEAVES = 8

@@ -19,6 +19,10 @@ if TYPE_CHECKING:
     from mvseg.checks.finding import Finding as Finding
     from mvseg.config import RunConfig as RunConfig
     from mvseg.demo import demo_scene as demo_scene
+    from mvseg.detection.assignment import EpipolarAssignment as EpipolarAssignment
+    from mvseg.detection.config import DetectConfig as DetectConfig
+    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN as MultiViewMaskRCNN
+    from mvseg.detection.nms import cluster_aware_nms as cluster_aware_nms
     from mvseg.detectors.zoo import load_detector as load_detector
     from mvseg.errors import InputError as InputError
     from mvseg.errors import InputWarning as InputWarning
@@ -39,10 +43,6 @@ if TYPE_CHECKING:
     from mvseg.matching.result import RefinedPoses as RefinedPoses
     from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
-    from mvseg.multiview.assignment import EpipolarAssignment as EpipolarAssignment
-    from mvseg.multiview.config import DetectConfig as DetectConfig
-    from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN as MultiViewMaskRCNN
-    from mvseg.multiview.nms import cluster_aware_nms as cluster_aware_nms
     from mvseg.pipeline import run_scene as run_scene
     from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig
     from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces as fit_surfaces
@@ -52,10 +52,10 @@ if TYPE_CHECKING:
     from mvseg.regions import regions_from_label_maps as regions_from_label_maps
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
+    from mvseg.system.worker_pool import start_workers as start_workers
     from mvseg.traits.config import TraitsConfig as TraitsConfig
     from mvseg.traits.measure import Traits as Traits
     from mvseg.traits.measure import measure_plant as measure_plant
-    from mvseg.worker_pool import start_workers as start_workers
 
 # The public names, by room.
 _HOME = {
@@ -78,19 +78,19 @@ _HOME = {
     "reconstruction.voxels": ("reconstruct_instances",),
     "reconstruction.surface.leaf_surface": ("LeafSurface",),
     "reconstruction.surface.fit_surfaces": ("fit_surfaces",),
-    "multiview.config": ("DetectConfig",),
+    "detection.config": ("DetectConfig",),
     "traits.config": ("TraitsConfig",),
     "traits.measure": ("Traits", "measure_plant"),
-    "multiview.assignment": ("EpipolarAssignment",),
-    "multiview.nms": ("cluster_aware_nms",),
-    "multiview.mask_rcnn": ("MultiViewMaskRCNN",),
+    "detection.assignment": ("EpipolarAssignment",),
+    "detection.nms": ("cluster_aware_nms",),
+    "detection.mask_rcnn": ("MultiViewMaskRCNN",),
     "evaluation.id_metrics": ("matching_metrics",),
     "evaluation.shape_distance": ("shape_distance",),
     "checks.finding": ("Finding",),
     "checks.check_scene": ("Check", "check_scene"),
     "config": ("RunConfig",),
     "pipeline": ("run_scene",),
-    "worker_pool": ("start_workers",),
+    "system.worker_pool": ("start_workers",),
 }
 __all__ = ["__version__", *(name for names in _HOME.values() for name in names)]
 

@@ -6,9 +6,9 @@ import math
 from dataclasses import dataclass
 from typing import Literal
 
+from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
-from mvseg.multiview.config import DetectConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.traits.config import TraitsConfig, Up
 

@@ -18,6 +18,8 @@ from tqdm import tqdm
 
 from mvseg._version import __version__
 from mvseg.config import RunConfig
+from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
+from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.masks.recognise import recognise_masks
@@ -26,16 +28,14 @@ from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.matching.match import check_baselines, match_regions
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
-from mvseg.multiview.config import DetectConfig
-from mvseg.multiview.kept_detections import KeptDetections, delete_kept, read_detections, write_detections
 from mvseg.results.provenance import hash_files
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 from mvseg.traits.up import find_up
 
 if TYPE_CHECKING:
-    from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
-    from mvseg.multiview.proposals import Proposals
+    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+    from mvseg.masks import Proposals
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
@@ -89,7 +89,7 @@ def run_scene(
             scene = pose_scene(scene, matching)
         if config.detect.witnesses:
             with _timed(seconds, "witnesses"):
-                from mvseg.multiview.witnesses import hear_witnesses
+                from mvseg.verification.other_views import hear_witnesses
 
                 detections, matching, starts = hear_witnesses(
                     detections,
@@ -126,7 +126,7 @@ def run_scene(
             )
             surfaces, voxels = reconstruct(regions, matching.instance_ids, starts=starts)
             if is_checked and surfaces is not None:
-                from mvseg.multiview.checked_ids import check_ids
+                from mvseg.verification.checked_ids import check_ids
 
                 checked = check_ids(regions, matching, surfaces, cameras=scene.cameras)
                 matching, moved, known = checked.matching, int(checked.is_moved.sum()), checked.unchanged(surfaces)
@@ -143,7 +143,7 @@ def run_scene(
 
             traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels, config=config.traits)
     if from_views is not None:
-        from mvseg.multiview.recut import recut_masks
+        from mvseg.verification.recut import recut_masks
 
         regions = recut_masks(
             regions, matching.instance_ids, surfaces or starts, cameras=scene.cameras, is_found=~from_views
@@ -211,9 +211,9 @@ def detect_regions(
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
     """
+    from mvseg.detection.crops import boxes_to_look_at, crop_cameras, place_crops
+    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
     from mvseg.detectors.zoo import load_detector
-    from mvseg.multiview.mask_rcnn import MultiViewMaskRCNN
-    from mvseg.multiview.plant_box import boxes_to_look_at, crop_cameras, place_crops
 
     detect = config.detect
     detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)

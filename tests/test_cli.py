@@ -25,13 +25,13 @@ import mvseg
 from mvseg.cli import main
 from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
+from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning
 from mvseg.formats.coco import encode_mask
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
-from mvseg.multiview.config import DetectConfig
-from mvseg.worker_pool import default_workers
+from mvseg.system.worker_pool import default_workers
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent

@@ -18,8 +18,8 @@ from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.run import detect, leave_autocast, run_heads
 from mvseg.detectors.scales import look, run_scales
 from mvseg.detectors.small import SMALL_ARCHITECTURES
+from mvseg.masks import Proposals
 from mvseg.matching.result import Matching
-from mvseg.multiview.proposals import Proposals
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from other_device import other_device
 from synthetic import arc_positions, cameras_at
@@ -151,7 +151,7 @@ def test_witnesses_are_heard_on_the_cpu(
         assert given["photos"](2).shape == (HEIGHT, WIDTH, 3)
         return replace(proposals, from_views=proposals.scores > 0.4), matching, {}
 
-    monkeypatch.setattr("mvseg.multiview.mask_rcnn.hear_witnesses", hear)
+    monkeypatch.setattr("mvseg.detection.mask_rcnn.hear_witnesses", hear)
     answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
     for answer, expected in zip(answers, wrapped(photos, cameras=CAMERAS), strict=True):
         check(answer, expected, device)

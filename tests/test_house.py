@@ -29,17 +29,18 @@ PACKAGE = ROOT / "mvseg"
 # A room (a folder, or a module of the top level) imports only from the lines above its own, so rooms of one line never
 # import each other. `__init__` stands for `mvseg` itself: below it, nothing imports the package.
 FLOORS = (
-    ("errors", "sigterm", "_version"),
-    ("worker_pool",),
+    ("errors", "_version"),
+    ("system",),
     ("scene",),
     ("regions",),
-    ("partition",),
-    ("demo",),
+    ("masks", "demo"),
     ("formats", "detectors", "matching", "reconstruction"),
-    ("multiview", "traits", "evaluation", "baselines", "simulation", "checks", "poses"),
+    ("verification", "traits", "evaluation", "simulation", "checks", "poses"),
+    ("detection",),
     ("config",),
     ("training", "results"),
     ("pipeline",),
+    ("runs",),
     ("batch", "adaptation"),
     ("__init__",),
     ("cli",),

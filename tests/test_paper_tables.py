@@ -22,12 +22,12 @@ from benchmarks.paper_tables.masks import detected_masks, tie_detections, true_m
 from benchmarks.paper_tables.methods import METHODS, PRINTED
 from benchmarks.paper_tables.number_of_leaves import DEFAULT, RULES, score_numbers
 from benchmarks.paper_tables.shape_error import TrueLeaves, measure_points, measure_shares, unite
+from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.shape_distance import shape_distance
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
-from mvseg.multiview.config import DetectConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.simulation.dataset import list_scenes
 

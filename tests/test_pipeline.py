@@ -32,14 +32,12 @@ from mvseg import (
     match_regions,
     run_scene,
 )
+from mvseg.detection.config import DetectConfig
+from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import read_photo
+from mvseg.masks import Proposals
 from mvseg.matching.result import Matching, MergedMask, RefinedPoses
-from mvseg.multiview.checked_ids import CheckedIds
-from mvseg.multiview.config import DetectConfig
-from mvseg.multiview.plant_box import crop_cameras, place_crops, plant_boxes
-from mvseg.multiview.proposals import Proposals
-from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.pipeline import detect_regions
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
@@ -48,6 +46,8 @@ from mvseg.results.folder import save_result
 from mvseg.results.provenance import describe_run
 from mvseg.results.result import Result
 from mvseg.scene import Scene, View
+from mvseg.verification.checked_ids import CheckedIds
+from mvseg.verification.other_views import hear_witnesses
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)
@@ -226,7 +226,7 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
         return CheckedIds(matching=moved, is_moved=is_moved, old_ids=torch.arange(1, 4), is_changed=is_changed)
 
     monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
-    monkeypatch.setattr("mvseg.multiview.checked_ids.check_ids", check)
+    monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
     config = RunConfig(reconstruct=ReconstructConfig(check_ids=is_wanted, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
     save_result(result, tmp_path / "out", {}, report=False)
@@ -267,7 +267,7 @@ def test_masks_are_cut_once_the_surfaces_were_heard_and_both_leaves_are_fitted_a
         return list_first(regions, match_regions(regions, *args, **kwargs))
 
     monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
-    monkeypatch.setattr("mvseg.multiview.checked_ids.check_ids", check)
+    monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
     monkeypatch.setattr("mvseg.pipeline.match_regions", match)
     config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)

@@ -14,13 +14,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvseg.batch import pose_photos
 from mvseg.cli import main
 from mvseg.errors import InputError
 from mvseg.formats.image_file import write_png
 from mvseg.formats.photos import check_photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.poses.mapping import Structure
+from mvseg.runs import pose_photos
 from room_scene import room_cameras, write_room
 
 BOARD = ["--board.columns", "5", "--board.rows", "4", "--board.square", "40", "--board.marker", "30"]

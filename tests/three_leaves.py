@@ -7,7 +7,7 @@ import numpy as np
 from blade_scene import SIZE, ring_cameras
 from known_leaves import flat_leaf
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.surface.visible_leaves import visible_leaves
+from mvseg.verification.visible_leaves import visible_leaves
 
 CAMERAS = ring_cameras(6, elevations_deg=(35, 60, 45))
 LEAVES = {

@@ -19,7 +19,7 @@ from benchmarks.paper_tables.cells import PRESETS, list_cells
 from benchmarks.paper_tables.experiments import TABLES, Plan, run_real, run_simulated
 from benchmarks.paper_tables.methods import METHODS
 from benchmarks.paper_tables.shapes import SHAPES
-from mvseg.worker_pool import run_all
+from mvseg.system.worker_pool import run_all
 
 
 def main(argv: Sequence[str] | None = None) -> None:

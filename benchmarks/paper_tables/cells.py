@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from mvseg.errors import InputError
-from mvseg.formats.atomic import write_text_whole
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
@@ -19,6 +18,7 @@ from mvseg.simulation import dataset
 from mvseg.simulation.dataset import Preset, SceneSpec, list_scenes, scene_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
+from mvseg.system.atomic import write_text_whole
 
 SEED = 7  # the test plants of seed 0 were used in development
 Record = dict[str, Any]

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.baselines.dense_points import DensePoints, sgbm_points
 from benchmarks.paper_tables.cells import Cell
-from mvseg.baselines.dense_points import DensePoints, sgbm_points
-from mvseg.formats.atomic import write_whole
+from mvseg.system.atomic import write_whole
 
 
 def dense_points(cell: Cell, cache: Path) -> DensePoints:

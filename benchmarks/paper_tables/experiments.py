@@ -14,8 +14,8 @@ from benchmarks.paper_tables.masks import Masks, degraded_masks, detected_masks,
 from benchmarks.paper_tables.methods import METHODS, score_method
 from benchmarks.paper_tables.number_of_leaves import score_numbers
 from benchmarks.paper_tables.shapes import SHAPES, measure_shape
+from mvseg.detection.config import DetectConfig
 from mvseg.detectors.zoo import find_weights
-from mvseg.multiview.config import DetectConfig
 from mvseg.simulation.dataset import SceneSpec, plant_index
 
 TABLES = ("1", "2", "3", "k")

@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 from benchmarks.paper_tables.cells import Cell
+from mvseg.detection.config import DetectConfig
 from mvseg.evaluation.truth import shown_instances, tied_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks
-from mvseg.multiview.config import DetectConfig
 from mvseg.regions import IGNORE_LABEL, Regions, mask_box, regions_from_label_maps, stack_regions
 from mvseg.simulation.faults import Faults, degrade_labels
 

@@ -9,12 +9,12 @@ from typing import Literal
 
 import torch
 
+from benchmarks.baselines.mvs import match_mvs
+from benchmarks.baselines.points import match_points
+from benchmarks.baselines.sparse import match_sparse
 from benchmarks.paper_tables.cells import Cell, Record
 from benchmarks.paper_tables.dense import dense_points
 from benchmarks.paper_tables.masks import Masks
-from mvseg.baselines.mvs import match_mvs
-from mvseg.baselines.points import match_points
-from mvseg.baselines.sparse import match_sparse
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.config import MatchConfig

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.baselines.semantic import reconstruct_semantic
 from benchmarks.paper_tables.cells import Cell, Record
 from benchmarks.paper_tables.dense import dense_points
 from benchmarks.paper_tables.masks import Masks
@@ -22,7 +23,6 @@ from benchmarks.paper_tables.shape_error import (
     true_leaves,
     unite,
 )
-from mvseg.baselines.semantic import reconstruct_semantic
 from mvseg.errors import InputError, InputWarning
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions

@@ -22,7 +22,7 @@ from benchmarks.paper_tables.tables import (
     table_numbers,
     table_rules,
 )
-from mvseg.formats.atomic import write_text_whole
+from mvseg.system.atomic import write_text_whole
 
 TEMPLATE = Path(__file__).with_name("benchmarks.template.md")
 NOTES = Path(__file__).with_name("notes.md")

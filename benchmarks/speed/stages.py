@@ -21,6 +21,8 @@ import torch
 from torch import Tensor
 
 from mvseg.demo import demo_scene
+from mvseg.detection.loop import match_proposals
+from mvseg.detection.proposals import gather_proposals
 from mvseg.detectors.run import run_heads
 from mvseg.detectors.zoo import load_detector
 from mvseg.formats.photos import load_photos
@@ -28,8 +30,6 @@ from mvseg.formats.scene_folder import load_scene
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
-from mvseg.multiview.loop import match_proposals
-from mvseg.multiview.proposals import gather_proposals
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.shapes import reconstruct_shapes
 from mvseg.regions import Regions, regions_from_label_maps
@@ -73,7 +73,7 @@ def fit_shapes(regions: Regions, instance_ids: Tensor, cameras: Cameras, *, num_
     if num_workers == 1:
         reconstruct_shapes(regions, instance_ids, cameras, config=config)
         return
-    from mvseg.worker_pool import start_workers  # earlier versions have none
+    from mvseg.system.worker_pool import start_workers  # earlier versions have none
 
     with start_workers(num_workers) as workers:
         reconstruct_shapes(regions, instance_ids, cameras, config=config, workers=workers)

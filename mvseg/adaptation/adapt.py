@@ -15,20 +15,20 @@ import torch
 from mvseg.adaptation.config import AdaptConfig
 from mvseg.adaptation.labels import FoundLeaves, write_labels
 from mvseg.config import RunConfig
+from mvseg.detection.crops import boxes_to_look_at
 from mvseg.detectors.weights_file import Description, encode_weights, read_weights
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.atomic import lock_folder, write_text_whole, write_whole
 from mvseg.formats.photos import check_photos, read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.matching.match import check_baselines
-from mvseg.multiview.confirmed_masks import confirmed_masks
-from mvseg.multiview.plant_box import boxes_to_look_at
-from mvseg.multiview.witnesses import hear_witnesses
 from mvseg.pipeline import detect_regions, pose_scene
 from mvseg.scene import Scene
+from mvseg.system.atomic import lock_folder, write_text_whole, write_whole
 from mvseg.training.config import TrainConfig
 from mvseg.training.loop import train
+from mvseg.verification.other_views import hear_witnesses
+from mvseg.verification.sure_masks import confirmed_masks
 
 SCALES = (0.7, 1.4)  # training samples against the size of the detection
 LEAST_KEPT = 0.5  # of the masks found, by the other views: where they keep fewer, labels are wrong too often

@@ -14,9 +14,9 @@ from tqdm import tqdm
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.photos import read_photo
-from mvseg.multiview.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Scene
+from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,8 +22,8 @@ from tqdm import tqdm
 
 from mvseg.batch.lost import Lost
 from mvseg.errors import InputError
-from mvseg.sigterm import Terminated, end_with_parent, stopped_by_sigterm
-from mvseg.worker_pool import one_thread
+from mvseg.system.sigterm import Terminated, end_with_parent, stopped_by_sigterm
+from mvseg.system.worker_pool import one_thread
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")

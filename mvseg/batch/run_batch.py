@@ -23,8 +23,8 @@ from mvseg.batch.work import Finished, work_on_scene
 from mvseg.config import RunConfig
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
-from mvseg.formats.atomic import is_partial, lock_folder, sweep_abandoned
 from mvseg.results.earlier import check_out
+from mvseg.system.atomic import is_partial, lock_folder, sweep_abandoned
 
 Started = Callable[[int], object]
 Engine = Callable[[dict[int, BatchScene], int | None, Started], Generator[tuple[int, Any], None, None]]

@@ -8,8 +8,8 @@ from typing import Literal
 from pydantic import BaseModel
 
 from mvseg.errors import InputError
-from mvseg.formats.atomic import write_text_whole
 from mvseg.formats.json_file import read_json
+from mvseg.system.atomic import write_text_whole
 
 STATUS_FILE = "status.json"
 FileHash = tuple[int, int, str]  # bytes, time of the last change in nanoseconds, SHA-256

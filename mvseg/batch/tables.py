@@ -13,8 +13,8 @@ from mvseg.batch.places import scene_result
 from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status
 from mvseg.errors import InputError
-from mvseg.formats.atomic import folder_whole
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
+from mvseg.system.atomic import folder_whole
 from mvseg.traits.table import escape_text, write_csv
 
 SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds", "peak_mb", "warning_text", "sentence")

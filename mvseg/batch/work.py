@@ -14,17 +14,17 @@ from pathlib import Path
 import cv2
 import torch
 
-from mvseg.batch.one_scene import find_masks, save_scene, solve_scene
 from mvseg.batch.places import scene_detections, scene_result, scene_state
 from mvseg.batch.scene_key import scene_key
 from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import FileHash, Status, read_status, write_status
 from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.atomic import lock_folder, sweep_abandoned
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, check_out
 from mvseg.results.provenance import hash_files
+from mvseg.runs.one_scene import find_masks, save_scene, solve_scene
+from mvseg.system.atomic import lock_folder, sweep_abandoned
 
 _one_at_a_time = threading.Lock()  # Dask's workers may have threads; warnings are caught for the whole process
 

@@ -11,8 +11,8 @@ from jsonargparse import ArgumentParser, Namespace
 from mvseg.adaptation.config import AdaptConfig
 from mvseg.cli.options import CheckedConfig, build_options
 from mvseg.config import RunConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.matching.config import MatchConfig
-from mvseg.multiview.config import DetectConfig
 
 
 def add(verbs: Any) -> None:

@@ -39,9 +39,9 @@ def add(verbs: Any) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    from mvseg.batch.one_scene import find_masks
     from mvseg.checks.check_scene import check_scene
     from mvseg.formats.scene_folder import load_masks, load_scene
+    from mvseg.runs.one_scene import find_masks
 
     wanted = () if args.categories is None else [name.strip() for name in args.categories.split(",")]
     unread: InputError | None = None
@@ -141,8 +141,8 @@ def _rows(check: Check) -> list[dict[str, Any]]:
 
 def _write(out: Path, check: Check, findings: list[Finding]) -> None:
     from mvseg.checks.camera_plan import draw_cameras
-    from mvseg.formats.atomic import write_text_whole, write_whole
     from mvseg.formats.image_file import write_png
+    from mvseg.system.atomic import write_text_whole, write_whole
 
     off = {view for each in findings if each.where == "poses" and each.level == "error" for view in each.views}
     content = {"scene": check.scene.name, "findings": [asdict(each) for each in findings], "views": _rows(check)}

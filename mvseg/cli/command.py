@@ -16,8 +16,8 @@ from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.atomic import clear_begun
-from mvseg.sigterm import Terminated, stopped_by_sigterm
+from mvseg.system.atomic import clear_begun
+from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
 INTERRUPTED, TERMINATED = 130, 143
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."

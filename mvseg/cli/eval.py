@@ -26,9 +26,9 @@ def run(args: Namespace) -> int:
     from mvseg.evaluation.id_metrics import matching_metrics
     from mvseg.evaluation.panoptic import leaf_metrics
     from mvseg.evaluation.truth import shown_instances
-    from mvseg.formats.atomic import write_text_whole
     from mvseg.regions import IGNORE_LABEL
     from mvseg.results.read import find_result, read_instances
+    from mvseg.system.atomic import write_text_whole
 
     result = find_result(args.result)
     if result != args.result:

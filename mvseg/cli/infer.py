@@ -8,9 +8,9 @@ from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.batch.one_scene import run_one_scene
 from mvseg.cli.options import DEFAULT_OUT, add_run_options, build_run
 from mvseg.demo import demo_scene
+from mvseg.runs.one_scene import run_one_scene
 
 
 def add(verbs: Any) -> None:
@@ -31,7 +31,7 @@ def run(args: Namespace) -> int:
         print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
     scene = args.scene or demo_scene()
     out = args.out or DEFAULT_OUT / scene.resolve().name
-    from mvseg.worker_pool import default_workers  # keeps --help and wrong options quick
+    from mvseg.system.worker_pool import default_workers  # keeps --help and wrong options quick
 
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     run_one_scene(scene, args.masks, out, config=build_run(args), num_workers=num_workers, quiet=args.quiet)

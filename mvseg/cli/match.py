@@ -7,13 +7,13 @@ from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.batch.one_scene import run_one_scene
 from mvseg.cli.complain import complain
 from mvseg.cli.options import DEFAULT_OUT, add_matching_options, build_options
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.runs.one_scene import run_one_scene
 
 
 def add(verbs: Any) -> None:

@@ -13,10 +13,10 @@ from jsonargparse import ActionConfigFile, ArgumentParser, Namespace  # type: ig
 
 from mvseg.adaptation.config import AdaptConfig
 from mvseg.config import RunConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
 from mvseg.formats.yaml_file import check_yaml
 from mvseg.matching.config import MatchConfig
-from mvseg.multiview.config import DetectConfig
 from mvseg.poses.config import PoseConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.training.config import TrainConfig

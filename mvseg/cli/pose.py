@@ -66,14 +66,14 @@ def run(args: Namespace) -> int:
     if args.turntable is not None:
         _run_turntable(args, known, config)
         return 0
-    from mvseg.batch.pose_photos import pose_photos  # keeps --help and wrong options quick
+    from mvseg.runs.pose_photos import pose_photos  # keeps --help and wrong options quick
 
     pose_photos(args.photos, args.out, config=config, known=known, up=read_up(args.up), quiet=args.quiet)
     return 0
 
 
 def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
-    from mvseg.batch.pose_turntable import pose_board_photos, pose_turntable_photos
+    from mvseg.runs.pose_turntable import pose_board_photos, pose_turntable_photos
 
     is_board = args.turntable == "board"
     used = ("marker", "distance", "positions") if is_board else ("board", "marker", "distance", "positions", "unit")

@@ -18,8 +18,8 @@ from pycocotools.cocoeval import COCOeval
 from torch import Tensor
 
 from mvseg.detectors.mask_cut import CUT
+from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.formats.coco import encode_mask
-from mvseg.formats.labelled_photo import LabelledPhoto
 
 MAX_DETECTIONS = 100  # per photo, the best by score: COCO's limit, and that of torchvision's detectors
 

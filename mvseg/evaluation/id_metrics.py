@@ -12,7 +12,7 @@ import numpy as np
 from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.partition import separate_unmatched
+from mvseg.matching.partition import separate_unmatched
 
 
 @dataclass(frozen=True)

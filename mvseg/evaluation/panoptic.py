@@ -16,7 +16,7 @@ from torch import Tensor
 
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import contingency_table, count_pairs
-from mvseg.partition import separate_unmatched
+from mvseg.matching.partition import separate_unmatched
 from mvseg.regions import IGNORE_LABEL, Regions
 
 RIGHT_IOU = 0.5  # above it, a segment finds a true one: never two, because the true ones do not overlap

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
 from mvseg.matching.affinity import Affinity
-from mvseg.partition import drop_singletons, number_instances, renumber
+from mvseg.matching.partition import drop_singletons, number_instances, renumber
 
 STOP = 0.2  # mean weight below which two clusters are not joined
 ALONE = 0.1  # gain of a region that stays alone, comparable to its mean weight to the V - 1 other views

@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
-from mvseg.partition import number_instances
+from mvseg.matching.partition import number_instances
 
 KS_AT_ONCE = 8
 DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation

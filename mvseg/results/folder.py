@@ -17,7 +17,6 @@ import numpy as np
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.formats.atomic import folder_whole
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
@@ -29,6 +28,7 @@ from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.scene import Scene
+from mvseg.system.atomic import folder_whole
 
 if TYPE_CHECKING:
     from mvseg.matching.result import RefinedPoses

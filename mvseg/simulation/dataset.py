@@ -13,7 +13,6 @@ import numpy as np
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.formats.atomic import is_partial, lock_folder, write_text_whole, write_whole
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.label_png import read_label_png
 from mvseg.scene import Cameras
@@ -21,7 +20,8 @@ from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.scene_writer import write_scene, write_table
 from mvseg.simulation.wild import make_wild
-from mvseg.worker_pool import run_all
+from mvseg.system.atomic import is_partial, lock_folder, write_text_whole, write_whole
+from mvseg.system.worker_pool import run_all
 
 Photo = tuple[dict[str, Any], list[dict[str, Any]]]  # COCO image and its annotations, still without ids
 

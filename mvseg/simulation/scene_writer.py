@@ -25,12 +25,12 @@ import trimesh
 from numpy.typing import NDArray
 
 from mvseg.errors import InputError
-from mvseg.formats.atomic import folder_whole, write_text_whole
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.rig import write_rig
 from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.growth import Plant
 from mvseg.simulation.ray_cast import build_stage, render_stage
+from mvseg.system.atomic import folder_whole, write_text_whole
 
 JPEG_QUALITY = 90
 

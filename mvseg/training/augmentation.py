@@ -17,7 +17,7 @@ from torch.utils.data import Dataset
 from torchvision import tv_tensors
 from torchvision.transforms import v2
 
-from mvseg.formats.labelled_photo import LabelledPhoto
+from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.regions import masks_to_boxes
 from mvseg.training.config import Orientation
 from mvseg.training.data import SampleList, read_sample

@@ -20,11 +20,11 @@ from pydantic import BaseModel
 from tqdm import tqdm
 
 from mvseg.errors import InputError
+from mvseg.evaluation.labelled_photo import LabelledPhoto, label_photo, mask_photo
 from mvseg.formats.coco import CocoAnnotation, CocoFile, decode_segmentation
 from mvseg.formats.image_file import PHOTO_SUFFIXES, file_name_problem, read_rgb
 from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.label_png import read_labels
-from mvseg.formats.labelled_photo import LabelledPhoto, label_photo, mask_photo
 
 
 @dataclass(frozen=True)

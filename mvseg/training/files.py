@@ -14,7 +14,7 @@ from torch import nn
 
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
-from mvseg.formats.atomic import is_partial, write_text_whole, write_whole
+from mvseg.system.atomic import is_partial, write_text_whole, write_whole
 
 logger = logging.getLogger(__name__)
 

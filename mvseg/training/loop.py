@@ -38,7 +38,7 @@ from mvseg.detectors.mask_rcnn import count_parameters
 from mvseg.detectors.weights_file import Description
 from mvseg.errors import InputError
 from mvseg.evaluation.average_precision import average_precision
-from mvseg.formats.atomic import is_partial, lock_folder, write_text_whole
+from mvseg.system.atomic import is_partial, lock_folder, write_text_whole
 from mvseg.training.augmentation import Augmentation, AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.errors import InputError
+from mvseg.evaluation.labelled_photo import LabelledPhoto, label_photo
 from mvseg.formats.image_file import PHOTO_SUFFIXES, read_rgb
-from mvseg.formats.labelled_photo import LabelledPhoto, label_photo
 from mvseg.scene import Cameras
 from mvseg.training.photo_faults import draw
 

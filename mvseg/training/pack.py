@@ -11,7 +11,7 @@ from pathlib import Path
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import HASH, WEIGHTS
 from mvseg.errors import InputError
-from mvseg.formats.atomic import write_text_whole, write_whole
+from mvseg.system.atomic import write_text_whole, write_whole
 
 
 def pack_detector(run: Path, folder: Path, image_size: int | None = None) -> None:

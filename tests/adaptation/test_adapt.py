@@ -13,12 +13,12 @@ from mvseg.adaptation.adapt import Agreement, adapt_detector, read_adaptable
 from mvseg.adaptation.config import AdaptConfig
 from mvseg.cli import main
 from mvseg.config import RunConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.detectors.weights_file import Description, encode_weights, read_weights
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_masks
+from mvseg.masks import Proposals
 from mvseg.matching.result import Matching
-from mvseg.multiview.config import DetectConfig
-from mvseg.multiview.proposals import Proposals
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Scene
 from mvseg.training.config import TrainConfig

@@ -11,8 +11,7 @@ import torch
 import trimesh
 from scipy.spatial import cKDTree
 
-from leafy_scene import LeafyScene
-from mvseg.baselines.dense_points import (
+from benchmarks.baselines.dense_points import (
     DensePoints,
     Workspace,
     depth_normals,
@@ -23,7 +22,8 @@ from mvseg.baselines.dense_points import (
     sgbm_points,
     write_map,
 )
-from mvseg.baselines.mvs import match_mvs
+from benchmarks.baselines.mvs import match_mvs
+from leafy_scene import LeafyScene
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import read_photo
@@ -188,7 +188,7 @@ def test_map_file_is_colmaps(tmp_path: Path) -> None:
 
 
 def test_large_photos_are_made_smaller_with_their_cameras(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvseg.baselines.dense_points.MAX_SIDE", 160)
+    monkeypatch.setattr("benchmarks.baselines.dense_points.MAX_SIDE", 160)
     scene = replace(leafy.scene, views=leafy.scene.views[:2], cameras=leafy.scene.cameras[[0, 1]])
     small, cameras = read_small_photos(scene)
     assert small[0].shape == (160, 160, 3)

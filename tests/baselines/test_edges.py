@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from mvseg.baselines.edges import edge_graph
+from benchmarks.baselines.edges import edge_graph
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_graph
 from mvseg.matching.result import Matching

@@ -6,8 +6,8 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
-from mvseg.baselines.dense_points import DensePoints
-from mvseg.baselines.mvs import match_mvs, projection_graph, region_points
+from benchmarks.baselines.dense_points import DensePoints
+from benchmarks.baselines.mvs import match_mvs, projection_graph, region_points
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 from mvseg.regions import regions_from_label_maps

@@ -7,7 +7,7 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
-from mvseg.baselines.points import centroid_rays, match_points, nearest_ray_graph, pairwise_ray_distance
+from benchmarks.baselines.points import centroid_rays, match_points, nearest_ray_graph, pairwise_ray_distance
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig

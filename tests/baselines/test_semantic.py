@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from mvseg.baselines.semantic import reconstruct_semantic
+from benchmarks.baselines.semantic import reconstruct_semantic
 from mvseg.errors import InputError
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import regions_from_label_maps

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from leafy_scene import LeafyScene
-from mvseg.baselines import sparse
-from mvseg.baselines.sparse import (
+from benchmarks.baselines import sparse
+from benchmarks.baselines.sparse import (
     Keypoints,
     find_keypoints,
     keypoint_graph,
@@ -18,6 +17,7 @@ from mvseg.baselines.sparse import (
     match_keypoints,
     match_sparse,
 )
+from leafy_scene import LeafyScene
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import read_photo

@@ -5,9 +5,8 @@ import numpy as np
 import pytest
 import torch
 
-from leafy_scene import LeafyScene, write_leafy_scene
-from mvseg.baselines import stereo
-from mvseg.baselines.stereo import (
+from benchmarks.baselines import stereo
+from benchmarks.baselines.stereo import (
     consistent_depth,
     disparity,
     neighbour_pairs,
@@ -17,6 +16,7 @@ from mvseg.baselines.stereo import (
     smooth,
     view_angles,
 )
+from leafy_scene import LeafyScene, write_leafy_scene
 from mvseg.formats.photos import read_photo
 from mvseg.scene import Cameras
 from reference import consistent_depth_reference

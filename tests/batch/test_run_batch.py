@@ -25,10 +25,10 @@ from mvseg.cli import main
 from mvseg.cli.command import build_parser
 from mvseg.cli.options import build_run
 from mvseg.config import RunConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
-from mvseg.formats.atomic import lock_folder
-from mvseg.multiview.config import DetectConfig
 from mvseg.results.read import read_instances
+from mvseg.system.atomic import lock_folder
 from scene_folders import write_scene
 
 COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]

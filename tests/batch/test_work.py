@@ -19,10 +19,10 @@ from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status
 from mvseg.batch.work import Finished, work_on_scene
 from mvseg.config import RunConfig
-from mvseg.formats.atomic import lock_folder
+from mvseg.detection import mask_rcnn
+from mvseg.detection.config import DetectConfig
 from mvseg.matching.config import MatchConfig
-from mvseg.multiview import mask_rcnn
-from mvseg.multiview.config import DetectConfig
+from mvseg.system.atomic import lock_folder
 from scene_folders import edit_rig, write_scene
 
 CONFIG = RunConfig(reconstruct=None)  # ids only: these tests look at no shape

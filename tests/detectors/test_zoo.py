@@ -12,10 +12,10 @@ from safetensors.torch import save_file
 
 import mvseg.detectors.zoo as zoo
 from mvseg.cli import main
+from mvseg.detection.config import DetectConfig
 from mvseg.detectors.mask_rcnn import count_parameters
 from mvseg.detectors.zoo import find_weights, list_detectors, load_detector
 from mvseg.errors import InputError
-from mvseg.multiview.config import DetectConfig
 from mvseg.training.data import list_samples
 from mvseg.training.pack import pack_detector
 from mvseg.training.state import start_state

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mvseg.evaluation.average_precision import annotate_detections, annotate_truth, average_precision, describe_mask
-from mvseg.formats.labelled_photo import LabelledPhoto
+from mvseg.evaluation.labelled_photo import LabelledPhoto
 
 
 def square(x: int, y: int, size: int = 8) -> Tensor:

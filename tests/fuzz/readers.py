@@ -21,6 +21,7 @@ from safetensors.torch import save
 
 from mvseg.cli.command import _parse
 from mvseg.cli.options import build_options
+from mvseg.detection.config import DetectConfig
 from mvseg.detectors.weights_file import read_weights
 from mvseg.errors import InputError
 from mvseg.formats.coco import encode_mask
@@ -29,7 +30,6 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import check_photos, read_photo
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.config import MatchConfig
-from mvseg.multiview.config import DetectConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.results.earlier import check_out
 from mvseg.results.read import read_instances

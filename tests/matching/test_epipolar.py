@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch.overrides import TorchFunctionMode
 
+from mvseg.detection.assignment import ruzicka_similarity
 from mvseg.errors import InputError
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.epipolar import (
@@ -24,7 +25,6 @@ from mvseg.matching.epipolar import (
 )
 from mvseg.matching.pencil import epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
 from mvseg.matching.samples import view_runs, view_samples
-from mvseg.multiview.assignment import ruzicka_similarity
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from reference import epipolar_map_reference, fundamental_reference

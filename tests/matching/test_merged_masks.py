@@ -13,7 +13,7 @@ from mvseg.matching.nview.label_rows import row_table
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.nview.merged_masks import second_part
 from mvseg.matching.one_per_view import ViewGraph
-from mvseg.partition import renumber
+from mvseg.matching.partition import renumber
 from synthetic import ball_scene, merged_balls
 
 

@@ -29,8 +29,8 @@ from mvseg.matching.nview.row_index import index_rows
 from mvseg.matching.nview.search import refine, search
 from mvseg.matching.nview.soft_start import em_affinities
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
+from mvseg.matching.partition import renumber
 from mvseg.matching.result import Matching
-from mvseg.partition import renumber
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
 from reference import soft_affinity_reference

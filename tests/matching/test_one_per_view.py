@@ -16,7 +16,7 @@ from mvseg.matching.one_per_view import (
     one_per_view_clusters,
     power_iteration,
 )
-from mvseg.partition import renumber
+from mvseg.matching.partition import renumber
 from reference import link_average_reference
 from synthetic import ball_scene
 

@@ -8,7 +8,7 @@ import pycolmap
 import pytest
 
 from mvseg.poses.cancellable import run_cancellable
-from mvseg.sigterm import Terminated, stopped_by_sigterm
+from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
 
 def test_answers_and_errors_pass() -> None:

@@ -10,8 +10,8 @@ from known_leaves import flat_leaf
 from mvseg.errors import InputError
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, spread_views
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.surface.visible_leaves import visible_leaves
 from mvseg.scene import Cameras
+from mvseg.verification.visible_leaves import visible_leaves
 
 FLAT, BENT = EllipticBlade(), EllipticBlade(bend=0.9)
 CAMERAS = ring_cameras(10)

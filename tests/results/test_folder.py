@@ -456,7 +456,7 @@ class TestWholeOrNotAtAll:
                 raise OSError(5, "Input/output error")
             return rename(self, target)
 
-        monkeypatch.setattr("mvseg.formats.atomic._exchange", lambda first, second: False)
+        monkeypatch.setattr("mvseg.system.atomic._exchange", lambda first, second: False)
         monkeypatch.setattr(Path, "rename", fail_into_place)
         with pytest.raises(InputError, match="Input/output error"):
             save_result(ids_only(result), tmp_path / "out", {})

@@ -14,12 +14,12 @@ import pytest
 from pycocotools.coco import COCO
 
 from mvseg.errors import InputError
-from mvseg.formats.atomic import lock_folder
 from mvseg.formats.label_png import read_label_png
 from mvseg.simulation import dataset
 from mvseg.simulation.dataset import EVALUATED_FAMILIES, PRESETS, Preset, list_scenes, plant_index, write_dataset
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.scene_writer import write_scene
+from mvseg.system.atomic import lock_folder
 
 TINY = Preset(
     plants=(("train", 1), ("val", 1)),

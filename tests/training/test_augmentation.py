@@ -12,7 +12,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from mvseg.formats.labelled_photo import LabelledPhoto
+from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.training.augmentation import (
     MEAN_COLOR,
     Augmentation,

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pycocotools import mask as coco_mask
 
 from mvseg.errors import InputError
-from mvseg.formats.labelled_photo import LabelledPhoto
+from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.training.data import Sample, check_samples, keep_sound, list_samples, read_sample
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in pycocotools

@@ -22,7 +22,7 @@ import yaml  # type: ignore[import-untyped]
 import mvseg.training.loop
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.errors import InputError
-from mvseg.formats.atomic import is_partial
+from mvseg.system.atomic import is_partial
 from mvseg.training.loop import TrainConfig, best_epoch, train
 from mvseg.training.processes import Processes
 from tiny_training import build_tiny, load_weights, make_config, parse_config, write_photos

@@ -22,8 +22,8 @@ from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.search import search
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
+from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
 from mvseg.matching.result import Matching, count_sure_views
-from mvseg.partition import drop_singletons, number_instances, renumber, separate_unmatched
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 

@@ -15,7 +15,7 @@ from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.soft_start import soft_starts
 from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_order
-from mvseg.partition import renumber
+from mvseg.matching.partition import renumber
 
 MAX_SWEEPS = 3
 AS_GOOD = 0.99  # share of the best value that pairwise clusters must reach to be kept

@@ -35,7 +35,7 @@ from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.worker_pool import spread
+from mvseg.system.worker_pool import spread
 
 HULL = ReconstructConfig(voxel_budget=25_000)
 HULL_BY_VOTE = ReconstructConfig(voxel_budget=25_000, seen_share=0.0)  # where faulty masks leave nothing of the first

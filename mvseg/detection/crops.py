@@ -1,0 +1,112 @@
+"""Where the plant is in every photo, once its leaves are matched: a second look sees it larger.
+
+Not in the paper.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvseg.masks import Proposals
+from mvseg.matching.result import SURE, Matching
+from mvseg.reconstruction.triangulate import triangulate
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+LEAST_VIEWS = 3  # of an instance that is part of the plant; all views where there are fewer
+MARGIN = 0.1  # of the longer side of a box, on each side: leaves that were missed
+LEAST_GAIN = 1.5  # by which a second look must see the plant larger, for most photos
+
+
+def boxes_to_look_at(regions: Regions, matching: Matching, cameras: Cameras, *, longest: int) -> Tensor | None:
+    """`plant_boxes`, if a detector that scales larger images down to a longer side of `longest` pixels sees the plant
+    at least `LEAST_GAIN` times as large in them, in most views; else None."""
+    boxes = plant_boxes(regions, matching, cameras)
+    gain = gain_of_crops(boxes, cameras.sizes, longest)
+    return boxes if float(gain.median()) >= LEAST_GAIN else None
+
+
+def plant_boxes(regions: Regions, matching: Matching, cameras: Cameras) -> Tensor:
+    """The box of the plant in each view: all instances that are surely matched, wherever they were found or not.
+
+    An instance is a ball around the point that its masks' boxes are centred on. A view's box holds the balls, and the
+    masks of these instances in that view.
+
+    Args:
+        regions: D masks.
+        matching: their ids.
+        cameras: V cameras.
+
+    Returns:
+        (V, 4) int64 xyxy, half-open, with a margin, inside the photos. The whole photo where no instance is sure.
+    """
+    width, height = cameras.sizes.T
+    frames = torch.stack((torch.zeros_like(width), torch.zeros_like(width), width, height), 1)
+    is_sure = (matching.instance_ids > 0) & (matching.match_scores >= SURE)
+    points, radii, of_plant = [], [], torch.zeros_like(is_sure)
+    for instance in matching.instance_ids[is_sure].unique().tolist():
+        members = (is_sure & (matching.instance_ids == instance)).nonzero()[:, 0]
+        views = regions.view_index[members]
+        if len(views) < max(2, min(LEAST_VIEWS, len(cameras))):
+            continue
+        boxes = regions.boxes[members].double()
+        seen = cameras[views]
+        point = triangulate(projections(seen), ((boxes[:, :2] + boxes[:, 2:]) / 2).numpy())
+        _, depth = seen.project(torch.from_numpy(point)[None])
+        of_plant[members] = True
+        if not bool((depth > 0).all()):
+            continue
+        half = (boxes[:, 2:] - boxes[:, :2]).amax(1) / 2
+        points.append(torch.from_numpy(point))
+        radii.append((half * depth[:, 0] / seen.K[:, 0, 0]).median())
+    if not points:
+        return frames
+    px, depth = cameras.project(torch.stack(points))
+    reach = (cameras.K[:, :1, 0] * torch.stack(radii) / depth)[..., None]
+    is_ahead = (depth > 0)[..., None]
+    low = torch.where(is_ahead, px - reach, torch.inf).amin(1)
+    high = torch.where(is_ahead, px + reach, -torch.inf).amax(1)
+    for view in range(len(cameras)):
+        own = regions.boxes[of_plant & (regions.view_index == view)].double()
+        low[view] = torch.cat((low[view][None], own[:, :2])).amin(0)
+        high[view] = torch.cat((high[view][None], own[:, 2:])).amax(0)
+    margin = MARGIN * (high - low).amax(1, keepdim=True)
+    low, high = (low - margin).floor().clamp(min=0), torch.minimum((high + margin).ceil(), cameras.sizes.double())
+    is_seen = ((high - low) >= 1).all(1, keepdim=True)  # else the plant is outside the photo
+    return torch.where(is_seen, torch.cat((low, high), 1).nan_to_num(0, 0, 0), frames).long()
+
+
+def projections(cameras: Cameras) -> np.ndarray:
+    """(V, 3, 4) px_from_world."""
+    return (cameras.K @ torch.cat((cameras.R, cameras.t[:, :, None]), 2)).numpy()
+
+
+def gain_of_crops(boxes: Tensor, sizes: Tensor, longest: int) -> Tensor:
+    """(V,) float64, how many times larger a detector sees crops than whole photos, without enlarging their pixels.
+
+    Args:
+        boxes: (V, 4) xyxy of the crops.
+        sizes: (V, 2) width and height of the photos.
+        longest: the longer side, pixels, to which the detector scales larger images down.
+    """
+    crops = (boxes[:, 2:] - boxes[:, :2]).amax(1)
+    of_crop, of_photo = (longest / side.double().clamp(min=longest) for side in (crops, sizes.amax(1)))
+    return of_crop / of_photo
+
+
+def crop_cameras(cameras: Cameras, boxes: Tensor) -> Cameras:
+    """The cameras of photos that were cut to (V, 4) int64 boxes, xyxy."""
+    K = cameras.K.clone()
+    K[:, :2, 2] -= boxes[:, :2]
+    return replace(cameras, K=K, sizes=boxes[:, 2:] - boxes[:, :2])
+
+
+def place_crops(proposals: Proposals, boxes: Tensor) -> Proposals:
+    """What was found in crops of the photos, (V, 4) int64 xyxy, in the frame of the photos."""
+    offset = boxes[proposals.regions.view_index, :2].repeat(1, 2)
+    moved = replace(proposals.regions, boxes=proposals.regions.boxes + offset)
+    return replace(proposals, regions=moved, boxes=proposals.boxes + offset)

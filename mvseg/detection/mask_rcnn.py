@@ -1,0 +1,263 @@
+"""A torchvision Mask R-CNN that sees all views of a scene at once (Sec. 3.2)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+from torchvision.models.detection import MaskRCNN
+from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
+
+from mvseg.detection.loop import match_proposals
+from mvseg.detection.proposals import gather_proposals
+from mvseg.detectors.scales import run_scales
+from mvseg.errors import InputError
+from mvseg.masks import Proposals
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.refine_poses import match_refined
+from mvseg.matching.result import Matching
+from mvseg.scene import Cameras
+from mvseg.verification.other_views import hear_witnesses
+from mvseg.verification.recut import recut_masks
+
+
+class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
+    """Wraps any torchvision Mask R-CNN: same modules, same state dict, and ids across views when given the cameras.
+
+    In train mode, and in eval mode without cameras, it is the detector it wraps. With cameras, in eval mode:
+
+    1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper:
+       0.7): an excessive set of masks. Each mask is cut where its expected IoU is largest, and its score multiplied by
+       that (`mvseg.detectors.mask_cut`); what then scores less than the detector's `roi_heads.score_thresh` is
+       discarded.
+    2. Match first: what plain NMS at `cluster_iou` keeps of it is matched across views. Objects of different
+       classes are never matched.
+    3. Alternate `num_iterations` times: every mask of the excessive set takes the id of the instance whose epipolar map
+       it resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each instance; match the
+       survivors again. Masks that resemble no map form one more group.
+    4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
+       better one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
+    5. With `witnesses`, surfaces fitted to what is matched correct it: for leaves only (`verification.other_views`).
+
+    Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
+    here, where `match` selects "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the
+    number of masks per view, from which the search range of |k| follows; that splits leaves, and the pieces then
+    shelter duplicates from NMS. The other methods of matching need no |k|.
+
+    Args:
+        detector: a torchvision Mask R-CNN (any builder, any backbone, or `MaskRCNN` itself). Its modules are shared,
+            not copied.
+        num_iterations: rounds of assignment and NMS; 0 only matches what plain NMS keeps.
+        proposal_iou: NMS threshold of the excessive set.
+        cluster_iou: NMS threshold inside a cluster, and of the set that is matched first.
+        proposals_per_view: size of the excessive set; the best scores are kept.
+        scales: factors of the size at which the detector sees photos; at several, what most of them show scores best
+            (`mvseg.detectors.scales`).
+        match: how regions are matched; a given number of instances applies to each class.
+        witnesses: let the other views correct what is found. All photos are then in memory, 3 bytes a pixel.
+
+    Raises:
+        InputError: the detector has no mask head.
+    """
+
+    def __init__(
+        self,
+        detector: MaskRCNN,
+        *,
+        num_iterations: int = 1,
+        proposal_iou: float = 0.7,
+        cluster_iou: float = 0.3,
+        proposals_per_view: int = 300,
+        scales: Sequence[float] = (1.0,),
+        match: MatchConfig = MatchConfig(),
+        witnesses: bool = False,
+    ) -> None:
+        if not (isinstance(detector, GeneralizedRCNN) and detector.roi_heads.has_mask()):
+            raise InputError(f"{type(detector).__name__} has no mask head, expected a torchvision Mask R-CNN")
+        super().__init__(detector.backbone, detector.rpn, detector.roi_heads, detector.transform)
+        self.num_iterations = num_iterations
+        self.proposal_iou = proposal_iou
+        self.cluster_iou = cluster_iou
+        self.proposals_per_view = proposals_per_view
+        self.scales = tuple(scales)
+        self.match = match
+        self.witnesses = witnesses
+        self.train(detector.training)
+
+    def forward(
+        self,
+        images: list[Tensor],
+        targets: list[dict[str, Tensor]] | None = None,
+        *,
+        cameras: Cameras | None = None,
+    ) -> dict[str, Tensor] | list[dict[str, Tensor]]:
+        """Detect, and match across views.
+
+        Args:
+            images: V tensors (3, H, W) in [0, 1], all of one scene when cameras are given; sizes may differ.
+            targets: in train mode, as torchvision's detectors take them.
+            cameras: the V undistorted cameras of the images; ignored in train mode.
+
+        Returns:
+            In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`
+            (probabilities, to be cut at 0.5); with cameras also `instance_ids` (int64, the same number for the same
+            instance in every view, -1 = matched to nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
+            With witnesses, masks are 0 or 1, and `from_views` (bool) marks those that only the other views show.
+
+        Raises:
+            InputError: fewer than two images, not one camera per image, or an image of another size than its camera.
+        """
+        if self.training or cameras is None:
+            return super().forward(images, targets)
+        sizes = [[image.shape[-1], image.shape[-2]] for image in images]
+        _check_cameras(cameras, sizes)
+        if self.witnesses:
+            return _result_dicts(*self.find_regions(images, cameras), sizes=sizes, device=images[0].device)
+        with torch.no_grad():
+            detections = [self._propose(image) for image in images]
+        # Pixel counts need single precision.
+        with torch.no_grad(), torch.autocast(images[0].device.type, enabled=False):
+            proposals = gather_proposals(detections, sizes)
+            keep, matching = self._match(proposals, cameras.to(images[0].device))
+            views = proposals.regions.view_index[keep]
+            return self._collect(detections, sizes, keep=keep, views=views, matching=matching)
+
+    def find_regions(
+        self, images: Iterable[Tensor], cameras: Cameras, *, progress: bool = False
+    ) -> tuple[Proposals, Matching]:
+        """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time, masks as crops.
+
+        Args:
+            images: V tensors (3, H, W) in [0, 1] on the detector's device, e.g. from a generator.
+            cameras: their V undistorted cameras.
+            progress: show progress bars while the detections are matched.
+
+        Returns:
+            The D detections that are kept, on the CPU, ordered by view and by falling score (with witnesses: by view
+            and instance), and their matching.
+
+        Raises:
+            InputError: as `forward`.
+        """
+        detections, sizes, photos = [], [], []
+        for image in images:
+            detections.append(self.detect(image))
+            sizes.append([image.shape[-1], image.shape[-2]])
+            if self.witnesses:
+                photos.append((255 * image.detach().cpu()).round().to(torch.uint8).permute(1, 2, 0).numpy())
+        _check_cameras(cameras, sizes)
+        proposals, matching = self.match_detections(detections, cameras, progress=progress)
+        if self.witnesses:
+            posed = (cameras if matching.poses is None else matching.poses.cameras).to("cpu")
+            proposals, matching, surfaces = hear_witnesses(
+                proposals, matching, cameras=posed, photos=photos.__getitem__, progress=progress
+            )
+            assert proposals.from_views is not None
+            regions = recut_masks(
+                proposals.regions, matching.instance_ids, surfaces, cameras=posed, is_found=~proposals.from_views
+            )
+            proposals = replace(proposals, regions=regions, boxes=regions.boxes.float())
+        return proposals, matching
+
+    @torch.no_grad()
+    def detect(self, image: Tensor) -> dict[str, Tensor]:
+        """The excessive set of one image (3, H, W) in [0, 1], on the CPU: what `match_detections` takes."""
+        return {key: value.cpu() for key, value in self._propose(image).items()}
+
+    @torch.no_grad()
+    def match_detections(
+        self, detections: list[dict[str, Tensor]], cameras: Cameras, *, progress: bool = False
+    ) -> tuple[Proposals, Matching]:
+        """The second half of `find_regions`: what is kept of what `detect` gives for V images, and its matching."""
+        with torch.autocast("cpu", enabled=False):
+            proposals = gather_proposals(detections, cameras.sizes.tolist())
+            keep, matching = self._match(proposals, cameras.to("cpu"), progress=progress)
+        order = proposals.regions.view_index[keep].argsort(stable=True)
+        kept = proposals.select(keep[order])
+        return kept, matching.select(order)
+
+    def _match(
+        self, proposals: Proposals, cameras: Cameras, *, progress: bool = False
+    ) -> tuple[Tensor, Matching]:
+        """Indices of the proposals to keep, without those whose mask is empty, and their matching."""
+        solid = (proposals.regions.areas > 0).nonzero()[:, 0]
+        chosen = proposals.select(solid)
+
+        def match(posed: Cameras) -> tuple[Tensor, Matching]:
+            return match_proposals(
+                chosen,
+                posed,
+                num_iterations=self.num_iterations,
+                cluster_iou=self.cluster_iou,
+                detections_per_view=self.roi_heads.detections_per_img,
+                match=replace(self.match, refine_poses=False),
+                progress=progress,
+            )
+
+        keep, matching = match_refined(chosen.regions, cameras, match) if self.match.refine_poses else match(cameras)
+        return solid[keep], matching
+
+    def _propose(self, image: Tensor) -> dict[str, Tensor]:
+        """One view's excessive set, as from `run_scales`, without masks that score too low once they are cut."""
+        detections = run_scales(
+            self, image, self.scales, nms_thresh=self.proposal_iou, detections_per_img=self.proposals_per_view
+        )
+        frame, is_good = detections.pop("frame"), detections["scores"] >= self.roi_heads.score_thresh
+        return {key: value[is_good] for key, value in detections.items()} | {"frame": frame}
+
+    def _collect(
+        self,
+        detections: list[dict[str, Tensor]],
+        sizes: list[list[int]],
+        *,
+        keep: Tensor,
+        views: Tensor,
+        matching: Matching,
+    ) -> list[dict[str, Tensor]]:
+        """torchvision's result dicts of the kept proposals, with their ids; `views` (S,) is the view of each."""
+        results, start = [], 0
+        for view, (proposals, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
+            is_here = views == view
+            kept = {key: proposals[key][keep[is_here] - start] for key in ("boxes", "labels", "scores", "masks")}
+            frame_width, frame_height = proposals["frame"].tolist()
+            (result,) = self.transform.postprocess([kept], [(frame_height, frame_width)], [(height, width)])
+            ids = {"instance_ids": matching.instance_ids[is_here], "match_scores": matching.match_scores[is_here]}
+            results.append(result | ids)
+            start += len(proposals["boxes"])
+        return results
+
+
+def _result_dicts(
+    proposals: Proposals, matching: Matching, *, sizes: list[list[int]], device: torch.device
+) -> list[dict[str, Tensor]]:
+    """torchvision's result dicts of what is left when the other views were heard, best score first."""
+    assert proposals.from_views is not None  # they were heard
+    results = []
+    for view, (width, height) in enumerate(sizes):
+        here = (proposals.regions.view_index == view).nonzero()[:, 0]
+        here = here[proposals.scores[here].argsort(descending=True, stable=True)]
+        masks = [proposals.regions.mask(index, width, height) for index in here.tolist()]
+        empty = torch.zeros((0, height, width))
+        result = {
+            "boxes": proposals.boxes[here],
+            "labels": proposals.classes[here],
+            "scores": proposals.scores[here],
+            "masks": (torch.stack(masks).float() if masks else empty)[:, None],
+            "instance_ids": matching.instance_ids[here],
+            "match_scores": matching.match_scores[here],
+            "from_views": proposals.from_views[here],
+        }
+        results.append({key: value.to(device) for key, value in result.items()})
+    return results
+
+
+def _check_cameras(cameras: Cameras, sizes: list[list[int]]) -> None:
+    if not isinstance(cameras, Cameras):
+        raise InputError(f"cameras is a {type(cameras).__name__}, expected Cameras (of a scene: scene.cameras)")
+    if len(sizes) < 2 or len(sizes) != len(cameras):
+        raise InputError(f"{len(sizes)} images with {len(cameras)} cameras, expected one per image, two or more")
+    for view, (size, expected) in enumerate(zip(sizes, cameras.sizes.tolist(), strict=True)):
+        if size != expected:
+            raise InputError(f"image {view} is {size[0]} x {size[1]}, its camera says {expected[0]} x {expected[1]}")

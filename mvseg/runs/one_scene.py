@@ -1,0 +1,105 @@
+"""One scene from its folder to its result folder."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mvseg.config import RunConfig
+from mvseg.detection.config import DetectConfig
+from mvseg.errors import InputError, InputWarning
+
+if TYPE_CHECKING:
+    from mvseg.results.result import Result
+
+
+def run_one_scene(
+    scene: Path, masks: Path | None, out: Path, *, config: RunConfig, num_workers: int = 1, quiet: bool
+) -> None:
+    """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
+    from mvseg.detection.cached_detections import delete_kept
+    from mvseg.results.earlier import check_out
+    from mvseg.system.atomic import sweep_abandoned
+    from mvseg.system.worker_pool import start_workers
+
+    sweep_abandoned(out)
+    check_out(out)
+    replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
+    masks = None if masks is None else find_masks(scene, masks)
+    keep = out.resolve().with_name(f"{out.resolve().name}.detections")
+    if masks is None and keep.is_dir():
+        print(f"mvseg: going on from the detections that a run left in {keep}", file=sys.stderr)
+    with start_workers(num_workers) as workers:
+        result, messages = solve_scene(scene, masks, config, keep=keep, workers=workers, progress=not quiet)
+    for message in messages:
+        print(f"mvseg: warning: {message}", file=sys.stderr)
+    save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)
+    delete_kept(keep)
+    num_masks, num_views = len(result.regions), len(result.scene.views)
+    masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
+    print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
+
+
+def solve_scene(
+    scene: Path,
+    masks: Path | None,
+    config: RunConfig,
+    *,
+    keep: Path,
+    workers: ProcessPoolExecutor | None = None,
+    progress: bool,
+) -> tuple[Result, list[str]]:
+    """The result of one scene and the InputWarnings on the way, each once; other warnings are passed on."""
+    from mvseg.pipeline import run_scene  # keeps --help and wrong options quick
+
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        if masks is not None and config.detect != DetectConfig():
+            warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
+        result = run_scene(scene, masks, config, keep=keep, workers=workers, progress=progress)
+    for other in (each for each in caught if not issubclass(each.category, InputWarning)):
+        warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
+    # each matching of a detector's loop may repeat a warning
+    messages = dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning))
+    return result, list(messages)
+
+
+def save_scene(
+    result: Result,
+    scene: Path,
+    out: Path,
+    *,
+    masks: Path | None,
+    config: RunConfig,
+    messages: Sequence[str],
+    progress: bool,
+) -> None:
+    """Write the result folder, run.json included; with the report, what the checks of the scene and its masks say."""
+    from mvseg.checks.check_scene import check_scene
+    from mvseg.results.folder import save_result
+    from mvseg.results.provenance import describe_run
+
+    run = describe_run(result, masks, config, messages=messages)
+    run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
+    if config.report:
+        run["checks"] = [asdict(finding) for finding in check_scene(result.scene, result.regions).findings]
+    save_result(result, out, run, progress=progress, draw_rims=config.draw_rims, report=config.report)
+
+
+def find_masks(scene: Path, masks: Path, beside: Path = Path()) -> Path:
+    """A relative path may start at the scene folder or at `beside`, as long as only one of the two exists."""
+    from mvseg.formats.find_views import list_some
+
+    inside, outside = scene / masks, beside / masks
+    if inside.exists() and outside.exists() and not inside.samefile(outside):
+        raise InputError(f"both {inside} and {outside.resolve()} exist, expected --masks with the full path of one")
+    if scene.is_dir() and not inside.exists() and not outside.exists() and not masks.is_absolute():
+        found = list_some(sorted(path.name for path in scene.iterdir()))
+        places = f"in {scene}, which holds {found}, nor in {beside.resolve()}"
+        raise InputError(f"{masks}: no such masks {places}; --masks says where they are")
+    return inside if inside.exists() else outside

@@ -1,0 +1,133 @@
+"""Photos of one plant, from their folder to a scene folder."""
+
+from __future__ import annotations
+
+import sys
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import pycolmap
+import torch
+
+from mvseg.errors import InputWarning
+from mvseg.formats.find_views import list_some
+from mvseg.formats.opencv_yaml import read_calibration
+from mvseg.formats.positions import read_positions
+from mvseg.poses.config import Known, PoseConfig
+from mvseg.poses.known_world import Placement, place
+from mvseg.poses.mapping import Structure, find_structure
+from mvseg.poses.photo_files import PhotoFile, copy_photos
+from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
+from mvseg.runs.pose_folder import check_folders, new_scene_folder, write_pose_file
+from mvseg.scene import Scene
+from mvseg.traits.config import Up
+from mvseg.traits.up import find_up
+
+UPSIDE_DOWN = -0.5  # mean of the cameras' own up along the known one
+
+
+def pose_photos(
+    photos: Path,
+    out: Path,
+    *,
+    config: PoseConfig = PoseConfig(),
+    known: Known = Known(),
+    up: Up | None = None,
+    quiet: bool = False,
+) -> Scene:
+    """Estimate the cameras of photos, and write a scene folder that `load_scene` reads: whole, or not at all.
+
+    An earlier scene of this kind at `out` is replaced; files that the user put there (masks, notes) stay.
+
+    Args:
+        photos: folder of photos, with one folder per camera below it or none.
+        out: the scene folder: images/ (upright copies), cameras.json, sparse/0 and pose.json.
+        config: how cameras are estimated.
+        known: where scale and axes come from.
+        up: the direction of up in the known world, or what shows it.
+        quiet: no progress bars and no line at the end.
+
+    Raises:
+        InputError: a photo is broken, too few photos register, what is known does not fit them, or `out` holds
+            something else than an earlier scene of this kind.
+    """
+    source, names = check_folders(photos, out)
+    file = config.calibration
+    calibration = None if file is None else read_calibration(file.parent, file.name)
+    if known.positions is not None:
+        read_positions(known.positions)  # a mistake in it must not cost the minutes that follow
+    start = time.perf_counter()
+    with warnings.catch_warnings(record=True) as caught, new_scene_folder(out) as folder:
+        warnings.simplefilter("always", InputWarning)
+        files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
+        structure = find_structure(
+            folder / IMAGES, files, config=config, calibration=calibration, work=folder, progress=not quiet
+        )
+        placement = place(write_structure(structure, folder), known, progress=not quiet)
+        scene = move_structure(structure, placement.similarity, folder)
+        scene = find_up(replace(scene, unit=placement.unit, up=placement.up), up)
+        warn_of_upside_down(scene)
+        write_cameras(scene, folder)
+        messages = list(dict.fromkeys(str(each.message) for each in caught))
+        run = describe_poses(structure, placement, files)
+        run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
+        run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}
+        write_pose_file(folder, out, run)
+    for message in messages:
+        print(f"mvseg: warning: {message}", file=sys.stderr)
+    if not quiet:
+        print(describe_result(out, structure, placement=placement, scene=scene))
+    return scene
+
+
+def warn_of_upside_down(scene: Scene) -> None:
+    """Say (InputWarning) that the cameras hang upside down, which left-handed positions in one plane make of them."""
+    if scene.up is None:
+        return
+    own = -(scene.cameras.R[:, 1] @ torch.tensor(scene.up, dtype=torch.float64)).mean().item()
+    if own < UPSIDE_DOWN:
+        message = "the cameras hang upside down in this world: expected right-handed axes, and up as --up says"
+        warnings.warn(message, InputWarning, stacklevel=2)
+
+
+def describe_poses(structure: Structure, placement: Placement, files: Sequence[PhotoFile]) -> dict[str, Any]:
+    """What pose.json says besides options and files."""
+    cameras = structure.model.cameras.values()
+    turned = [photo.name for photo in files if photo.is_turned]
+    return {
+        "pycolmap": pycolmap.__version__,
+        "photos": len(files),
+        "registered": list(structure.registered),
+        "not_registered": list(structure.left_out),
+        "other_models": list(structure.other_models),
+        "turned_upright": turned,
+        "residual_px": round(structure.residual_px, 4),
+        "points": structure.model.num_points3D(),
+        "lenses": [{"model": each.model_name, "params": list(map(float, each.params))} for each in cameras],
+        "scale": {
+            "unit": placement.unit,
+            "source": placement.source,
+            "residual": placement.residual,
+            "left_out": list(placement.left_out),
+        },
+    }
+
+
+def describe_result(out: Path, structure: Structure, *, placement: Placement, scene: Scene) -> str:
+    """The lines that a run ends with."""
+    found, lost = len(structure.registered), len(structure.left_out)
+    points = structure.model.num_points3D()
+    lines = [f"{out}: {found} of {found + lost} photos registered, {structure.residual_px:.2f} px, {points} points"]
+    if lost:
+        lines.append(f"  not registered: {list_some(structure.left_out)}")
+    if structure.other_models:
+        numbers = " and ".join(map(str, structure.other_models))
+        lines.append(f"  others fit among themselves only ({numbers} photos): photos in between would join them")
+    lines.append(f"  {placement.describe()}")
+    up = "unknown (--up X Y Z, rig or board)" if scene.up is None else " ".join(f"{x:.3f}" for x in scene.up)
+    lines.append(f"  up is {up}")
+    return "\n".join(lines)

@@ -1,0 +1,241 @@
+"""Photos from a turntable, from their folder to a scene folder: calibrated once from a board, then used for plants."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from tqdm import tqdm
+
+from mvseg.errors import InputError
+from mvseg.formats.board import BoardConfig
+from mvseg.formats.image_file import read_rgb
+from mvseg.formats.photo_angles import read_photo_angles
+from mvseg.formats.scene_folder import load_scene
+from mvseg.formats.turntable import read_turntable_parts, write_turntable
+from mvseg.poses.board_calibration import calibrate_turntable
+from mvseg.poses.photo_files import PhotoFile, copy_photos
+from mvseg.poses.scene_files import IMAGES
+from mvseg.poses.table_fit import TableCamera
+from mvseg.poses.table_refinement import Refinement, Shots, Table, find_tracks, refine_table
+from mvseg.runs.pose_folder import check_folders, new_scene_folder, write_pose_file
+from mvseg.scene import Scene
+
+TURNTABLE_FILE = "turntable.json"
+ONLY_CAMERA = "camera"  # name of a camera whose photos lie in no folder of their own
+
+Angles = Path | float | None
+
+
+def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str = "", quiet: bool = False) -> Scene:
+    """Calibrate a turntable from photos of a board on it, and write a scene folder with a `turntable.json`.
+
+    Args:
+        photos: folder of photos that one camera took from one place; or of one folder for each camera, with photos at
+            the same angles in the same order.
+        out: the scene folder; an earlier one is replaced, files of the user in it stay.
+        board: what is printed; its lengths are in `unit`.
+        unit: name of the unit.
+        quiet: no progress bars and no line at the end.
+
+    Raises:
+        InputError: see `calibrate_turntable`; a photo is broken, or `out` holds something else.
+    """
+    source, names = check_folders(photos, out)
+    with new_scene_folder(out) as folder:
+        files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
+        by_camera = _group_by_folder(files)
+        grey = iter(_read_grey(folder, [file for each in by_camera.values() for file in each], quiet=quiet))
+        found = calibrate_turntable({name: [next(grey) for _ in each] for name, each in by_camera.items()}, board)
+        views, shown = [], []
+        for camera, each in by_camera.items():
+            for file, angle in zip(each, found.angles.tolist(), strict=True):
+                if np.isfinite(angle):
+                    views.append((f"{IMAGES}/{file.name}", camera, round(angle, 6)))
+                    shown.append(file.name)
+                else:
+                    (folder / IMAGES / file.name).unlink()
+        cameras = {name: _describe_camera(camera) for name, camera in found.cameras.items()}
+        write_turntable(folder / TURNTABLE_FILE, {name: cameras[name] for name in by_camera}, views, unit=unit)
+        scene = load_scene(folder)
+        run: dict[str, Any] = {"residual_px": round(found.residual_px, 4), "corners": found.num_corners}
+        run["photos"] = len(files)
+        run |= {"registered": shown, "board": asdict(board), "unit": unit}
+        write_pose_file(folder, out, run)
+    if not quiet:
+        share = f"{len(shown)} of {len(files)} photos are at angles at which the board is seen"
+        print(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
+        print(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
+    return scene
+
+
+def pose_turntable_photos(
+    photos: Path, out: Path, *, turntable: Path, angles: Angles = None, refine: bool = False, quiet: bool = False
+) -> Scene:
+    """The scene folder of photos from a turntable that was calibrated before.
+
+    Args:
+        photos: folder of photos, or of one folder for each camera, named as in the calibration.
+        out: the scene folder, as above.
+        turntable: a turntable file.
+        angles: CSV file of `read_photo_angles`; or the degrees from one photo of a camera to its next one; None: those
+            of the file, which then has as many views of each camera as there are photos.
+        refine: let the plant's own features refine cameras and angles, see `refine_table`.
+        quiet: no progress bars and no line at the end.
+
+    Raises:
+        InputError: photos of a camera that the file does not know, of another number or size than it says, or without
+            an angle; a photo is broken, or `out` holds something else.
+    """
+    source, names = check_folders(photos, out)
+    cameras, known, unit = read_turntable_parts(turntable)
+    camera_of = _camera_of(names, list(cameras), turntable)
+    angle_of = _angles_of(names, camera_of, known, angles=angles, turntable=turntable)
+    with new_scene_folder(out) as folder:
+        files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
+        for file, camera in zip(files, camera_of, strict=True):
+            size, expected = (file.width, file.height), (cameras[camera]["width"], cameras[camera]["height"])
+            if size != expected:
+                given = f"{size[0]} x {size[1]} pixels, the turntable's camera {expected[0]} x {expected[1]}"
+                raise InputError(f"{file.name} has {given}, expected photos of that camera")
+        run: dict[str, Any] = {"photos": len(files), "turntable": str(turntable), "unit": unit}
+        if refine:
+            used = {name: cameras[name] for name in cameras if name in camera_of}
+            found, distinct = _refine(folder, files, used, camera_of=camera_of, angle_of=angle_of, quiet=quiet)
+            run["refinement"] = _describe_refinement(found)
+            if found.is_taken:
+                refined = zip(used, found.table.cameras, strict=True)
+                cameras = {name: used[name] | _pose_of(camera) for name, camera in refined}
+                of_angle = dict(zip(distinct, found.table.angles.tolist(), strict=True))
+                angle_of = [round(of_angle[angle], 6) for angle in angle_of]
+        views = [
+            (f"{IMAGES}/{file.name}", camera, angle)
+            for file, camera, angle in zip(files, camera_of, angle_of, strict=True)
+        ]
+        write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
+        scene = load_scene(folder)
+        write_pose_file(folder, out, run)
+    if not quiet:
+        has_step = isinstance(angles, float)
+        described = f"steps of {angles:g} degrees" if has_step else f"the angles of {angles or turntable}"
+        print(f"{out}: {len(files)} photos at {described}")
+    if refine and (not quiet or not found.is_taken):
+        verb = "refined" if found.is_taken else "not refined"
+        print(f"  {verb}: {found.reason}{_say_residuals(found)}")
+    return replace(scene, source=out / TURNTABLE_FILE)
+
+
+def _group_by_folder(files: Sequence[PhotoFile]) -> dict[str, list[PhotoFile]]:
+    """The photos of each camera."""
+    grouped: dict[str, list[PhotoFile]] = {}
+    for file in files:
+        grouped.setdefault(file.folder or ONLY_CAMERA, []).append(file)
+    return grouped
+
+
+def _camera_of(names: Sequence[str], cameras: Sequence[str], turntable: Path) -> list[str]:
+    """The camera of each photo: that of its folder's name, or the only one that there is."""
+    if len(cameras) == 1:
+        return [cameras[0]] * len(names)
+    folders = [name.rpartition("/")[0] for name in names]
+    unknown = next((name for name, folder in zip(names, folders, strict=True) if folder not in cameras), None)
+    if unknown is not None:
+        message = f"{unknown} is in no folder of a camera"
+        raise InputError(f"{turntable}: {message}, expected folders of these names: {', '.join(cameras)}")
+    return folders
+
+
+def _angles_of(
+    names: Sequence[str],
+    camera_of: Sequence[str],
+    known: Sequence[tuple[str, float]],
+    *,
+    angles: Angles,
+    turntable: Path,
+) -> list[float]:
+    """The angle of each photo, degrees."""
+    if isinstance(angles, Path):
+        listed = read_photo_angles(angles)
+        found = [listed.get(name, listed.get(name.rpartition("/")[2])) for name in names]
+        missing = next((name for name, angle in zip(names, found, strict=True) if angle is None), None)
+        if missing is not None:
+            raise InputError(f"{angles}: there is no angle of photo {missing}")
+        return [angle for angle in found if angle is not None]
+    place: dict[str, int] = {}
+    places = []
+    for camera in camera_of:
+        places.append(place.get(camera, 0))
+        place[camera] = places[-1] + 1
+    if angles is not None:
+        return [angles * index for index in places]
+    of_camera = {camera: [angle for name, angle in known if name == camera] for camera in place}
+    for camera, count in place.items():
+        if count != len(of_camera[camera]):
+            of = f" of camera {camera}" if len(place) > 1 else ""
+            message = f"{len(of_camera[camera])} views{of} for {count} photos"
+            message = f"{message}, expected one per photo, in the order of their names, or --angles"
+            raise InputError(f"{turntable}: {message}")
+    return [of_camera[camera][index] for camera, index in zip(camera_of, places, strict=True)]
+
+
+def _refine(
+    folder: Path,
+    files: Sequence[PhotoFile],
+    cameras: dict[str, dict[str, Any]],
+    *,
+    camera_of: Sequence[str],
+    angle_of: Sequence[float],
+    quiet: bool,
+) -> tuple[Refinement, list[float]]:
+    """What becomes of the cameras, in their order, and of the distinct angles, which are the second."""
+    names, distinct = list(cameras), list(dict.fromkeys(angle_of))
+    table = Table([_read_camera(camera) for camera in cameras.values()], np.array(distinct))
+    shots = Shots(
+        camera=np.array([names.index(camera) for camera in camera_of]),
+        angle=np.array([distinct.index(angle) for angle in angle_of]),
+    )
+    of_photo = [table.cameras[index] for index in shots.camera]
+    tracks = find_tracks(folder / IMAGES, files, of_photo, work=folder, progress=not quiet)
+    return refine_table(table, shots, tracks), distinct
+
+
+def _describe_refinement(found: Refinement) -> dict[str, Any]:
+    before, after = (None, None) if found.held_out_px is None else (round(each, 4) for each in found.held_out_px)
+    return {
+        "taken": found.is_taken,
+        "reason": found.reason,
+        "points": found.num_points,
+        "held_out_px_before": before,
+        "held_out_px_after": after,
+    }
+
+
+def _say_residuals(found: Refinement) -> str:
+    return "" if found.held_out_px is None else " ({:.2f} px before, {:.2f} px after)".format(*found.held_out_px)
+
+
+def _read_grey(folder: Path, files: Sequence[PhotoFile], *, quiet: bool) -> list[np.ndarray]:
+    bar = tqdm(files, desc="board", unit="photo", disable=quiet)
+    return [cv2.cvtColor(read_rgb(folder / IMAGES / file.name), cv2.COLOR_RGB2GRAY) for file in bar]
+
+
+def _describe_camera(camera: TableCamera) -> dict[str, Any]:
+    arrays = {"K": camera.K, "R": camera.R, "t": camera.t, "distortion": camera.distortion}
+    described: dict[str, Any] = {"width": camera.size[0], "height": camera.size[1]}
+    return described | {name: each.tolist() for name, each in arrays.items()}
+
+
+def _pose_of(camera: TableCamera) -> dict[str, Any]:
+    return {"R": camera.R.tolist(), "t": camera.t.tolist()}
+
+
+def _read_camera(camera: dict[str, Any]) -> TableCamera:
+    distortion = np.zeros(5)
+    given = camera.get("distortion", [])
+    distortion[: len(given)] = given
+    K, R, t = (np.array(camera[name], float) for name in ("K", "R", "t"))
+    return TableCamera(K=K, distortion=distortion, R=R, t=t, size=(camera["width"], camera["height"]))

@@ -1,0 +1,283 @@
+"""Surfaces check the ids: masks that show another instance's surface get its id. Not in the paper.
+
+Rays and epipolar lines know nothing of shape. A surface that is fitted to an instance's masks in all views says what
+each view must show of it. So it recognises its masks where they were matched to another instance, and the pieces of
+its leaf where leaves that cross it made several masks of one. And where two instances are halves of one leaf, one
+surface explains the masks of both. Where two surfaces explain one mask in disjoint parts, it shows two leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from mvseg.matching.result import Matching, MergedMask, count_sure_views
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+from mvseg.verification.visible_leaves import visible_leaves
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Surfaces = Mapping[int, LeafSurface]
+
+FITS = 0.5  # IoU of a mask with what its view shows of a surface, from which it shows that surface
+FEW_VIEWS = 0.75  # instances that at most this share of the views shows may be made of pieces
+INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
+MOST_PIECES = 0.5  # an instance is made of pieces when more than this share of its masks are pieces
+TOUCHES = 0.02  # of a surface's length, to the nearest point of one that may be the rest of its leaf
+EACH, BOTH = 0.2, 0.7  # of a merged mask, that shows either of its two surfaces, and both together
+MOST = 0.5  # of what its view shows of the second one, that lies in the mask
+
+
+@dataclass(frozen=True, eq=False)
+class CheckedIds:
+    """Ids after the surfaces were heard.
+
+    Attributes:
+        matching: of the same D regions. Masks with a new id have the mean match score of those that had it before.
+        is_moved: (D,) bool, masks with a new id.
+        old_ids: (K',) int64, the former id of each instance; those that lost all their masks are gone.
+        is_changed: (K',) bool, instances that lost or won masks.
+    """
+
+    matching: Matching
+    is_moved: Tensor
+    old_ids: Tensor
+    is_changed: Tensor
+
+    def unchanged(self, surfaces: Surfaces) -> dict[int, LeafSurface]:
+        """The surfaces (former ids) of the instances whose masks are the same as before, with their new ids."""
+        pairs = enumerate(zip(self.old_ids.tolist(), self.is_changed.tolist(), strict=True), start=1)
+        return {new: surfaces[old] for new, (old, is_changed) in pairs if not is_changed and old in surfaces}
+
+
+def check_ids(regions: Regions, matching: Matching, surfaces: Surfaces, *, cameras: Cameras) -> CheckedIds:
+    """Move masks to the instances whose surfaces they show.
+
+    First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
+    halves of leaves (`join_halves`). No mask loses its id without getting another; masks that fit nothing stay where
+    they are. An instance may have several masks in a view afterwards: they show it together. Last, the masks that show
+    two surfaces are listed as merged (`find_shared`).
+
+    Args:
+        regions: D regions.
+        matching: of these; "merged" masks that move are forgotten, unless they show two surfaces.
+        surfaces: {instance id: surface} fitted to them, of every instance that has one.
+        cameras: V cameras.
+    """
+    on_cpu, cameras = regions.to("cpu"), cameras.to("cpu")
+    old = matching.instance_ids.cpu().numpy()
+    ids = move_pieces(on_cpu, old, surfaces, cameras=cameras)
+    left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
+    ids = move_misfits(on_cpu, ids, left, cameras=cameras)
+    ids = join_halves(on_cpu, ids, left, cameras=cameras)
+    is_moved = ids != old
+    scores = matching.match_scores.clone()
+    for instance in np.unique(ids[is_moved]).tolist():
+        others = torch.from_numpy((old == instance) & ~is_moved)
+        others = others if others.any() else torch.from_numpy(old == instance)
+        moved = torch.from_numpy(is_moved & (ids == instance))
+        scores[moved.to(scores.device)] = matching.match_scores[others.to(scores.device)].mean()
+    every = np.arange(1, matching.num_instances + 1)
+    is_gone = np.isin(every, old) & ~np.isin(every, ids)
+    numbers = np.where(is_gone, -1, np.cumsum(~is_gone))
+    moved_ids = torch.from_numpy(ids).to(matching.instance_ids)
+    merged = {mask.region: mask for mask in matching.merged if not is_moved[mask.region]}
+    shared = find_shared(on_cpu, ids, left, cameras=cameras, named=list(merged.values()))
+    merged |= {mask.region: mask for mask in shared}
+    by_region = tuple(mask for _, mask in sorted(merged.items()))
+    checked = replace(matching, instance_ids=moved_ids, match_scores=scores, merged=by_region)
+    checked = checked.relabel(torch.from_numpy(numbers))
+    if matching.support is not None and is_moved.any():
+        checked = replace(checked, support=count_sure_views(checked, regions.view_index))
+    kept = every[~is_gone]
+    touched = np.concatenate([old[is_moved], ids[is_moved]])
+    return CheckedIds(
+        matching=checked,
+        is_moved=torch.from_numpy(is_moved),
+        old_ids=torch.from_numpy(kept),
+        is_changed=torch.from_numpy(np.isin(kept, touched)),
+    )
+
+
+def move_pieces(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
+    """Masks of instances that are made of pieces of leaves get the ids of these leaves.
+
+    Where leaves cross, each piece may have a mask of its own, and pieces found in several views form instances of their
+    own, with surfaces that lie in those of the leaves. So the surfaces of instances that few views show are left out,
+    and those of all others drawn. An instance of few views most of whose masks lie in one of these, which need not
+    be the same for all, is made of pieces: those masks join the leaves that they lie in.
+
+    Args:
+        regions: D regions on the CPU.
+        ids: (D,) from 1 on; -1 = no instance.
+        surfaces: {instance id: surface}.
+        cameras: V cameras.
+
+    Returns:
+        (D,) ids.
+    """
+    few = _seen_rarely(regions, ids)
+    leaves = {instance: surface for instance, surface in surfaces.items() if instance not in few}
+    if not few or not leaves:
+        return ids
+    inside = match_surfaces(regions, leaves, cameras=cameras)[1]
+    is_inside = inside.max(1) >= INSIDE
+    revised = ids.copy()
+    for instance in few:
+        own = ids == instance
+        if (own & is_inside).sum() > MOST_PIECES * own.sum():
+            revised[own & is_inside] = inside[own & is_inside].argmax(1)
+    return revised
+
+
+def move_misfits(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
+    """Masks that do not fit their own surface, but another one, get its id; for the arguments see `move_pieces`.
+
+    The IoU with the visible part of their own must be below `FITS`, that with the other at least `FITS`, and no other
+    mask of the view may fit that one as well. Two masks with each other's ids are swapped so. A mask that is already
+    there and fits worse stays.
+    """
+    ious = match_surfaces(regions, surfaces, cameras=cameras)[0]
+    every = np.arange(len(ids))
+    own_column = np.where(np.isin(ids, list(surfaces)), ids, 0)
+    best = ious.argmax(1)
+    best_iou, own_iou = ious[every, best], ious[every, own_column]
+    wants = np.flatnonzero((own_iou < FITS) & (best_iou >= FITS))
+    revised = ids.copy()
+    for region in wants.tolist():
+        rivals = (regions.view_index == regions.view_index[region]).numpy() & (every != region)
+        if not (ious[rivals, best[region]] >= best_iou[region]).any():
+            revised[region] = best[region]
+    return revised
+
+
+def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
+    """Instances that are parts of one leaf become one; for the arguments see `move_pieces`.
+
+    Where something crosses a leaf, masks on either side may form an instance each, and neither lies in the other's
+    surface. So a credible surface of an instance that few views show is doubted where it touches another one. If one
+    surface that is fitted to the masks of both fits no worse than each alone, in the views of each, they are the same
+    leaf. All join the one of them that has most masks.
+    """
+    shown = {instance: each for instance, each in surfaces.items() if each.exists and (ids == instance).any()}
+    pairs = set()
+    for part in _seen_rarely(regions, ids):
+        if part in shown and shown[part].is_credible:
+            whole = touched_surface(part, shown)
+            if whole and _is_one_leaf(regions, ids, (part, whole), surfaces=shown, cameras=cameras):
+                pairs.add((part, whole))
+    if not pairs:
+        return ids
+    part, whole = np.array(sorted(pairs)).T
+    size = int(ids.max()) + 1
+    _, leaf = connected_components(coo_array((np.ones(len(part)), (part, whole)), shape=(size, size)), directed=False)
+    num_masks = np.bincount(ids[ids > 0], minlength=size)
+    largest = np.array([np.where(leaf == number, num_masks, -1).argmax() for number in range(leaf.max() + 1)])
+    return np.where(ids > 0, largest[leaf[ids]], ids)
+
+
+def _seen_rarely(regions: Regions, ids: Ints) -> list[int]:
+    """The instances that at most `FEW_VIEWS` of the views show, in ascending order."""
+    views, most = regions.view_index.numpy(), FEW_VIEWS * regions.num_views
+    return [number for number in np.unique(ids[ids > 0]).tolist() if len(np.unique(views[ids == number])) <= most]
+
+
+def touched_surface(part: int, surfaces: Surfaces) -> int | None:
+    """The nearest of the other surfaces, if it touches this one."""
+    points = {instance: surface.points().reshape(-1, 3).numpy() for instance, surface in surfaces.items()}
+    tree = cKDTree(points.pop(part))
+    gaps = {instance: float(tree.query(there)[0].min()) for instance, there in points.items()}
+    nearest = min(gaps, key=lambda instance: gaps[instance], default=None)
+    return nearest if nearest is not None and gaps[nearest] <= TOUCHES * surfaces[part].length else None
+
+
+def _is_one_leaf(
+    regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras
+) -> bool:
+    """Does one surface fit the masks of two instances no worse than their own surfaces do, in the views of each?"""
+    joint = fit_surfaces(regions, torch.from_numpy(np.where(np.isin(ids, pair), 1, -1)), cameras)[1]
+    for instance in pair:
+        is_seen = torch.isin(joint.views, regions.view_index[torch.from_numpy(ids == instance)])
+        fits_alone = surfaces[instance].iou.median()
+        if not is_seen.any() or not joint.iou[is_seen].median() >= fits_alone:
+            return False
+    return True
+
+
+def find_shared(
+    regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras, named: Iterable[MergedMask] = ()
+) -> list[MergedMask]:
+    """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
+
+    Half of what the view shows of the second one must lie in the mask, or the matcher must have `named` the two: a
+    mask that is drawn too large, or a surface that is drawn over another by mistake, shows a strip of it only. The
+    second part is what is nearer to what is seen of the second surface than to what is seen of the first. For the other
+    arguments see `move_pieces`.
+    """
+    inside, every = match_surfaces(regions, surfaces, cameras=cameras)[1], np.arange(len(ids))
+    own = np.where(np.isin(ids, list(surfaces)), ids, 0)
+    by_own = inside[every, own]
+    inside[every, own] = 0
+    second, by_second = inside.argmax(1), inside.max(1)
+    is_explained = (by_own >= EACH) & (by_second >= EACH) & (by_own + by_second >= BOTH)
+    pairs = {(mask.region, mask.own, mask.other) for mask in named}
+    shared = []
+    views = regions.view_index.numpy()
+    for view in np.unique(views[is_explained]).tolist():
+        shown = _draw(surfaces, cameras, view)
+        for region in np.flatnonzero(is_explained & (views == view)).tolist():
+            pair = int(own[region]), int(second[region])
+            x1, y1, x2, y2 = regions.boxes[region].tolist()
+            mask = regions.crop(region).numpy()
+            seen = np.where(mask, shown[y1:y2, x1:x2], 0)
+            if (region, *pair) in pairs or (seen == pair[1]).sum() >= MOST * (shown == pair[1]).sum():
+                to_first, to_second = (distance_transform_edt(seen != instance) for instance in pair)
+                part = torch.from_numpy(mask & (to_second < to_first))
+                shared.append(MergedMask(region=region, own=pair[0], other=pair[1], part=part))
+    return shared
+
+
+def match_surfaces(regions: Regions, surfaces: Surfaces, *, cameras: Cameras) -> tuple[Floats, Floats]:
+    """How well masks fit surfaces.
+
+    Nearer surfaces hide others; those that are not credible show and hide nothing.
+
+    Returns:
+        (D, 1 + highest instance id) IoU of each region with what its view shows of each surface, in the column of its
+        instance; 0 where that is nothing, and in column 0. And the share of the region that lies in it, likewise.
+    """
+    columns = max(surfaces, default=0) + 1
+    ious, inside = np.zeros((len(regions), columns)), np.zeros((len(regions), columns))
+    for view in range(len(cameras)):
+        shown = _draw(surfaces, cameras, view)
+        sizes = np.bincount(shown.ravel(), minlength=columns)
+        for region in (regions.view_index == view).nonzero()[:, 0].tolist():
+            x1, y1, x2, y2 = regions.boxes[region].tolist()
+            covered = shown[y1:y2, x1:x2][regions.crop(region).numpy()]
+            common = np.bincount(covered, minlength=columns)
+            ious[region] = common / np.maximum(sizes + len(covered) - common, 1)
+            inside[region] = common / max(len(covered), 1)
+    ious[:, 0] = inside[:, 0] = 0
+    return ious, inside
+
+
+def _draw(surfaces: Surfaces, cameras: Cameras, view: int) -> Ints:
+    """(H, W) the instance whose surface each pixel of a view shows, 0 = none."""
+    width, height = cameras.sizes[view].tolist()
+    shown = np.zeros((height, width), np.int64)
+    for leaf in visible_leaves(surfaces, cameras, view):
+        x1, y1, x2, y2 = leaf.box
+        shown[y1:y2, x1:x2][leaf.mask] = leaf.instance
+    return shown

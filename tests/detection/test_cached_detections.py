@@ -1,0 +1,107 @@
+"""Detections that are kept until a result is there: the same bits back, and never for another photo or option."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from mvseg.config import RunConfig
+from mvseg.detection import mask_rcnn
+from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
+from mvseg.detection.config import DetectConfig
+from mvseg.formats.photos import read_photo
+from mvseg.formats.scene_folder import load_scene
+from mvseg.pipeline import detect_regions
+from scene_folders import edit_rig, write_image, write_scene
+
+FOUND = {
+    "boxes": torch.rand(3, 4),
+    "labels": torch.ones(3, dtype=torch.int64),
+    "scores": torch.rand(3),
+    "masks": torch.rand(3, 1, 28, 28),
+    "frame": torch.tensor([128, 96]),
+}
+
+
+def test_the_same_bits_come_back(tmp_path: Path) -> None:
+    path = tmp_path / "kept" / f"{'0' * 64}.safetensors"
+    write_detections(path, FOUND)
+    back = read_detections(path)
+    assert back is not None
+    assert {key: (value.dtype, value.tolist()) for key, value in back.items()} == {
+        key: (value.dtype, value.tolist()) for key, value in FOUND.items()
+    }
+
+
+@pytest.mark.parametrize("content", [None, b"", b"torn off", b"\x02\0\0\0\0\0\0\0{}"])
+def test_what_is_broken_counts_as_absent(content: bytes | None, tmp_path: Path) -> None:
+    path = tmp_path / "file.safetensors"
+    if content is not None:
+        path.write_bytes(content)
+    assert read_detections(path) is None
+
+
+def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    names = []
+
+    def note(made_by: str = "leaf-slim") -> None:
+        names.append(KeptDetections(tmp_path / "kept", made_by).path(load_scene(folder), 1))
+
+    note()
+    note("another")
+    edit_rig(folder, 1, distortion=[0.1, 0, 0, 0, 0])
+    note()
+    write_image(folder / "images" / "001.png", 255 - read_photo(load_scene(folder), 2))
+    note()
+    assert len(set(names)) == 4
+    note()
+    assert names[-1] == names[-2]
+
+
+def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:
+    kept = tmp_path / "kept"
+    delete_kept(kept)
+    write_detections(kept / f"{'0' * 64}.safetensors", FOUND)
+    (kept / f".{'0' * 64}.safetensors.00000000-1-0.partial").touch()
+    (kept / "notes.txt").touch()
+    delete_kept(kept)
+    assert [path.name for path in kept.iterdir()] == ["notes.txt"]
+    (kept / "notes.txt").unlink()
+    delete_kept(kept)
+    assert not kept.exists()
+
+
+def test_a_run_that_was_cut_off_goes_on_from_its_detections(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, keep = load_scene(write_scene(tmp_path / "plant")), tmp_path / "kept"
+    config = RunConfig(detect=DetectConfig(min_score=0.05))
+    whole, ids = detect_regions(scene, config)
+    assert len(whole.regions)
+    ran: list[tuple[int, ...]] = []
+    run_scales = mask_rcnn.run_scales
+
+    def count(model: object, photo: torch.Tensor, scales: object, **options: object) -> dict[str, torch.Tensor]:
+        ran.append(tuple(photo.shape))
+        if len(ran) == 3:
+            raise KeyboardInterrupt
+        return run_scales(model, photo, scales, **options)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(mask_rcnn, "run_scales", count)
+    with pytest.raises(KeyboardInterrupt):
+        detect_regions(scene, config, keep=keep)
+    assert len(list(keep.iterdir())) == 2
+    resumed, resumed_ids = detect_regions(scene, config, keep=keep)
+    assert len(ran) == 3 + 2  # the first two photos were not looked at again
+    assert torch.equal(resumed.regions.crops, whole.regions.crops)
+    assert torch.equal(resumed.scores, whole.scores)
+    assert torch.equal(resumed_ids.instance_ids, ids.instance_ids)
+    detect_regions(scene, RunConfig(detect=DetectConfig(min_score=0.06)), keep=keep)
+    assert len(ran) == 3 + 2 + 4
+    assert len(list(keep.iterdir())) == 4 + 4  # scenes may share a folder
+    detect_regions(scene, config, keep=keep, prune=True)
+    assert len(ran) == 3 + 2 + 4
+    assert len(list(keep.iterdir())) == 4

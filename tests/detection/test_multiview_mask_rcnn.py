@@ -1,0 +1,417 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from torchvision.models.detection import MaskRCNN, fasterrcnn_mobilenet_v3_large_320_fpn, maskrcnn_resnet50_fpn
+from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.roi_heads import paste_masks_in_image
+from torchvision.ops import box_iou
+
+import mvseg.detection.mask_rcnn
+from leafy_scene import write_leafy_scene
+from mvseg.detection.config import DetectConfig
+from mvseg.detection.loop import match_proposals
+from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+from mvseg.detection.nms import cluster_aware_nms
+from mvseg.detection.proposals import gather_proposals
+from mvseg.detectors.mask_cut import decide_masks
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.photos import load_photos, read_photo
+from mvseg.masks import Proposals
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.result import Matching, RefinedPoses
+from mvseg.regions import regions_from_label_maps
+from mvseg.scene import Cameras
+from mvseg.verification.other_views import hear_witnesses
+from simulated_proposals import simulate_proposals
+from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
+
+# what an untrained detector finds in noise does not agree across views
+pytestmark = pytest.mark.filterwarnings("ignore:the views hardly agree")
+
+
+class TinyBackbone(torch.nn.Sequential):
+    out_channels = 8
+
+    def __init__(self) -> None:
+        super().__init__(torch.nn.Conv2d(3, 8, 7, stride=16, padding=3), torch.nn.ReLU())
+
+
+def tiny_detector() -> MaskRCNN:
+    """An untrained Mask R-CNN that answers in milliseconds, and calls almost everything an object."""
+    torch.manual_seed(0)
+    detector = MaskRCNN(
+        TinyBackbone(),
+        num_classes=3,
+        min_size=96,
+        max_size=128,
+        rpn_anchor_generator=AnchorGenerator(((24, 48),), ((0.5, 1.0, 2.0),)),
+        box_score_thresh=0.05,
+        box_detections_per_img=12,
+        rpn_post_nms_top_n_test=25,
+        box_roi_pool=_align(7),
+        mask_roi_pool=_align(14),
+    )
+    return detector.eval()
+
+
+def _align(size: int) -> torch.nn.Module:
+    from torchvision.ops import MultiScaleRoIAlign
+
+    return MultiScaleRoIAlign(["0"], size, 2)
+
+
+def some_images(count: int = 3, width: int = 160, height: int = 120) -> list[torch.Tensor]:
+    return list(torch.rand(count, 3, height, width, generator=torch.Generator().manual_seed(1)))
+
+
+def small_cameras(count: int = 3):
+    return cameras_at(arc_positions(count), focal=200.0, width=160, height=120)
+
+
+def test_without_cameras_it_is_the_detector_it_wraps() -> None:
+    detector = tiny_detector()
+    wrapped = MultiViewMaskRCNN(detector)
+    assert list(wrapped.state_dict()) == list(detector.state_dict())
+    images = some_images()
+    with torch.no_grad():
+        expected, results = detector(images), wrapped(images)
+    assert len(expected[0]["boxes"]) > 0
+    for plain, ours in zip(expected, results, strict=True):
+        assert plain.keys() == ours.keys()
+        assert all(torch.equal(plain[key], ours[key]) for key in plain)
+    fresh = MultiViewMaskRCNN(maskrcnn_resnet50_fpn(weights=None, weights_backbone=None))
+    fresh.load_state_dict(maskrcnn_resnet50_fpn(weights=None, weights_backbone=None).state_dict())
+
+
+def test_losses_in_train_mode_are_untouched_even_with_cameras() -> None:
+    detector = tiny_detector().train()
+    wrapped = MultiViewMaskRCNN(detector)
+    assert wrapped.training
+    images = some_images(2)
+    target = {
+        "boxes": torch.tensor([[20.0, 20, 90, 80]]),
+        "labels": torch.tensor([1]),
+        "masks": torch.ones(1, 120, 160, dtype=torch.uint8),
+    }
+    losses = []
+    for model, arguments in ((detector, {}), (wrapped, {}), (wrapped, {"cameras": small_cameras(2)})):
+        torch.manual_seed(5)
+        losses.append(model(images, [target, target], **arguments))
+    assert losses[0].keys() == losses[1].keys() == losses[2].keys()
+    assert all(losses[0][key] == losses[1][key] == losses[2][key] for key in losses[0])
+    sum(losses[2].values()).backward()
+    assert detector.backbone[0].weight.grad.abs().sum() > 0
+
+
+def test_with_cameras_the_usual_dicts_and_ids() -> None:
+    wrapped = MultiViewMaskRCNN(tiny_detector())
+    results = wrapped(some_images(), cameras=small_cameras())
+    assert len(results) == 3
+    for result in results:
+        count = len(result["boxes"])
+        assert result["masks"].shape == (count, 1, 120, 160)
+        assert result["instance_ids"].dtype == torch.int64
+        assert result["match_scores"].dtype == torch.float32
+        assert {len(value) for value in result.values()} == {count}
+        assert count <= 20
+        assert (result["scores"].diff() <= 0).all()
+        assert not result["boxes"].requires_grad
+    assert max(int(result["instance_ids"].max()) for result in results) >= 1
+    classes: dict[int, set[int]] = {}
+    for result in results:
+        for instance, label in zip(result["instance_ids"].tolist(), result["labels"].tolist(), strict=True):
+            classes.setdefault(instance, set()).add(label)
+    assert all(len(labels) == 1 for instance, labels in classes.items() if instance > 0)
+
+
+@pytest.mark.slow
+def test_poses_are_refined_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    better = small_cameras().scale(2)
+
+    def refine(regions, cameras, match):
+        assert len(regions) > 0
+        kept, matching = match(cameras)
+        return kept, replace(matching, poses=RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2)))
+
+    monkeypatch.setattr(mvseg.detection.mask_rcnn, "match_refined", refine)
+    plain = MultiViewMaskRCNN(tiny_detector()).find_regions(some_images(), small_cameras())[1]
+    wrapped = MultiViewMaskRCNN(tiny_detector(), match=MatchConfig(refine_poses=True))
+    matching = wrapped.find_regions(some_images(), small_cameras())[1]
+    assert plain.poses is None
+    assert matching.poses is not None
+    assert matching.poses.cameras is better
+    assert torch.equal(matching.instance_ids, plain.instance_ids)
+
+
+def test_the_detectors_own_thresholds_stay_as_they_were() -> None:
+    detector = tiny_detector()
+    before = (detector.roi_heads.nms_thresh, detector.roi_heads.detections_per_img)
+    MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
+    assert (detector.roi_heads.nms_thresh, detector.roi_heads.detections_per_img) == before
+
+
+def test_masks_are_cut_and_low_scores_discarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    seen = []
+
+    def watch(raw: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+        seen.append(raw)
+        return decide_masks(raw)
+
+    monkeypatch.setattr("mvseg.detectors.run.decide_masks", watch)
+    detector = tiny_detector()
+    detector.roi_heads.score_thresh = 0.16
+    proposals, _ = MultiViewMaskRCNN(detector, num_iterations=0).find_regions(some_images(), small_cameras())
+    decided = [decide_masks(raw)["scores"] for raw in seen]
+    assert sum(int((scores < 0.16).sum()) for scores in decided) > 0
+    allowed = torch.cat([scores[scores >= 0.16] for scores in decided])
+    assert len(proposals.scores) > 0
+    assert torch.isin(proposals.scores, allowed).all()
+
+
+def test_boxes_that_the_other_views_do_not_confirm_are_discarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector()), some_images(), small_cameras()
+
+    def refuse_first(boxes: torch.Tensor, *others: torch.Tensor, **options: object) -> torch.Tensor:
+        return torch.arange(len(boxes)) > 0
+
+    monkeypatch.setattr("mvseg.detection.loop.confirmed", refuse_first)
+    after, matching = wrapped.find_regions(images, cameras)
+    monkeypatch.setattr("mvseg.detection.loop.confirmed", lambda boxes, *_, **__: torch.ones(len(boxes)) > 0)
+    unasked, _ = wrapped.find_regions(images, cameras)
+    assert len(after.scores) == len(unasked.scores) - 1 == len(matching.instance_ids)
+
+
+def test_boxes_of_the_excessive_set_overlap_no_more_than_its_threshold() -> None:
+    overlaps = []
+    for iou in (0.1, 0.7):
+        wrapped = MultiViewMaskRCNN(tiny_detector(), proposal_iou=iou, cluster_iou=1.0, num_iterations=0)
+        proposals, _ = wrapped.find_regions(some_images(), small_cameras())
+        groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
+        is_rival = (groups[:, None] == groups).all(2).fill_diagonal_(False)
+        overlaps.append(float((box_iou(proposals.boxes, proposals.boxes) * is_rival).max()))
+    assert overlaps[0] <= 0.1 + 1e-6 < 0.5 < overlaps[1] <= 0.7 + 1e-6
+
+
+def test_wrong_arguments_are_named() -> None:
+    wrapped = MultiViewMaskRCNN(tiny_detector())
+    with pytest.raises(InputError, match="2 images with 3 cameras"):
+        wrapped(some_images(2), cameras=small_cameras(3))
+    with pytest.raises(InputError, match="image 0 is 150 x 120, its camera says 160 x 120"):
+        wrapped(some_images(3, width=150), cameras=small_cameras(3))
+    with pytest.raises(InputError, match="expected one per image, two or more"):
+        wrapped(some_images(1), cameras=small_cameras(2)[:1])
+    with pytest.raises(InputError, match=r"expected Cameras \(of a scene"):
+        wrapped(some_images(3), cameras="cameras.json")
+    boxes_only = fasterrcnn_mobilenet_v3_large_320_fpn(weights=None, weights_backbone=None)
+    with pytest.raises(InputError, match="no mask head"):
+        MultiViewMaskRCNN(boxes_only)
+
+
+def test_crops_hold_exactly_what_torchvision_pastes() -> None:
+    generator = torch.Generator().manual_seed(0)
+    corner = torch.rand(12, 2, generator=generator) * 60 - 3
+    boxes = torch.cat((corner, corner + 5 + 40 * torch.rand(12, 2, generator=generator)), 1)
+    boxes = boxes.clamp(min=torch.zeros(4), max=torch.tensor([80.0, 60, 80, 60]))
+    masks = torch.rand(12, 1, 28, 28, generator=generator)
+    detections = {"boxes": boxes, "masks": masks, "scores": torch.rand(12), "labels": torch.ones(12, dtype=torch.int64)}
+    proposals = gather_proposals([detections | {"frame": torch.tensor([80, 60])}], [[160, 120]])
+    torch.testing.assert_close(proposals.boxes, boxes * 2)
+    pasted = paste_masks_in_image(masks, proposals.boxes, (120, 160))[:, 0] > 0.5
+    for number in range(12):
+        assert torch.equal(proposals.regions.mask(number, 160, 120), pasted[number])
+
+
+def crowded_scene() -> tuple[BallScene, Proposals, torch.Tensor]:
+    scene = ball_scene(14, 8, seed=3, radius=0.5, spread=1.3)
+    proposals, labels = simulate_proposals(scene.label_maps, seed=0)
+    excess = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.7)
+    chosen = (proposals.boxes[excess], proposals.scores[excess], proposals.classes[excess])
+    return scene, Proposals(proposals.regions.select(excess), *chosen), labels[excess]
+
+
+def test_cluster_aware_nms_finds_more_than_plain_nms_does() -> None:
+    """Balls count as found when a kept proposal was made from them; crowded ones share half of their box."""
+    scene, proposals, labels = crowded_scene()
+    truth = regions_from_label_maps(scene.label_maps)
+    overlap = box_iou(truth.boxes.float(), truth.boxes.float()).fill_diagonal_(0)
+    overlap[truth.view_index[:, None] != truth.view_index] = 0
+    crowded = [
+        (view, label)
+        for view, label, most in zip(
+            truth.view_index.tolist(), truth.labels.tolist(), overlap.max(1).values.tolist(), strict=True
+        )
+        if most > 0.4
+    ]
+    assert len(crowded) >= 8
+
+    def recall(keep: torch.Tensor) -> float:
+        kept = set(zip(proposals.regions.view_index[keep].tolist(), labels[keep].tolist(), strict=True))
+        return sum(pair in kept for pair in crowded) / len(crowded)
+
+    plain = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.3)
+    keep, matching = match_proposals(proposals, scene.cameras)
+    assert recall(keep) > recall(plain)
+    assert len(keep) < 1.35 * len(truth)
+    assert len(matching.instance_ids) == len(keep)
+
+
+def test_iterating_is_deterministic_and_zero_iterations_only_match() -> None:
+    scene, proposals, _ = crowded_scene()
+    first, second = (match_proposals(proposals, scene.cameras, num_iterations=1) for _ in range(2))
+    assert torch.equal(first[0], second[0])
+    assert torch.equal(first[1].instance_ids, second[1].instance_ids)
+    keep, _ = match_proposals(proposals, scene.cameras, num_iterations=0)
+    groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
+    assert torch.equal(keep, cluster_aware_nms(proposals.boxes, proposals.scores, groups, 0.3))
+
+
+def test_views_that_disagree_are_warned_of_once() -> None:
+    """Whatever was said of the matchings before the last one."""
+    scene = ball_scene(6, 5, seed=7)
+    proposals, _ = simulate_proposals(scene.label_maps, seed=0)
+    order = [2, 0, 4, 1, 3]
+    cameras = Cameras(K=scene.cameras.K, R=scene.cameras.R[order], t=scene.cameras.t[order], sizes=scene.cameras.sizes)
+    with pytest.warns(InputWarning) as caught:
+        match_proposals(proposals, cameras, num_iterations=2)
+    assert ["hardly agree" in str(each.message) for each in caught] == [True]
+
+
+def test_classes_are_matched_apart_and_their_matchings_joined() -> None:
+    """True masks of balls, the even ones of another class; one mask of class 1 covers two balls."""
+    scene = ball_scene(6, 8, seed=3)
+    regions, (small, large), _ = merged_balls(scene)
+    first = (regions.labels == small) | (regions.labels == large)
+    classes = torch.where(first | (regions.labels % 2 == 1), 1, 2)
+    order = torch.randperm(len(regions), generator=torch.Generator().manual_seed(0))
+    proposals = Proposals(regions, regions.boxes.float(), torch.rand(len(regions)), classes).select(order)
+    keep, matching = match_proposals(proposals, scene.cameras, num_iterations=0, cluster_iou=0.99)
+    labels = proposals.regions.labels[keep]
+    assert matching.support is not None
+    assert len(matching.support) == matching.num_instances == 6
+    assert matching.residual_px == 1
+    for instance in range(1, 7):
+        assert len(proposals.classes[keep][matching.instance_ids == instance].unique()) == 1
+    (merged,) = matching.merged
+    assert labels[merged.region] == large
+    assert matching.instance_ids[merged.region] == merged.own
+    assert merged.part.shape == proposals.regions.crop(int(keep[merged.region])).shape
+    shown = [int(labels[matching.instance_ids == number].mode().values) for number in (merged.own, merged.other)]
+    assert sorted(shown) == sorted((small, large))
+
+
+def test_detections_per_view_are_limited() -> None:
+    scene, proposals, _ = crowded_scene()
+    keep, _ = match_proposals(proposals, scene.cameras, num_iterations=1, detections_per_view=5)
+    assert proposals.regions.select(keep).num_per_view.max() == 5
+
+
+def test_nothing_found_is_an_empty_answer() -> None:
+    detector = tiny_detector()
+    detector.roi_heads.score_thresh = 0.999
+    results = MultiViewMaskRCNN(detector)(some_images(), cameras=small_cameras())
+    assert [len(result["instance_ids"]) for result in results] == [0, 0, 0]
+    assert results[0]["masks"].shape == (0, 1, 120, 160)
+
+
+def test_the_other_views_are_heard_where_that_is_asked_for(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160)
+    missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
+    regions = leafy.regions.select(~missed)
+    ones = torch.ones(len(regions))
+    found = Proposals(regions=regions, boxes=regions.boxes.float(), scores=ones / 2, classes=ones.long())
+    matching = Matching(regions.labels, 0.9 * ones, num_instances=2, method="nview")
+    wrapped = MultiViewMaskRCNN(tiny_detector(), witnesses=True)
+    monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: (found, matching))
+    images, cameras = load_photos(leafy.scene), leafy.scene.cameras
+    heard = hear_witnesses(found, matching, cameras=cameras, photos=partial(read_photo, leafy.scene))
+    said: list[Matching] = []
+
+    def hear(proposals: Proposals, matching: Matching, **given: Any) -> Any:
+        """What it says takes seconds; what it is asked is checked."""
+        assert proposals is found
+        assert torch.equal(given["cameras"].t, cameras.t)
+        assert all((given["photos"](view) == read_photo(leafy.scene, view)).all() for view in range(5))
+        said.append(matching)
+        return heard
+
+    monkeypatch.setattr(mvseg.detection.mask_rcnn, "hear_witnesses", hear)
+    results = wrapped(images, cameras=cameras)
+    assert [result["from_views"].tolist() for result in results].count([False, False]) == 4
+    assert sorted(results[2]["from_views"].tolist()) == [False, True]
+    shown = results[2]["masks"][results[2]["from_views"]][0, 0].bool()
+    true = leafy.regions.mask(int(missed.nonzero()), 160, 160)
+    assert float((true & shown).sum() / (true | shown).sum()) > 0.9
+    corrected, rematched = wrapped.find_regions(iter(images), cameras)
+    by_view = torch.cat([result["instance_ids"].sort().values for result in results])
+    assert torch.equal(rematched.instance_ids, by_view)
+    assert torch.equal(corrected.scores, heard[0].scores)
+    assert 0 < (corrected.boxes - heard[0].boxes).abs().max() < 8  # edges between those of masks and surfaces
+    assert torch.equal(corrected.boxes, corrected.regions.boxes.float())
+    assert len(said) == 2
+    assert {key: (value.dtype, value.shape[1:]) for key, value in results[0].items()} == {
+        "boxes": (torch.float32, (4,)),
+        "labels": (torch.int64, ()),
+        "scores": (torch.float32, ()),
+        "masks": (torch.float32, (1, 160, 160)),
+        "instance_ids": (torch.int64, ()),
+        "match_scores": (torch.float32, ()),
+        "from_views": (torch.bool, ()),
+    }
+
+
+@pytest.mark.slow
+def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
+    wrapped = MultiViewMaskRCNN(tiny_detector())
+    with torch.autocast("cpu", torch.bfloat16):
+        results = wrapped(some_images(), cameras=small_cameras())
+        proposals, matching = wrapped.find_regions(some_images(), small_cameras())
+    assert results[0]["match_scores"].dtype == torch.float32
+    assert max(int(result["instance_ids"].max()) for result in results) >= 1
+    assert torch.equal(matching.match_scores, torch.cat([result["match_scores"] for result in results]))
+    boxes = proposals.boxes[proposals.boxes > 16]
+    assert not torch.equal(boxes, boxes.bfloat16().float())
+
+
+def test_every_photo_is_seen_at_every_scale() -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(
+        tiny_detector(), scales=(0.5, 1.0), proposals_per_view=40
+    ), some_images(), small_cameras()
+    seen: list[int] = []
+    wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0].shape[-1]))
+    proposals, _ = wrapped.find_regions(iter(images), cameras)
+    assert seen[0::2] == [seen[0]] * 3
+    assert seen[1::2] == [2 * seen[0]] * 3
+    results = wrapped(images, cameras=cameras)
+    assert torch.equal(proposals.scores, torch.cat([result["scores"] for result in results]))
+    assert (proposals.scores >= wrapped.roi_heads.score_thresh).all()
+
+
+@pytest.mark.parametrize("scales", [(), (0.0, 1.0), (5.0,), (float("nan"),)])
+def test_scales_have_a_range(scales: tuple[float, ...]) -> None:
+    with pytest.raises(InputError, match=r"detect\.scales is \[.*\], expected factors above 0 and up to 4"):
+        DetectConfig(scales=scales)
+
+
+def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:
+    wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), proposals_per_view=40), some_images(), small_cameras()
+    proposals, matching = wrapped.find_regions(iter(images), cameras)
+    results = wrapped(images, cameras=cameras)
+    views = proposals.regions.view_index
+    assert torch.equal(views, views.sort().values)
+    assert (proposals.regions.areas > 0).all()
+    for view, result in enumerate(results):
+        here = views == view
+        assert torch.equal(proposals.scores[here], result["scores"])
+        assert torch.equal(matching.instance_ids[here], result["instance_ids"])
+        assert torch.equal(matching.match_scores[here], result["match_scores"])
+        assert (result["scores"].diff() <= 0).all()
+        for number, mask in zip(here.nonzero()[:, 0].tolist(), result["masks"][:, 0], strict=True):
+            assert torch.equal(proposals.regions.mask(number, 160, 120), mask > 0.5)
+    with pytest.raises(InputError, match="2 images with 3 cameras"):
+        wrapped.find_regions(iter(images[:2]), cameras)

@@ -1,0 +1,100 @@
+"""Work in processes is what it is without them: the same answers, order, warnings and errors."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import active_children
+
+import pytest
+import torch
+
+from blade_scene import EllipticBlade, as_regions, blade_masks, ring_cameras
+from mvseg.errors import InputError, InputWarning
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.system.worker_pool import default_workers, run_all, spread, start_workers
+
+pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed")
+
+
+def work(number: int) -> tuple[int, int, str | None]:
+    """The square, the process, and how many threads its libraries were told to use; some numbers misbehave."""
+    if number == 13:
+        raise InputError("13 brings bad luck")
+    if number == 7:
+        warnings.warn("7 is odd", InputWarning, stacklevel=1)
+    if number < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2, os.getpid(), os.environ.get("OMP_NUM_THREADS")
+
+
+@pytest.fixture(scope="module")
+def workers() -> Iterator[ProcessPoolExecutor | None]:
+    with start_workers(2) as workers:
+        yield workers
+
+
+def test_answers_come_in_order_from_other_processes(workers: ProcessPoolExecutor) -> None:
+    answers = list(spread(work, range(40, 80), workers))
+    assert [square for square, _, _ in answers] == [number**2 for number in range(40, 80)]
+    assert os.getpid() not in {process for _, process, _ in answers}
+    assert {threads for _, _, threads in answers} == {"1"}
+    assert [square for square, _, _ in spread(work, range(3), None)] == [0, 1, 4]
+
+
+def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor) -> None:
+    with pytest.warns(InputWarning, match=r"^7 is odd$"):
+        assert next(spread(work, [7], workers))[0] == 49
+    with pytest.raises(InputError, match=r"^13 brings bad luck$"):
+        list(spread(work, [1, 13, 2], workers))
+    assert next(spread(work, [3], workers))[0] == 9  # the workers are still there
+
+
+def test_surfaces_are_the_same_to_the_bit(workers: ProcessPoolExecutor, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.FEW_MASKS", 0)
+    cameras = ring_cameras(4)
+    regions, ids = as_regions(blade_masks(EllipticBlade(), cameras))
+    here, there = (fit_surfaces(regions, ids, cameras, jackknife=True, workers=each)[1] for each in (None, workers))
+    assert here.exists
+    assert torch.equal(here.coefficients, there.coefficients)
+    assert torch.equal(here.covariance, there.covariance)
+
+
+def nap(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+@pytest.mark.slow
+def test_an_interruption_ends_them_at_once() -> None:
+    before = set(active_children())
+
+    def interrupt() -> None:
+        with start_workers(2) as workers:
+            next(spread(nap, [0.0] * 20 + [3600.0] * 2, workers))
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        interrupt()
+    assert set(active_children()) <= before
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_said_and_none_is_left() -> None:
+    before = set(active_children())
+    with pytest.raises(InputError, match=r"^a worker process was killed, .* expected fewer workers$"):
+        list(run_all(work, [1, -1, 2], 2))
+    for process in set(active_children()) - before:
+        process.join(20)
+        assert not process.is_alive()
+
+
+def test_how_many() -> None:
+    assert 1 <= default_workers() <= 4
+    with start_workers(1) as workers:
+        assert workers is None
+    with pytest.raises(InputError, match=r"^0 workers asked for, expected at least 1$"), start_workers(0):
+        pass

@@ -1,0 +1,258 @@
+"""What surfaces say of ids: three known leaves, seen by six cameras, with masks of the wrong ids and in pieces."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from scipy.ndimage import distance_transform_edt
+from torch import Tensor
+
+from blade_scene import SIZE, as_regions
+from known_leaves import flat_leaf
+from mvseg.matching.result import Matching, MergedMask
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
+from mvseg.verification.checked_ids import CheckedIds, check_ids, match_surfaces, touched_surface
+from three_leaves import CAMERAS, LEAVES, true_maps
+
+
+def match_all(ids: Tensor, view_index: Tensor, scores: Tensor | None = None) -> Matching:
+    """All masks with these ids, as sure as 0.9."""
+    num_instances = int(ids.max())
+    views = [len(view_index[ids == instance].unique()) for instance in range(1, num_instances + 1)]
+    return Matching(
+        instance_ids=ids,
+        match_scores=torch.where(ids > 0, 0.9, 0.0) if scores is None else scores,
+        num_instances=num_instances,
+        method="nview",
+        support=torch.tensor(views),
+    )
+
+
+def check(regions: Regions, ids: Tensor, surfaces: dict[int, LeafSurface] = LEAVES) -> CheckedIds:
+    return check_ids(regions, match_all(ids, regions.view_index), surfaces, cameras=CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def scene() -> tuple[Regions, Tensor]:
+    return as_regions(true_maps())
+
+
+def place_of(regions: Regions, ids: Tensor, view: int, instance: int) -> int:
+    return int(((regions.view_index == view) & (ids == instance)).nonzero()[0, 0])
+
+
+def test_right_ids_stay_as_they_are(scene: tuple[Regions, Tensor]) -> None:
+    regions, ids = scene
+    checked = check(regions, ids)
+    before = match_all(ids, regions.view_index)
+    assert torch.equal(checked.matching.instance_ids, ids)
+    assert torch.equal(checked.matching.match_scores, before.match_scores)
+    assert checked.matching.support is not None
+    assert checked.matching.support.tolist() == [6, 6, 6]
+    assert not checked.is_moved.any()
+    assert not checked.is_changed.any()
+    assert checked.old_ids.tolist() == [1, 2, 3]
+    assert checked.unchanged(LEAVES) == LEAVES
+
+
+def test_two_masks_with_each_others_ids_are_swapped(scene: tuple[Regions, Tensor]) -> None:
+    regions, ids = scene
+    one, other = (place_of(regions, ids, 2, instance) for instance in (1, 2))
+    wrong = ids.clone()
+    wrong[one], wrong[other] = 2, 1
+    scores = torch.full((len(ids),), 0.9)
+    scores[one], scores[other] = 0.1, 0.2
+    merged = MergedMask(region=one, own=2, other=1, part=regions.crop(one))
+    matching = replace(match_all(wrong, regions.view_index, scores), merged=(merged,))
+    checked = check_ids(regions, matching, LEAVES, cameras=CAMERAS)
+    assert torch.equal(checked.matching.instance_ids, ids)
+    assert checked.is_moved.nonzero()[:, 0].tolist() == sorted([one, other])
+    assert checked.is_changed.tolist() == [True, True, False]
+    assert checked.unchanged(LEAVES) == {3: LEAVES[3]}
+    assert checked.matching.match_scores.tolist() == pytest.approx([0.9] * len(ids))  # of those that had the id before
+    assert checked.matching.merged == ()
+
+
+def merged_maps(view: int, share: float) -> list[np.ndarray]:
+    """In this view, the mask of leaf 1 covers this share of leaf 2 as well, what is nearest, and leaf 2 has none."""
+    maps = true_maps()
+    gap = distance_transform_edt(maps[view] != 1)
+    is_second = maps[view] == 2
+    is_near = is_second & (gap <= np.quantile(gap[is_second], share))
+    maps[view][is_second] = 0
+    maps[view][is_near] = 1
+    return maps
+
+
+@pytest.mark.parametrize(
+    ("share", "is_named", "is_listed"), [(1, False, True), (0.49, False, False), (0.49, True, True)]
+)
+def test_a_mask_that_shows_two_surfaces_is_listed(share: float, is_named: bool, is_listed: bool) -> None:
+    """By most of what its view shows of the second one, or where the matcher says so; its cut is that of surfaces."""
+    regions, ids = as_regions(merged_maps(3, share))
+    region = place_of(regions, ids, 3, 1)
+    named = MergedMask(region=region, own=1, other=2, part=torch.zeros_like(regions.crop(region)))
+    matching = replace(match_all(ids, regions.view_index), merged=(named,) if is_named else ())
+    checked = check_ids(regions, matching, LEAVES, cameras=CAMERAS)
+    assert torch.equal(checked.matching.instance_ids, ids)
+    assert not checked.is_changed.any()
+    assert [(mask.region, mask.own, mask.other) for mask in checked.matching.merged] == [(region, 1, 2)] * is_listed
+    x1, y1, x2, y2 = regions.boxes[region].tolist()
+    is_second = torch.from_numpy(true_maps()[3][y1:y2, x1:x2] == 2) & regions.crop(region)
+    assert is_second.sum() > 0.2 * regions.areas[region]
+    for mask in checked.matching.merged:
+        assert torch.equal(mask.part, is_second)
+
+
+def test_what_no_surface_explains_goes_to_the_nearest_part() -> None:
+    """A merged mask that is drawn three pixels too large; and what the matcher alone calls merged stays on the list."""
+    maps = merged_maps(3, 1)
+    maps[3] = np.where(distance_transform_edt(maps[3] != 1) <= 3, 1, maps[3])
+    regions, ids = as_regions(maps)
+    region, alone = place_of(regions, ids, 3, 1), place_of(regions, ids, 0, 3)
+    named = MergedMask(region=alone, own=3, other=1, part=regions.crop(alone))
+    matching = replace(match_all(ids, regions.view_index), merged=(named,))
+    merged = check_ids(regions, matching, LEAVES, cameras=CAMERAS).matching.merged
+    assert [mask.region for mask in merged] == sorted([alone, region])
+    part = next(mask.part for mask in merged if mask.region == region)
+    x1, y1, x2, y2 = regions.boxes[region].tolist()
+    true = true_maps()[3]
+    nearest = [distance_transform_edt(true != leaf)[y1:y2, x1:x2] for leaf in (1, 2)]
+    assert torch.equal(part, regions.crop(region) & torch.from_numpy(nearest[1] < nearest[0]))
+
+
+def test_a_mask_without_an_id_gets_one_and_what_shows_no_surface_keeps_its_own(scene: tuple[Regions, Tensor]) -> None:
+    maps = true_maps()
+    maps[1][5:25, 5:25] = 103  # of leaf 3, says the matcher, which has a mask there
+    regions, numbers = as_regions(maps)
+    ids = numbers % 10
+    wrong = ids.clone()
+    wrong[place_of(regions, numbers, 4, 2)] = -1
+    checked = check(regions, wrong)
+    assert torch.equal(checked.matching.instance_ids, ids)
+    assert checked.is_changed.tolist() == [False, True, False]
+
+
+def test_a_mask_does_not_go_where_another_fits_as_well(scene: tuple[Regions, Tensor]) -> None:
+    """Two masks of the same pixels, one of them matched to a leaf far away."""
+    regions, ids = scene
+    one = place_of(regions, ids, 0, 1)
+    twice = regions.select(torch.cat((torch.arange(len(ids)), torch.tensor([one]))))
+    checked = check(twice, torch.cat((ids, torch.tensor([3]))))
+    assert not checked.is_moved.any()
+
+
+def cut_maps(views: tuple[int, ...]) -> list[np.ndarray]:
+    """In these views, the right third of leaf 1 is a mask of its own, 11."""
+    maps = true_maps()
+    for view in views:
+        is_right = np.indices((SIZE, SIZE))[1] > np.quantile(np.nonzero(maps[view] == 1)[1], 0.7)
+        maps[view][(maps[view] == 1) & is_right] = 11
+    return maps
+
+
+@pytest.mark.parametrize("has_surface", [True, False])
+def test_pieces_join_their_leaf_and_ids_close_up(has_surface: bool) -> None:
+    """Pieces of leaf 1 that were found in four views form an instance of their own, 2; the others are 1, 3 and 4."""
+    regions, numbers = as_regions(cut_maps((0, 1, 2, 3)))
+    ids = torch.tensor([0, 1, 3, 4, *[0] * 7, 2])[numbers]
+    surfaces = {1: LEAVES[1], 3: LEAVES[2], 4: LEAVES[3]}
+    surfaces[2] = LEAVES[1] if has_surface else LeafSurface.none(torch.arange(4), "its masks agree on no point")
+    checked = check(regions, ids, surfaces)
+    assert torch.equal(checked.matching.instance_ids, numbers % 10)
+    assert checked.is_moved.tolist() == (numbers == 11).tolist()
+    assert checked.old_ids.tolist() == [1, 3, 4]
+    assert checked.is_changed.tolist() == [True, False, False]
+    assert checked.unchanged(surfaces) == {2: LEAVES[2], 3: LEAVES[3]}
+    assert checked.matching.num_instances == 3
+    assert checked.matching.support is not None
+    assert checked.matching.support.tolist() == [6, 6, 6]
+
+
+def test_a_small_leaf_before_a_large_one_is_no_piece() -> None:
+    """Nearly all views show it before the large one; few could not tell it from a piece."""
+    leaves = LEAVES | {4: flat_leaf(length=0.3, half_width=0.1, at=(0.1, 0.2, 0.1))}
+    regions, ids = as_regions(true_maps(leaves))
+    assert len(regions.view_index[ids == 4].unique()) == 6
+    assert torch.equal(check(regions, ids, leaves).matching.instance_ids, ids)
+
+
+def test_the_order_of_masks_and_of_ids_does_not_matter() -> None:
+    regions, numbers = as_regions(cut_maps((0, 1, 2, 3)))
+    ids = torch.where(numbers == 11, 4, numbers)
+    one, other = (place_of(regions, numbers, 5, instance) for instance in (1, 2))
+    ids[one], ids[other] = 2, 1
+    surfaces = LEAVES | {4: LEAVES[1]}
+    expected = check(regions, ids, surfaces)
+    assert torch.equal(expected.matching.instance_ids, numbers % 10)
+    order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(2))
+    renamed = torch.tensor([0, 3, 1, 4, 2])  # of the ids
+    named_anew = {int(renamed[instance]): surface for instance, surface in surfaces.items()}
+    checked = check(regions.select(order), renamed[ids[order]], dict(sorted(named_anew.items())))
+    assert torch.equal(checked.is_moved, expected.is_moved[order])
+    former = renamed[expected.old_ids][expected.matching.instance_ids - 1]
+    assert torch.equal(checked.old_ids[checked.matching.instance_ids - 1], former[order])
+
+
+def test_shares_are_those_of_whole_frames(scene: tuple[Regions, Tensor]) -> None:
+    """The same as counted on frames, mask by mask and leaf by leaf."""
+    regions, _ = scene
+    ious, inside = match_surfaces(regions, LEAVES, cameras=CAMERAS)
+    for view, labels in enumerate(true_maps()):
+        for region in (regions.view_index == view).nonzero()[:, 0].tolist():
+            mask = regions.mask(region, SIZE, SIZE).numpy()
+            for leaf in LEAVES:
+                both = (mask & (labels == leaf)).sum()
+                assert ious[region, leaf] == pytest.approx(both / (mask | (labels == leaf)).sum())
+                assert inside[region, leaf] == pytest.approx(both / mask.sum())
+    assert not ious[:, 0].any()
+
+
+def test_without_surfaces_or_masks_nothing_happens(scene: tuple[Regions, Tensor]) -> None:
+    regions, ids = scene
+    assert torch.equal(check(regions, ids, {}).matching.instance_ids, ids)
+    empty, nothing = as_regions([np.zeros((SIZE, SIZE), np.int64)] * 6)
+    matching = Matching(instance_ids=nothing, match_scores=torch.zeros(0), num_instances=0, method="nview")
+    checked = check_ids(empty, matching, {}, cameras=CAMERAS)
+    assert checked.matching.num_instances == len(checked.is_moved) == len(checked.old_ids) == 0
+
+
+def halved_maps(views: tuple[int, ...]) -> list[np.ndarray]:
+    """Something crosses leaf 1, here or there: what lies right of it is 11 in these views, and nothing in others."""
+    maps = true_maps()
+    v, u = np.mgrid[:SIZE, :SIZE] + 0.5
+    for view, labels in enumerate(maps):
+        rays = np.stack([u, v, np.ones_like(u)], -1) @ CAMERAS.world_from_px[view].numpy().T
+        x, _, z = CAMERAS.centers[view].tolist()
+        on_leaf = x + rays[..., 0] * (0.4 - z) / rays[..., 2]  # where the ray meets the leaf's plane
+        is_right = (labels == 1) & (on_leaf > 0.1 * (view % 3 - 1))
+        labels[is_right] = 11 if view in views else 0
+    return maps
+
+
+@pytest.mark.slow
+def test_halves_of_a_leaf_become_one() -> None:
+    regions, numbers = as_regions(halved_maps((0, 1, 2, 3)))
+    ids = torch.where(numbers == 11, 4, numbers)
+    surfaces = fit_surfaces(regions, ids, CAMERAS)
+    checked = check(regions, ids, surfaces)
+    assert torch.equal(checked.matching.instance_ids, numbers % 10)
+    assert checked.is_moved.tolist() == (numbers == 11).tolist()
+    assert checked.old_ids.tolist() == [1, 2, 3]
+    assert checked.is_changed.tolist() == [True, False, False]
+
+
+@pytest.mark.slow
+def test_leaves_that_touch_stay_apart() -> None:
+    """Two leaves from one place, one of which four views show."""
+    leaves = {1: LEAVES[1], 2: LEAVES[2], 3: flat_leaf(length=0.9, half_width=0.2, at=(0.75, -0.3, 0.4))}
+    maps = [np.where((labels == 3) & (view > 3), 0, labels) for view, labels in enumerate(true_maps(leaves))]
+    regions, ids = as_regions(maps)
+    surfaces = fit_surfaces(regions, ids, CAMERAS)
+    assert touched_surface(3, surfaces) == 1
+    assert torch.equal(check(regions, ids, surfaces).matching.instance_ids, ids)

@@ -1,0 +1,46 @@
+"""Colours of leaves: laws of the counting, and photos whose answer is known."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+
+GREEN, DARK_GREEN, BROWN, WHITE = (60, 160, 40), (60, 150, 45), (120, 80, 40), (240, 240, 240)
+
+
+def paint(*colors: tuple[int, int, int], height: int = 4) -> np.ndarray:
+    """(height, n, 3) uint8: a column of each colour."""
+    return np.tile(np.array(colors, np.uint8)[None], (height, 1, 1))
+
+
+def test_a_missed_leaf_has_the_colour_of_the_others() -> None:
+    photo = paint(GREEN, GREEN, *[BROWN] * 8, *[WHITE] * 8, DARK_GREEN)
+    is_inside = np.zeros(photo.shape[:2], bool)
+    is_inside[:, :2] = True
+    colors = leaf_colors(count_colors(photo, is_inside))
+    assert has_leaf_color(photo, colors)[0].tolist() == [True] * 2 + [False] * 16 + [True]
+
+
+def test_counts_of_photos_add_up() -> None:
+    rng = np.random.default_rng(0)
+    photos = rng.integers(0, 256, (2, 6, 5, 3), dtype=np.uint8)
+    is_inside = rng.random((2, 6, 5)) < 0.4
+    parts = [count_colors(photo, inside) for photo, inside in zip(photos, is_inside, strict=True)]
+    whole, added = count_colors(photos, is_inside), parts[0] + parts[1] + ColorCounts.none()
+    np.testing.assert_array_equal(added.inside, whole.inside)
+    np.testing.assert_array_equal(added.outside, whole.outside)
+    assert whole.inside.sum() == is_inside.sum()
+    assert whole.outside.sum() == (~is_inside).sum()
+
+
+def test_how_often_photos_are_counted_does_not_matter() -> None:
+    rng = np.random.default_rng(1)
+    photo = rng.integers(0, 256, (8, 8, 3), dtype=np.uint8)
+    counts = count_colors(photo, rng.random((8, 8)) < 0.3)
+    np.testing.assert_array_equal(leaf_colors(counts), leaf_colors(counts + counts + counts))
+
+
+def test_nothing_inside_has_no_colour() -> None:
+    photo = paint(GREEN, WHITE)
+    assert not leaf_colors(count_colors(photo, np.zeros(photo.shape[:2], bool))).any()
