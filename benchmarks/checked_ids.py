@@ -3,7 +3,8 @@
 For each scene: ARI and e_k of the ids found and of those that the surfaces correct
 (`mvseg.verification.checked_ids`), how many masks are moved, how many of the moved were right before and are right
 afterwards, and CPU seconds of matching, of surfaces, of the check and of the surfaces that are fitted again.
-"degraded" and "true" are the masks of the evaluation scenes, "pieces" those of `straps.py`, 8 and 12 leaves whatever --leaves says.
+"degraded" and "true" are the masks of the evaluation scenes, "pieces" those of `straps.py`, 8 and 12 leaves whatever
+--leaves says.
 """
 
 from __future__ import annotations
