@@ -33,7 +33,7 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.growth import grow_plant
-from mvseg.verification.checked_ids import check_ids
+from mvseg.verification.checked_ids import check_ids, unchanged_surfaces
 
 STRAPS = 8, 12  # leaves
 
@@ -72,15 +72,17 @@ def main() -> None:
         times.append(time.process_time())
         surfaces = fit_surfaces(regions, matching.instance_ids, cameras)
         times.append(time.process_time())
-        checked = check_ids(regions, matching, surfaces, cameras=cameras)
+        checked = check_ids(matching.masks, surfaces, cameras=cameras)
+        is_moved = matching.instance_ids != checked.instance_ids
         times.append(time.process_time())
-        if checked.is_moved.any():
-            fit_surfaces(regions, checked.matching.instance_ids, cameras, known=checked.unchanged(surfaces))
+        if is_moved.any():
+            known = unchanged_surfaces(matching.masks, checked, surfaces)
+            fit_surfaces(regions, checked.instance_ids, cameras, known=known)
         times.append(time.process_time())
-        both = matching.instance_ids, checked.matching.instance_ids
+        both = matching.instance_ids, checked.instance_ids
         before, after = (matching_metrics(ids, leaf) for ids in both)
-        right = [int(has_right_id(ids.numpy(), leaf.numpy())[checked.is_moved.numpy()].sum()) for ids in both]
-        cells = f"{before.ari:9.3f}{after.ari:9.3f}{before.e_k:9.0f}{after.e_k:9.0f}{int(checked.is_moved.sum()):9}"
+        right = [int(has_right_id(ids.numpy(), leaf.numpy())[is_moved.numpy()].sum()) for ids in both]
+        cells = f"{before.ari:9.3f}{after.ari:9.3f}{before.e_k:9.0f}{after.e_k:9.0f}{int(is_moved.sum()):9}"
         cells += "".join(f"{count:9}" for count in right)
         cells += "".join(f"{end - start:9.1f}" for start, end in pairwise(times))
         print(f"{name:26}{cells}", flush=True)

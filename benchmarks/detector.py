@@ -47,7 +47,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import undistort
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.masks import Proposals
+from mvseg.masks import Masks
 from mvseg.regions import IGNORE_LABEL, Regions
 from mvseg.scene import Cameras, Scene
 from mvseg.training.data import SampleList, list_samples, read_sample
@@ -96,12 +96,13 @@ def silhouette_area(mesh: trimesh.Trimesh, cameras: Cameras, view: int) -> int:
     return int(frame.sum())
 
 
-def annotate(proposals: Proposals, sizes: list[list[int]], first_image: int) -> list[dict[str, Any]]:
+def annotate(masks: Masks, sizes: list[list[int]], first_image: int) -> list[dict[str, Any]]:
     """COCO annotations of the detections of one scene."""
     annotations = []
-    for index, view in enumerate(proposals.regions.view_index.tolist()):
-        described = describe_mask(proposals.regions.mask(index, *sizes[view]), first_image + view)
-        annotations.append({**described, "category_id": 1, "iscrowd": 0, "score": float(proposals.scores[index])})
+    for index, view in enumerate(masks.view_index.tolist()):
+        described = describe_mask(masks.regions.mask(index, *sizes[view]), first_image + view)
+        score = float(masks.detection_scores[index])
+        annotations.append({**described, "category_id": 1, "iscrowd": 0, "score": score})
     return annotations
 
 
@@ -128,13 +129,13 @@ def read_truth(folder: Path, scene: Scene) -> SceneTruth:
     return SceneTruth(regions, maps, torch.from_numpy(visible_share(folder, scene.cameras, regions) < HIDDEN))
 
 
-def count_found(proposals: Proposals, instance_ids: torch.Tensor, truth: SceneTruth) -> dict[str, float]:
+def count_found(masks: Masks, truth: SceneTruth) -> dict[str, float]:
     """Numbers of true regions and of detections, and how right the ids of those detections are that find a leaf."""
-    credited = credit_masks(proposals.regions, proposals.scores, truth.maps)
-    right, found = credited > 0, is_found(truth.regions, proposals.regions, credited)
-    is_ignored = (shown_instances(proposals.regions, truth.maps) == IGNORE_LABEL) & ~right
-    ids = matching_metrics(instance_ids[right], credited[right])
-    leaves = leaf_metrics(proposals.regions, instance_ids, truth.maps)
+    credited = credit_masks(masks.regions, masks.detection_scores, truth.maps)
+    right, found = credited > 0, is_found(truth.regions, masks.regions, credited)
+    is_ignored = (shown_instances(masks.regions, truth.maps) == IGNORE_LABEL) & ~right
+    ids = matching_metrics(masks.instance_ids[right], credited[right])
+    leaves = leaf_metrics(masks.regions, masks.instance_ids, truth.maps)
     return {
         "found": int(found.sum()),
         "true": len(found),
@@ -164,9 +165,9 @@ def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dic
         for view, name in enumerate(view.name for view in scene.views):
             truths += annotate_truth(read_sample(by_name[Path(name).stem]), num_images + view, 1)
         for row in rows:
-            proposals, matching = build_model(args, row).find_regions(photos, scene.cameras)
-            detections[row] += annotate(proposals, scene.cameras.sizes.tolist(), num_images)
-            totals[row].update(count_found(proposals, matching.instance_ids, truth))
+            masks = build_model(args, row).find_regions(photos, scene.cameras).masks
+            detections[row] += annotate(masks, scene.cameras.sizes.tolist(), num_images)
+            totals[row].update(count_found(masks, truth))
         num_images += len(photos)
     table: dict[str, dict[str, float | None]] = {}
     for row, total in totals.items():

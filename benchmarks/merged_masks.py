@@ -90,7 +90,7 @@ def main() -> None:
         regions, leaf = scene.masks("degraded")
         matching = match_regions(regions, scene.cameras)
         surfaces = fit_surfaces(regions, matching.instance_ids, scene.cameras)
-        checked = check_ids(regions, matching, surfaces, cameras=scene.cameras).matching
+        checked = matching.with_masks(check_ids(matching.masks, surfaces, cameras=scene.cameras))
         counts = count_scene(regions, leaf, (matching, checked), true=scene.true)
         print_row(f"{spec.num_leaves}x{spec.num_views} {spec.family}", counts)
         total += counts

@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -20,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.nms import cluster_aware_nms
-from mvseg.masks import Proposals
+from mvseg.detection.proposals import Proposals
 from mvseg.matching.config import MatchConfig
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -49,8 +50,8 @@ def run_all_nms(proposals: Proposals, cameras: Cameras, match: MatchConfig) -> d
     """{row of the table: indices of the proposals that are kept}."""
     kept = {f"plain NMS {iou}": plain_nms(proposals, iou) for iou in (0.3, 0.5, 0.7)}
     for iterations in (1, 2, 3):
-        keep, _ = match_proposals(proposals, cameras, num_iterations=iterations, match=match)
-        kept[f"cluster-aware, {iterations} iterations"] = keep
+        matching = match_proposals(proposals, cameras, num_iterations=iterations, match=match)
+        kept[f"cluster-aware, {iterations} iterations"] = matching.masks.regions.labels
     return kept
 
 
@@ -74,7 +75,7 @@ def main() -> None:
         proposals, _ = simulate_proposals(maps, seed=seed)
         first = plain_nms(proposals, 0.7)
         proposals = Proposals(
-            regions=proposals.regions.select(first),
+            regions=replace(proposals.regions.select(first), labels=torch.arange(len(first))),
             boxes=proposals.boxes[first],
             scores=proposals.scores[first],
             classes=proposals.classes[first],

@@ -64,11 +64,11 @@ def main() -> None:
     start, start_cpu = time.perf_counter(), time.process_time()
     proposals = gather_proposals(outputs, cameras.sizes.tolist())
     gathered, gathered_cpu = time.perf_counter(), time.process_time()
-    keep, matching = match_proposals(proposals, cameras)
+    matching = match_proposals(proposals, cameras)
     report = {
         "proposals": len(proposals.boxes),
         "mean_crop_px": int(proposals.regions.crop_sizes.prod(1).float().mean()),
-        "kept": len(keep),
+        "kept": len(matching),
         "instances": matching.num_instances,
         "gather_s": round(gathered - start, 1),
         "gather_cpu_s": round(gathered_cpu - start_cpu, 1),

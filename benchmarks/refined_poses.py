@@ -1,7 +1,7 @@
 """Do masks put poses right that are a few pixels off? `python benchmarks/refined_poses.py --cache ~/mvseg-cells`
 
 The scenes are those of `label_maps`, with true and with degraded masks; the cameras have the faults of `camera_faults`.
-Each is matched with the poses as given, and with `MatchConfig.refine_poses`. Printed for each fault, before and after:
+Each is matched with the poses as given, and with refined poses. Printed for each fault, before and after:
 ARI, e_k, and the error of the poses, in pixels: the median distance from where the true cameras see points of the
 plant, after the similarity of the world that makes it smallest. `--area` adds the median error of the areas of the
 surfaces fitted to the ids found, in percent, over leaves that match a true one.
@@ -28,10 +28,9 @@ from benchmarks.camera_faults import faulty_cameras
 from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
-from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
-from mvseg.matching.refine_poses import mean_score
 from mvseg.matching.result import Matching
+from mvseg.poses.refine_poses import mean_score, refine_poses
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -85,10 +84,11 @@ def run_scene(spec: SceneSpec, *, cache: Path, faults: list[str], kinds: list[st
             rng = np.random.default_rng([spec.seed, spec.num_views, *fault.encode()])
             given, measured, is_refined = faulty_cameras(scene.cameras, fault, rng), [], False
             for refine in (False, True):
-                matching = match_regions(regions, given, MatchConfig(refine_poses=refine))
                 cameras = given
-                if matching.poses is not None:
-                    cameras, is_refined = matching.poses.cameras, matching.poses.is_refined
+                if refine:
+                    poses = refine_poses(given, partial(match_regions, regions))
+                    cameras, is_refined = poses.cameras, poses.is_refined
+                matching = match_regions(regions, cameras)
                 metrics = matching_metrics(matching.instance_ids, truth)
                 measures = [metrics.ari, metrics.e_k, pose_error(cameras, scene.cameras, points), mean_score(matching)]
                 if area:

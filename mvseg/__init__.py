@@ -33,17 +33,21 @@ if TYPE_CHECKING:
     from mvseg.formats.photos import load_photos as load_photos
     from mvseg.formats.scene_folder import load_masks as load_masks
     from mvseg.formats.scene_folder import load_scene as load_scene
+    from mvseg.masks import Masks as Masks
+    from mvseg.masks import MergedMask as MergedMask
+    from mvseg.masks import Origin as Origin
     from mvseg.matching.affinity import Affinity as Affinity
     from mvseg.matching.affinity import region_affinity as region_affinity
     from mvseg.matching.config import MatchConfig as MatchConfig
     from mvseg.matching.epipolar import epipolar_map as epipolar_map
     from mvseg.matching.match import match_regions as match_regions
     from mvseg.matching.result import Matching as Matching
-    from mvseg.matching.result import MergedMask as MergedMask
-    from mvseg.matching.result import RefinedPoses as RefinedPoses
+    from mvseg.matching.result import MatchReport as MatchReport
     from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
     from mvseg.pipeline import run_scene as run_scene
+    from mvseg.poses.refine_poses import RefinedPoses as RefinedPoses
+    from mvseg.poses.refine_poses import refine_poses as refine_poses
     from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig
     from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces as fit_surfaces
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface as LeafSurface
@@ -72,7 +76,9 @@ _HOME = {
     "matching.affinity": ("Affinity", "region_affinity"),
     "matching.symnmf": ("cluster_affinity",),
     "matching.match": ("match_regions",),
-    "matching.result": ("Matching", "MergedMask", "RefinedPoses"),
+    "masks": ("Masks", "MergedMask", "Origin"),
+    "matching.result": ("Matching", "MatchReport"),
+    "poses.refine_poses": ("RefinedPoses", "refine_poses"),
     "matching.split": ("split_merged",),
     "reconstruction.config": ("ReconstructConfig",),
     "reconstruction.voxels": ("reconstruct_instances",),

@@ -26,6 +26,8 @@ class RunConfig:
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
             level, "board" from ArUco markers that lie flat; None for that of the scene.
+        refine_poses: refine poses that are a few pixels off, with the masks as the only evidence; kept only if leaves
+            that they were not fitted to agree clearly better.
         split_merged: cut a mask that seems to cover two instances in two.
         draw_rims: draw the rims of the surfaces into the overlays.
         report: write report.html, the result as one page.
@@ -42,6 +44,7 @@ class RunConfig:
     scale: float | None = None
     unit: str | None = None
     up: Up | None = None
+    refine_poses: bool = False
     split_merged: bool = False
     draw_rims: bool = True
     report: bool = True

@@ -1,39 +1,241 @@
-"""The masks of all views of a scene, with what the stages find out about each."""
+"""The one table: the masks of all views of a scene, a row each, with what the stages find out about them.
+
+A stage takes `Masks` and gives `Masks` back; nothing about a mask is kept anywhere else.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+from typing import Any, TypeVar
 
+import torch
 from torch import Tensor
 
-from mvseg.regions import Regions
+from mvseg.errors import InputError
+from mvseg.regions import Regions, stack_regions
+
+T = TypeVar("T")
+
+SURE = 0.5  # match score from which a mask counts for its instance's support
+
+
+class Origin(IntEnum):
+    """Where a mask comes from."""
+
+    GIVEN = 0  # the user's
+    DETECTED = 1
+    OTHER_VIEWS = 2  # no detector found it: surfaces fitted to the masks of other views show it
+    CORRECTED = 3  # a person made or confirmed it
 
 
 @dataclass(frozen=True, eq=False)
-class Proposals:
-    """R scored masks of V views, many of them of the same object.
+class MergedMask:
+    """A mask that seems to cover two instances.
 
     Attributes:
-        regions: the R masks as box crops, in the frame of the images.
-        boxes: (R, 4) float32 xyxy in the frame of the images; what NMS compares.
-        scores: (R,) float32.
-        classes: (R,) int64; objects of different classes are never matched.
-        from_views: (R,) bool, the masks that no detector found: the other views show them, see `hear_witnesses`. None
-            where the other views were not heard.
+        region: its row.
+        own: id of the instance that it was matched to.
+        other: id of the second instance.
+        part: (h, w) bool on the CPU, the pixels of the mask's box that show the second instance.
+    """
+
+    region: int
+    own: int
+    other: int
+    part: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """D masks in V views.
+
+    Attributes:
+        regions: view, box and crop of each.
+        instance_ids: (D,) int64, the same number in [1, K] for masks of one instance; -1 = matched to nothing.
+        match_scores: (D,) float32 in [0, 1], see `Matching.match_scores`.
+        detection_scores: (D,) float32, the detector's; NaN for masks that no detector scored.
+        classes: (D,) int64; masks of different classes are never matched.
+        origin: (D,) int64, of `Origin`.
+        second_ids: (D,) int64, id of the second instance that a mask seems to show; -1 for none.
+        second_parts: D times (h, w) bool on the CPU, the pixels of the mask's box that show it; None for none.
+
+    Raises:
+        InputError: columns of other lengths than there are regions.
     """
 
     regions: Regions
-    boxes: Tensor
-    scores: Tensor
+    instance_ids: Tensor
+    match_scores: Tensor
+    detection_scores: Tensor
     classes: Tensor
-    from_views: Tensor | None = None
+    origin: Tensor
+    second_ids: Tensor
+    second_parts: tuple[Tensor | None, ...]
 
-    def select(self, index: Tensor) -> Proposals:
-        """The proposals at an int64 index, in that order."""
-        return Proposals(
-            regions=self.regions.select(index),
-            boxes=self.boxes[index],
-            scores=self.scores[index],
-            classes=self.classes[index],
-            from_views=None if self.from_views is None else self.from_views[index],
+    def __post_init__(self) -> None:
+        lengths = [*(len(column) for column in self._columns().values()), len(self.second_parts)]
+        if lengths != [len(self.regions)] * len(lengths):
+            raise InputError(f"{len(self.regions)} regions with columns of {lengths} rows, expected one row each")
+
+    @staticmethod
+    def of(
+        regions: Regions,
+        instance_ids: Tensor | None = None,
+        match_scores: Tensor | None = None,
+        *,
+        detection_scores: Tensor | None = None,
+        classes: Tensor | None = None,
+        origin: Origin = Origin.GIVEN,
+    ) -> Masks:
+        """The table of these regions; by default they are matched to nothing, unscored, and of class 1."""
+        count, device = len(regions), regions.device
+        integer = torch.ones(count, dtype=torch.int64, device=device)
+        return Masks(
+            regions=regions,
+            instance_ids=-integer if instance_ids is None else instance_ids,
+            match_scores=torch.zeros(count, device=device) if match_scores is None else match_scores,
+            detection_scores=integer * torch.nan if detection_scores is None else detection_scores,
+            classes=integer if classes is None else classes,
+            origin=int(origin) * integer,
+            second_ids=-integer,
+            second_parts=(None,) * count,
         )
+
+    def __len__(self) -> int:
+        return len(self.regions)
+
+    @property
+    def view_index(self) -> Tensor:
+        """(D,) int64, the view of each."""
+        return self.regions.view_index
+
+    @property
+    def num_instances(self) -> int:
+        """K, the largest id."""
+        return max(int(self.instance_ids.max()), 0) if len(self) else 0
+
+    @property
+    def merged(self) -> tuple[MergedMask, ...]:
+        """The masks that seem to show two instances, by row."""
+        ids, others = self.instance_ids.tolist(), self.second_ids.tolist()
+        return tuple(
+            MergedMask(region=row, own=ids[row], other=others[row], part=part)
+            for row, part in enumerate(self.second_parts)
+            if part is not None
+        )
+
+    def with_merged(self, found: Iterable[MergedMask]) -> Masks:
+        """The same masks, of which those `found`, and no others, seem to show two instances."""
+        ids, parts = torch.full_like(self.second_ids, -1), [None] * len(self)
+        for each in found:
+            ids[each.region], parts[each.region] = each.other, each.part  # type: ignore[call-overload]
+        return replace(self, second_ids=ids, second_parts=tuple(parts))
+
+    def to(self, device: torch.device | str) -> Masks:
+        columns: dict[str, Any] = {name: column.to(device) for name, column in self._columns().items()}
+        return replace(self, regions=self.regions.to(device), **columns)
+
+    def select(self, index: Tensor) -> Masks:
+        """The rows at an int64 index or a bool mask, in that order; ids stay what they are."""
+        keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
+        columns: dict[str, Any] = {name: column[keep] for name, column in self._columns().items()}
+        parts = tuple(self.second_parts[row] for row in keep.tolist())
+        return replace(self, regions=self.regions.select(index), second_parts=parts, **columns)
+
+    def relabel(self, numbers: Tensor) -> Masks:
+        """Instance k gets the id `numbers[k - 1]`.
+
+        Args:
+            numbers: (K,) int64: 1, 2, ... in any order, each once, and -1 for every instance to discard: its masks
+                become unmatched, and nothing shows it as a second instance any more.
+
+        Raises:
+            InputError: any other numbers.
+        """
+        kept = int((numbers > 0).sum())
+        if sorted(numbers.tolist()) != [-1] * (len(numbers) - kept) + list(range(1, kept + 1)):
+            raise InputError(f"instances get the numbers {numbers.tolist()}, expected 1, 2, ... once each, or -1")
+        if len(numbers) < self.num_instances:
+            raise InputError(f"{self.num_instances} instances get {len(numbers)} numbers, expected one each")
+        lookup = torch.cat((numbers.to(self.instance_ids), self.instance_ids.new_tensor([-1])))
+
+        def renumber(ids: Tensor) -> Tensor:
+            return lookup[torch.where(ids > 0, ids - 1, len(numbers))]
+
+        ids, second_ids = renumber(self.instance_ids), renumber(self.second_ids)
+        second_ids = torch.where(ids > 0, second_ids, -1)
+        parts = zip(self.second_parts, (second_ids > 0).tolist(), strict=True)
+        return replace(
+            self,
+            instance_ids=ids,
+            match_scores=self.match_scores * (ids > 0),
+            second_ids=second_ids,
+            second_parts=tuple(part if stays else None for part, stays in parts),
+        )
+
+    def close_gaps(self) -> Masks:
+        """The ids as 1, 2, ... without gaps, in the order that they have."""
+        used = self.instance_ids[self.instance_ids > 0].unique()
+        numbers = torch.full((self.num_instances,), -1, dtype=torch.int64, device=used.device)
+        numbers[used - 1] = torch.arange(1, len(used) + 1, device=used.device)
+        return self.relabel(numbers)
+
+    def renumber(self, of_instances: Mapping[int, T]) -> dict[int, T]:
+        """What is known by the ids that masks have, by those that `close_gaps` gives them."""
+        used = self.instance_ids[self.instance_ids > 0].unique().tolist()
+        return {new: of_instances[old] for new, old in enumerate(used, start=1) if old in of_instances}
+
+    @staticmethod
+    def concatenate(parts: Sequence[Masks]) -> Masks:
+        """The rows of one or more tables of the same views, one after another.
+
+        No instance is shared by two parts: the ids of each follow those of the parts before it.
+        """
+        shifted, largest = [], 0
+        for part in parts:
+            columns = {
+                name: torch.where(column > 0, column + largest, -1)
+                for name, column in (("instance_ids", part.instance_ids), ("second_ids", part.second_ids))
+            }
+            shifted.append(replace(part, **columns))  # type: ignore[arg-type]
+            largest += part.num_instances
+        regions, names = [part.regions for part in parts], ("view_index", "boxes", "crops", "labels")
+        fields: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in regions]) for name in names}
+        columns = {name: torch.cat([part._columns()[name] for part in shifted]) for name in shifted[0]._columns()}
+        return Masks(
+            regions=replace(regions[0], **fields),
+            second_parts=sum((part.second_parts for part in parts), ()),
+            **columns,
+        )
+
+    def count_sure_views(self) -> Tensor:
+        """(K,) int64: in how many views a mask of each instance has a match score of at least 0.5."""
+        is_sure = (self.instance_ids > 0) & (self.match_scores >= SURE)
+        seen = torch.zeros(self.num_instances, self.regions.num_views, dtype=torch.int64, device=self.view_index.device)
+        seen[self.instance_ids[is_sure] - 1, self.view_index[is_sure]] = 1
+        return seen.sum(1)
+
+    def _columns(self) -> dict[str, Tensor]:
+        """The columns that are tensors."""
+        names = ("instance_ids", "match_scores", "detection_scores", "classes", "origin", "second_ids")
+        return {name: getattr(self, name) for name in names}
+
+
+def replace_crops(masks: Masks, boxes: Sequence[tuple[int, int, int, int]], crops: Sequence[Tensor]) -> Masks:
+    """The same rows with other pixels, on the CPU.
+
+    Args:
+        masks: D masks.
+        boxes: D boxes, xyxy, half-open.
+        crops: D times (h, w) bool, the pixels in the box.
+    """
+    regions = stack_regions(
+        masks.view_index.tolist(),
+        boxes,
+        [crop.flatten() for crop in crops],
+        labels=masks.regions.labels.tolist(),
+        num_views=masks.regions.num_views,
+    )
+    return replace(masks.to("cpu"), regions=regions)

@@ -1,17 +1,16 @@
-"""The whole method as a list of calls."""
+"""The whole method as a list of stages: each takes what is known of a scene, and gives it back with more."""
 
 from __future__ import annotations
 
 import json
 import time
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 from tqdm import tqdm
@@ -23,23 +22,70 @@ from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.masks.recognise import recognise_masks
-from mvseg.formats.photos import check_photos, describe_folder, read_photo
+from mvseg.formats.photos import Photos, check_photos, describe_folder
 from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.matching.match import check_baselines, match_regions
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
+from mvseg.poses.refine_poses import RefinedPoses, refine_poses
 from mvseg.results.provenance import hash_files
 from mvseg.results.result import Result
-from mvseg.scene import Scene
+from mvseg.scene import Cameras, Scene
 from mvseg.traits.up import find_up
 
 if TYPE_CHECKING:
     from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
-    from mvseg.masks import Proposals
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+    from mvseg.reconstruction.voxels import VoxelGrid
+    from mvseg.traits.measure import Traits
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
+
+Match = Callable[[Cameras], Matching]
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """What is known of a scene between two stages, and how the run works.
+
+    Attributes:
+        config: the options of all stages.
+        scene: cameras and views.
+        photos: of the scene.
+        keep, workers, progress: see `run_scene`.
+        match: from cameras to the masks of the scene, matched; what `find` leaves.
+        matching: the table of masks, and what matching says of the scene.
+        poses: what came of refining them; None where that was not asked for.
+        starts: {instance id: surface} that the masks were verified with; where the final ones start.
+        surfaces, voxels, traits, mask_kind, num_moved: see `Result`; `surfaces` may hold only those that are known
+            already until `reconstruct`.
+    """
+
+    config: RunConfig
+    scene: Scene
+    photos: Photos
+    keep: Path | None = None
+    workers: ProcessPoolExecutor | None = None
+    progress: bool = False
+    match: Match | None = None
+    matching: Matching | None = None
+    poses: RefinedPoses | None = None
+    starts: Mapping[int, LeafSurface] = field(default_factory=dict)
+    surfaces: Mapping[int, LeafSurface] | None = None
+    voxels: Mapping[int, VoxelGrid] | None = None
+    traits: Traits | None = None
+    mask_kind: str = ""
+    num_moved: int | None = None
+
+    @property
+    def matched(self) -> Matching:
+        """The matching, for the stages after it."""
+        assert self.matching is not None
+        return self.matching
+
+
+Stage = Callable[[State], State]
 
 
 def run_scene(
@@ -69,98 +115,217 @@ def run_scene(
     Raises:
         InputError: bad input; see the stages.
     """
-    seconds: dict[str, float] = {}
-    scores = from_views = None
-    starts: dict[int, LeafSurface] = {}
-    with _timed(seconds, "load"):
-        scene = place_scene(load_scene(folder), config)
-        check_photos(scene)
-        check_baselines(scene.cameras)
-        wanted = () if config.categories is None else [name.strip() for name in config.categories.split(",")]
-        found = None if masks is None else recognise_masks(scene, masks)
-        regions = None if found is None else read_masks(scene, found, crowd=config.coco_crowd, categories=wanted)
-    if masks is None and not scene.views[0].path.is_file():
-        beside = describe_folder(scene.views[0].path.parent)
-        end = f"; {beside}" if beside else ""
-        raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them{end}")
-    if regions is None:
-        with _timed(seconds, "detect"):
-            detections, matching = detect_regions(scene, config, keep=keep, prune=True, progress=progress)
-            scene = pose_scene(scene, matching)
-        if config.detect.witnesses:
-            with _timed(seconds, "witnesses"):
-                from mvseg.verification.other_views import hear_witnesses
-
-                detections, matching, starts = hear_witnesses(
-                    detections,
-                    matching,
-                    cameras=scene.cameras,
-                    photos=partial(read_photo, scene),
-                    workers=workers,
-                    progress=progress,
-                )
-        regions, scores, from_views = detections.regions, detections.scores, detections.from_views
-    else:
-        with _timed(seconds, "match"):
-            matching = match_regions(regions, scene.cameras, config.match, progress=progress)
-            scene = pose_scene(scene, matching)
-    shapes = config.reconstruct
-    is_checked = shapes is not None and shapes.check_ids and shapes.shape != "voxels" and from_views is None
-    if config.split_merged and not is_checked:
-        regions, matching, source = split_merged(regions, matching)
-        scores = None if scores is None else scores[source]
-        from_views = None if from_views is None else from_views[source]
-    surfaces: Mapping[int, LeafSurface] | None = None
-    voxels = traits = moved = None
-    if shapes is not None:
-        with _timed(seconds, "reconstruct"):
-            from mvseg.reconstruction.shapes import reconstruct_shapes
-
-            reconstruct = partial(
-                reconstruct_shapes,
-                cameras=scene.cameras,
-                config=shapes,
-                photos=partial(read_photo, scene) if scene.views[0].path.is_file() else None,
-                workers=workers,
-                progress=progress,
-            )
-            surfaces, voxels = reconstruct(regions, matching.instance_ids, starts=starts)
-            if is_checked and surfaces is not None:
-                from mvseg.verification.checked_ids import check_ids
-
-                checked = check_ids(regions, matching, surfaces, cameras=scene.cameras)
-                matching, moved, known = checked.matching, int(checked.is_moved.sum()), checked.unchanged(surfaces)
-                cut: set[int] = set()
-                if config.split_merged:
-                    cut = {instance for mask in matching.merged for instance in (mask.own, mask.other)}
-                    known = {instance: surface for instance, surface in known.items() if instance not in cut}
-                    regions, matching, source = split_merged(regions, matching)
-                    scores = None if scores is None else scores[source]
-                if moved or cut:
-                    surfaces, voxels = reconstruct(regions, matching.instance_ids, known=known)
-        with _timed(seconds, "measure"):
-            from mvseg.traits.measure import measure_plant
-
-            traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels, config=config.traits)
-    if from_views is not None:
-        from mvseg.verification.recut import recut_masks
-
-        regions = recut_masks(
-            regions, matching.instance_ids, surfaces or starts, cameras=scene.cameras, is_found=~from_views
-        )
+    begun = time.perf_counter()
+    state = load(folder, masks, config, keep=keep, workers=workers, progress=progress)
+    seconds = {"load": time.perf_counter() - begun}
+    for name, stage in list_stages(config, has_masks=masks is not None).items():
+        begun = time.perf_counter()
+        state = stage(state)
+        seconds[name] = time.perf_counter() - begun
     return Result(
-        scene=scene,
-        regions=regions,
-        matching=matching,
-        surfaces=surfaces,
-        voxels=voxels,
-        traits=traits,
+        scene=state.scene,
+        matching=state.matched,
+        photos=state.photos,
+        poses=state.poses,
+        surfaces=state.surfaces,
+        voxels=state.voxels,
+        traits=state.traits,
         seconds=seconds,
-        detection_scores=scores,
-        from_other_views=from_views,
-        mask_kind="" if found is None else found.kind,
-        num_moved=moved,
+        mask_kind=state.mask_kind,
+        num_moved=state.num_moved,
     )
+
+
+def list_stages(config: RunConfig, *, has_masks: bool) -> dict[str, Stage]:
+    """The stages that a config asks for, in their order.
+
+    Masks that were given are checked by surfaces where they are to be cut, since these know best which ones show two
+    leaves. What a detector found is cut before surfaces are fitted to it.
+    """
+    shapes = config.reconstruct
+    is_verified = not has_masks and config.detect.witnesses
+    is_checked = shapes is not None and shapes.check_ids and shapes.shape != "voxels" and not is_verified
+    stages = {
+        "detect": None if has_masks else detect,
+        "match": match_refined if config.refine_poses else match,
+        "split": split if config.split_merged and not is_checked else None,
+        "verify": verify if is_verified else None,
+        "check_ids": check_ids if is_checked else None,
+        "split_checked": split if config.split_merged and is_checked else None,
+        "reconstruct": None if shapes is None else reconstruct,
+        "measure": None if shapes is None else measure,
+        "recut": recut if is_verified else None,
+    }
+    return {name: stage for name, stage in stages.items() if stage is not None}
+
+
+# --- the stages
+
+
+def load(folder: Path, masks: Path | None, config: RunConfig, **how: Any) -> State:
+    """Cameras, and the masks if there are any."""
+    scene = place_scene(load_scene(folder), config)
+    check_photos(scene)
+    check_baselines(scene.cameras)
+    state = State(config=config, scene=scene, photos=Photos(scene), **how)
+    if masks is None:
+        if not state.photos.exist:
+            beside = describe_folder(scene.views[0].path.parent)
+            end = f"; {beside}" if beside else ""
+            raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them{end}")
+        return state
+    wanted = () if config.categories is None else [name.strip() for name in config.categories.split(",")]
+    found = recognise_masks(scene, masks)
+    regions = read_masks(scene, found, crowd=config.coco_crowd, categories=wanted)
+    matcher = partial(match_regions, regions, config=config.match, progress=state.progress)
+    return replace(state, match=matcher, mask_kind=found.kind)
+
+
+def detect(state: State) -> State:
+    """Find instances in every photo, and again, larger, where the plant fills a small part of the photos.
+
+    Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps.
+
+    Raises:
+        InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
+    """
+    from mvseg.detection.crops import boxes_to_look_at, crop_cameras, place_crops
+    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+    from mvseg.detectors.zoo import load_detector
+
+    options, cameras = state.config.detect, state.scene.cameras
+    detector = load_detector(options.weights, image_size=options.image_size, min_score=options.min_score)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = MultiViewMaskRCNN(
+        detector, num_iterations=options.num_iterations, scales=options.scales, match=state.config.match
+    ).to(device)
+    kept = None if state.keep is None else KeptDetections(state.keep, _describe_detector(options, model, device))
+    found, names = _look(model, state, kept=kept)
+    # the first look is matched once, and not again by the next stage
+    matcher: Match = lru_cache(maxsize=1)(partial(model.match_detections, found, progress=state.progress))
+    boxes = None
+    if options.crop == "auto":
+        boxes = boxes_to_look_at(matcher(cameras).masks, cameras, longest=model.transform.max_size)
+    if boxes is not None:
+        in_crops, more_names = _look(model, state, boxes, kept=kept)
+        names |= more_names
+
+        def matcher(cameras: Cameras) -> Matching:
+            matching = model.match_detections(in_crops, crop_cameras(cameras, boxes), progress=state.progress)
+            return matching.with_masks(place_crops(matching.masks, boxes))
+
+    if state.keep is not None:
+        delete_kept(state.keep, but=names)
+    return replace(state, match=matcher)
+
+
+def match(state: State) -> State:
+    """The same id for masks of the same instance, see `match_regions`."""
+    assert state.match is not None
+    matching = state.match(state.scene.cameras)
+    if not len(matching) and not state.mask_kind:
+        message = f"the detector finds nothing that scores {state.config.detect.min_score:g} or more"
+        warnings.warn(message, InputWarning, stacklevel=3)
+    return replace(state, matching=matching)
+
+
+def match_refined(state: State) -> State:
+    """The same with refined poses, see `refine_poses`. Warns (InputWarning) of cameras that no rig file can hold."""
+    assert state.match is not None
+    poses = refine_poses(state.scene.cameras, state.match)
+    odd = [view for view in state.scene.views if view.lens is not None and opencv_distortion(view.lens) is None]
+    if odd and poses.is_refined:
+        message = f"the refined cameras are not written: view {odd[0].name} has a lens that no rig file can hold"
+        warnings.warn(message, InputWarning, stacklevel=3)
+    scene = replace(state.scene, cameras=poses.cameras)
+    return match(replace(state, scene=scene, poses=poses))
+
+
+def split(state: State) -> State:
+    """Cut masks that show two instances; surfaces of these are not known any more."""
+    from mvseg.verification.checked_ids import unchanged_surfaces
+
+    before, after = state.matched.masks, split_merged(state.matched.masks)
+    surfaces = None if state.surfaces is None else unchanged_surfaces(before, after, state.surfaces)
+    return replace(state, matching=state.matched.with_masks(after), surfaces=surfaces)
+
+
+def verify(state: State) -> State:
+    """The other views correct what the detector found, see `verify_masks`."""
+    from mvseg.verification.other_views import verify_masks
+
+    masks, starts = verify_masks(
+        state.matched.masks,
+        cameras=state.scene.cameras,
+        photos=state.photos,
+        workers=state.workers,
+        progress=state.progress,
+    )
+    return replace(state, matching=state.matched.with_masks(masks), starts=starts)
+
+
+def check_ids(state: State) -> State:
+    """Surfaces correct the ids, see `mvseg.verification.checked_ids`; those of the other instances are known then."""
+    from mvseg.verification import checked_ids
+
+    before = state.matched.masks
+    surfaces = reconstruct(state, with_voxels=False).surfaces
+    assert surfaces is not None
+    after = checked_ids.check_ids(before, surfaces, cameras=state.scene.cameras)
+    known = checked_ids.unchanged_surfaces(before, after, surfaces)
+    return replace(
+        state,
+        matching=state.matched.with_masks(after.close_gaps()),
+        surfaces=after.renumber(known),
+        num_moved=int((before.instance_ids != after.instance_ids).sum()),
+    )
+
+
+def reconstruct(state: State, *, with_voxels: bool = True) -> State:
+    """A shape for every instance, see `reconstruct_shapes`."""
+    from mvseg.reconstruction.shapes import reconstruct_shapes
+
+    assert state.config.reconstruct is not None
+    masks = state.matched.masks
+    surfaces, voxels = reconstruct_shapes(
+        masks.regions,
+        masks.instance_ids,
+        state.scene.cameras,
+        config=state.config.reconstruct,
+        starts=state.starts,
+        known=state.surfaces or {},
+        photos=state.photos if state.photos.exist else None,
+        with_voxels=with_voxels,
+        workers=state.workers,
+        progress=state.progress,
+    )
+    return replace(state, surfaces=surfaces, voxels=voxels)
+
+
+def measure(state: State) -> State:
+    """Traits of the leaves and of the plant, see `measure_plant`."""
+    from mvseg.traits.measure import measure_plant
+
+    traits = measure_plant(
+        state.scene,
+        state.matched,
+        surfaces=state.surfaces,
+        voxels=state.voxels or {},
+        photos=state.photos,
+        config=state.config.traits,
+    )
+    return replace(state, traits=traits)
+
+
+def recut(state: State) -> State:
+    """Cut the detector's masks anew by their surfaces, see `recut_masks`."""
+    from mvseg.verification.recut import recut_masks
+
+    masks = recut_masks(state.matched.masks, state.surfaces or state.starts, cameras=state.scene.cameras)
+    return replace(state, matching=state.matched.with_masks(masks))
+
+
+# --- parts of the stages
 
 
 def place_scene(scene: Scene, config: RunConfig) -> Scene:
@@ -181,86 +346,29 @@ def place_scene(scene: Scene, config: RunConfig) -> Scene:
     return find_up(scene, config.up)
 
 
-def pose_scene(scene: Scene, matching: Matching) -> Scene:
-    """The scene with the poses that its masks were matched with, see `MatchConfig.refine_poses`.
-
-    Warns (InputWarning) of refined cameras that no rig file can hold.
-    """
-    if matching.poses is None or not matching.poses.is_refined:
-        return scene
-    odd = [view for view in scene.views if view.lens is not None and opencv_distortion(view.lens) is None]
-    if odd:
-        message = f"the refined cameras are not written: view {odd[0].name} has a lens that no rig file can hold"
-        warnings.warn(message, InputWarning, stacklevel=3)
-    return replace(scene, cameras=matching.poses.cameras)
-
-
 def detect_regions(
-    scene: Scene,
-    config: RunConfig = RunConfig(),
-    *,
-    keep: Path | None = None,
-    prune: bool = False,
-    progress: bool = False,
-) -> tuple[Proposals, Matching]:
-    """Find and match the instances in the photos of a scene, see `MultiViewMaskRCNN.find_regions`.
+    scene: Scene, config: RunConfig = RunConfig(), *, keep: Path | None = None, progress: bool = False
+) -> Matching:
+    """Find and match the instances in the photos of a scene: the stages `detect` and `match`.
 
-    Runs on the first GPU, if there is one. Torch's thread count and random generators are left alone. One photo at a
-    time is in memory. For `keep` see `run_scene`; `prune` deletes what it holds of other photos and options.
-
-    Raises:
-        InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
+    For `keep` see `run_scene`.
     """
-    from mvseg.detection.crops import boxes_to_look_at, crop_cameras, place_crops
-    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
-    from mvseg.detectors.zoo import load_detector
-
-    detect = config.detect
-    detector = load_detector(detect.weights, image_size=detect.image_size, min_score=detect.min_score)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = MultiViewMaskRCNN(
-        detector, num_iterations=detect.num_iterations, scales=detect.scales, match=config.match
-    ).to(device)
-    kept = None if keep is None else KeptDetections(keep, _describe_detector(detect, model, device))
-    found, names = _look(model, scene, kept=kept, progress=progress)
-    detections, matching = model.match_detections(found, scene.cameras, progress=progress)
-    if detect.crop == "auto":
-        longest = model.transform.max_size
-        boxes = boxes_to_look_at(detections.regions, matching, scene.cameras, longest=longest)
-        if boxes is not None:
-            found, more_names = _look(model, scene, boxes, kept=kept, progress=progress)
-            cropped = crop_cameras(scene.cameras, boxes)
-            detections, matching = model.match_detections(found, cropped, progress=progress)
-            detections, names = place_crops(detections, boxes), names | more_names
-            if matching.poses is not None:  # of the crops
-                posed = replace(matching.poses.cameras, K=scene.cameras.K, sizes=scene.cameras.sizes)
-                matching = replace(matching, poses=replace(matching.poses, cameras=posed))
-    if keep is not None and prune:
-        delete_kept(keep, but=names)
-    if not len(detections.regions):
-        message = f"the detector finds nothing that scores {detect.min_score:g} or more"
-        warnings.warn(message, InputWarning, stacklevel=3)
-    return detections, matching
+    return match(detect(State(config=config, scene=scene, photos=Photos(scene), keep=keep, progress=progress))).matched
 
 
 def _look(
-    model: MultiViewMaskRCNN,
-    scene: Scene,
-    boxes: torch.Tensor | None = None,
-    *,
-    kept: KeptDetections | None,
-    progress: bool,
+    model: MultiViewMaskRCNN, state: State, boxes: torch.Tensor | None = None, *, kept: KeptDetections | None
 ) -> tuple[list[dict[str, torch.Tensor]], set[str]]:
     """What the detector finds in every photo, or in its box (V, 4) xyxy, and the names of the files that keep it."""
-    found, names = [], set()
+    found, names, scene = [], set(), state.scene
     device = next(model.parameters()).device
-    for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress):
+    for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not state.progress):
         box = None if boxes is None else boxes[view].tolist()
-        path = kept.path(scene, view, box) if kept is not None and scene.views[view].path.is_file() else None
+        path = kept.path(scene, view, box) if kept is not None and state.photos.exist else None
         shown = None if path is None else read_detections(path)
         if shown is None:
             x1, y1, x2, y2 = box or (0, 0, *scene.cameras.sizes[view].tolist())
-            photo = torch.from_numpy(read_photo(scene, view)[y1:y2, x1:x2]).to(device).permute(2, 0, 1)
+            photo = torch.from_numpy(state.photos(view)[y1:y2, x1:x2].copy()).to(device).permute(2, 0, 1)
             shown = model.detect(photo.float().div_(255))
             if path is not None:
                 write_detections(path, shown)
@@ -279,10 +387,3 @@ def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: s
     options |= {"num_iterations": None, "witnesses": None, "crop": None}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "mvseg": __version__}
     return json.dumps(options | {"torch": torch.__version__, "device": device})
-
-
-@contextmanager
-def _timed(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    start = time.perf_counter()
-    yield
-    seconds[stage] = time.perf_counter() - start

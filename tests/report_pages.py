@@ -34,7 +34,7 @@ def rename_hostile(result: Result) -> Result:
 
 def draw_pictures(result: Result) -> list[Picture]:
     views = range(len(result.scene.views))
-    return [draw_picture(read_photo(result.scene, view), result.regions, result.matching, view=view) for view in views]
+    return [draw_picture(read_photo(result.scene, view), result.masks, view=view) for view in views]
 
 
 def write_page(path: Path, result: Result) -> Path:

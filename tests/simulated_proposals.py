@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.masks import Proposals
+from mvseg.detection.proposals import Proposals
 from mvseg.regions import mask_box, regions_from_label_maps, stack_regions
 
 

@@ -18,8 +18,7 @@ from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.run import detect, leave_autocast, run_heads
 from mvseg.detectors.scales import look, run_scales
 from mvseg.detectors.small import SMALL_ARCHITECTURES
-from mvseg.masks import Proposals
-from mvseg.matching.result import Matching
+from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from other_device import other_device
 from synthetic import arc_positions, cameras_at
@@ -128,14 +127,13 @@ def test_all_views_with_cameras_and_without(model: MaskRCNN, photos: list[Tensor
 def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8)
     images = (photo.to(device) for photo in photos)
-    found, matching = there(wrapped, device).find_regions(images, CAMERAS.to(device))
-    expected, rematched = wrapped.find_regions(photos, CAMERAS)
-    assert (found.boxes.dtype, found.scores.dtype, found.classes.dtype) == (torch.float32, torch.float32, torch.int64)
-    for name in ("boxes", "scores", "classes"):
+    found = there(wrapped, device).find_regions(images, CAMERAS.to(device)).masks
+    expected = wrapped.find_regions(photos, CAMERAS).masks
+    assert (found.detection_scores.dtype, found.classes.dtype) == (torch.float32, torch.int64)
+    for name in ("detection_scores", "classes", "match_scores"):
         torch.testing.assert_close(getattr(found, name), getattr(expected, name))
     assert torch.equal(found.regions.crops, expected.regions.crops)
-    assert torch.equal(matching.instance_ids, rematched.instance_ids)
-    torch.testing.assert_close(matching.match_scores, rematched.match_scores)
+    assert torch.equal(found.instance_ids, expected.instance_ids)
 
 
 def test_witnesses_are_heard_on_the_cpu(
@@ -144,14 +142,13 @@ def test_witnesses_are_heard_on_the_cpu(
     """And their answer is where the images are."""
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, witnesses=True)
 
-    def hear(
-        proposals: Proposals, matching: Matching, **given: Any
-    ) -> tuple[Proposals, Matching, dict[int, LeafSurface]]:
-        assert given["cameras"].K.device.type == proposals.boxes.device.type == "cpu"
+    def verify(masks: Masks, **given: Any) -> tuple[Masks, dict[int, LeafSurface]]:
+        assert given["cameras"].K.device.type == masks.view_index.device.type == "cpu"
         assert given["photos"](2).shape == (HEIGHT, WIDTH, 3)
-        return replace(proposals, from_views=proposals.scores > 0.4), matching, {}
+        origin = torch.where(masks.detection_scores > 0.4, int(Origin.OTHER_VIEWS), masks.origin)
+        return replace(masks, origin=origin), {}
 
-    monkeypatch.setattr("mvseg.detection.mask_rcnn.hear_witnesses", hear)
+    monkeypatch.setattr("mvseg.detection.mask_rcnn.verify_masks", verify)
     answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
     for answer, expected in zip(answers, wrapped(photos, cameras=CAMERAS), strict=True):
         check(answer, expected, device)

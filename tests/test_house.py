@@ -41,7 +41,7 @@ FLOORS = (
     ("training", "results"),
     ("pipeline",),
     ("runs",),
-    ("batch", "adaptation"),
+    ("batch",),
     ("__init__",),
     ("cli",),
 )

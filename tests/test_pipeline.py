@@ -36,18 +36,17 @@ from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import read_photo
-from mvseg.masks import Proposals
-from mvseg.matching.result import Matching, MergedMask, RefinedPoses
-from mvseg.pipeline import detect_regions
+from mvseg.masks import Masks, MergedMask, Origin
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline import State, detect_regions
+from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
-from mvseg.regions import Regions
 from mvseg.results.folder import save_result
 from mvseg.results.provenance import describe_run
 from mvseg.results.result import Result
-from mvseg.scene import Scene, View
-from mvseg.verification.checked_ids import CheckedIds
-from mvseg.verification.other_views import hear_witnesses
+from mvseg.scene import Cameras, Scene, View
+from mvseg.verification.other_views import verify_masks
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)
@@ -93,18 +92,17 @@ def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.M
     given = load_scene(plant).cameras
     better = replace(given, t=given.t + 0.01)
 
-    def match(*args: Any, **options: Any) -> Matching:
-        poses = RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2))
-        return replace(match_regions(*args, **options), poses=poses)
-
-    monkeypatch.setattr(mvseg.pipeline, "match_regions", match)
-    result = run_scene(plant, plant / "masks", IDS_ONLY)
+    poses = RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2))
+    monkeypatch.setattr(mvseg.pipeline, "refine_poses", lambda *_: poses)
+    result = run_scene(plant, plant / "masks", replace(IDS_ONLY, refine_poses=True))
     assert result.scene.cameras is better
+    assert result.poses is poses
     fisheye = pycolmap.Camera(model="OPENCV_FISHEYE", width=128, height=96, params=[150, 150, 64, 48, 0, 0, 0, 0])
-    view, *others = result.scene.views
-    odd = replace(result.scene, views=(replace(view, lens=fisheye), *others))
+    state = mvseg.pipeline.load(plant, plant / "masks", IDS_ONLY)
+    view, *others = state.scene.views
+    odd = replace(state.scene, views=(replace(view, lens=fisheye), *others))
     with pytest.warns(InputWarning, match="view 000 has a lens that no rig file can hold"):
-        assert mvseg.pipeline.pose_scene(odd, result.matching).cameras is better
+        assert mvseg.pipeline.match_refined(replace(state, scene=odd)).scene.cameras is better
 
 
 def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
@@ -165,7 +163,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert (run["scene"], run["warnings"]) == ("plant", ["odd"])
-        ran = {"masks", "match", "split_merged", "coco_crowd", "categories", "report"}  # the stages that ran
+        ran = {"masks", "match", "refine_poses", "split_merged", "coco_crowd", "categories", "report"}
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"
@@ -200,7 +198,7 @@ def test_surfaces_are_fitted_to_the_photos_when_wanted_and_there(
         (shutil.copytree if name == "masks" else shutil.copy)(demo_scene() / name, tmp_path / name)
     for folder in (tmp_path, demo_scene()):
         run_scene(folder, folder / "masks", config)
-    without, with_photos = asked_with
+    without, with_photos = asked_with[0], asked_with[-1]
     assert without is None
     assert (with_photos is not None) == is_wanted
     if with_photos is not None:
@@ -217,13 +215,10 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
         fits.append((ids.tolist(), dict(known)))
         return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
 
-    def check(_: object, matching: Matching, *__: object, **___: object) -> CheckedIds:
-        ids = matching.instance_ids.clone()
+    def check(masks: Masks, *_: object, **__: object) -> Masks:
+        ids = masks.instance_ids.clone()
         ids[0] = ids[0] % 3 + 1
-        is_moved = torch.arange(len(ids)) == 0
-        is_changed = torch.tensor([number in (int(ids[0]), int(matching.instance_ids[0])) for number in (1, 2, 3)])
-        moved = replace(matching, instance_ids=ids)
-        return CheckedIds(matching=moved, is_moved=is_moved, old_ids=torch.arange(1, 4), is_changed=is_changed)
+        return replace(masks, instance_ids=ids)
 
     monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
@@ -242,6 +237,13 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
         assert result.voxels is not None
 
 
+def show_two(masks: Masks) -> Masks:
+    """The left half of the first mask shows the next leaf."""
+    own, part = int(masks.instance_ids[0]), masks.regions.crop(0).clone()
+    part[:, part.shape[1] // 2 :] = False
+    return masks.with_merged([MergedMask(region=0, own=own, other=own % 3 + 1, part=part)])
+
+
 @pytest.mark.parametrize("is_checked", [True, False])
 def test_masks_are_cut_once_the_surfaces_were_heard_and_both_leaves_are_fitted_again(
     plant: Path, monkeypatch: pytest.MonkeyPatch, is_checked: bool
@@ -252,19 +254,12 @@ def test_masks_are_cut_once_the_surfaces_were_heard_and_both_leaves_are_fitted_a
         fits.append((ids.tolist(), list(known)))
         return {number: LeafSurface.none(torch.arange(2), "a test") for number in (1, 2, 3)}
 
-    def list_first(regions: Regions, matching: Matching, *_: object) -> Matching:
-        """The left half of the first mask shows the next leaf."""
-        own, part = int(matching.instance_ids[0]), regions.crop(0).clone()
-        part[:, part.shape[1] // 2 :] = False
-        return replace(matching, merged=(MergedMask(region=0, own=own, other=own % 3 + 1, part=part),))
+    def check(masks: Masks, *_: object, **__: object) -> Masks:
+        return show_two(masks)
 
-    def check(regions: Regions, matching: Matching, *_: object, **__: object) -> CheckedIds:
-        none = torch.zeros(len(regions), dtype=torch.bool)
-        listed = list_first(regions, matching)
-        return CheckedIds(matching=listed, is_moved=none, old_ids=torch.arange(1, 4), is_changed=none[:3])
-
-    def match(regions: Regions, *args: Any, **kwargs: Any) -> Matching:
-        return list_first(regions, match_regions(regions, *args, **kwargs))
+    def match(*args: Any, **kwargs: Any) -> Matching:
+        matching = match_regions(*args, **kwargs)
+        return matching.with_masks(show_two(matching.masks))
 
     monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
@@ -280,42 +275,69 @@ def test_masks_are_cut_once_the_surfaces_were_heard_and_both_leaves_are_fitted_a
     assert fits == ([(whole, []), (ids, left)] if is_checked else [(ids, [])])
 
 
+@pytest.mark.parametrize("witnesses", [True, False])
+def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
+    plant: Path, monkeypatch: pytest.MonkeyPatch, witnesses: bool
+) -> None:
+    """Before the other views judge them."""
+    regions = load_masks(load_scene(plant), plant / "masks")
+    asked: list[Masks] = []
+
+    def detect(state: State) -> State:
+        def match(cameras: Cameras) -> Matching:
+            matching = match_regions(regions, cameras)
+            origin = torch.full_like(matching.masks.origin, Origin.DETECTED)
+            return matching.with_masks(show_two(replace(matching.masks, origin=origin)))
+
+        return replace(state, match=match)
+
+    def verify(masks: Masks, **_: object) -> tuple[Masks, dict[int, LeafSurface]]:
+        asked.append(masks)
+        return masks, {}
+
+    monkeypatch.setattr(mvseg.pipeline, "detect", detect)
+    monkeypatch.setattr("mvseg.verification.other_views.verify_masks", verify)
+    config = replace(IDS_ONLY, split_merged=True, detect=DetectConfig(witnesses=witnesses))
+    result = run_scene(plant, None, config)
+    assert len(result.masks) == len(regions) + 1
+    assert result.masks.merged == ()
+    assert [len(masks) for masks in asked] == [len(regions) + 1] * witnesses
+    whole = run_scene(plant, None, replace(config, split_merged=False))
+    assert len(whole.masks) == len(regions)
+    assert len(whole.masks.merged) == 1
+
+
 def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
     leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160)
     missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
     regions = leafy.regions.select(~missed)
-    count = len(regions)
-    matching = Matching(
-        instance_ids=regions.labels, match_scores=torch.full((count,), 0.9), num_instances=2, method="nview"
+    found = Masks.of(
+        regions,
+        regions.labels,
+        torch.full((len(regions),), 0.9),
+        detection_scores=torch.linspace(0.4, 0.9, len(regions)),
+        classes=regions.labels + 3,
+        origin=Origin.DETECTED,
     )
-    scores = torch.linspace(0.4, 0.9, count)
-    found = Proposals(regions=regions, boxes=regions.boxes.float(), scores=scores, classes=regions.labels + 3)
     photos = partial(read_photo, leafy.scene)
-    corrected, rematched, starts = hear_witnesses(found, matching, cameras=leafy.scene.cameras, photos=photos)
-    assert len(corrected.regions) == count + 1
-    assert corrected.from_views is not None
-    (new,) = corrected.from_views.nonzero()[:, 0].tolist()
-    assert (int(corrected.regions.view_index[new]), int(rematched.instance_ids[new])) == (2, 1)
-    assert float(corrected.scores[new]) == pytest.approx(float(scores[regions.labels == 1].mean()))
-    assert torch.equal(corrected.classes, rematched.instance_ids + 3)
+    masks, starts = verify_masks(found, cameras=leafy.scene.cameras, photos=photos)
+    assert len(masks) == len(found) + 1
+    (new,) = (masks.origin == Origin.OTHER_VIEWS).nonzero()[:, 0].tolist()
+    assert (int(masks.view_index[new]), int(masks.instance_ids[new])) == (2, 1)
+    of_leaf = found.detection_scores[regions.labels == 1]
+    assert float(masks.detection_scores[new]) == pytest.approx(float(of_leaf.mean()))
+    assert torch.equal(masks.classes, masks.instance_ids + 3)
     true = leafy.regions.mask(int(missed.nonzero()), 160, 160)
-    shown = corrected.regions.mask(new, 160, 160)
+    shown = masks.regions.mask(new, 160, 160)
     assert float((true & shown).sum() / (true | shown).sum()) > 0.9
-    assert torch.equal(corrected.boxes, corrected.regions.boxes.float())
     assert list(starts) == [1, 2]
     for number, start in starts.items():  # the new mask is drawn from it
-        assert set(start.views.tolist()) <= set(corrected.regions.view_index[rematched.instance_ids == number].tolist())
+        assert set(start.views.tolist()) <= set(masks.view_index[masks.instance_ids == number].tolist())
 
-    result = Result(
-        scene=leafy.scene,
-        regions=corrected.regions,
-        matching=rematched,
-        detection_scores=corrected.scores,
-        from_other_views=corrected.from_views,
-    )
+    result = Result(scene=leafy.scene, matching=Matching(masks, MatchReport("nview", has_probabilities=True)))
     save_result(result, tmp_path / "out", {})
     written = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
-    assert [entry["from_other_views"] for entry in written] == corrected.from_views.tolist()
+    assert [entry["from_other_views"] for entry in written] == (masks.origin == Origin.OTHER_VIEWS).tolist()
 
 
 @pytest.mark.slow
@@ -332,21 +354,16 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
         write_png(views[-1].path, photo)
     scene = Scene("far", tuple(views), cameras)
     kept = tmp_path / "kept"
-    first, matching = detect_regions(scene, RunConfig(detect=DetectConfig(crop="off")))
-    again, rematched = detect_regions(scene, RunConfig(match=MatchConfig(refine_poses=True)), keep=kept)
-    assert rematched.poses is not None
-    assert torch.equal(rematched.poses.cameras.K, cameras.K)
-    assert torch.equal(rematched.poses.cameras.sizes, cameras.sizes)
-    assert not rematched.poses.is_refined  # exact ones stay
-    assert len(again.regions) > len(first.regions)
+    first = detect_regions(scene, RunConfig(detect=DetectConfig(crop="off"))).masks
+    again = detect_regions(scene, keep=kept).masks
+    assert len(again) > len(first)
     assert len([*kept.iterdir()]) == 2 * len(chosen)
 
-    boxes = plant_boxes(first.regions, matching, cameras)
+    boxes = plant_boxes(first, cameras)
     for view, (x1, y1, x2, y2) in zip(views, boxes.tolist(), strict=True):
         write_png(view.path, np.ascontiguousarray(read_rgb(view.path)[y1:y2, x1:x2]))
-    expected, _ = detect_regions(Scene("cut", tuple(views), crop_cameras(cameras, boxes)))
+    expected = detect_regions(Scene("cut", tuple(views), crop_cameras(cameras, boxes))).masks
     placed = place_crops(expected, boxes)
     assert torch.equal(again.regions.boxes, placed.regions.boxes)
     assert torch.equal(again.regions.crops, placed.regions.crops)
-    assert torch.equal(again.boxes, placed.boxes)
-    assert int(rematched.instance_ids.max()) >= 10  # of 12 leaves
+    assert int(again.instance_ids.max()) >= 10  # of 12 leaves

@@ -19,7 +19,8 @@ from mvseg import Matching, load_masks, load_scene, match_regions
 from mvseg.demo import demo_scene
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import read_photo
-from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.masks import Masks
+from mvseg.regions import regions_from_label_maps
 from mvseg.results.overlay import draw_overlay
 from mvseg.scene import Scene
 from mvseg.simulation.faults import Faults, degrade_labels
@@ -40,12 +41,12 @@ def wrong_regions(matching: Matching, leaf: torch.Tensor) -> torch.Tensor:
     return wrong
 
 
-def draw_tile(scene: Scene, regions: Regions, matching: Matching, *, view: int, wrong: torch.Tensor) -> np.ndarray:
+def draw_tile(scene: Scene, masks: Masks, *, view: int, wrong: torch.Tensor) -> np.ndarray:
     """(h, w, 3) RGB: the overlay of a view, with the wrong regions outlined."""
-    overlay = draw_overlay(read_photo(scene, view), regions, matching, view=view)
+    overlay = draw_overlay(read_photo(scene, view), masks, view=view)
     height, width = overlay.shape[:2]
-    for index in ((regions.view_index == view) & wrong).nonzero()[:, 0].tolist():
-        mask = regions.mask(index, *scene.cameras.sizes[view].tolist()).numpy().astype(np.uint8)
+    for index in ((masks.view_index == view) & wrong).nonzero()[:, 0].tolist():
+        mask = masks.regions.mask(index, *scene.cameras.sizes[view].tolist()).numpy().astype(np.uint8)
         mask = np.asarray(cv2.resize(mask, (width, height), interpolation=cv2.INTER_NEAREST))
         borders, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         cv2.drawContours(overlay, borders, -1, WHITE, 3)
@@ -60,7 +61,7 @@ def draw_failures(scene: Scene, truth: list[np.ndarray], seed: int) -> tuple[np.
     wrong = wrong_regions(matching, shown_instances(regions, truth, count_background=False))
     failures = torch.bincount(regions.view_index[wrong], minlength=len(truth))
     views = failures.argsort(descending=True, stable=True)[:NUM_TILES].sort().values.tolist()
-    tiles = [draw_tile(scene, regions, matching, view=view, wrong=wrong) for view in views]
+    tiles = [draw_tile(scene, matching.masks, view=view, wrong=wrong) for view in views]
     return np.concatenate(tiles, 1), int(wrong.sum())
 
 

@@ -122,9 +122,9 @@ def draw_cluster(example: Example) -> list[np.ndarray]:
     example.outline(heat, example.leaf, WHITE, thickness=1)
     tiles = [caption(heat, f"view {SOURCE}: the map of its cluster")]
     ids = torch.where(example.members, example.matching.instance_ids, -1)
-    cluster = replace(example.matching, instance_ids=ids)
+    cluster = replace(example.matching.masks, instance_ids=ids)
     for view in OTHERS:
-        overlay = draw_overlay(example.photo(view), example.regions, cluster, view=view)
+        overlay = draw_overlay(example.photo(view), cluster, view=view)
         tiles.append(caption(overlay, f"view {view}: its cluster"))
     return tiles
 

@@ -27,6 +27,7 @@ from mvseg.detectors.run import run_heads
 from mvseg.detectors.zoo import load_detector
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_scene
+from mvseg.masks import Masks
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
@@ -59,12 +60,12 @@ def cpu_seconds() -> float:
     return time.process_time() + gone.ru_utime + gone.ru_stime
 
 
-def draw_pictures(regions: Regions, matching: Matching, cameras: Cameras) -> None:
+def draw_pictures(masks: Masks, cameras: Cameras) -> None:
     tiles, names = [], [str(view) for view in range(len(cameras))]
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         photo = np.full((height, width, 3), 40, np.uint8)
-        draw_overlay(photo, regions, matching, view=view)
-        tiles.append(draw_tile(photo, regions, matching, view=view))
+        draw_overlay(photo, masks, view=view)
+        tiles.append(draw_tile(photo, masks, view=view))
     draw_contact_sheet(tiles, names)
 
 
@@ -127,7 +128,7 @@ def run_stages(path: str, masks: str, *, every: bool) -> dict[str, Any]:
     watch.time("affinity", lambda: region_affinity(regions, cameras))
     matching = watch.time("matching", lambda: match_regions(regions, cameras))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    watch.time("pictures", lambda: draw_pictures(regions, matching, cameras))
+    watch.time("pictures", lambda: draw_pictures(matching.masks, cameras))
     if every:
         time_all(watch, regions, matching, cameras, maps)
     ids = matching.instance_ids.numpy().astype(np.int64)

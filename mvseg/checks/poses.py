@@ -181,7 +181,7 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     missing = tuple(index for index in missed if index not in view.off)
     if missing:
         most = np.nanmax(view.offset_px[list(missing)])
-        step = "refine the poses, with --match.refine_poses true or COLMAP's bundle adjustment"
+        step = "refine the poses, with --refine_poses true or COLMAP's bundle adjustment"
         what = f"epipolar lines of {name_views(missing, names)} miss by up to {most:.0f} px: {step}"
         findings.append(Finding(where="poses", what=what, level="warning", views=missing))
     return findings

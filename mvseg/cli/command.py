@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg._version import __version__
-from mvseg.cli import adapt, batch, check, infer, match, models, pose, simulate, train
+from mvseg.cli import batch, check, infer, match, models, pose, simulate, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -29,7 +29,6 @@ VERBS = {
     "match": match,
     "eval": evaluate,
     "train": train,
-    "adapt": adapt,
     "simulate": simulate,
     "models": models,
 }

@@ -38,6 +38,7 @@ def run(args: Namespace) -> int:
     config = RunConfig(
         match=build_options(MatchConfig, args.match, "match."),
         reconstruct=None,
+        refine_poses=args.refine_poses,
         split_merged=args.split_merged,
         report=args.report,
         coco_crowd=args.coco_crowd,

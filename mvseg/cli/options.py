@@ -11,7 +11,6 @@ from typing import Any, Literal, TypeVar
 
 from jsonargparse import ActionConfigFile, ArgumentParser, Namespace  # type: ignore[attr-defined]  # documented
 
-from mvseg.adaptation.config import AdaptConfig
 from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
@@ -26,7 +25,7 @@ DEFAULT_OUT = Path("results")
 # an installed mvseg carries configs/ inside the package, a checkout has it beside the package
 CONFIG_HOMES = (Path(str(files("mvseg") / "configs")), Path(str(files("mvseg"))).parent / "configs")
 Options = TypeVar(
-    "Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, AdaptConfig, PoseConfig
+    "Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, PoseConfig
 )
 
 
@@ -79,6 +78,7 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
     parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
     parser.add_argument("--quiet", action="store_true", help="no progress bars")
     parser.add_argument("--report", type=bool, default=True, help="write report.html, the result as one page")
+    parser.add_argument("--refine_poses", type=bool, default=False, help="refine poses that are a few pixels off")
     parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that cover two instances in two")
     parser.add_argument(
         "--coco_crowd",
@@ -118,6 +118,7 @@ def build_run(args: Namespace) -> RunConfig:
         scale=args.scale,
         unit=args.unit,
         up=read_up(args.up),
+        refine_poses=args.refine_poses,
         split_merged=args.split_merged,
         draw_rims=args.draw_rims,
         report=args.report,

@@ -11,10 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.masks import Proposals
-from mvseg.matching.result import SURE, Matching
+from mvseg.masks import SURE, Masks
 from mvseg.reconstruction.triangulate import triangulate
-from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 LEAST_VIEWS = 3  # of an instance that is part of the plant; all views where there are fewer
@@ -22,23 +20,22 @@ MARGIN = 0.1  # of the longer side of a box, on each side: leaves that were miss
 LEAST_GAIN = 1.5  # by which a second look must see the plant larger, for most photos
 
 
-def boxes_to_look_at(regions: Regions, matching: Matching, cameras: Cameras, *, longest: int) -> Tensor | None:
+def boxes_to_look_at(masks: Masks, cameras: Cameras, *, longest: int) -> Tensor | None:
     """`plant_boxes`, if a detector that scales larger images down to a longer side of `longest` pixels sees the plant
     at least `LEAST_GAIN` times as large in them, in most views; else None."""
-    boxes = plant_boxes(regions, matching, cameras)
+    boxes = plant_boxes(masks, cameras)
     gain = gain_of_crops(boxes, cameras.sizes, longest)
     return boxes if float(gain.median()) >= LEAST_GAIN else None
 
 
-def plant_boxes(regions: Regions, matching: Matching, cameras: Cameras) -> Tensor:
+def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
     """The box of the plant in each view: all instances that are surely matched, wherever they were found or not.
 
     An instance is a ball around the point that its masks' boxes are centred on. A view's box holds the balls, and the
     masks of these instances in that view.
 
     Args:
-        regions: D masks.
-        matching: their ids.
+        masks: D masks.
         cameras: V cameras.
 
     Returns:
@@ -46,10 +43,11 @@ def plant_boxes(regions: Regions, matching: Matching, cameras: Cameras) -> Tenso
     """
     width, height = cameras.sizes.T
     frames = torch.stack((torch.zeros_like(width), torch.zeros_like(width), width, height), 1)
-    is_sure = (matching.instance_ids > 0) & (matching.match_scores >= SURE)
+    regions = masks.regions
+    is_sure = (masks.instance_ids > 0) & (masks.match_scores >= SURE)
     points, radii, of_plant = [], [], torch.zeros_like(is_sure)
-    for instance in matching.instance_ids[is_sure].unique().tolist():
-        members = (is_sure & (matching.instance_ids == instance)).nonzero()[:, 0]
+    for instance in masks.instance_ids[is_sure].unique().tolist():
+        members = (is_sure & (masks.instance_ids == instance)).nonzero()[:, 0]
         views = regions.view_index[members]
         if len(views) < max(2, min(LEAST_VIEWS, len(cameras))):
             continue
@@ -105,8 +103,7 @@ def crop_cameras(cameras: Cameras, boxes: Tensor) -> Cameras:
     return replace(cameras, K=K, sizes=boxes[:, 2:] - boxes[:, :2])
 
 
-def place_crops(proposals: Proposals, boxes: Tensor) -> Proposals:
+def place_crops(masks: Masks, boxes: Tensor) -> Masks:
     """What was found in crops of the photos, (V, 4) int64 xyxy, in the frame of the photos."""
-    offset = boxes[proposals.regions.view_index, :2].repeat(1, 2)
-    moved = replace(proposals.regions, boxes=proposals.regions.boxes + offset)
-    return replace(proposals, regions=moved, boxes=proposals.boxes + offset)
+    offset = boxes[masks.view_index, :2].repeat(1, 2)
+    return replace(masks, regions=replace(masks.regions, boxes=masks.regions.boxes + offset))

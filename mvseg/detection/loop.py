@@ -12,10 +12,11 @@ from torch import Tensor
 
 from mvseg.detection.assignment import EpipolarAssignment
 from mvseg.detection.nms import cluster_aware_nms, confirmed
-from mvseg.masks import Proposals
+from mvseg.detection.proposals import Proposals
+from mvseg.masks import Masks, Origin
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
-from mvseg.matching.result import Matching
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.scene import Cameras
 
 
@@ -28,7 +29,7 @@ def match_proposals(
     detections_per_view: int = 100,
     match: MatchConfig = MatchConfig(),
     progress: bool = False,
-) -> tuple[Tensor, Matching]:
+) -> Matching:
     """Match first, alternate assignment and NMS, then discard unconfirmed boxes (steps 2 to 4 of `MultiViewMaskRCNN`).
 
     Args:
@@ -41,8 +42,8 @@ def match_proposals(
         progress: show progress bars.
 
     Returns:
-        (S,) int64 indices of the proposals kept, best score first, and their matching. Warns of what `match_regions`
-        says of it; what that said of earlier rounds is forgotten.
+        The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns of
+        what `match_regions` says of it; what that said of earlier rounds is forgotten.
     """
     assignment = EpipolarAssignment()
     per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
@@ -66,12 +67,14 @@ def match_proposals(
             )[0]
 
         for _ in range(num_iterations):
-            regions = proposals.regions.select(keep)
-            ids, _ = assignment(proposals.regions, regions, matching.instance_ids, cameras=cameras, progress=progress)
+            matched = matching.masks
+            ids, _ = assignment(
+                proposals.regions, matched.regions, matched.instance_ids, cameras=cameras, progress=progress
+            )
             groups = torch.cat((per_class, ids[:, None]), 1)
             keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
             matching = rematch(keep)
-        if num_iterations and matching.support is not None:
+        if num_iterations and matching.report.has_probabilities:
             stays = confirmed(
                 proposals.boxes[keep],
                 per_class[keep],
@@ -80,11 +83,10 @@ def match_proposals(
                 iou_threshold=cluster_iou,
             )
             if not stays.all():
-                keep = keep[stays]
-                matching = rematch(keep)
+                matching = rematch(keep[stays])
     for each in caught:
         warnings.warn(each.message, stacklevel=2)
-    return keep, matching
+    return matching
 
 
 def _suppress(
@@ -117,21 +119,24 @@ def _match_classes(
         members = (proposals.classes == label).nonzero()[:, 0]
         config = replace(match, num_instances=num_instances.get(label) or match.num_instances)
         part = match_regions(
-            proposals.regions.select(members),
-            cameras,
-            config,
-            residual_px=residual_px,
-            progress=progress,
+            proposals.regions.select(members), cameras, config, residual_px=residual_px, progress=progress
         )
         parts.append(part)
         indices.append(members)
         counts[label] = parts[-1].num_instances
     if not parts:
-        zeros = torch.zeros(0, device=proposals.regions.device)
-        empty = Matching(
-            instance_ids=zeros.long(), match_scores=zeros, num_instances=0, method=match.resolved_method
-        )
-        return empty, counts
-    joined = Matching.concatenate(parts).reorder(torch.cat(indices))
-    methods = {part.method for part in parts}
-    return (joined if len(methods) == 1 else replace(joined, method=match.resolved_method)), counts
+        return Matching(Masks.of(proposals.regions, origin=Origin.DETECTED), MatchReport(match.resolved_method)), counts
+    order = torch.cat(indices).argsort()
+    joined = Masks.concatenate([part.masks for part in parts]).select(order)
+    masks = replace(
+        joined,
+        detection_scores=proposals.scores,
+        classes=proposals.classes,
+        origin=torch.full_like(proposals.classes, Origin.DETECTED),
+    )
+    report = MatchReport.join(
+        [part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts]
+    )
+    if len({part.method for part in parts}) > 1:
+        report = replace(report, method=match.resolved_method)
+    return Matching(masks, report), counts

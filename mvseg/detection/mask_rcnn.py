@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,15 +10,14 @@ from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
 from mvseg.detection.loop import match_proposals
-from mvseg.detection.proposals import gather_proposals
+from mvseg.detection.proposals import Proposals, gather_proposals
 from mvseg.detectors.scales import run_scales
 from mvseg.errors import InputError
-from mvseg.masks import Proposals
+from mvseg.masks import Masks, Origin
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.refine_poses import match_refined
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
-from mvseg.verification.other_views import hear_witnesses
+from mvseg.verification.other_views import verify_masks
 from mvseg.verification.recut import recut_masks
 
 
@@ -114,19 +112,18 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         sizes = [[image.shape[-1], image.shape[-2]] for image in images]
         _check_cameras(cameras, sizes)
         if self.witnesses:
-            return _result_dicts(*self.find_regions(images, cameras), sizes=sizes, device=images[0].device)
+            return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
             detections = [self._propose(image) for image in images]
         # Pixel counts need single precision.
         with torch.no_grad(), torch.autocast(images[0].device.type, enabled=False):
             proposals = gather_proposals(detections, sizes)
-            keep, matching = self._match(proposals, cameras.to(images[0].device))
-            views = proposals.regions.view_index[keep]
-            return self._collect(detections, sizes, keep=keep, views=views, matching=matching)
+            matching = self._match(proposals, cameras.to(images[0].device))
+            return self._collect(detections, sizes, masks=matching.masks)
 
     def find_regions(
         self, images: Iterable[Tensor], cameras: Cameras, *, progress: bool = False
-    ) -> tuple[Proposals, Matching]:
+    ) -> Matching:
         """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time, masks as crops.
 
         Args:
@@ -135,8 +132,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             progress: show progress bars while the detections are matched.
 
         Returns:
-            The D detections that are kept, on the CPU, ordered by view and by falling score (with witnesses: by view
-            and instance), and their matching.
+            The D detections that are kept, matched, on the CPU, ordered by view and by falling score (with witnesses:
+            by view and instance).
 
         Raises:
             InputError: as `forward`.
@@ -148,18 +145,14 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             if self.witnesses:
                 photos.append((255 * image.detach().cpu()).round().to(torch.uint8).permute(1, 2, 0).numpy())
         _check_cameras(cameras, sizes)
-        proposals, matching = self.match_detections(detections, cameras, progress=progress)
+        matching = self.match_detections(detections, cameras, progress=progress)
         if self.witnesses:
-            posed = (cameras if matching.poses is None else matching.poses.cameras).to("cpu")
-            proposals, matching, surfaces = hear_witnesses(
-                proposals, matching, cameras=posed, photos=photos.__getitem__, progress=progress
+            posed = cameras.to("cpu")
+            masks, surfaces = verify_masks(
+                matching.masks, cameras=posed, photos=photos.__getitem__, progress=progress
             )
-            assert proposals.from_views is not None
-            regions = recut_masks(
-                proposals.regions, matching.instance_ids, surfaces, cameras=posed, is_found=~proposals.from_views
-            )
-            proposals = replace(proposals, regions=regions, boxes=regions.boxes.float())
-        return proposals, matching
+            matching = matching.with_masks(recut_masks(masks, surfaces, cameras=posed))
+        return matching
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:
@@ -169,35 +162,24 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     @torch.no_grad()
     def match_detections(
         self, detections: list[dict[str, Tensor]], cameras: Cameras, *, progress: bool = False
-    ) -> tuple[Proposals, Matching]:
-        """The second half of `find_regions`: what is kept of what `detect` gives for V images, and its matching."""
+    ) -> Matching:
+        """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched."""
         with torch.autocast("cpu", enabled=False):
             proposals = gather_proposals(detections, cameras.sizes.tolist())
-            keep, matching = self._match(proposals, cameras.to("cpu"), progress=progress)
-        order = proposals.regions.view_index[keep].argsort(stable=True)
-        kept = proposals.select(keep[order])
-        return kept, matching.select(order)
+            matching = self._match(proposals, cameras.to("cpu"), progress=progress)
+        return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
 
-    def _match(
-        self, proposals: Proposals, cameras: Cameras, *, progress: bool = False
-    ) -> tuple[Tensor, Matching]:
-        """Indices of the proposals to keep, without those whose mask is empty, and their matching."""
-        solid = (proposals.regions.areas > 0).nonzero()[:, 0]
-        chosen = proposals.select(solid)
-
-        def match(posed: Cameras) -> tuple[Tensor, Matching]:
-            return match_proposals(
-                chosen,
-                posed,
-                num_iterations=self.num_iterations,
-                cluster_iou=self.cluster_iou,
-                detections_per_view=self.roi_heads.detections_per_img,
-                match=replace(self.match, refine_poses=False),
-                progress=progress,
-            )
-
-        keep, matching = match_refined(chosen.regions, cameras, match) if self.match.refine_poses else match(cameras)
-        return solid[keep], matching
+    def _match(self, proposals: Proposals, cameras: Cameras, *, progress: bool = False) -> Matching:
+        """The proposals that are kept, of those whose mask is not empty, matched; `labels` say which they are."""
+        return match_proposals(
+            proposals.select((proposals.regions.areas > 0).nonzero()[:, 0]),
+            cameras,
+            num_iterations=self.num_iterations,
+            cluster_iou=self.cluster_iou,
+            detections_per_view=self.roi_heads.detections_per_img,
+            match=self.match,
+            progress=progress,
+        )
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
         """One view's excessive set, as from `run_scales`, without masks that score too low once they are cut."""
@@ -208,46 +190,37 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         return {key: value[is_good] for key, value in detections.items()} | {"frame": frame}
 
     def _collect(
-        self,
-        detections: list[dict[str, Tensor]],
-        sizes: list[list[int]],
-        *,
-        keep: Tensor,
-        views: Tensor,
-        matching: Matching,
+        self, detections: list[dict[str, Tensor]], sizes: list[list[int]], *, masks: Masks
     ) -> list[dict[str, Tensor]]:
-        """torchvision's result dicts of the kept proposals, with their ids; `views` (S,) is the view of each."""
+        """torchvision's result dicts of the kept proposals, with their ids."""
         results, start = [], 0
         for view, (proposals, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
-            is_here = views == view
-            kept = {key: proposals[key][keep[is_here] - start] for key in ("boxes", "labels", "scores", "masks")}
+            here = masks.select(masks.view_index == view)
+            places = here.regions.labels - start
+            kept = {key: proposals[key][places] for key in ("boxes", "labels", "scores", "masks")}
             frame_width, frame_height = proposals["frame"].tolist()
             (result,) = self.transform.postprocess([kept], [(frame_height, frame_width)], [(height, width)])
-            ids = {"instance_ids": matching.instance_ids[is_here], "match_scores": matching.match_scores[is_here]}
-            results.append(result | ids)
+            results.append(result | {"instance_ids": here.instance_ids, "match_scores": here.match_scores})
             start += len(proposals["boxes"])
         return results
 
 
-def _result_dicts(
-    proposals: Proposals, matching: Matching, *, sizes: list[list[int]], device: torch.device
-) -> list[dict[str, Tensor]]:
-    """torchvision's result dicts of what is left when the other views were heard, best score first."""
-    assert proposals.from_views is not None  # they were heard
+def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:
+    """torchvision's result dicts of what the other views leave, best score first."""
     results = []
     for view, (width, height) in enumerate(sizes):
-        here = (proposals.regions.view_index == view).nonzero()[:, 0]
-        here = here[proposals.scores[here].argsort(descending=True, stable=True)]
-        masks = [proposals.regions.mask(index, width, height) for index in here.tolist()]
+        shown = masks.select(masks.view_index == view)
+        shown = shown.select(shown.detection_scores.argsort(descending=True, stable=True))
+        frames = [shown.regions.mask(index, width, height) for index in range(len(shown))]
         empty = torch.zeros((0, height, width))
         result = {
-            "boxes": proposals.boxes[here],
-            "labels": proposals.classes[here],
-            "scores": proposals.scores[here],
-            "masks": (torch.stack(masks).float() if masks else empty)[:, None],
-            "instance_ids": matching.instance_ids[here],
-            "match_scores": matching.match_scores[here],
-            "from_views": proposals.from_views[here],
+            "boxes": shown.regions.boxes.float(),
+            "labels": shown.classes,
+            "scores": shown.detection_scores,
+            "masks": (torch.stack(frames).float() if frames else empty)[:, None],
+            "instance_ids": shown.instance_ids,
+            "match_scores": shown.match_scores,
+            "from_views": shown.origin == Origin.OTHER_VIEWS,
         }
         results.append({key: value.to(device) for key, value in result.items()})
     return results

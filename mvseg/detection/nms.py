@@ -7,7 +7,7 @@ import torchvision
 from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.matching.result import SURE
+from mvseg.masks import SURE
 
 
 def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float = 0.3) -> Tensor:

@@ -2,14 +2,41 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 from torchvision.models.detection.roi_heads import expand_boxes, expand_masks, paste_mask_in_image
 from torchvision.models.detection.transform import resize_boxes
 
 from mvseg.detectors.mask_cut import CUT
-from mvseg.masks import Proposals
-from mvseg.regions import stack_regions
+from mvseg.regions import Regions, stack_regions
+
+
+@dataclass(frozen=True, eq=False)
+class Proposals:
+    """R scored masks of V views before matching, many of them of the same object.
+
+    Attributes:
+        regions: the R masks as box crops, in the frame of the images; `labels` counts them.
+        boxes: (R, 4) float32 xyxy in the frame of the images; what NMS compares.
+        scores: (R,) float32.
+        classes: (R,) int64; objects of different classes are never matched.
+    """
+
+    regions: Regions
+    boxes: Tensor
+    scores: Tensor
+    classes: Tensor
+
+    def select(self, index: Tensor) -> Proposals:
+        """The proposals at an int64 index, in that order."""
+        return Proposals(
+            regions=self.regions.select(index),
+            boxes=self.boxes[index],
+            scores=self.scores[index],
+            classes=self.classes[index],
+        )
 
 
 def gather_proposals(detections: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:

@@ -28,6 +28,8 @@ from mvseg.formats.image_file import (
 from mvseg.formats.lens import undistort
 from mvseg.scene import Cameras, Scene, View, camera_problem
 
+CACHED_BYTES = 256 * 2**20  # 12 photos of 7 megapixels
+
 
 @dataclass(frozen=True, eq=False)
 class Photo:
@@ -237,6 +239,36 @@ def load_photos(scene: Scene) -> list[torch.Tensor]:
     """
     photos = [read_photo(scene, view) for view in range(len(scene.views))]
     return [torch.from_numpy(photo).permute(2, 0, 1).float() / 255 for photo in photos]
+
+
+class Photos:
+    """The photos of a scene: `photos(view)` is (H, W, 3) uint8 RGB with its lens distortion removed, see `read_photo`.
+
+    Those asked for last stay in memory, up to `CACHED_BYTES` in all, so that a scene that fits into that is decoded
+    once, however many stages look at it. What is returned is shared: it must not be written to.
+
+    Attributes:
+        scene: whose photos these are.
+        exist: whether there are photos; all of them or none, see `check_photos`.
+    """
+
+    def __init__(self, scene: Scene) -> None:
+        self.scene = scene
+        self._cached: dict[int, np.ndarray] = {}
+
+    @property
+    def exist(self) -> bool:
+        return self.scene.views[0].path.is_file()
+
+    def __call__(self, view: int) -> np.ndarray:
+        photo = self._cached.pop(view, None)
+        if photo is None:
+            photo = read_photo(self.scene, view)
+            photo.flags.writeable = False
+        self._cached[view] = photo  # the last ones were asked for last
+        while len(self._cached) > 1 and sum(each.nbytes for each in self._cached.values()) > CACHED_BYTES:
+            del self._cached[next(iter(self._cached))]
+        return photo
 
 
 def read_photo(scene: Scene, view: int) -> np.ndarray:

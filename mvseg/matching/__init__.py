@@ -17,8 +17,7 @@ if TYPE_CHECKING:
     from mvseg.matching.epipolar import epipolar_map as epipolar_map
     from mvseg.matching.match import match_regions as match_regions
     from mvseg.matching.result import Matching as Matching
-    from mvseg.matching.result import MergedMask as MergedMask
-    from mvseg.matching.result import RefinedPoses as RefinedPoses
+    from mvseg.matching.result import MatchReport as MatchReport
     from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
 
@@ -28,7 +27,7 @@ _HOME = {
     "affinity": ("Affinity", "region_affinity"),
     "symnmf": ("cluster_affinity",),
     "match": ("match_regions",),
-    "result": ("Matching", "MergedMask", "RefinedPoses"),
+    "result": ("Matching", "MatchReport"),
     "split": ("split_merged",),
 }
 __all__ = [name for names in _HOME.values() for name in names]

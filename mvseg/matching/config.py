@@ -23,8 +23,6 @@ class MatchConfig:
             only.
         num_restarts: random starts per factorisation; symnmf only.
         seed: for the random pixels and starts.
-        refine_poses: refine poses that are a few pixels off, with the masks as the only evidence; kept only if leaves
-            that they were not fitted to agree clearly better.
     """
 
     method: Literal["auto", "nview", "one-per-view", "symnmf"] = "auto"
@@ -33,7 +31,6 @@ class MatchConfig:
     search_range: tuple[int, int] | None = None
     num_restarts: int = 2
     seed: int = 0
-    refine_poses: bool = False
 
     def __post_init__(self) -> None:
         for name in ("num_points", "num_instances", "num_restarts"):

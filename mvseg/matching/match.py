@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import replace
 
 import torch
 from torch import Tensor
 
 from mvseg.errors import InputError, InputWarning
+from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.nview.match_nview import WIDENINGS, match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.pencil import is_coincident
-from mvseg.matching.refine_poses import match_refined
-from mvseg.matching.result import Matching
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.symnmf import cluster_affinity
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -61,20 +60,13 @@ def match_regions(
     check_views(regions, cameras)
     check_baselines(cameras)
     _check_sizes(regions, cameras)
-    if config.refine_poses:
-        every, plain = torch.arange(len(regions), device=regions.device), replace(config, refine_poses=False)
-
-        def match(posed: Cameras) -> tuple[Tensor, Matching]:
-            return every, match_regions(regions, posed, plain, progress=progress)
-
-        return match_refined(regions, cameras, match)[1]
     _warn_of_gaps(regions, cameras)
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
     method = config.resolved_method
     if method == "nview":
         matching = match_nview(regions, cameras, affinity, residual_px=residual_px, progress=progress)
         if len(cameras) > 2 and len(regions):
-            _warn_of_disagreement(matching, regions)
+            _warn_of_disagreement(matching)
         return matching
     if method == "one-per-view":
         ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
@@ -108,12 +100,8 @@ def match_graph(
 
 def matching_of_ids(instance_ids: Tensor, regions: Regions, graph: Affinity, *, method: str) -> Matching:
     """The matching for ids in [1, K] or -1 from a graph; the scores are mean weights within clusters."""
-    return Matching(
-        instance_ids=instance_ids,
-        match_scores=mean_affinity(graph, instance_ids, regions),
-        num_instances=max(int(instance_ids.max()), 0) if len(instance_ids) else 0,
-        method=method,
-    )
+    masks = Masks.of(regions, instance_ids, mean_affinity(graph, instance_ids, regions))
+    return Matching(masks, MatchReport(method=method))
 
 
 def mean_affinity(affinity: Affinity, instance_ids: Tensor, regions: Regions) -> Tensor:
@@ -163,7 +151,7 @@ def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
         warnings.warn(f"{first}: {skipped}", InputWarning, stacklevel=3)
 
 
-def _warn_of_disagreement(matching: Matching, regions: Regions) -> None:
+def _warn_of_disagreement(matching: Matching) -> None:
     """Poses are wrong where ids are likely to be wrong, where no reprojection error that is tried is large enough, or
     where some views explain far less than the others (`benchmarks/confidence.py` counts how often this is so)."""
     assert matching.explained is not None
@@ -181,9 +169,10 @@ def _warn_of_disagreement(matching: Matching, regions: Regions) -> None:
     if matching.method != "nview":
         facts += f"; '{matching.method}' matched them"
     question = "do R and t map world points to the camera, and does each mask belong to its photo?"
-    richest, sparse = int(regions.num_per_view.max()), regions.num_per_view <= regions.num_per_view.max() / 2
+    num_per_view = matching.masks.regions.num_per_view
+    richest, sparse = int(num_per_view.max()), num_per_view <= num_per_view.max() / 2
     if int(sparse.sum()) > len(sparse) / 2:  # then rays find nothing whatever the poses are
-        view = int(regions.num_per_view.argmax())
+        view = int(num_per_view.argmax())
         counts = f"{int(sparse.sum())} of {len(sparse)} views have at most half of the {richest} masks of view {view}"
         question = f"{counts}: are masks missing there?"
     warnings.warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}", InputWarning, stacklevel=3)

@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.masks import Masks
 from mvseg.matching.pencil import epipolar_pencils, is_coincident
-from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -74,14 +74,15 @@ class Gaps:
     weight: Tensor
 
 
-def find_outlines(regions: Regions, matching: Matching, cameras: Cameras) -> Outlines:
+def find_outlines(masks: Masks, cameras: Cameras) -> Outlines:
     """The outlines of the matched masks, without those that touch the border of the photo, and those of instances with
     several masks in the view: they end where the leaf does not. Neighbours hide parts of others; that is for a robust
     fit to find out."""
-    ids, views = matching.instance_ids.cpu(), regions.view_index.cpu()
+    regions = masks.regions
+    ids, views = masks.instance_ids.cpu(), regions.view_index.cpu()
     regions, sizes = regions.to("cpu"), cameras.sizes.cpu()[views]
     is_cut = ((regions.boxes[:, :2] <= 0) | (regions.boxes[:, 2:] >= sizes)).any(1)
-    place = views * (matching.num_instances + 1) + ids.clamp(min=0)
+    place = views * (masks.num_instances + 1) + ids.clamp(min=0)
     is_only = torch.bincount(place, minlength=1)[place] == 1
     chosen = ((ids > 0) & ~is_cut & is_only).nonzero()[:, 0]
     hulls = [_hull(regions, index) for index in chosen.tolist()]
@@ -92,7 +93,7 @@ def find_outlines(regions: Regions, matching: Matching, cameras: Cameras) -> Out
         middle=torch.stack([hull.mean(0) for hull in hulls]) if hulls else torch.zeros(0, 2).double(),
         view=views[chosen],
         instance=ids[chosen],
-        weight=matching.match_scores.cpu()[chosen].double(),
+        weight=masks.match_scores.cpu()[chosen].double(),
     )
 
 

@@ -5,46 +5,34 @@ from __future__ import annotations
 from dataclasses import replace
 
 import torch
-from torch import Tensor
 
-from mvseg.matching.result import Matching
-from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.masks import Masks, replace_crops
+from mvseg.regions import mask_box
 
 
-def split_merged(regions: Regions, matching: Matching) -> tuple[Regions, Matching, Tensor]:
-    """Cut each mask that covers two instances in two, one part per instance.
+def split_merged(masks: Masks) -> Masks:
+    """Cut each mask that shows two instances in two, one part per instance.
 
     Args:
-        regions: the D regions that were matched.
-        matching: their matching.
+        masks: D masks, of which `second_parts` tells what shows a second instance.
 
     Returns:
-        D' >= D regions in the same order, the second part of a mask right after the first. Their matching: both parts
-        keep the mask's match score, the support is unchanged, `merged` is empty. And (D',) int64, the region that each
-        comes from. A mask stays whole if one part would be empty.
+        D' >= D masks in the same order, the second part of a mask right after the first. Both have its scores; none
+        shows two instances any more. A mask stays whole if one part would be empty.
     """
-    merged = {mask.region: mask for mask in matching.merged}
-    source, boxes, crops, ids = [], [], [], []
-    for region, (own_id, box) in enumerate(zip(matching.instance_ids.tolist(), regions.boxes.tolist(), strict=True)):
-        crop = regions.crop(region)
+    rows, boxes, crops, ids = [], [], [], []
+    columns = zip(masks.instance_ids.tolist(), masks.second_ids.tolist(), masks.regions.boxes.tolist(), strict=True)
+    for row, (own_id, other_id, box) in enumerate(columns):
+        crop, second = masks.regions.crop(row).cpu(), masks.second_parts[row]
         parts = [(own_id, crop)]
-        if region in merged:
-            second = merged[region].part.to(crop.device) & crop
-            halves = [(own_id, crop & ~second), (merged[region].other, second)]
-            parts = halves if all(bool(half.any()) for _, half in halves) else parts
+        if second is not None and (second & crop).any() and (crop & ~second).any():
+            parts = [(own_id, crop & ~second), (other_id, second & crop)]
         for instance, part in parts:
             x1, y1, x2, y2 = mask_box(part) if len(parts) > 1 else (0, 0, crop.shape[1], crop.shape[0])
-            source.append(region)
+            rows.append(row)
             boxes.append((box[0] + x1, box[1] + y1, box[0] + x2, box[1] + y2))
-            crops.append(part[y1:y2, x1:x2].flatten().cpu())
+            crops.append(part[y1:y2, x1:x2])
             ids.append(instance)
-    index = torch.tensor(source, dtype=torch.int64, device=regions.device)
-    views, labels = regions.view_index[index].tolist(), regions.labels[index].tolist()
-    cut = stack_regions(views, boxes, crops, labels=labels, num_views=regions.num_views)
-    matched = replace(
-        matching,
-        instance_ids=torch.tensor(ids, dtype=torch.int64, device=regions.device),
-        match_scores=matching.match_scores[index],
-        merged=(),
-    )
-    return cut.to(regions.device), matched, index
+    repeated = masks.select(torch.tensor(rows, dtype=torch.int64, device=masks.regions.device)).with_merged(())
+    cut = replace_crops(repeated, boxes, crops)
+    return replace(cut, instance_ids=torch.tensor(ids, dtype=torch.int64)).to(masks.regions.device)

@@ -31,6 +31,7 @@ def reconstruct_shapes(
     starts: Surfaces = MappingProxyType({}),
     known: Surfaces = MappingProxyType({}),
     photos: Callable[[int], NDArray[np.uint8]] | None = None,
+    with_voxels: bool = True,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> tuple[Surfaces | None, Voxels]:
@@ -44,6 +45,7 @@ def reconstruct_shapes(
         starts: instance id -> a surface that is nearly right, see `fit_surfaces`.
         known: instance id -> a surface that stays as it is, see `fit_surfaces`.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; None: there are none.
+        with_voxels: False leaves voxels out, whatever the config says.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars over the instances.
 
@@ -67,6 +69,8 @@ def reconstruct_shapes(
             workers=workers,
             progress=progress,
         )
+        if not with_voxels:
+            return surfaces, {}
         if config.shape == "surface":
             credible = [instance for instance, surface in surfaces.items() if surface.is_credible]
             instance_ids = instance_ids.where(~torch.isin(instance_ids, torch.tensor(credible).to(instance_ids)), -1)

@@ -21,8 +21,9 @@ from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import distort, opencv_distortion
-from mvseg.formats.photos import read_photo
+from mvseg.formats.photos import Photos
 from mvseg.formats.rig import write_rig
+from mvseg.masks import Origin
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
 from mvseg.results.report.pictures import Picture, draw_picture
@@ -31,7 +32,7 @@ from mvseg.scene import Scene
 from mvseg.system.atomic import folder_whole
 
 if TYPE_CHECKING:
-    from mvseg.matching.result import RefinedPoses
+    from mvseg.poses.refine_poses import RefinedPoses
     from mvseg.results.rims import Rims
     from mvseg.traits.measure import Traits
 
@@ -78,7 +79,7 @@ def save_result(
             counts |= {} if result.num_moved is None else {"moved": result.num_moved}
             seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
             matched: dict[str, Any] = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
-            poses = result.matching.poses
+            poses = result.poses
             if poses is not None:
                 matched["poses"] = _describe_poses(poses)
                 if poses.is_refined:
@@ -98,19 +99,19 @@ def save_result(
 
 def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bool) -> list[Picture]:
     """Labels, overlays and the contact sheet; what the report shows of the photos, which are read only once."""
-    scene, ids = result.scene, result.matching.instance_ids
-    tiles, pictures, has_photos = [], [], any(view.path.exists() for view in scene.views)
+    scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
+    tiles, pictures = [], []
     rims = _rims_of(result) if draw_rims else [{}] * len(scene.views)
     views = list(enumerate(scene.views))
     for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
         width, height = scene.cameras.sizes[index].tolist()
-        labels = result.regions.label_map(index, ids, (width, height)).cpu().numpy().astype(np.uint16)
+        labels = masks.regions.label_map(index, masks.instance_ids, (width, height)).cpu().numpy().astype(np.uint16)
         labels = distort(labels, view.lens, scene.cameras.K[index].cpu().numpy())
         write_label_png(folder / "labels" / f"{view.name}.png", labels)
-        photo = read_photo(scene, index) if has_photos else np.full((height, width, 3), 40, np.uint8)
-        drawn = draw_overlay(photo, result.regions, result.matching, view=index, rims=rims[index])
-        tiles.append(draw_tile(photo, result.regions, result.matching, view=index))
-        pictures.append(draw_picture(photo, result.regions, result.matching, view=index))
+        photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
+        drawn = draw_overlay(photo, masks, view=index, rims=rims[index])
+        tiles.append(draw_tile(photo, masks, view=index))
+        pictures.append(draw_picture(photo, masks, view=index))
         overlay = folder / "overlay" / f"{view.name}.png"
         overlay.parent.mkdir(parents=True, exist_ok=True)
         write_png(overlay, drawn)
@@ -134,11 +135,11 @@ def _write_instances(result: Result, folder: Path, progress: bool) -> None:
         width, height = scene.cameras.sizes[index].tolist()
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
         images.append({"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height})
-    others = {mask.region: mask.other for mask in result.matching.merged}
+    others = result.masks.second_ids.tolist()
     annotations = []
     for region in tqdm(range(len(result.regions)), desc="masks", unit="mask", disable=not progress):
         annotation = _annotate(result, region)
-        if region in others:
+        if others[region] > 0:
             annotation["other_instance_id"] = others[region]
         annotations.append(annotation)
     write_coco(folder / "instances.json", images, annotations)
@@ -152,12 +153,13 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
     K = result.scene.cameras.K[view].cpu().numpy()
     instance = int(result.matching.instance_ids[region])
     track = {"track_id": instance} if instance > 0 else {}
-    if result.detection_scores is None:
+    if result.masks.origin[region] == Origin.GIVEN:
         source: dict[str, Any] = {"source_label": int(result.regions.labels[region])}
     else:
-        source = {"score": round(float(result.detection_scores[region]), 4)}
-        if result.from_other_views is not None:
-            source["from_other_views"] = bool(result.from_other_views[region])
+        is_from_views = bool(result.masks.origin[region] == Origin.OTHER_VIEWS)
+        source = {
+            "score": round(float(result.masks.detection_scores[region]), 4), "from_other_views": is_from_views
+        }
     return {
         "image_id": view + 1,
         "instance_id": instance,

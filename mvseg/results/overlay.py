@@ -11,8 +11,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
-from mvseg.matching.result import SURE, Matching
-from mvseg.regions import Regions
+from mvseg.masks import SURE, Masks
 
 if TYPE_CHECKING:
     from mvseg.results.rims import Rims  # loads trimesh
@@ -38,14 +37,13 @@ def instance_color(instance: int) -> tuple[int, int, int]:
 
 
 def draw_overlay(
-    photo: np.ndarray, regions: Regions, matching: Matching, *, view: int, rims: Rims | None = None
+    photo: np.ndarray, masks: Masks, *, view: int, rims: Rims | None = None
 ) -> np.ndarray:
     """Tint the regions of one view in the colours of their instances, with outline and number.
 
     Args:
         photo: (H, W, 3) uint8 RGB, undistorted.
-        regions: D regions.
-        matching: of the regions. Unmatched regions are grey and have no number; numbers get a question mark where the
+        masks: D masks. Unmatched regions are grey and have no number; numbers get a question mark where the
             match score is below 0.5.
         view: index of the view.
         rims: {instance id: lines}, see `visible_rims`; drawn on top, in the instance's colour with a dark edge.
@@ -57,36 +55,36 @@ def draw_overlay(
     scale = min(1.0, MAX_SIDE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     window = _Window((0, 0, width, height), size)
-    return _draw(photo, regions, matching, view=view, window=window, rims=rims or {})
+    return _draw(photo, masks, view=view, window=window, rims=rims or {})
 
 
-def draw_tile(photo: np.ndarray, regions: Regions, matching: Matching, *, view: int) -> np.ndarray:
+def draw_tile(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
     """The overlay of one view for the contact sheet: 480 pixels wide, cropped to the plant (`find_plant`).
 
     Arguments as in `draw_overlay`.
     """
     height, width = photo.shape[:2]
-    box = find_plant(regions, matching, view=view, size=(width, height))
+    box = find_plant(masks, view=view, size=(width, height))
     tile_height = max(1, round(TILE_WIDTH * height / width))
     window = _Window(box, (TILE_WIDTH, tile_height))
-    return _draw(photo, regions, matching, view=view, window=window, rims={})
+    return _draw(photo, masks, view=view, window=window, rims={})
 
 
 def find_plant(
-    regions: Regions, matching: Matching, *, view: int, size: tuple[int, int]
+    masks: Masks, *, view: int, size: tuple[int, int]
 ) -> tuple[int, int, int, int]:
     """Box (xyxy, pixels) around all matched regions of one view, with a margin and the proportions of the photo.
 
     Args:
-        regions: D regions.
-        matching: of the regions.
+        masks: D masks.
         view: index of the view.
         size: width and height of the photo, pixels.
 
     Returns:
         The box, inside the photo; the whole photo where nothing is matched.
     """
-    boxes = regions.boxes[(regions.view_index == view) & (matching.instance_ids > 0) & (regions.areas > 0)]
+    regions = masks.regions
+    boxes = regions.boxes[(regions.view_index == view) & (masks.instance_ids > 0) & (regions.areas > 0)]
     if not len(boxes):
         return 0, 0, *size
     low, high = boxes[:, :2].amin(0).cpu().numpy(), boxes[:, 2:].amax(0).cpu().numpy()
@@ -124,7 +122,7 @@ class _Number:
 
 
 def _draw(
-    photo: np.ndarray, regions: Regions, matching: Matching, *, view: int, window: _Window, rims: Rims
+    photo: np.ndarray, masks: Masks, *, view: int, window: _Window, rims: Rims
 ) -> np.ndarray:
     height, width = photo.shape[:2]
     longer = max(window.size)
@@ -132,10 +130,11 @@ def _draw(
     canvas = window.cut(photo, cv2.INTER_CUBIC if enlarges else cv2.INTER_AREA)
     painted = canvas.copy()
     labels: list[_Number] = []
+    regions = masks.regions
     members = (regions.view_index == view).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]  # small ones on top
     for index in members.tolist():
-        instance = int(matching.instance_ids[index])
+        instance = int(masks.instance_ids[index])
         mask = window.cut(regions.mask(index, width, height).cpu().numpy().astype(np.uint8), cv2.INTER_NEAREST)
         x, y, mask_width, mask_height = cv2.boundingRect(mask)
         if not mask_width:  # too small to be seen here
@@ -150,7 +149,7 @@ def _draw(
             # The number goes where the mask is thickest, which is always inside it.
             depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
             row, column = np.unravel_index(depth.argmax(), depth.shape)
-            doubt = "?" if matching.match_scores[index] < SURE else ""
+            doubt = "?" if masks.match_scores[index] < SURE else ""
             labels.append(_Number(f"{instance}{doubt}", (x + int(column), y + int(row)), float(depth.max())))
     for instance, lines in rims.items():
         placed = [window.place(line) for line in lines]

@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from torch import Tensor
-
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
 from mvseg.matching.result import Matching
+from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 
@@ -23,30 +24,37 @@ class Result:
     """Everything known about one scene.
 
     Attributes:
-        scene: the scene.
-        regions: D masks, undistorted.
-        matching: their ids.
+        scene: the scene, with refined cameras where `poses` has them.
+        matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
+        photos: of the scene; None: they are read when they are needed.
+        poses: what came of refining them; None where that was not asked for.
         surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None when no surfaces were
             asked for.
         voxels: {instance id: voxels}: of all instances where voxels were asked for, otherwise of those without a
             credible surface; None when only ids were asked for.
         traits: of the plant and its leaves; None when only ids were asked for.
         seconds: {stage: wall time}.
-        detection_scores: (D,) float32, the detector's score of each mask; None when the masks were given.
-        from_other_views: (D,) bool, masks that no detector found: the other views show that a leaf is there; None where
-            masks were given, or the other views were not asked.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
         num_moved: how many masks got another id from the surfaces, see `check_ids`; None where they were not asked.
     """
 
     scene: Scene
-    regions: Regions
     matching: Matching
+    photos: Photos | None = None
+    poses: RefinedPoses | None = None
     surfaces: Mapping[int, LeafSurface] | None = None
     voxels: Mapping[int, VoxelGrid] | None = None
     traits: Traits | None = None
     seconds: dict[str, float] = field(default_factory=dict)
-    detection_scores: Tensor | None = None
-    from_other_views: Tensor | None = None
     mask_kind: str = ""
     num_moved: int | None = None
+
+    @property
+    def masks(self) -> Masks:
+        """The table."""
+        return self.matching.masks
+
+    @property
+    def regions(self) -> Regions:
+        """D masks, undistorted."""
+        return self.matching.masks.regions

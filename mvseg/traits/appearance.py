@@ -7,13 +7,12 @@ from collections.abc import Mapping
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from torch import Tensor
 
-from mvseg.formats.photos import read_photo
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
-from mvseg.regions import Regions
-from mvseg.scene import Cameras, Scene
+from mvseg.scene import Cameras
 from mvseg.traits.leaf import Measurement, missing
 
 Floats = NDArray[np.float64]
@@ -26,15 +25,15 @@ NO_PHOTOS = missing("not measured: there are no photos")
 
 
 def measure_appearance(
-    surfaces: Mapping[int, LeafSurface], regions: Regions, instance_ids: Tensor, *, scene: Scene
+    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos
 ) -> dict[int, dict[str, Measurement]]:
     """Visible share, mean colour and greenness of leaves.
 
     Args:
         surfaces: {instance id: surface that exists}.
-        regions: D regions of the scene.
-        instance_ids: (D,) int64.
-        scene: its photos are read, if there are any.
+        masks: D masks of the scene, with ids.
+        cameras: V cameras.
+        photos: looked at, if they exist.
 
     Returns:
         {instance id: {trait: number}}. The standard deviation of a colour is the standard error over the views, so
@@ -43,14 +42,14 @@ def measure_appearance(
     Raises:
         InputError: a photo is broken, or missing while others exist.
     """
-    has_photos = bool(surfaces) and any(view.path.exists() for view in scene.views)
+    has_photos = bool(surfaces) and photos.exist
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
     colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # sure pixels, their mean
-    for view in range(len(scene.views)):
-        photo = read_photo(scene, view) if has_photos else None
-        labels = regions.label_map(view, instance_ids, scene.cameras.sizes[view].tolist()).cpu().numpy()
+    for view in range(len(cameras)):
+        photo = photos(view) if has_photos else None
+        labels = masks.regions.label_map(view, masks.instance_ids, cameras.sizes[view].tolist()).cpu().numpy()
         for instance, surface in surfaces.items():
-            covered, (x, y) = project_crop(surface, scene.cameras, view)
+            covered, (x, y) = project_crop(surface, cameras, view)
             if not covered.any():
                 continue
             window = np.s_[y : y + covered.shape[0], x : x + covered.shape[1]]

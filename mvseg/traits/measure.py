@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.shapes import Surfaces, Voxels, best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
-from mvseg.regions import Regions
 from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import TraitsConfig
@@ -73,21 +73,21 @@ class Traits:
 
 def measure_plant(
     scene: Scene,
-    regions: Regions,
     matching: Matching,
     *,
     surfaces: Surfaces | None,
     voxels: Voxels,
+    photos: Photos | None = None,
     config: TraitsConfig = TraitsConfig(),
 ) -> Traits:
     """Measure all instances, and the plant that those make which count as leaves.
 
     Args:
-        scene: gives unit, the direction of up (None: angles and heights are left out) and the photos.
-        regions: D regions.
-        matching: their ids.
+        scene: gives unit and the direction of up (None: angles and heights are left out).
+        matching: D masks with their ids.
         surfaces: {instance id: surface}; None where none were asked for.
         voxels: {instance id: voxels}.
+        photos: of the scene; None: they are read.
         config: what counts as a leaf.
 
     Returns:
@@ -103,13 +103,13 @@ def measure_plant(
     sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     shapes = {instance: shape for instance, shape in best.items() if shape is not None}
     every = {instance: shape for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
-    appearance = measure_appearance(every, regions, matching.instance_ids, scene=scene)
+    appearance = measure_appearance(every, matching.masks, scene.cameras, photos=photos or Photos(scene))
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
     rejected = find_rejected(shapes, Support(sure_views, visible), up, config=config)
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     cells = {} if frame is None else look_from_above(blades, frame)
     numbers = {
-        instance: _count(instance, regions, matching.instance_ids, sure_views=sure_views) for instance in instances
+        instance: _count(instance, matching.masks, sure_views=sure_views) for instance in instances
     }
     for instance, found in measure_blades(blades, frame, cells=cells).items():
         numbers[instance] |= found | appearance[instance]
@@ -181,10 +181,8 @@ def describe_leaf(
     return LeafTraits(leaf=instance, numbers=full, method=method, reasons=reasons, rejection=rejection)
 
 
-def _count(
-    instance: int, regions: Regions, instance_ids: Tensor, *, sure_views: Mapping[int, int]
-) -> dict[str, Measurement]:
-    num_views = len(torch.unique(regions.view_index[instance_ids == instance]))
+def _count(instance: int, masks: Masks, *, sure_views: Mapping[int, int]) -> dict[str, Measurement]:
+    num_views = len(torch.unique(masks.view_index[masks.instance_ids == instance]))
     sure = sure_views.get(instance)
     return {
         "num_views": Measurement(float(num_views), float("nan"), "masks"),

@@ -9,7 +9,7 @@ surface explains the masks of both. Where two surfaces explain one mask in disjo
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -18,9 +18,8 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from torch import Tensor
 
-from mvseg.matching.result import Matching, MergedMask, count_sure_views
+from mvseg.masks import Masks, MergedMask
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
@@ -40,75 +39,58 @@ EACH, BOTH = 0.2, 0.7  # of a merged mask, that shows either of its two surfaces
 MOST = 0.5  # of what its view shows of the second one, that lies in the mask
 
 
-@dataclass(frozen=True, eq=False)
-class CheckedIds:
-    """Ids after the surfaces were heard.
-
-    Attributes:
-        matching: of the same D regions. Masks with a new id have the mean match score of those that had it before.
-        is_moved: (D,) bool, masks with a new id.
-        old_ids: (K',) int64, the former id of each instance; those that lost all their masks are gone.
-        is_changed: (K',) bool, instances that lost or won masks.
-    """
-
-    matching: Matching
-    is_moved: Tensor
-    old_ids: Tensor
-    is_changed: Tensor
-
-    def unchanged(self, surfaces: Surfaces) -> dict[int, LeafSurface]:
-        """The surfaces (former ids) of the instances whose masks are the same as before, with their new ids."""
-        pairs = enumerate(zip(self.old_ids.tolist(), self.is_changed.tolist(), strict=True), start=1)
-        return {new: surfaces[old] for new, (old, is_changed) in pairs if not is_changed and old in surfaces}
-
-
-def check_ids(regions: Regions, matching: Matching, surfaces: Surfaces, *, cameras: Cameras) -> CheckedIds:
+def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras) -> Masks:
     """Move masks to the instances whose surfaces they show.
 
     First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
     halves of leaves (`join_halves`). No mask loses its id without getting another; masks that fit nothing stay where
     they are. An instance may have several masks in a view afterwards: they show it together. Last, the masks that show
-    two surfaces are listed as merged (`find_shared`).
+    two surfaces are marked as merged (`find_shared`).
 
     Args:
-        regions: D regions.
-        matching: of these; "merged" masks that move are forgotten, unless they show two surfaces.
+        masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         cameras: V cameras.
+
+    Returns:
+        The same masks. Those with a new id have the mean match score of those that had it before. Instances that lost
+        all their masks leave gaps between the ids.
     """
-    on_cpu, cameras = regions.to("cpu"), cameras.to("cpu")
-    old = matching.instance_ids.cpu().numpy()
+    on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
+    old = masks.instance_ids.cpu().numpy()
     ids = move_pieces(on_cpu, old, surfaces, cameras=cameras)
     left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
     ids = move_misfits(on_cpu, ids, left, cameras=cameras)
     ids = join_halves(on_cpu, ids, left, cameras=cameras)
     is_moved = ids != old
-    scores = matching.match_scores.clone()
+    scores = masks.match_scores.clone()
     for instance in np.unique(ids[is_moved]).tolist():
         others = torch.from_numpy((old == instance) & ~is_moved)
         others = others if others.any() else torch.from_numpy(old == instance)
         moved = torch.from_numpy(is_moved & (ids == instance))
-        scores[moved.to(scores.device)] = matching.match_scores[others.to(scores.device)].mean()
-    every = np.arange(1, matching.num_instances + 1)
-    is_gone = np.isin(every, old) & ~np.isin(every, ids)
-    numbers = np.where(is_gone, -1, np.cumsum(~is_gone))
-    moved_ids = torch.from_numpy(ids).to(matching.instance_ids)
-    merged = {mask.region: mask for mask in matching.merged if not is_moved[mask.region]}
+        scores[moved.to(scores.device)] = masks.match_scores[others.to(scores.device)].mean()
+    merged = {each.region: each for each in masks.merged if not is_moved[each.region] and (ids == each.other).any()}
     shared = find_shared(on_cpu, ids, left, cameras=cameras, named=list(merged.values()))
-    merged |= {mask.region: mask for mask in shared}
-    by_region = tuple(mask for _, mask in sorted(merged.items()))
-    checked = replace(matching, instance_ids=moved_ids, match_scores=scores, merged=by_region)
-    checked = checked.relabel(torch.from_numpy(numbers))
-    if matching.support is not None and is_moved.any():
-        checked = replace(checked, support=count_sure_views(checked, regions.view_index))
-    kept = every[~is_gone]
-    touched = np.concatenate([old[is_moved], ids[is_moved]])
-    return CheckedIds(
-        matching=checked,
-        is_moved=torch.from_numpy(is_moved),
-        old_ids=torch.from_numpy(kept),
-        is_changed=torch.from_numpy(np.isin(kept, touched)),
-    )
+    merged |= {each.region: each for each in shared}
+    checked = replace(masks, instance_ids=torch.from_numpy(ids).to(masks.instance_ids), match_scores=scores)
+    return checked.with_merged(merged.values())
+
+
+def unchanged_surfaces(before: Masks, after: Masks, surfaces: Surfaces) -> dict[int, LeafSurface]:
+    """The surfaces of the instances whose masks are the same before and after, by their ids; `after` are the same D
+    masks, or these and more in the place of some of them."""
+    same = len(before) == len(after)
+
+    def members(masks: Masks, instance: int) -> Masks:
+        return masks.select(masks.instance_ids == instance)
+
+    def is_same(instance: int) -> bool:
+        if same:
+            return bool(((before.instance_ids == instance) == (after.instance_ids == instance)).all())
+        one, other = members(before, instance).regions, members(after, instance).regions
+        return len(one) == len(other) and torch.equal(one.boxes, other.boxes) and torch.equal(one.crops, other.crops)
+
+    return {instance: surface for instance, surface in surfaces.items() if is_same(instance)}
 
 
 def move_pieces(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:

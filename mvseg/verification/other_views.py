@@ -1,4 +1,4 @@
-"""The other views as witnesses: they correct the masks that a detector found.
+"""Cross-view verification: the other views correct the masks that a detector found.
 
 A surface that is fitted to an instance's masks in all views says where each view must show it. That settles what no
 photo can by itself: which piece of a leaf is the leaf, which mask is none, and which leaf was missed. Not in the paper.
@@ -19,15 +19,13 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.errors import InputWarning
-from mvseg.masks import Proposals
-from mvseg.matching.result import SURE, Matching, count_sure_views
+from mvseg.masks import SURE, Masks, MergedMask, Origin, replace_crops
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.regions import mask_box
 from mvseg.scene import Cameras
 from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 from mvseg.verification.recut import AGREES, Box, Mask, agreement
-from mvseg.verification.sure_masks import confirmed_masks
 from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
 
 Photos = Callable[[int], NDArray[np.uint8]]
@@ -38,24 +36,6 @@ LEAST_COLORED = 0.8  # of it, that have the colour of leaves, for it to become a
 LEAST_FOUND = 0.3  # of the views that show an instance openly, where its surface agrees with what the detector found
 ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
 SURE_VIEWS = 4  # of an instance whose masks tell that colour
-
-
-@dataclass(frozen=True, eq=False)
-class Revised:
-    """Masks after the other views were heard.
-
-    Attributes:
-        regions: D' masks, at most one for each instance and view.
-        matching: their ids, 1 to K' without gaps, in the order of the old ones.
-        source: (D',) int64, the largest of the regions that a mask was made of; -1 for one that only the other views
-            show.
-        old_ids: (K',) int64, the former id of each instance.
-    """
-
-    regions: Regions
-    matching: Matching
-    source: Tensor
-    old_ids: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,63 +50,45 @@ class _Found:
     crop: Tensor
 
 
-def hear_witnesses(
-    proposals: Proposals,
-    matching: Matching,
+def verify_masks(
+    masks: Masks,
     *,
     cameras: Cameras,
     photos: Photos,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
-) -> tuple[Proposals, Matching, dict[int, LeafSurface]]:
+) -> tuple[Masks, dict[int, LeafSurface]]:
     """Detections as the other views correct them: surfaces are fitted to them, and they are revised as these say.
 
     Args:
-        proposals: D detections.
-        matching: of these.
+        masks: D detections, matched.
         cameras: V cameras.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars.
 
     Returns:
-        D' detections with `from_views`, on the CPU, and their matching, see `revise_masks`; a mask that only the other
-        views show has the mean detection score of its instance. And {instance id: surface}, what they were judged by.
+        D' masks on the CPU, see `revise_masks`, their ids without gaps. And {instance id: surface}, what they were
+        judged by.
     """
-    regions, ids = proposals.regions.to("cpu"), matching.instance_ids.cpu()
+    masks, cameras = masks.to("cpu"), cameras.to("cpu")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
         surfaces = fit_surfaces(
-            regions, ids, cameras.to("cpu"), most_views=ROUGH_VIEWS, workers=workers, progress=progress
+            masks.regions, masks.instance_ids, cameras, most_views=ROUGH_VIEWS, workers=workers, progress=progress
         )
-    revised = revise_masks(regions, matching, surfaces, cameras=cameras.to("cpu"), photos=photos, progress=progress)
-    from_views, new_ids = revised.source < 0, revised.matching.instance_ids
-    old_scores, old_classes = proposals.scores.cpu(), proposals.classes.cpu()
-    scores, classes = old_scores[revised.source], old_classes[revised.source]
-    for number in new_ids[from_views].unique().tolist():
-        of_instance = revised.old_ids[number - 1] == ids
-        scores[from_views & (new_ids == number)] = old_scores[of_instance].mean()
-        classes[from_views & (new_ids == number)] = old_classes[of_instance].mode()[0]
-    corrected = Proposals(
-        regions=revised.regions,
-        boxes=revised.regions.boxes.float(),
-        scores=scores,
-        classes=classes,
-        from_views=from_views,
-    )
-    judged_by = {number: surfaces[old] for number, old in enumerate(revised.old_ids.tolist(), start=1)}
-    return corrected, revised.matching, judged_by
+    revised = revise_masks(masks, surfaces, cameras=cameras, photos=photos, progress=progress)
+    return revised.close_gaps(), revised.renumber(surfaces)
 
 
 def revise_masks(
-    regions: Regions,
-    matching: Matching,
+    masks: Masks,
     surfaces: Mapping[int, LeafSurface],
     *,
     cameras: Cameras,
     photos: Photos,
     progress: bool = False,
-) -> Revised:
+) -> Masks:
     """Keep, replace, add and drop masks as the surfaces of their instances say.
 
     For every instance and view:
@@ -143,23 +105,22 @@ def revise_masks(
     stem or the like.
 
     Args:
-        regions: D masks, as a detector found them.
-        matching: their ids.
+        masks: D masks on the CPU, as a detector found them, matched.
         surfaces: {instance id: surface} fitted to them.
         cameras: V cameras.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view.
         progress: show a progress bar over the views.
 
     Returns:
-        The masks and their ids, on the CPU. A mask made of several has the best match score of theirs; one that only
-        the other views show has the mean of its instance's.
+        The D' masks that are left, at most one for each instance and view, by view and instance; ids are as before,
+        with gaps where instances went. A mask made of several takes the columns of the largest and the best match score
+        of theirs. One that only the other views show has `Origin.OTHER_VIEWS` and the mean scores of its instance.
     """
-    ids, scores = matching.instance_ids.cpu(), matching.match_scores.cpu()
-    regions, matching = regions.to("cpu"), replace(matching, instance_ids=ids, match_scores=scores)
-    colors = _colors_of_leaves(regions, matching, photos)
+    regions, ids = masks.regions, masks.instance_ids
+    colors = _colors_of_leaves(masks, photos)
     found: list[_Found] = []
     shown_openly: Counter[int] = Counter()
-    for view in tqdm(range(regions.num_views), "witnesses", unit="view", disable=not progress):
+    for view in tqdm(range(regions.num_views), "verification", unit="view", disable=not progress):
         colored = has_leaf_color(photos(view), colors)
         for leaf in visible_leaves(surfaces, cameras, view):
             members = ((regions.view_index == view) & (ids == leaf.instance)).nonzero()[:, 0].tolist()
@@ -172,35 +133,71 @@ def revise_masks(
                 found.append(_found(view, leaf, members, (box, own.numpy()), is_own=True))
             elif _is_leaf(leaf, colored_here):
                 found.append(_found(view, leaf, members, (leaf.box, leaf.mask & colored_here), is_own=False))
-    found = _borne_out(found, shown_openly)
-    number = {instance: place for place, instance in enumerate(sorted({each.instance for each in found}), start=1)}
-    revised = stack_regions(
-        [each.view for each in found],
+    return _as_masks(masks, _borne_out(found, shown_openly))
+
+
+def _as_masks(masks: Masks, found: list[_Found]) -> Masks:
+    """The table of the revised masks, from the one of the old masks."""
+    areas, scores = masks.regions.areas, masks.match_scores
+    rows = []  # of the old table, that the columns begin with: for what no detector found, any of its instance
+    for each in found:
+        rows.append(max(each.members, key=lambda row: int(areas[row])) if each.is_own else _first(masks, each.instance))
+    is_own = torch.tensor([each.is_own for each in found], dtype=torch.bool)
+    best = torch.tensor([float(scores[each.members].max()) if each.is_own else 0.0 for each in found])
+    revised = replace_crops(
+        masks.select(torch.tensor(rows, dtype=torch.int64)).with_merged(()),
         [each.box for each in found],
         [each.crop for each in found],
-        labels=range(1, len(found) + 1),
-        num_views=regions.num_views,
     )
-    areas = regions.areas
-    source = [max(each.members, key=lambda n: int(areas[n])) if each.is_own else -1 for each in found]
-    return Revised(
-        regions=revised,
-        matching=_rematch(matching, found, number),
-        source=torch.tensor(source, dtype=torch.int64),
-        old_ids=torch.tensor(list(number), dtype=torch.int64),
+    views = torch.tensor([each.view for each in found], dtype=torch.int64)
+    labels = torch.arange(1, len(found) + 1)
+    detection_scores, classes = revised.detection_scores.clone(), revised.classes.clone()
+    for instance in revised.instance_ids[~is_own].unique().tolist():
+        of_instance, before = revised.instance_ids == instance, masks.instance_ids == instance
+        best[of_instance & ~is_own] = best[of_instance & is_own].mean().nan_to_num(0)
+        detection_scores[of_instance & ~is_own] = masks.detection_scores[before].mean()
+        classes[of_instance & ~is_own] = masks.classes[before].mode()[0]
+    revised = revised.with_merged(_still_merged(masks, found))
+    return replace(
+        revised,
+        regions=replace(revised.regions, view_index=views, labels=labels),
+        match_scores=best,
+        detection_scores=detection_scores,
+        classes=classes,
+        origin=torch.where(is_own, revised.origin, int(Origin.OTHER_VIEWS)),
     )
 
 
-def _colors_of_leaves(regions: Regions, matching: Matching, photos: Photos) -> NDArray[np.bool_]:
-    """The colours of masks that are surely matched in `SURE_VIEWS` views, or in all where there are fewer; where there
-    are no such masks, those of all that are matched."""
-    is_sure = confirmed_masks(regions, matching, min_match_score=SURE, min_views=SURE_VIEWS)
-    chosen = is_sure if is_sure.any() else matching.instance_ids > 0
+def _still_merged(masks: Masks, found: list[_Found]) -> list[MergedMask]:
+    """The merged masks that stayed as they were, in views where their second instance has no mask of its own."""
+    merged = {each.region: each for each in masks.merged}
+    shown = {(each.view, each.instance) for each in found}
+    left = {each.instance for each in found}
+    return [
+        replace(merged[each.members[0]], region=row)
+        for row, each in enumerate(found)
+        if each.is_own and len(each.members) == 1 and each.members[0] in merged
+        and merged[each.members[0]].part.shape == each.crop.shape
+        and merged[each.members[0]].other in left and (each.view, merged[each.members[0]].other) not in shown
+    ]  # fmt: skip
+
+
+def _first(masks: Masks, instance: int) -> int:
+    return int((masks.instance_ids == instance).nonzero()[0, 0])
+
+
+def _colors_of_leaves(masks: Masks, photos: Photos) -> NDArray[np.bool_]:
+    """The colours of masks that are surely matched, of instances that are so in `SURE_VIEWS` views, or in all where
+    there are fewer; where there are no such masks, those of all that are matched."""
+    enough = masks.count_sure_views() >= min(SURE_VIEWS, masks.regions.num_views)
+    of_instance = torch.cat((enough, enough.new_zeros(1)))[masks.instance_ids.clamp(min=0) - 1]
+    is_sure = (masks.instance_ids > 0) & of_instance & (masks.match_scores >= SURE)
+    chosen = is_sure if is_sure.any() else masks.instance_ids > 0
     counts = ColorCounts.none()
-    for view in range(regions.num_views):
+    for view in range(masks.regions.num_views):
         photo = photos(view)
         size = photo.shape[1], photo.shape[0]
-        counts += count_colors(photo, regions.label_map(view, chosen.long(), size).numpy() > 0)
+        counts += count_colors(photo, masks.regions.label_map(view, chosen.long(), size).numpy() > 0)
     return leaf_colors(counts)
 
 
@@ -219,7 +216,7 @@ def _found(
 ) -> _Found:
     (left, top, _, _), mask = placed
     x1, y1, x2, y2 = mask_box(torch.from_numpy(mask))
-    crop = torch.from_numpy(mask[y1:y2, x1:x2].copy()).flatten()
+    crop = torch.from_numpy(mask[y1:y2, x1:x2].copy())
     box = (left + x1, top + y1, left + x2, top + y2)
     return _Found(view=view, instance=leaf.instance, members=members, is_own=is_own, box=box, crop=crop)
 
@@ -233,25 +230,3 @@ def _borne_out(found: list[_Found], shown_openly: Mapping[int, int]) -> list[_Fo
         each for each in found
         if masks[each.instance] > 1 and seen[each.instance] >= LEAST_FOUND * shown_openly[each.instance]
     ]  # fmt: skip
-
-
-def _rematch(matching: Matching, found: list[_Found], number: Mapping[int, int]) -> Matching:
-    """The matching of the revised masks."""
-    ids = torch.tensor([number[each.instance] for each in found], dtype=torch.int64)
-    is_own = torch.tensor([each.is_own for each in found], dtype=torch.bool)
-    scores = torch.tensor([float(matching.match_scores[each.members].max()) if each.is_own else 0.0 for each in found])
-    for instance in ids[~is_own].unique().tolist():
-        scores[~is_own & (ids == instance)] = scores[is_own & (ids == instance)].mean().nan_to_num(0)
-    revised = Matching(
-        instance_ids=ids,
-        match_scores=scores,
-        num_instances=len(number),
-        method=matching.method,
-        residual_px=matching.residual_px,
-        explained=matching.explained,
-        poses=matching.poses,
-    )
-    if matching.support is None:
-        return revised
-    view_index = torch.tensor([each.view for each in found], dtype=torch.int64)
-    return replace(revised, support=count_sure_views(revised, view_index))

@@ -19,10 +19,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from scipy.special import logit
-from torch import Tensor
 
+from mvseg.masks import Masks, Origin, replace_crops
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.regions import mask_box
 from mvseg.scene import Cameras
 from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
 
@@ -35,27 +35,23 @@ Mask = NDArray[np.bool_]
 Box = tuple[int, int, int, int]
 
 
-def recut_masks(
-    regions: Regions, instance_ids: Tensor, surfaces: Mapping[int, LeafSurface], *, cameras: Cameras, is_found: Tensor
-) -> Regions:
-    """Found masks, each cut anew by the visible part of its instance's surface, see `recut`.
+def recut_masks(masks: Masks, surfaces: Mapping[int, LeafSurface], *, cameras: Cameras) -> Masks:
+    """Cut the masks that a detector found, as `recut`, where they agree with their surfaces.
 
     Args:
-        regions: D masks, at most one for each instance and view.
-        instance_ids: (D,) int64.
+        masks: D masks, at most one detected mask for each instance and view.
         surfaces: {instance id: surface}.
         cameras: V cameras.
-        is_found: (D,) bool, the masks of the detector. The others, and those that agree with their surface by less than
-            `AGREES` or have no credible one, stay as they are.
 
     Returns:
-        D masks in the same order, on the CPU.
+        The same rows, on the CPU. Masks that no detector found, and those that agree with their surface by less than
+        `AGREES` or have no credible one, stay as they are. What is cut shows one instance only.
     """
-    regions, place = regions.to("cpu"), {}
-    for index in is_found.cpu().nonzero()[:, 0].tolist():
-        place[int(regions.view_index[index]), int(instance_ids[index])] = index
+    regions, place = masks.regions.to("cpu"), {}
+    for index in (masks.origin.cpu() == Origin.DETECTED).nonzero()[:, 0].tolist():
+        place[int(regions.view_index[index]), int(masks.instance_ids[index])] = index
     boxes: list[Box] = [tuple(box) for box in regions.boxes.tolist()]
-    crops = [regions.crop(index).flatten() for index in range(len(regions))]
+    crops, cut_rows = [regions.crop(index) for index in range(len(regions))], set()
     for view in range(regions.num_views):
         size = cameras.sizes[view].tolist()
         for leaf in visible_leaves(surfaces, cameras, view):
@@ -72,10 +68,10 @@ def recut_masks(
             cut = recut(_place(box, found, both), _place(leaf.box, leaf.mask, both))
             left, top, right, bottom = mask_box(torch.from_numpy(cut))
             boxes[index] = (x1 + left, y1 + top, x1 + right, y1 + bottom)
-            crops[index] = torch.from_numpy(cut[top:bottom, left:right].copy()).flatten()
-    return stack_regions(
-        regions.view_index.tolist(), boxes, crops, labels=regions.labels.tolist(), num_views=regions.num_views
-    )
+            cut_rows.add(index)
+            crops[index] = torch.from_numpy(cut[top:bottom, left:right].copy())
+    merged = [each for each in masks.merged if each.region not in cut_rows]
+    return replace_crops(masks.with_merged(merged), boxes, crops)
 
 
 def recut(found: Mask, shown: Mask) -> Mask:

@@ -7,12 +7,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
+from matched import matched
 from mvseg.detection.crops import crop_cameras, gain_of_crops, place_crops, plant_boxes, projections
-from mvseg.masks import Proposals
-from mvseg.matching.result import Matching
-from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.masks import Masks
+from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import grow_plant
@@ -21,7 +20,7 @@ CENTERS = torch.tensor([[0.0, 0.0, 60.0], [40.0, 10.0, 90.0], [-20.0, -45.0, 40.
 RADIUS = 6.0  # mm
 
 
-def ball_scene(num_views: int = 6, size: int = 400) -> tuple[Regions, Matching, Cameras]:
+def ball_scene(num_views: int = 6, size: int = 400) -> tuple[Masks, Cameras]:
     """Four balls, as discs in every view, far away from the cameras."""
     cameras = arc_cameras(num_views, grow_plant("ovate", 4, 1), width=size, height=size)
     K = cameras.K.clone()
@@ -36,19 +35,13 @@ def ball_scene(num_views: int = 6, size: int = 400) -> tuple[Regions, Matching, 
             radius = float(K[view, 0, 0] * RADIUS / depth[view, number - 1])
             labels[(columns - x) ** 2 + (rows - y) ** 2 < radius**2] = number
         maps.append(labels)
-    regions = regions_from_label_maps(maps)
-    scores = torch.full((len(regions),), 0.9)
-    return regions, Matching(regions.labels, scores, num_instances=4, method="nview"), cameras
-
-
-def select(matching: Matching, index: Tensor) -> Matching:
-    scores = matching.match_scores[index]
-    return replace(matching, instance_ids=matching.instance_ids[index], match_scores=scores)
+    return matched(regions_from_label_maps(maps)).masks, cameras
 
 
 def test_boxes_hold_the_plant_and_little_else() -> None:
-    regions, matching, cameras = ball_scene()
-    boxes = plant_boxes(regions, matching, cameras)
+    masks, cameras = ball_scene()
+    regions = masks.regions
+    boxes = plant_boxes(masks, cameras)
     for view in range(len(cameras)):
         own = regions.boxes[regions.view_index == view]
         x1, y1, x2, y2 = boxes[view].tolist()
@@ -61,43 +54,46 @@ def test_boxes_hold_the_plant_and_little_else() -> None:
 
 
 def test_a_view_that_shows_nothing_has_the_box_of_the_others() -> None:
-    regions, matching, cameras = ball_scene()
+    masks, cameras = ball_scene()
+    regions = masks.regions
     seen = regions.view_index != 2
-    boxes = plant_boxes(regions.select(seen), select(matching, seen), cameras)
-    expected = plant_boxes(regions, matching, cameras)
+    boxes = plant_boxes(masks.select(seen), cameras)
+    expected = plant_boxes(masks, cameras)
     assert int((boxes - expected).abs().max()) <= 3
 
 
 def test_doubtful_masks_do_not_widen_the_boxes() -> None:
-    regions, matching, cameras = ball_scene()
+    masks, cameras = ball_scene()
+    regions = masks.regions
     without = regions.labels != 4
-    expected = plant_boxes(regions.select(without), select(matching, without), cameras)
+    expected = plant_boxes(masks.select(without), cameras)
     for ids, scores in ((4, 0.3), (-1, 0.0)):
         doubtful = replace(
-            matching,
-            instance_ids=matching.instance_ids.masked_fill(~without, ids),
-            match_scores=matching.match_scores.masked_fill(~without, scores),
+            masks,
+            instance_ids=masks.instance_ids.masked_fill(~without, ids),
+            match_scores=masks.match_scores.masked_fill(~without, scores),
         )
-        assert torch.equal(plant_boxes(regions, doubtful, cameras), expected)
+        assert torch.equal(plant_boxes(doubtful, cameras), expected)
     few = without | (regions.view_index < 2)  # one instance in two views only
-    assert torch.equal(plant_boxes(regions.select(few), select(matching, few), cameras), expected)
+    assert torch.equal(plant_boxes(masks.select(few), cameras), expected)
 
 
 def test_law_views_may_be_permuted_and_the_world_scaled() -> None:
-    regions, matching, cameras = ball_scene()
-    boxes = plant_boxes(regions, matching, cameras)
-    assert torch.equal(plant_boxes(regions, matching, cameras.scale(0.01)), boxes)
+    masks, cameras = ball_scene()
+    regions = masks.regions
+    boxes = plant_boxes(masks, cameras)
+    assert torch.equal(plant_boxes(masks, cameras.scale(0.01)), boxes)
     order = torch.tensor([3, 0, 5, 1, 4, 2])
     place = order.argsort()
-    permuted = replace(regions, view_index=place[regions.view_index])
-    assert torch.equal(plant_boxes(permuted, matching, cameras[order]), boxes[order])
+    permuted = replace(masks, regions=replace(regions, view_index=place[regions.view_index]))
+    assert torch.equal(plant_boxes(permuted, cameras[order]), boxes[order])
 
 
 def test_without_a_sure_instance_the_photo_is_whole() -> None:
-    regions, matching, cameras = ball_scene()
-    doubtful = replace(matching, match_scores=torch.full_like(matching.match_scores, 0.2))
+    masks, cameras = ball_scene()
+    doubtful = replace(masks, match_scores=torch.full_like(masks.match_scores, 0.2))
     whole = torch.tensor([[0, 0, 400, 400]] * len(cameras))
-    assert torch.equal(plant_boxes(regions, doubtful, cameras), whole)
+    assert torch.equal(plant_boxes(doubtful, cameras), whole)
 
 
 def test_gain_does_not_count_pixels_that_are_not_there() -> None:
@@ -107,21 +103,16 @@ def test_gain_does_not_count_pixels_that_are_not_there() -> None:
 
 
 def test_what_is_found_in_crops_is_placed_where_it_is() -> None:
-    regions, matching, cameras = ball_scene()
-    boxes = plant_boxes(regions, matching, cameras)
+    masks, cameras = ball_scene()
+    regions = masks.regions
+    boxes = plant_boxes(masks, cameras)
     cropped = crop_cameras(cameras, boxes)
     px, _ = cameras.project(CENTERS)
     assert torch.allclose(cropped.project(CENTERS)[0], px - boxes[:, None, :2])
     maps = [regions.label_map(view, regions.labels, (400, 400)).numpy() for view in range(len(cameras))]
     cut = [labels[y1:y2, x1:x2] for labels, (x1, y1, x2, y2) in zip(maps, boxes.tolist(), strict=True)]
-    found = regions_from_label_maps(cut)
-    count = len(found)
-    proposals = Proposals(
-        regions=found, boxes=found.boxes.float(), scores=torch.ones(count), classes=torch.ones(count).long()
-    )
-    placed = place_crops(proposals, boxes)
+    placed = place_crops(Masks.of(regions_from_label_maps(cut)), boxes)
     assert torch.equal(placed.regions.boxes, regions.boxes)
-    assert torch.equal(placed.boxes, regions.boxes.float())
     assert torch.equal(placed.regions.crops, regions.crops)
     ones = torch.cat((CENTERS, torch.ones(4, 1)), 1).numpy()
     seen = projections(cameras) @ ones.T

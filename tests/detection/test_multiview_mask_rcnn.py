@@ -14,20 +14,20 @@ from torchvision.ops import box_iou
 
 import mvseg.detection.mask_rcnn
 from leafy_scene import write_leafy_scene
+from matched import matched
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detection.nms import cluster_aware_nms
-from mvseg.detection.proposals import gather_proposals
+from mvseg.detection.proposals import Proposals, gather_proposals
 from mvseg.detectors.mask_cut import decide_masks
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import load_photos, read_photo
-from mvseg.masks import Proposals
-from mvseg.matching.config import MatchConfig
-from mvseg.matching.result import Matching, RefinedPoses
+from mvseg.masks import Masks, Origin
+from mvseg.matching.result import Matching
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
-from mvseg.verification.other_views import hear_witnesses
+from mvseg.verification.other_views import verify_masks
 from simulated_proposals import simulate_proposals
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at, merged_balls
 
@@ -130,25 +130,6 @@ def test_with_cameras_the_usual_dicts_and_ids() -> None:
     assert all(len(labels) == 1 for instance, labels in classes.items() if instance > 0)
 
 
-@pytest.mark.slow
-def test_poses_are_refined_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    better = small_cameras().scale(2)
-
-    def refine(regions, cameras, match):
-        assert len(regions) > 0
-        kept, matching = match(cameras)
-        return kept, replace(matching, poses=RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2)))
-
-    monkeypatch.setattr(mvseg.detection.mask_rcnn, "match_refined", refine)
-    plain = MultiViewMaskRCNN(tiny_detector()).find_regions(some_images(), small_cameras())[1]
-    wrapped = MultiViewMaskRCNN(tiny_detector(), match=MatchConfig(refine_poses=True))
-    matching = wrapped.find_regions(some_images(), small_cameras())[1]
-    assert plain.poses is None
-    assert matching.poses is not None
-    assert matching.poses.cameras is better
-    assert torch.equal(matching.instance_ids, plain.instance_ids)
-
-
 def test_the_detectors_own_thresholds_stay_as_they_were() -> None:
     detector = tiny_detector()
     before = (detector.roi_heads.nms_thresh, detector.roi_heads.detections_per_img)
@@ -166,12 +147,12 @@ def test_masks_are_cut_and_low_scores_discarded(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr("mvseg.detectors.run.decide_masks", watch)
     detector = tiny_detector()
     detector.roi_heads.score_thresh = 0.16
-    proposals, _ = MultiViewMaskRCNN(detector, num_iterations=0).find_regions(some_images(), small_cameras())
+    masks = MultiViewMaskRCNN(detector, num_iterations=0).find_regions(some_images(), small_cameras()).masks
     decided = [decide_masks(raw)["scores"] for raw in seen]
     assert sum(int((scores < 0.16).sum()) for scores in decided) > 0
     allowed = torch.cat([scores[scores >= 0.16] for scores in decided])
-    assert len(proposals.scores) > 0
-    assert torch.isin(proposals.scores, allowed).all()
+    assert len(masks) > 0
+    assert torch.isin(masks.detection_scores, allowed).all()
 
 
 def test_boxes_that_the_other_views_do_not_confirm_are_discarded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -181,20 +162,20 @@ def test_boxes_that_the_other_views_do_not_confirm_are_discarded(monkeypatch: py
         return torch.arange(len(boxes)) > 0
 
     monkeypatch.setattr("mvseg.detection.loop.confirmed", refuse_first)
-    after, matching = wrapped.find_regions(images, cameras)
+    after = wrapped.find_regions(images, cameras)
     monkeypatch.setattr("mvseg.detection.loop.confirmed", lambda boxes, *_, **__: torch.ones(len(boxes)) > 0)
-    unasked, _ = wrapped.find_regions(images, cameras)
-    assert len(after.scores) == len(unasked.scores) - 1 == len(matching.instance_ids)
+    assert len(after) == len(wrapped.find_regions(images, cameras)) - 1
 
 
 def test_boxes_of_the_excessive_set_overlap_no_more_than_its_threshold() -> None:
     overlaps = []
     for iou in (0.1, 0.7):
         wrapped = MultiViewMaskRCNN(tiny_detector(), proposal_iou=iou, cluster_iou=1.0, num_iterations=0)
-        proposals, _ = wrapped.find_regions(some_images(), small_cameras())
-        groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
-        is_rival = (groups[:, None] == groups).all(2).fill_diagonal_(False)
-        overlaps.append(float((box_iou(proposals.boxes, proposals.boxes) * is_rival).max()))
+        results = wrapped(some_images(), cameras=small_cameras())
+        overlaps.append(0.0)
+        for result in results:
+            is_rival = (result["labels"][:, None] == result["labels"]).fill_diagonal_(False)
+            overlaps.append(max(overlaps.pop(), float((box_iou(result["boxes"], result["boxes"]) * is_rival).max())))
     assert overlaps[0] <= 0.1 + 1e-6 < 0.5 < overlaps[1] <= 0.7 + 1e-6
 
 
@@ -232,7 +213,14 @@ def crowded_scene() -> tuple[BallScene, Proposals, torch.Tensor]:
     proposals, labels = simulate_proposals(scene.label_maps, seed=0)
     excess = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.7)
     chosen = (proposals.boxes[excess], proposals.scores[excess], proposals.classes[excess])
-    return scene, Proposals(proposals.regions.select(excess), *chosen), labels[excess]
+    regions = replace(proposals.regions.select(excess), labels=torch.arange(len(excess)))
+    return scene, Proposals(regions, *chosen), labels[excess]
+
+
+def places(proposals: Proposals, matching: Matching) -> torch.Tensor:
+    """(S,) int64, which of the proposals were kept."""
+    assert torch.equal(proposals.scores[matching.masks.regions.labels], matching.masks.detection_scores)
+    return matching.masks.regions.labels
 
 
 def test_cluster_aware_nms_finds_more_than_plain_nms_does() -> None:
@@ -255,7 +243,8 @@ def test_cluster_aware_nms_finds_more_than_plain_nms_does() -> None:
         return sum(pair in kept for pair in crowded) / len(crowded)
 
     plain = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.3)
-    keep, matching = match_proposals(proposals, scene.cameras)
+    matching = match_proposals(proposals, scene.cameras)
+    keep = places(proposals, matching)
     assert recall(keep) > recall(plain)
     assert len(keep) < 1.35 * len(truth)
     assert len(matching.instance_ids) == len(keep)
@@ -264,9 +253,9 @@ def test_cluster_aware_nms_finds_more_than_plain_nms_does() -> None:
 def test_iterating_is_deterministic_and_zero_iterations_only_match() -> None:
     scene, proposals, _ = crowded_scene()
     first, second = (match_proposals(proposals, scene.cameras, num_iterations=1) for _ in range(2))
-    assert torch.equal(first[0], second[0])
-    assert torch.equal(first[1].instance_ids, second[1].instance_ids)
-    keep, _ = match_proposals(proposals, scene.cameras, num_iterations=0)
+    assert torch.equal(first.masks.regions.labels, second.masks.regions.labels)
+    assert torch.equal(first.instance_ids, second.instance_ids)
+    keep = places(proposals, match_proposals(proposals, scene.cameras, num_iterations=0))
     groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
     assert torch.equal(keep, cluster_aware_nms(proposals.boxes, proposals.scores, groups, 0.3))
 
@@ -290,25 +279,25 @@ def test_classes_are_matched_apart_and_their_matchings_joined() -> None:
     classes = torch.where(first | (regions.labels % 2 == 1), 1, 2)
     order = torch.randperm(len(regions), generator=torch.Generator().manual_seed(0))
     proposals = Proposals(regions, regions.boxes.float(), torch.rand(len(regions)), classes).select(order)
-    keep, matching = match_proposals(proposals, scene.cameras, num_iterations=0, cluster_iou=0.99)
-    labels = proposals.regions.labels[keep]
+    matching = match_proposals(proposals, scene.cameras, num_iterations=0, cluster_iou=0.99)
+    labels = matching.masks.regions.labels
     assert matching.support is not None
     assert len(matching.support) == matching.num_instances == 6
     assert matching.residual_px == 1
     for instance in range(1, 7):
-        assert len(proposals.classes[keep][matching.instance_ids == instance].unique()) == 1
+        assert len(matching.masks.classes[matching.instance_ids == instance].unique()) == 1
     (merged,) = matching.merged
     assert labels[merged.region] == large
     assert matching.instance_ids[merged.region] == merged.own
-    assert merged.part.shape == proposals.regions.crop(int(keep[merged.region])).shape
+    assert merged.part.shape == matching.masks.regions.crop(merged.region).shape
     shown = [int(labels[matching.instance_ids == number].mode().values) for number in (merged.own, merged.other)]
     assert sorted(shown) == sorted((small, large))
 
 
 def test_detections_per_view_are_limited() -> None:
     scene, proposals, _ = crowded_scene()
-    keep, _ = match_proposals(proposals, scene.cameras, num_iterations=1, detections_per_view=5)
-    assert proposals.regions.select(keep).num_per_view.max() == 5
+    kept = match_proposals(proposals, scene.cameras, num_iterations=1, detections_per_view=5).masks
+    assert kept.regions.num_per_view.max() == 5
 
 
 def test_nothing_found_is_an_empty_answer() -> None:
@@ -323,36 +312,37 @@ def test_the_other_views_are_heard_where_that_is_asked_for(tmp_path: Path, monke
     leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160)
     missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
     regions = leafy.regions.select(~missed)
-    ones = torch.ones(len(regions))
-    found = Proposals(regions=regions, boxes=regions.boxes.float(), scores=ones / 2, classes=ones.long())
-    matching = Matching(regions.labels, 0.9 * ones, num_instances=2, method="nview")
+    found = matched(regions)
+    detected = Masks.of(
+        regions, regions.labels, found.match_scores, detection_scores=found.match_scores / 2, origin=Origin.DETECTED
+    )
     wrapped = MultiViewMaskRCNN(tiny_detector(), witnesses=True)
-    monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: (found, matching))
+    monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: found.with_masks(detected))
     images, cameras = load_photos(leafy.scene), leafy.scene.cameras
-    heard = hear_witnesses(found, matching, cameras=cameras, photos=partial(read_photo, leafy.scene))
-    said: list[Matching] = []
+    heard = verify_masks(detected, cameras=cameras, photos=partial(read_photo, leafy.scene))
+    said: list[Masks] = []
 
-    def hear(proposals: Proposals, matching: Matching, **given: Any) -> Any:
+    def verify(masks: Masks, **given: Any) -> Any:
         """What it says takes seconds; what it is asked is checked."""
-        assert proposals is found
+        assert masks is detected
         assert torch.equal(given["cameras"].t, cameras.t)
         assert all((given["photos"](view) == read_photo(leafy.scene, view)).all() for view in range(5))
-        said.append(matching)
+        said.append(masks)
         return heard
 
-    monkeypatch.setattr(mvseg.detection.mask_rcnn, "hear_witnesses", hear)
+    monkeypatch.setattr(mvseg.detection.mask_rcnn, "verify_masks", verify)
     results = wrapped(images, cameras=cameras)
     assert [result["from_views"].tolist() for result in results].count([False, False]) == 4
     assert sorted(results[2]["from_views"].tolist()) == [False, True]
     shown = results[2]["masks"][results[2]["from_views"]][0, 0].bool()
     true = leafy.regions.mask(int(missed.nonzero()), 160, 160)
     assert float((true & shown).sum() / (true | shown).sum()) > 0.9
-    corrected, rematched = wrapped.find_regions(iter(images), cameras)
+    corrected = wrapped.find_regions(iter(images), cameras).masks
     by_view = torch.cat([result["instance_ids"].sort().values for result in results])
-    assert torch.equal(rematched.instance_ids, by_view)
-    assert torch.equal(corrected.scores, heard[0].scores)
-    assert 0 < (corrected.boxes - heard[0].boxes).abs().max() < 8  # edges between those of masks and surfaces
-    assert torch.equal(corrected.boxes, corrected.regions.boxes.float())
+    assert torch.equal(corrected.instance_ids, by_view)
+    assert torch.equal(corrected.detection_scores, heard[0].detection_scores)
+    moved = (corrected.regions.boxes - heard[0].regions.boxes).abs().max()
+    assert 0 < moved < 8  # edges between those of masks and surfaces
     assert len(said) == 2
     assert {key: (value.dtype, value.shape[1:]) for key, value in results[0].items()} == {
         "boxes": (torch.float32, (4,)),
@@ -370,11 +360,12 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
     wrapped = MultiViewMaskRCNN(tiny_detector())
     with torch.autocast("cpu", torch.bfloat16):
         results = wrapped(some_images(), cameras=small_cameras())
-        proposals, matching = wrapped.find_regions(some_images(), small_cameras())
+        matching = wrapped.find_regions(some_images(), small_cameras())
     assert results[0]["match_scores"].dtype == torch.float32
     assert max(int(result["instance_ids"].max()) for result in results) >= 1
     assert torch.equal(matching.match_scores, torch.cat([result["match_scores"] for result in results]))
-    boxes = proposals.boxes[proposals.boxes > 16]
+    boxes = torch.cat([result["boxes"] for result in results])
+    boxes = boxes[boxes > 16]
     assert not torch.equal(boxes, boxes.bfloat16().float())
 
 
@@ -384,12 +375,12 @@ def test_every_photo_is_seen_at_every_scale() -> None:
     ), some_images(), small_cameras()
     seen: list[int] = []
     wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0].shape[-1]))
-    proposals, _ = wrapped.find_regions(iter(images), cameras)
+    scores = wrapped.find_regions(iter(images), cameras).masks.detection_scores
     assert seen[0::2] == [seen[0]] * 3
     assert seen[1::2] == [2 * seen[0]] * 3
     results = wrapped(images, cameras=cameras)
-    assert torch.equal(proposals.scores, torch.cat([result["scores"] for result in results]))
-    assert (proposals.scores >= wrapped.roi_heads.score_thresh).all()
+    assert torch.equal(scores, torch.cat([result["scores"] for result in results]))
+    assert (scores >= wrapped.roi_heads.score_thresh).all()
 
 
 @pytest.mark.parametrize("scales", [(), (0.0, 1.0), (5.0,), (float("nan"),)])
@@ -400,18 +391,18 @@ def test_scales_have_a_range(scales: tuple[float, ...]) -> None:
 
 def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:
     wrapped, images, cameras = MultiViewMaskRCNN(tiny_detector(), proposals_per_view=40), some_images(), small_cameras()
-    proposals, matching = wrapped.find_regions(iter(images), cameras)
+    masks = wrapped.find_regions(iter(images), cameras).masks
     results = wrapped(images, cameras=cameras)
-    views = proposals.regions.view_index
+    views = masks.view_index
     assert torch.equal(views, views.sort().values)
-    assert (proposals.regions.areas > 0).all()
+    assert (masks.regions.areas > 0).all()
     for view, result in enumerate(results):
         here = views == view
-        assert torch.equal(proposals.scores[here], result["scores"])
-        assert torch.equal(matching.instance_ids[here], result["instance_ids"])
-        assert torch.equal(matching.match_scores[here], result["match_scores"])
+        assert torch.equal(masks.detection_scores[here], result["scores"])
+        assert torch.equal(masks.instance_ids[here], result["instance_ids"])
+        assert torch.equal(masks.match_scores[here], result["match_scores"])
         assert (result["scores"].diff() <= 0).all()
         for number, mask in zip(here.nonzero()[:, 0].tolist(), result["masks"][:, 0], strict=True):
-            assert torch.equal(proposals.regions.mask(number, 160, 120), mask > 0.5)
+            assert torch.equal(masks.regions.mask(number, 160, 120), mask > 0.5)
     with pytest.raises(InputError, match="2 images with 3 cameras"):
         wrapped.find_regions(iter(images[:2]), cameras)

@@ -105,9 +105,9 @@ def test_merged_masks_can_be_cut_in_two() -> None:
     regions, balls, merged = merged_balls(scene)
     matching = match_regions(regions, scene.cameras)
     assert [mask.region for mask in matching.merged] == [merged]
-    cut, matched, source = split_merged(regions, matching)
+    matched = split_merged(matching.masks)
+    cut, source = matched.regions, torch.tensor(sorted([*range(len(regions)), merged]))
     assert len(cut) == len(regions) + 1
-    assert source.tolist() == sorted([*range(len(regions)), merged])
     assert matched.merged == ()
     assert torch.equal(matched.match_scores, matching.match_scores[source])
     assert torch.equal(cut.view_index, regions.view_index[source])
@@ -122,9 +122,9 @@ def test_merged_masks_can_be_cut_in_two() -> None:
     assert sorted(shown) == sorted(balls)
     instances = [int(matching.instance_ids[whole][regions.labels[whole] == ball][0]) for ball in shown]
     assert matched.instance_ids[pieces].tolist() == instances
-    again, same, _ = split_merged(cut, matched)
-    assert torch.equal(again.crops, cut.crops)
-    assert torch.equal(same.instance_ids, matched.instance_ids)
+    again = split_merged(matched)
+    assert torch.equal(again.regions.crops, cut.crops)
+    assert torch.equal(again.instance_ids, matched.instance_ids)
 
 
 def test_views_that_agree_on_nothing_are_warned_of() -> None:

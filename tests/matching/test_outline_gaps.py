@@ -6,17 +6,16 @@ import numpy as np
 import pytest
 import torch
 
+from matched import matched
+from mvseg.masks import Masks
 from mvseg.matching.outline_gaps import Outlines, find_outlines, measure_gaps, move_cameras, pair_outlines
-from mvseg.matching.result import Matching
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at
 
 
-def true_matching(scene: BallScene) -> Matching:
-    num = len(scene.regions)
-    ids = scene.regions.labels
-    return Matching(instance_ids=ids, match_scores=torch.ones(num), num_instances=int(ids.max()), method="truth")
+def true_masks(scene: BallScene) -> Masks:
+    return matched(scene.regions, scores=1.0).masks
 
 
 def points_as_outlines(cameras: Cameras, points: torch.Tensor) -> Outlines:
@@ -34,7 +33,7 @@ def points_as_outlines(cameras: Cameras, points: torch.Tensor) -> Outlines:
 
 def test_balls_begin_and_end_on_the_same_lines() -> None:
     scene = ball_scene(5, 6, seed=3, radius=0.25)
-    outlines = find_outlines(scene.regions, true_matching(scene), scene.cameras)
+    outlines = find_outlines(true_masks(scene), scene.cameras)
     pairs = pair_outlines(outlines, scene.cameras)
     gaps = measure_gaps(outlines, pairs, scene.cameras, world_per_px=torch.ones(6))
     assert len(gaps.px) == 2 * len(pairs) > 100
@@ -43,7 +42,7 @@ def test_balls_begin_and_end_on_the_same_lines() -> None:
 
 def test_wrong_poses_leave_gaps_of_about_their_error() -> None:
     scene = ball_scene(5, 6, seed=3, radius=0.25)
-    outlines = find_outlines(scene.regions, true_matching(scene), scene.cameras)
+    outlines = find_outlines(true_masks(scene), scene.cameras)
     steps = torch.from_numpy(np.random.default_rng(0).normal(0, 6, (6, 6)))
     steps[:, 3:] = 0
     turned = move_cameras(scene.cameras, steps, torch.ones(6))
@@ -98,9 +97,8 @@ def test_masks_that_end_elsewhere_are_left_out() -> None:
     labels[:, 50:55, 60:70] = 5  # matched to nothing
     regions = regions_from_label_maps(list(labels))
     ids = torch.where(regions.labels == 4, 3, torch.where(regions.labels == 5, -1, regions.labels))
-    matching = Matching(instance_ids=ids, match_scores=torch.ones(len(ids)), num_instances=3, method="truth")
     cameras = cameras_at(arc_positions(2), width=80, height=60)
-    outlines = find_outlines(regions, matching, cameras)
+    outlines = find_outlines(matched(regions, ids).masks, cameras)
     found = sorted(zip(outlines.view.tolist(), outlines.instance.tolist(), strict=True))
     assert found == [(0, 1), (1, 1), (1, 2), (1, 3)]
 
@@ -108,10 +106,7 @@ def test_masks_that_end_elsewhere_are_left_out() -> None:
 @pytest.mark.parametrize("num_views", [2, 3])
 def test_without_masks_there_are_no_gaps(num_views: int) -> None:
     regions = regions_from_label_maps(list(np.zeros((num_views, 60, 80), np.int64)))
-    matching = Matching(
-        instance_ids=torch.zeros(0).long(), match_scores=torch.zeros(0), num_instances=0, method="truth"
-    )
     cameras = cameras_at(arc_positions(num_views), width=80, height=60)
-    outlines = find_outlines(regions, matching, cameras)
+    outlines = find_outlines(Masks.of(regions), cameras)
     gaps = measure_gaps(outlines, pair_outlines(outlines, cameras), cameras, world_per_px=torch.ones(num_views))
     assert len(gaps.px) == len(gaps.weight) == 0

@@ -26,8 +26,9 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.rig import opencv_lens
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.matching.result import MergedMask, RefinedPoses
+from mvseg.masks import MergedMask
 from mvseg.pipeline import run_scene
+from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import check_out
@@ -110,7 +111,7 @@ def with_poses(result: Result, *, is_refined: bool) -> Result:
         scene = replace(scene, cameras=replace(scene.cameras, t=scene.cameras.t + 0.1))
     gaps = (3.14159, 0.5) if is_refined else (float("nan"), float("nan"))
     poses = RefinedPoses(cameras=scene.cameras, is_refined=is_refined, gap_px=gaps)
-    return replace(ids_only(result), scene=scene, matching=replace(result.matching, poses=poses))
+    return replace(ids_only(result), scene=scene, poses=poses)
 
 
 def test_refined_cameras_can_be_read_back(result: Result, plant: Path, tmp_path: Path) -> None:
@@ -160,8 +161,12 @@ class TestContent:
     def test_what_the_matcher_is_unsure_of_is_said(self, result: Result, tmp_path: Path) -> None:
         part = torch.zeros_like(result.regions.crop(3))
         merged = (MergedMask(region=3, own=1, other=3, part=part),)
-        matching = replace(result.matching, merged=merged, support=torch.tensor([4, 3, 2]), residual_px=2)
-        traits = measure_plant(result.scene, result.regions, matching, surfaces=None, voxels=result.voxels or {})
+        report = replace(result.matching.report, residual_px=2)
+        is_unsure = result.masks.view_index < result.masks.instance_ids - 1  # instance 2 in one view, 3 in two
+        scores = torch.where(is_unsure, 0.1, 0.9)
+        masks = replace(result.masks, match_scores=scores).with_merged(merged)
+        matching = replace(result.matching, masks=masks, report=report)
+        traits = measure_plant(result.scene, matching, surfaces=None, voxels=result.voxels or {})
         save_result(replace(result, matching=matching, traits=traits), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         others = {n: entry["other_instance_id"] for n, entry in enumerate(annotations) if "other_instance_id" in entry}
@@ -282,7 +287,7 @@ class TestVariants:
     def test_unmatched_regions(self, result: Result, tmp_path: Path) -> None:
         ids = result.matching.instance_ids.clone()
         ids[ids == 2] = -1
-        matching = replace(result.matching, instance_ids=ids)
+        matching = result.matching.with_masks(replace(result.masks, instance_ids=ids))
         save_result(replace(ids_only(result), matching=matching), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         assert [entry["instance_id"] for entry in annotations].count(-1) == 4
@@ -297,7 +302,7 @@ class TestVariants:
     def test_an_instance_without_shape_has_a_row_but_no_mesh(self, result: Result, tmp_path: Path) -> None:
         assert result.voxels is not None
         voxels = {instance: grid for instance, grid in result.voxels.items() if instance != 2}
-        traits = measure_plant(result.scene, result.regions, result.matching, surfaces=None, voxels=voxels)
+        traits = measure_plant(result.scene, result.matching, surfaces=None, voxels=voxels)
         save_result(replace(result, voxels=voxels, traits=traits), tmp_path / "out", {})
         rows = read_rows(tmp_path / "out")
         assert [row["leaf"] for row in rows] == ["1", "2", "3"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.matching.result import Matching
+from mvseg.masks import Masks
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.overlay import (
     MARGIN,
@@ -26,13 +26,9 @@ from mvseg.results.overlay import (
 GREY = np.full((200, 300, 3), 90, np.uint8)
 
 
-def matching(ids: list[int], scores: list[float] | None = None) -> Matching:
-    return Matching(
-        instance_ids=torch.tensor(ids),
-        match_scores=torch.tensor(scores or [0.9] * len(ids)),
-        num_instances=max(ids),
-        method="nview",
-    )
+def masks(regions: Regions, ids: list[int], scores: list[float] | None = None) -> Masks:
+    ids = ids[: len(regions)]
+    return Masks.of(regions, torch.tensor(ids, dtype=torch.int64), torch.tensor(scores or [0.9] * len(ids)))
 
 
 @pytest.fixture
@@ -53,8 +49,8 @@ def test_colours_differ() -> None:
 
 
 def test_an_instance_has_one_colour_in_every_view(regions: Regions) -> None:
-    ids = matching([5, 1, 5, 1])
-    first, second = (draw_overlay(GREY, regions, ids, view=view) for view in (0, 1))
+    ids = masks(regions, [5, 1, 5, 1])
+    first, second = (draw_overlay(GREY, ids, view=view) for view in (0, 1))
     tint = (0.45 * 90 + 0.55 * np.array(instance_color(5))).astype(np.uint8)
     assert (first[30:50, 30:50] == tint).all()
     assert (second[30:50, 250:270] == tint).all()
@@ -70,14 +66,14 @@ def test_drawing_in_the_box_of_a_mask_is_drawing_in_the_whole_picture() -> None:
     expected[labels > 0] = 0.45 * GREY[labels > 0] + 0.55 * np.array(UNMATCHED)
     outlines, _ = cv2.findContours(labels.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     cv2.drawContours(expected, outlines, -1, UNMATCHED, 1)
-    np.testing.assert_array_equal(draw_overlay(GREY, regions, matching([-1]), view=0), expected)
+    np.testing.assert_array_equal(draw_overlay(GREY, masks(regions, [-1]), view=0), expected)
 
 
 def test_a_mask_that_is_too_small_for_the_picture_is_not_drawn() -> None:
     labels = np.zeros((4000, 6000), np.uint16)
     labels[12, 13] = 1  # between the pixels that the overlay takes
     photo = np.full((4000, 6000, 3), 90, np.uint8)
-    assert (draw_overlay(photo, regions_from_label_maps([labels]), matching([1]), view=0) == 90).all()
+    assert (draw_overlay(photo, masks(regions_from_label_maps([labels]), [1]), view=0) == 90).all()
 
 
 def test_the_small_one_is_on_top(regions: Regions) -> None:
@@ -91,17 +87,17 @@ def test_the_small_one_is_on_top(regions: Regions) -> None:
         num_views=1,
         labels=torch.tensor([1, 2]),
     )
-    painted = draw_overlay(GREY, both, matching([1, 2]), view=0)
+    painted = draw_overlay(GREY, masks(both, [1, 2]), view=0)
     small = 0.45 * 90 + 0.55 * np.array(instance_color(1))
     assert np.abs(painted[62:64, 62:64] - small).max() <= 1
 
 
 def test_unmatched_regions_are_grey_and_without_number(regions: Regions) -> None:
-    painted = draw_overlay(GREY, regions, matching([-1, -1, 1, 1]), view=0)
+    painted = draw_overlay(GREY, masks(regions, [-1, -1, 1, 1]), view=0)
     assert (painted[..., 0] == painted[..., 1]).all()
     assert (painted[..., 1] == painted[..., 2]).all()
     assert painted.max() == UNMATCHED[0]
-    numbered = draw_overlay(GREY, regions, matching([-1, -1, 1, 1]), view=1)
+    numbered = draw_overlay(GREY, masks(regions, [-1, -1, 1, 1]), view=1)
     assert numbered.max() == 255  # the white rim of a number
 
 
@@ -109,7 +105,7 @@ def test_large_photos_are_scaled_down() -> None:
     labels = np.zeros((1000, 4000), np.uint16)
     labels[400:600, 1000:1400] = 1
     photo = np.full((1000, 4000, 3), 90, np.uint8)
-    painted = draw_overlay(photo, regions_from_label_maps([labels]), matching([1]), view=0)
+    painted = draw_overlay(photo, masks(regions_from_label_maps([labels]), [1]), view=0)
     assert painted.shape == (400, MAX_SIDE, 3)
     tint = (0.45 * 90 + 0.55 * np.array(instance_color(1))).astype(np.uint8)
     assert (painted[165:170, 405:410] == tint).all()
@@ -117,7 +113,7 @@ def test_large_photos_are_scaled_down() -> None:
 
 def test_a_view_without_regions_is_the_photo(regions: Regions) -> None:
     nothing = regions.select(regions.view_index == 1)
-    np.testing.assert_array_equal(draw_overlay(GREY, nothing, matching([1, 2]), view=0), GREY)
+    np.testing.assert_array_equal(draw_overlay(GREY, masks(nothing, [1, 2]), view=0), GREY)
 
 
 @pytest.mark.parametrize(("count", "columns", "rows"), [(1, 1, 1), (2, 2, 1), (5, 4, 2), (12, 4, 3), (30, 6, 5)])
@@ -143,7 +139,7 @@ def test_contact_sheet_of_odd_sizes() -> None:
 
 def test_unsure_matches_are_marked(regions: Regions) -> None:
     sure, surer, unsure = (
-        draw_overlay(GREY, regions, matching([1, 2, 1, 2], [score, 0.9, 0.9, 0.9]), view=0) for score in (0.5, 0.9, 0.4)
+        draw_overlay(GREY, masks(regions, [1, 2, 1, 2], [score, 0.9, 0.9, 0.9]), view=0) for score in (0.5, 0.9, 0.4)
     )
     np.testing.assert_array_equal(sure, surer)
     assert (unsure != sure).any()
@@ -152,7 +148,7 @@ def test_unsure_matches_are_marked(regions: Regions) -> None:
 def test_numbers_have_a_white_edge_on_large_photos() -> None:
     labels = np.ones((900, 1200), np.uint16)
     photo = np.full((900, 1200, 3), 90, np.uint8)
-    painted = draw_overlay(photo, regions_from_label_maps([labels]), matching([1]), view=0)
+    painted = draw_overlay(photo, masks(regions_from_label_maps([labels]), [1]), view=0)
     is_black, is_white = (painted == 0).all(2), (painted == 255).all(2)
     around = cv2.dilate(is_black.astype(np.uint8), np.ones((3, 3))) > 0
     assert is_black.sum() > 30
@@ -165,7 +161,7 @@ def test_numbers_are_smaller_on_small_leaves() -> None:
     labels = np.zeros((900, 1200), np.uint16)
     labels[100:800, 100:800], labels[300:316, 1000:1016] = 1, 2
     painted = draw_overlay(
-        np.full((900, 1200, 3), 90, np.uint8), regions_from_label_maps([labels]), matching([1, 1]), view=0
+        np.full((900, 1200, 3), 90, np.uint8), masks(regions_from_label_maps([labels]), [1, 1]), view=0
     )
     is_black = (painted == 0).all(2)
     large, small = is_black[:, :850].any(1).sum(), is_black[:, 850:].any(1).sum()
@@ -177,7 +173,7 @@ class TestRims:
 
     def test_a_line_in_the_colour_of_its_instance_with_a_dark_edge(self, regions: Regions) -> None:
         nothing = regions.select(regions.view_index == 1)
-        painted = draw_overlay(GREY, nothing, matching([1, 2]), view=0, rims={3: [self.LINE]})
+        painted = draw_overlay(GREY, masks(nothing, [1, 2]), view=0, rims={3: [self.LINE]})
         assert np.abs(painted[100, 30:270].astype(int) - instance_color(3)).max() < 30  # versions of OpenCV
         for row in (99, 101):
             assert painted[row, 30:270].max() < 90  # darker than the photo
@@ -186,7 +182,7 @@ class TestRims:
     def test_rims_are_scaled_with_the_photo(self) -> None:
         nothing = regions_from_label_maps([np.zeros((1600, 3200), np.uint16)])
         photo = np.full((1600, 3200, 3), 90, np.uint8)
-        painted = draw_overlay(photo, nothing, matching([1]), view=0, rims={3: [4 * self.LINE]})
+        painted = draw_overlay(photo, masks(nothing, [1, 2]), view=0, rims={3: [4 * self.LINE]})
         assert (painted[200:202, 100:500] == instance_color(3)).all(2).any(0).all()
 
 
@@ -197,32 +193,32 @@ class TestTiles:
         labels[300:360, 500:540], labels[300:330, 540:580] = 1, 2
         labels[10:60, 10:60] = 3
         found = regions_from_label_maps([labels])
-        x1, y1, x2, y2 = find_plant(found, matching([1, 2, -1]), view=0, size=(800, 600))
+        x1, y1, x2, y2 = find_plant(masks(found, [1, 2, -1]), view=0, size=(800, 600))
         assert (x1 + x2) / 2 == pytest.approx(540, abs=1)
         assert (y1 + y2) / 2 == pytest.approx(330, abs=1)
         assert x2 - x1 == pytest.approx((1 + 2 * MARGIN) * 80, abs=1)
         assert (x2 - x1) / (y2 - y1) == pytest.approx(4 / 3, abs=0.02)
-        tile = draw_tile(np.full((600, 800, 3), 90, np.uint8), found, matching([1, 2, -1]), view=0)
+        tile = draw_tile(np.full((600, 800, 3), 90, np.uint8), masks(found, [1, 2, -1]), view=0)
         assert tile.shape == (360, TILE_WIDTH, 3)
         assert (tile != 90).any(2).mean() > 0.4
-        whole = draw_tile(np.full((600, 800, 3), 90, np.uint8), found, matching([-1, -1, -1]), view=0)
+        whole = draw_tile(np.full((600, 800, 3), 90, np.uint8), masks(found, [-1, -1, -1]), view=0)
         assert (whole != 90).any(2).mean() < 0.05
 
     @pytest.mark.parametrize("at", [(0, 0), (0, 760), (560, 0), (560, 760)])
     def test_the_box_stays_in_the_photo(self, at: tuple[int, int]) -> None:
         labels = np.zeros((600, 800), np.uint16)
         labels[at[0] : at[0] + 40, at[1] : at[1] + 40] = 1
-        x1, y1, x2, y2 = find_plant(regions_from_label_maps([labels]), matching([1]), view=0, size=(800, 600))
+        x1, y1, x2, y2 = find_plant(masks(regions_from_label_maps([labels]), [1]), view=0, size=(800, 600))
         assert 0 <= x1 <= at[1] < at[1] + 40 <= x2 <= 800
         assert 0 <= y1 <= at[0] < at[0] + 40 <= y2 <= 600
 
     def test_without_matched_masks_it_is_the_photo(self, regions: Regions) -> None:
         for ids in ([-1, -1, 1, 2], [1, 2, -1, -1]):
-            boxes = [find_plant(regions, matching(ids), view=view, size=(300, 200)) for view in (0, 1)]
+            boxes = [find_plant(masks(regions, ids), view=view, size=(300, 200)) for view in (0, 1)]
             assert boxes.count((0, 0, 300, 200)) == 1
 
     def test_a_tiny_mask_is_not_blown_up_to_fill_the_tile(self) -> None:
         labels = np.zeros((600, 800), np.uint16)
         labels[300, 400] = 1
-        x1, y1, x2, y2 = find_plant(regions_from_label_maps([labels]), matching([1]), view=0, size=(800, 600))
+        x1, y1, x2, y2 = find_plant(masks(regions_from_label_maps([labels]), [1]), view=0, size=(800, 600))
         assert (x2 - x1, y2 - y1) == (40, 30)

@@ -5,12 +5,14 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from blade_scene import SIZE, ring_cameras
 from known_leaves import flat_leaf
+from matched import matched
 from mvseg.formats.image_file import write_png
-from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
+from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from mvseg.traits.appearance import COLORS, mean_colors, measure_appearance, project_crop, shrink
 
@@ -26,9 +28,8 @@ def scene_of(folder: Path, photos: list[np.ndarray] | None, cameras: Cameras = C
     return Scene("plant", views, cameras)
 
 
-def labels_of(masks: list[np.ndarray]) -> tuple[Regions, torch.Tensor]:
-    regions = regions_from_label_maps([mask.astype(np.int64) for mask in masks])
-    return regions, regions.labels
+def labels_of(masks: list[np.ndarray]) -> Masks:
+    return matched(regions_from_label_maps([mask.astype(np.int64) for mask in masks])).masks
 
 
 def painted(mask: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
@@ -41,7 +42,7 @@ def painted(mask: np.ndarray, color: tuple[int, int, int]) -> np.ndarray:
 def test_colours_are_those_of_sure_pixels(tmp_path: Path) -> None:
     masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
     scene = scene_of(tmp_path, [painted(mask, GREEN) for mask in masks])
-    found = measure_appearance({5: LEAF}, *labels_of([5 * mask for mask in masks]), scene=scene)[5]
+    found = measure_appearance({5: LEAF}, labels_of([5 * mask for mask in masks]), CAMERAS, photos=Photos(scene))[5]
     assert found.keys() == {"visible_share", *COLORS}
     assert found["visible_share"].value == 1
     assert [found[name].value for name in COLORS[:3]] == pytest.approx(np.array(GREEN) / 255)
@@ -53,7 +54,7 @@ def test_masks_that_reach_beyond_the_leaf_add_no_colour(tmp_path: Path) -> None:
     masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
     wide = [cv2.dilate(mask.astype(np.uint8), np.ones((21, 21), np.uint8)) for mask in masks]
     photos = [np.where(mask[..., None], GREEN, RED).astype(np.uint8) for mask in masks]
-    found = measure_appearance({1: LEAF}, *labels_of(wide), scene=scene_of(tmp_path, photos))[1]
+    found = measure_appearance({1: LEAF}, labels_of(wide), CAMERAS, photos=Photos(scene_of(tmp_path, photos)))[1]
     assert found["mean_green"].value == pytest.approx(180 / 255, abs=0.01)
 
 
@@ -64,7 +65,7 @@ def test_visible_share_counts_all_views(tmp_path: Path) -> None:
     columns = np.flatnonzero(masks[0].any(0))
     masks[0][:, int(columns.mean()) :] = False
     masks[1][:] = False
-    found = measure_appearance({1: LEAF}, *labels_of(masks), scene=scene_of(tmp_path, None))[1]
+    found = measure_appearance({1: LEAF}, labels_of(masks), CAMERAS, photos=Photos(scene_of(tmp_path, None)))[1]
     assert found["visible_share"].value == pytest.approx((masks[0].sum() + sizes[2]) / sum(sizes))
     assert not found["mean_red"].exists
     assert found["mean_red"].method == "not measured: there are no photos"
@@ -84,7 +85,8 @@ def test_crops_are_the_projections(tmp_path: Path) -> None:
 def test_a_leaf_outside_all_photos_has_no_share(tmp_path: Path) -> None:
     far = flat_leaf(length=2, half_width=0.45, at=(-40, 30, 0))
     empty = [np.zeros((SIZE, SIZE), bool)] * 3
-    found = measure_appearance({1: far}, *labels_of(empty), scene=scene_of(tmp_path, [painted(empty[0], GREEN)] * 3))
+    photos = Photos(scene_of(tmp_path, [painted(empty[0], GREEN)] * 3))
+    found = measure_appearance({1: far}, labels_of(empty), CAMERAS, photos=photos)
     assert not any(number.exists for number in found[1].values())
 
 

@@ -9,10 +9,11 @@ import torch
 
 from blade_scene import SIZE, ring_cameras
 from known_leaves import bent_blade, move, turn_about
+from matched import matched
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.reconstruction.voxels import VoxelGrid
-from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.measure import LeafTraits, Traits, measure_plant
@@ -30,7 +31,7 @@ def small_leaf(number: int) -> LeafSurface:
     return move(leaf, turn_about(UP, 110 * number), shift=(0, 0, 0.1 * number))
 
 
-def make_inputs(order: list[int]) -> tuple[Regions, Matching, dict[int, LeafSurface]]:
+def make_inputs(order: list[int]) -> tuple[Matching, dict[int, LeafSurface]]:
     """Leaf n gets the id `order[n - 1]`; its masks are its projections, the nearest id on top."""
     surfaces = {instance: small_leaf(number) for number, instance in enumerate(order, start=1)}
     maps = []
@@ -40,14 +41,7 @@ def make_inputs(order: list[int]) -> tuple[Regions, Matching, dict[int, LeafSurf
             labels[surface.project(CAMERAS)[view].numpy()] = surface_id
         maps.append(labels)
     regions = regions_from_label_maps(maps)
-    matching = Matching(
-        instance_ids=regions.labels,
-        match_scores=torch.ones(len(regions)),
-        num_instances=len(order),
-        method="nview",
-        support=torch.full((len(order),), 3),
-    )
-    return regions, matching, dict(sorted(surfaces.items()))
+    return matched(regions, scores=1.0), dict(sorted(surfaces.items()))
 
 
 def rod() -> VoxelGrid:
@@ -61,8 +55,8 @@ def numbers_of(leaf: LeafTraits) -> list[tuple[str, float, float]]:
 
 @pytest.fixture(scope="module")
 def traits() -> Traits:
-    regions, matching, surfaces = make_inputs([1, 2, 3, 4])
-    return measure_plant(SCENE, regions, matching, surfaces=surfaces, voxels={})
+    matching, surfaces = make_inputs([1, 2, 3, 4])
+    return measure_plant(SCENE, matching, surfaces=surfaces, voxels={})
 
 
 def test_every_leaf_has_every_trait(traits: Traits) -> None:
@@ -86,8 +80,8 @@ def test_every_leaf_has_every_trait(traits: Traits) -> None:
 
 def test_ids_may_be_permuted(traits: Traits) -> None:
     order = [3, 1, 4, 2]
-    regions, matching, surfaces = make_inputs(order)
-    other = measure_plant(SCENE, regions, matching, surfaces=surfaces, voxels={})
+    matching, surfaces = make_inputs(order)
+    other = measure_plant(SCENE, matching, surfaces=surfaces, voxels={})
     for leaf, instance in zip(traits.leaves, order, strict=True):
         found = other.leaves[instance - 1]
         assert found.leaf == instance
@@ -99,11 +93,11 @@ def test_ids_may_be_permuted(traits: Traits) -> None:
 
 
 def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
-    regions, matching, surfaces = make_inputs([1, 2, 3, 4])
+    matching, surfaces = make_inputs([1, 2, 3, 4])
     surfaces[2] = LeafSurface.none(torch.arange(3), "its masks agree on no point")
     surfaces[4] = LeafSurface.none(torch.arange(1), "seen in one view only")
     surfaces[3] = replace(surfaces[3], quality=Quality(("seen in two views only",)))
-    traits = measure_plant(SCENE, regions, matching, surfaces=surfaces, voxels={2: rod()})
+    traits = measure_plant(SCENE, matching, surfaces=surfaces, voxels={2: rod()})
     good, voxels, doubted, nothing = traits.leaves
     assert [leaf.method for leaf in traits.leaves] == ["surface", "voxels", "surface", "none"]
     assert good.reasons == ()
@@ -121,9 +115,11 @@ def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
 
 
 def test_rejected_leaves_are_empty_counted_and_left_out() -> None:
-    regions, matching, surfaces = make_inputs([1, 2, 3, 4])
-    matching = replace(matching, support=torch.tensor([3, 1, 3, 3]))
-    traits = measure_plant(SCENE, regions, matching, surfaces=surfaces, voxels={2: rod()})
+    matching, surfaces = make_inputs([1, 2, 3, 4])
+    is_doubtful = (matching.instance_ids == 2) & (matching.masks.view_index > 0)
+    scores = matching.match_scores.masked_fill(is_doubtful, 0.1)  # so instance 2 is surely seen by one view
+    matching = matching.with_masks(replace(matching.masks, match_scores=scores))
+    traits = measure_plant(SCENE, matching, surfaces=surfaces, voxels={2: rod()})
     assert traits.rejected == {"few_sure_views": 1}
     leaf = traits.leaves[1]
     assert leaf.reasons == ("rejected: 1 sure views, asked for are 2",)
@@ -131,15 +127,15 @@ def test_rejected_leaves_are_empty_counted_and_left_out() -> None:
     assert leaf.numbers["area"].method == leaf.reasons[0]
     assert traits.whole["number_of_leaves"].value == 3
     kept = measure_plant(
-        SCENE, regions, matching, surfaces=surfaces, voxels={}, config=TraitsConfig(min_sure_views=1)
+        SCENE, matching, surfaces=surfaces, voxels={}, config=TraitsConfig(min_sure_views=1)
     )  # fmt: skip
     assert kept.rejected == {}
     assert kept.whole["number_of_leaves"].value == 4
 
 
 def test_voxels_only() -> None:
-    regions, matching, _ = make_inputs([1, 2])
-    traits = measure_plant(SCENE, regions, matching, surfaces=None, voxels={1: rod()})
+    matching, _ = make_inputs([1, 2])
+    traits = measure_plant(SCENE, matching, surfaces=None, voxels={1: rod()})
     first, second = traits.leaves
     assert (first.method, first.reasons) == ("voxels", ())
     assert first.numbers["volume"].value == pytest.approx(36e-3)
@@ -151,12 +147,12 @@ def test_voxels_only() -> None:
 
 @pytest.mark.parametrize("asked_for", [True, False])
 def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
-    regions, matching, surfaces = make_inputs([1, 2, 3, 4])
+    matching, surfaces = make_inputs([1, 2, 3, 4])
     surfaces[2] = LeafSurface.none(torch.arange(3), "its masks agree on no point")
     apart = rod().votes.clone()
     apart[:, :, 1] = 0
     voxels = {2: replace(rod(), votes=apart)}
-    found = measure_plant(SCENE, regions, matching, surfaces=surfaces if asked_for else None, voxels=voxels)
+    found = measure_plant(SCENE, matching, surfaces=surfaces if asked_for else None, voxels=voxels)
     leaf = found.leaves[1]
     assert leaf.method == "voxels"
     assert leaf.numbers["num_pieces"].value == 2
@@ -167,8 +163,8 @@ def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
 
 
 def test_unknown_up() -> None:
-    regions, matching, surfaces = make_inputs([1, 2, 3, 4])
-    traits = measure_plant(replace(SCENE, up=None), regions, matching, surfaces=surfaces, voxels={})
+    matching, surfaces = make_inputs([1, 2, 3, 4])
+    traits = measure_plant(replace(SCENE, up=None), matching, surfaces=surfaces, voxels={})
     for number in (traits.leaves[0].numbers["lit_share"], traits.leaves[0].numbers["inclination"],
                    traits.whole["height"], traits.whole["projected_area"]):  # fmt: skip
         assert not number.exists

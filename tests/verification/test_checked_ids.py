@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 import torch
@@ -12,29 +10,21 @@ from torch import Tensor
 
 from blade_scene import SIZE, as_regions
 from known_leaves import flat_leaf
-from mvseg.matching.result import Matching, MergedMask
+from matched import matched
+from mvseg.masks import Masks, MergedMask
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
-from mvseg.verification.checked_ids import CheckedIds, check_ids, match_surfaces, touched_surface
+from mvseg.verification.checked_ids import check_ids, match_surfaces, touched_surface, unchanged_surfaces
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 
-def match_all(ids: Tensor, view_index: Tensor, scores: Tensor | None = None) -> Matching:
-    """All masks with these ids, as sure as 0.9."""
-    num_instances = int(ids.max())
-    views = [len(view_index[ids == instance].unique()) for instance in range(1, num_instances + 1)]
-    return Matching(
-        instance_ids=ids,
-        match_scores=torch.where(ids > 0, 0.9, 0.0) if scores is None else scores,
-        num_instances=num_instances,
-        method="nview",
-        support=torch.tensor(views),
-    )
+def check(regions: Regions, ids: Tensor, surfaces: dict[int, LeafSurface] = LEAVES) -> Masks:
+    return check_ids(matched(regions, ids).masks, surfaces, cameras=CAMERAS)
 
 
-def check(regions: Regions, ids: Tensor, surfaces: dict[int, LeafSurface] = LEAVES) -> CheckedIds:
-    return check_ids(regions, match_all(ids, regions.view_index), surfaces, cameras=CAMERAS)
+def is_moved(before: Tensor, after: Masks) -> Tensor:
+    return before != after.instance_ids
 
 
 @pytest.fixture(scope="module")
@@ -49,15 +39,11 @@ def place_of(regions: Regions, ids: Tensor, view: int, instance: int) -> int:
 def test_right_ids_stay_as_they_are(scene: tuple[Regions, Tensor]) -> None:
     regions, ids = scene
     checked = check(regions, ids)
-    before = match_all(ids, regions.view_index)
-    assert torch.equal(checked.matching.instance_ids, ids)
-    assert torch.equal(checked.matching.match_scores, before.match_scores)
-    assert checked.matching.support is not None
-    assert checked.matching.support.tolist() == [6, 6, 6]
-    assert not checked.is_moved.any()
-    assert not checked.is_changed.any()
-    assert checked.old_ids.tolist() == [1, 2, 3]
-    assert checked.unchanged(LEAVES) == LEAVES
+    before = matched(regions, ids).masks
+    assert torch.equal(checked.instance_ids, ids)
+    assert torch.equal(checked.match_scores, before.match_scores)
+    assert checked.count_sure_views().tolist() == [6, 6, 6]
+    assert unchanged_surfaces(before, checked, LEAVES) == LEAVES
 
 
 def test_two_masks_with_each_others_ids_are_swapped(scene: tuple[Regions, Tensor]) -> None:
@@ -68,14 +54,13 @@ def test_two_masks_with_each_others_ids_are_swapped(scene: tuple[Regions, Tensor
     scores = torch.full((len(ids),), 0.9)
     scores[one], scores[other] = 0.1, 0.2
     merged = MergedMask(region=one, own=2, other=1, part=regions.crop(one))
-    matching = replace(match_all(wrong, regions.view_index, scores), merged=(merged,))
-    checked = check_ids(regions, matching, LEAVES, cameras=CAMERAS)
-    assert torch.equal(checked.matching.instance_ids, ids)
-    assert checked.is_moved.nonzero()[:, 0].tolist() == sorted([one, other])
-    assert checked.is_changed.tolist() == [True, True, False]
-    assert checked.unchanged(LEAVES) == {3: LEAVES[3]}
-    assert checked.matching.match_scores.tolist() == pytest.approx([0.9] * len(ids))  # of those that had the id before
-    assert checked.matching.merged == ()
+    before = matched(regions, wrong, scores).masks.with_merged([merged])
+    checked = check_ids(before, LEAVES, cameras=CAMERAS)
+    assert torch.equal(checked.instance_ids, ids)
+    assert is_moved(wrong, checked).nonzero()[:, 0].tolist() == sorted([one, other])
+    assert unchanged_surfaces(before, checked, LEAVES) == {3: LEAVES[3]}
+    assert checked.match_scores.tolist() == pytest.approx([0.9] * len(ids))  # of those that had the id before
+    assert checked.merged == ()
 
 
 def merged_maps(view: int, share: float) -> list[np.ndarray]:
@@ -97,15 +82,14 @@ def test_a_mask_that_shows_two_surfaces_is_listed(share: float, is_named: bool, 
     regions, ids = as_regions(merged_maps(3, share))
     region = place_of(regions, ids, 3, 1)
     named = MergedMask(region=region, own=1, other=2, part=torch.zeros_like(regions.crop(region)))
-    matching = replace(match_all(ids, regions.view_index), merged=(named,) if is_named else ())
-    checked = check_ids(regions, matching, LEAVES, cameras=CAMERAS)
-    assert torch.equal(checked.matching.instance_ids, ids)
-    assert not checked.is_changed.any()
-    assert [(mask.region, mask.own, mask.other) for mask in checked.matching.merged] == [(region, 1, 2)] * is_listed
+    before = matched(regions, ids).masks.with_merged([named] if is_named else [])
+    checked = check_ids(before, LEAVES, cameras=CAMERAS)
+    assert torch.equal(checked.instance_ids, ids)
+    assert [(mask.region, mask.own, mask.other) for mask in checked.merged] == [(region, 1, 2)] * is_listed
     x1, y1, x2, y2 = regions.boxes[region].tolist()
     is_second = torch.from_numpy(true_maps()[3][y1:y2, x1:x2] == 2) & regions.crop(region)
     assert is_second.sum() > 0.2 * regions.areas[region]
-    for mask in checked.matching.merged:
+    for mask in checked.merged:
         assert torch.equal(mask.part, is_second)
 
 
@@ -116,8 +100,7 @@ def test_what_no_surface_explains_goes_to_the_nearest_part() -> None:
     regions, ids = as_regions(maps)
     region, alone = place_of(regions, ids, 3, 1), place_of(regions, ids, 0, 3)
     named = MergedMask(region=alone, own=3, other=1, part=regions.crop(alone))
-    matching = replace(match_all(ids, regions.view_index), merged=(named,))
-    merged = check_ids(regions, matching, LEAVES, cameras=CAMERAS).matching.merged
+    merged = check_ids(matched(regions, ids).masks.with_merged([named]), LEAVES, cameras=CAMERAS).merged
     assert [mask.region for mask in merged] == sorted([alone, region])
     part = next(mask.part for mask in merged if mask.region == region)
     x1, y1, x2, y2 = regions.boxes[region].tolist()
@@ -134,8 +117,8 @@ def test_a_mask_without_an_id_gets_one_and_what_shows_no_surface_keeps_its_own(s
     wrong = ids.clone()
     wrong[place_of(regions, numbers, 4, 2)] = -1
     checked = check(regions, wrong)
-    assert torch.equal(checked.matching.instance_ids, ids)
-    assert checked.is_changed.tolist() == [False, True, False]
+    assert torch.equal(checked.instance_ids, ids)
+    assert unchanged_surfaces(matched(regions, wrong).masks, checked, LEAVES) == {1: LEAVES[1], 3: LEAVES[3]}
 
 
 def test_a_mask_does_not_go_where_another_fits_as_well(scene: tuple[Regions, Tensor]) -> None:
@@ -143,8 +126,8 @@ def test_a_mask_does_not_go_where_another_fits_as_well(scene: tuple[Regions, Ten
     regions, ids = scene
     one = place_of(regions, ids, 0, 1)
     twice = regions.select(torch.cat((torch.arange(len(ids)), torch.tensor([one]))))
-    checked = check(twice, torch.cat((ids, torch.tensor([3]))))
-    assert not checked.is_moved.any()
+    doubled = torch.cat((ids, torch.tensor([3])))
+    assert not is_moved(doubled, check(twice, doubled)).any()
 
 
 def cut_maps(views: tuple[int, ...]) -> list[np.ndarray]:
@@ -164,14 +147,12 @@ def test_pieces_join_their_leaf_and_ids_close_up(has_surface: bool) -> None:
     surfaces = {1: LEAVES[1], 3: LEAVES[2], 4: LEAVES[3]}
     surfaces[2] = LEAVES[1] if has_surface else LeafSurface.none(torch.arange(4), "its masks agree on no point")
     checked = check(regions, ids, surfaces)
-    assert torch.equal(checked.matching.instance_ids, numbers % 10)
-    assert checked.is_moved.tolist() == (numbers == 11).tolist()
-    assert checked.old_ids.tolist() == [1, 3, 4]
-    assert checked.is_changed.tolist() == [True, False, False]
-    assert checked.unchanged(surfaces) == {2: LEAVES[2], 3: LEAVES[3]}
-    assert checked.matching.num_instances == 3
-    assert checked.matching.support is not None
-    assert checked.matching.support.tolist() == [6, 6, 6]
+    assert torch.equal(checked.close_gaps().instance_ids, numbers % 10)
+    assert is_moved(ids, checked).tolist() == (numbers == 11).tolist()
+    known = unchanged_surfaces(matched(regions, ids).masks, checked, surfaces)
+    assert known == {3: LEAVES[2], 4: LEAVES[3]}
+    assert checked.renumber(known) == {2: LEAVES[2], 3: LEAVES[3]}
+    assert checked.close_gaps().count_sure_views().tolist() == [6, 6, 6]
 
 
 def test_a_small_leaf_before_a_large_one_is_no_piece() -> None:
@@ -179,7 +160,7 @@ def test_a_small_leaf_before_a_large_one_is_no_piece() -> None:
     leaves = LEAVES | {4: flat_leaf(length=0.3, half_width=0.1, at=(0.1, 0.2, 0.1))}
     regions, ids = as_regions(true_maps(leaves))
     assert len(regions.view_index[ids == 4].unique()) == 6
-    assert torch.equal(check(regions, ids, leaves).matching.instance_ids, ids)
+    assert torch.equal(check(regions, ids, leaves).instance_ids, ids)
 
 
 def test_the_order_of_masks_and_of_ids_does_not_matter() -> None:
@@ -189,14 +170,12 @@ def test_the_order_of_masks_and_of_ids_does_not_matter() -> None:
     ids[one], ids[other] = 2, 1
     surfaces = LEAVES | {4: LEAVES[1]}
     expected = check(regions, ids, surfaces)
-    assert torch.equal(expected.matching.instance_ids, numbers % 10)
+    assert torch.equal(expected.instance_ids, numbers % 10)
     order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(2))
     renamed = torch.tensor([0, 3, 1, 4, 2])  # of the ids
     named_anew = {int(renamed[instance]): surface for instance, surface in surfaces.items()}
     checked = check(regions.select(order), renamed[ids[order]], dict(sorted(named_anew.items())))
-    assert torch.equal(checked.is_moved, expected.is_moved[order])
-    former = renamed[expected.old_ids][expected.matching.instance_ids - 1]
-    assert torch.equal(checked.old_ids[checked.matching.instance_ids - 1], former[order])
+    assert torch.equal(checked.instance_ids, renamed[expected.instance_ids][order])
 
 
 def test_shares_are_those_of_whole_frames(scene: tuple[Regions, Tensor]) -> None:
@@ -215,11 +194,9 @@ def test_shares_are_those_of_whole_frames(scene: tuple[Regions, Tensor]) -> None
 
 def test_without_surfaces_or_masks_nothing_happens(scene: tuple[Regions, Tensor]) -> None:
     regions, ids = scene
-    assert torch.equal(check(regions, ids, {}).matching.instance_ids, ids)
+    assert torch.equal(check(regions, ids, {}).instance_ids, ids)
     empty, nothing = as_regions([np.zeros((SIZE, SIZE), np.int64)] * 6)
-    matching = Matching(instance_ids=nothing, match_scores=torch.zeros(0), num_instances=0, method="nview")
-    checked = check_ids(empty, matching, {}, cameras=CAMERAS)
-    assert checked.matching.num_instances == len(checked.is_moved) == len(checked.old_ids) == 0
+    assert len(check(empty, nothing, {})) == 0
 
 
 def halved_maps(views: tuple[int, ...]) -> list[np.ndarray]:
@@ -241,10 +218,9 @@ def test_halves_of_a_leaf_become_one() -> None:
     ids = torch.where(numbers == 11, 4, numbers)
     surfaces = fit_surfaces(regions, ids, CAMERAS)
     checked = check(regions, ids, surfaces)
-    assert torch.equal(checked.matching.instance_ids, numbers % 10)
-    assert checked.is_moved.tolist() == (numbers == 11).tolist()
-    assert checked.old_ids.tolist() == [1, 2, 3]
-    assert checked.is_changed.tolist() == [True, False, False]
+    assert torch.equal(checked.instance_ids, numbers % 10)
+    assert is_moved(ids, checked).tolist() == (numbers == 11).tolist()
+    assert list(unchanged_surfaces(matched(regions, ids).masks, checked, surfaces)) == [2, 3]
 
 
 @pytest.mark.slow
@@ -255,4 +231,4 @@ def test_leaves_that_touch_stay_apart() -> None:
     regions, ids = as_regions(maps)
     surfaces = fit_surfaces(regions, ids, CAMERAS)
     assert touched_surface(3, surfaces) == 1
-    assert torch.equal(check(regions, ids, surfaces).matching.instance_ids, ids)
+    assert torch.equal(check(regions, ids, surfaces).instance_ids, ids)

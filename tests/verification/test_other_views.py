@@ -9,9 +9,9 @@ import pytest
 import torch
 
 from blade_scene import SIZE, as_regions
-from mvseg.matching.result import Matching
+from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions
-from mvseg.verification.other_views import Revised, revise_masks
+from mvseg.verification.other_views import revise_masks
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 GREEN, BROWN = (70, 150, 50), (120, 90, 60)
@@ -27,35 +27,32 @@ def photo(view: int) -> np.ndarray:
     return np.array([BROWN, GREEN], np.uint8)[(TRUE[view] > 0).astype(int)]
 
 
-def match_all(regions: Regions, ids: torch.Tensor) -> Matching:
-    return Matching(
-        instance_ids=ids,
-        match_scores=torch.where(ids > 0, 0.9, 0.0),
-        num_instances=int(ids.max()),
-        method="nview",
-        support=torch.full((int(ids.max()),), 6),
-    )
+def detected(regions: Regions, ids: torch.Tensor) -> Masks:
+    return Masks.of(regions, ids, torch.where(ids > 0, 0.9, 0.0), origin=Origin.DETECTED)
 
 
-def revise(maps: list[np.ndarray], **changes: object) -> Revised:
+def revise(maps: list[np.ndarray], **changes: object) -> Masks:
     regions, numbers = as_regions(maps)
     ids = torch.where(numbers > 100, -1, numbers % 10)  # 11 is a second piece of leaf 1
     given = {"surfaces": LEAVES, "photos": photo, **changes}
-    return revise_masks(regions, match_all(regions, ids), cameras=CAMERAS, **given)  # type: ignore[arg-type]
+    return revise_masks(detected(regions, ids), cameras=CAMERAS, **given)  # type: ignore[arg-type]
 
 
-def label_maps(revised: Revised) -> list[np.ndarray]:
-    ids = revised.matching.instance_ids
+def label_maps(revised: Masks) -> list[np.ndarray]:
+    ids = revised.instance_ids
     return [revised.regions.label_map(view, ids, (SIZE, SIZE)).numpy() for view in range(len(CAMERAS))]
+
+
+def is_new(revised: Masks) -> torch.Tensor:
+    return revised.origin == Origin.OTHER_VIEWS
 
 
 def test_right_masks_stay_as_they_are() -> None:
     revised = revise(TRUE)
     assert all(np.array_equal(*pair) for pair in zip(label_maps(revised), TRUE, strict=True))
-    assert sorted(revised.source.tolist()) == [*range(num_masks(TRUE))]
-    assert revised.old_ids.tolist() == [1, 2, 3]
-    assert revised.matching.support is not None
-    assert revised.matching.support.tolist() == [6, 6, 6]
+    assert len(revised) == num_masks(TRUE)
+    assert not is_new(revised).any()
+    assert revised.count_sure_views().tolist() == [6, 6, 6]
 
 
 def test_a_missed_leaf_is_shown_by_the_others() -> None:
@@ -64,10 +61,10 @@ def test_a_missed_leaf_is_shown_by_the_others() -> None:
     revised = revise(maps)
     shown = label_maps(revised)
     assert all(np.array_equal(*pair) for pair in zip(shown, TRUE, strict=True))
-    (new,) = (revised.source < 0).nonzero()[:, 0].tolist()
-    assert (int(revised.regions.view_index[new]), int(revised.matching.instance_ids[new])) == (2, 1)
-    assert float(revised.matching.match_scores[new]) == pytest.approx(0.9)
-    assert len(revised.source) == num_masks(TRUE)
+    (new,) = is_new(revised).nonzero()[:, 0].tolist()
+    assert (int(revised.regions.view_index[new]), int(revised.instance_ids[new])) == (2, 1)
+    assert float(revised.match_scores[new]) == pytest.approx(0.9)
+    assert len(revised) == num_masks(TRUE)
 
 
 def test_pieces_of_a_leaf_are_joined_and_a_piece_alone_is_completed() -> None:
@@ -79,8 +76,8 @@ def test_pieces_of_a_leaf_are_joined_and_a_piece_alone_is_completed() -> None:
     maps[3][(TRUE[3] == 2) & rest] = 0
     revised = revise(maps)
     assert all(np.array_equal(*pair) for pair in zip(label_maps(revised), TRUE, strict=True))
-    assert int((revised.source < 0).sum()) == 1  # the piece alone
-    assert len(revised.source) == num_masks(maps) - 1  # of two pieces one was made
+    assert int(is_new(revised).sum()) == 1  # the piece alone
+    assert len(revised) == num_masks(maps) - 1  # of two pieces one was made
 
 
 def test_false_leaves_go() -> None:
@@ -90,7 +87,7 @@ def test_false_leaves_go() -> None:
     maps[4][5:25, 5:25] = 3  # the id of leaf 3 at a wrong place
     revised = revise(maps)
     assert all(np.array_equal(*pair) for pair in zip(label_maps(revised), TRUE, strict=True))
-    assert int((revised.source >= 0).sum()) == num_masks(maps) - 2
+    assert int((~is_new(revised)).sum()) == num_masks(maps) - 2
 
 
 def test_what_the_photo_cannot_show_is_not_added() -> None:
@@ -104,15 +101,15 @@ def test_what_the_photo_cannot_show_is_not_added() -> None:
 
     revised = revise(maps, photos=with_pot)
     assert not (label_maps(revised)[2] == 1).any()
-    assert (revised.source >= 0).all()
+    assert not is_new(revised).any()
 
 
 def test_leaves_without_a_credible_surface_go_and_ids_close_up() -> None:
     doubtful = LEAVES | {1: replace(LEAVES[1], iou=torch.full((6,), 0.5, dtype=torch.float64))}
     revised = revise(TRUE, surfaces=doubtful)
-    assert revised.old_ids.tolist() == [2, 3]
-    assert revised.matching.num_instances == 2
-    assert sorted(revised.matching.instance_ids.unique().tolist()) == [1, 2]
+    assert revised.instance_ids.unique().tolist() == [2, 3]
+    assert revised.close_gaps().instance_ids.unique().tolist() == [1, 2]
+    assert revised.renumber(LEAVES) == {1: LEAVES[2], 2: LEAVES[3]}
 
 
 @pytest.mark.parametrize(("num_found", "left"), [(2, [1, 2, 3]), (1, [1, 2])])
@@ -120,7 +117,7 @@ def test_what_is_found_in_too_few_of_the_views_that_show_it_goes(num_found: int,
     maps = [labels.copy() for labels in TRUE]
     for labels in maps[num_found:]:
         labels[labels == 3] = 0
-    assert revise(maps).old_ids.tolist() == left  # leaf 3 is seen by all six
+    assert revise(maps).instance_ids.unique().tolist() == left  # leaf 3 is seen by all six
 
 
 def test_views_that_show_no_leaf_where_it_lies_open_count_against_it() -> None:
@@ -131,7 +128,8 @@ def test_views_that_show_no_leaf_where_it_lies_open_count_against_it() -> None:
     def brown_from_view_2(view: int) -> np.ndarray:
         return np.where((TRUE[view] == 3)[..., None] & (view > 1), np.uint8(BROWN), photo(view))
 
-    assert revise(maps, photos=brown_from_view_2).old_ids.tolist() == [1, 2]  # found in one of six, green in two
+    revised = revise(maps, photos=brown_from_view_2)
+    assert revised.instance_ids.unique().tolist() == [1, 2]  # found in one of six, green in two
 
 
 def test_the_order_of_masks_does_not_matter() -> None:
@@ -140,19 +138,16 @@ def test_the_order_of_masks_does_not_matter() -> None:
     regions, ids = as_regions(maps)
     order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(2))
     one, other = (
-        revise_masks(part, match_all(part, numbers), LEAVES, cameras=CAMERAS, photos=photo)
+        revise_masks(detected(part, numbers), LEAVES, cameras=CAMERAS, photos=photo)
         for part, numbers in ((regions, ids), (regions.select(order), ids[order]))
     )
     assert torch.equal(one.regions.crops, other.regions.crops)
-    assert torch.equal(one.matching.instance_ids, other.matching.instance_ids)
-    is_own = one.source >= 0
-    assert torch.equal(order[other.source[is_own]], one.source[is_own])
+    assert torch.equal(one.instance_ids, other.instance_ids)
+    assert torch.equal(one.origin, other.origin)
 
 
 def test_nothing_found() -> None:
     regions, ids = as_regions([np.zeros((SIZE, SIZE), np.int64)] * 6)
-    matching = Matching(instance_ids=ids, match_scores=torch.zeros(0), num_instances=0, method="nview")
-    revised = revise_masks(regions, matching, {}, cameras=CAMERAS, photos=photo)
-    assert len(revised.regions) == revised.matching.num_instances == 0
+    revised = revise_masks(detected(regions, ids), {}, cameras=CAMERAS, photos=photo)
+    assert len(revised) == revised.num_instances == 0
     assert revised.regions.num_views == 6
-    assert len(revised.source) == len(revised.old_ids) == 0

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from scipy.special import logit
 
 from blade_scene import SIZE, as_regions
+from mvseg.masks import Masks, Origin
 from mvseg.verification.recut import blur_px, recut, recut_masks
 from three_leaves import CAMERAS, LEAVES, true_maps
 
@@ -79,13 +80,12 @@ def test_found_masks_are_cut_and_all_others_stay() -> None:
     maps[3][maps[3] == 2] = 0
     maps[3][5:25, 5:25] = 2  # what its surface does not agree with
     regions, ids = as_regions(maps)
-    is_found = torch.ones(len(regions), dtype=torch.bool)
-    cut = recut_masks(regions, ids, LEAVES, cameras=CAMERAS, is_found=is_found)
+    cut = recut_masks(Masks.of(regions, ids, origin=Origin.DETECTED), LEAVES, cameras=CAMERAS).regions
     shown = [cut.label_map(view, ids, (SIZE, SIZE)).numpy() for view in range(len(CAMERAS))]
     true = true_maps()
     assert ((maps[0] == 1) ^ (true[0] == 1)).sum() > 20
     assert ((shown[0] == 1) ^ (true[0] == 1)).sum() < 0.3 * ((maps[0] == 1) ^ (true[0] == 1)).sum()
     assert all(np.array_equal(shown[view], maps[view]) for view in range(1, len(CAMERAS)))
-    as_it_was = recut_masks(regions, ids, LEAVES, cameras=CAMERAS, is_found=~is_found)
+    as_it_was = recut_masks(Masks.of(regions, ids, origin=Origin.OTHER_VIEWS), LEAVES, cameras=CAMERAS).regions
     assert torch.equal(as_it_was.boxes, regions.boxes)
     assert torch.equal(as_it_was.pixels()[0], regions.pixels()[0])

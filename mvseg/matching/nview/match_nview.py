@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
@@ -23,7 +24,7 @@ from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.search import search
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
 from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
-from mvseg.matching.result import Matching, count_sure_views
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -70,19 +71,18 @@ def match_nview(
     )
     scores, clusters = found.scores, found.clusters
     evidence = collect_evidence(scores, clusters, pairwise)
-    matching = Matching(
-        instance_ids=torch.from_numpy(clusters + 1),
-        match_scores=torch.from_numpy(match_scores(evidence)).float(),
-        num_instances=int(clusters.max(initial=-1)) + 1,
+    report = MatchReport(
         method=found.method,
-        merged=find_merged(scores, clusters, ordered),
+        has_probabilities=True,
         residual_px=found.residual_px,
         explained=scores.explained(clusters),
-        view_explained=torch.from_numpy(scores.explained_per_view(clusters)).float(),
-    ).reorder(order.cpu())
-    matching = matching.relabel(_final_numbers(matching))
-    matching = replace(matching, support=count_sure_views(matching, regions.view_index.cpu()))
-    return matching.to(regions.device)
+        view_explained=torch.from_numpy(scores.explained_per_view(clusters)).float().to(regions.device),
+    )
+    probabilities = torch.from_numpy(match_scores(evidence)).float()
+    masks = Masks.of(ordered.to("cpu"), torch.from_numpy(clusters + 1), probabilities)
+    masks = masks.with_merged(find_merged(scores, clusters, ordered)).select(order.argsort().cpu())
+    masks = masks.relabel(_final_numbers(masks.instance_ids))
+    return Matching(replace(masks.to(regions.device), regions=regions), report)
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,9 +167,9 @@ def fit_poses(
     return score(row_table(regions, cameras, widen_px=WIDENINGS[best], progress=progress)), WIDENINGS[best]
 
 
-def _final_numbers(matching: Matching) -> torch.Tensor:
+def _final_numbers(ids: torch.Tensor) -> torch.Tensor:
     """(K,) int64: number of each instance by its first region; -1 for one with a single region."""
-    clusters = matching.instance_ids.numpy() - 1
+    clusters = ids.numpy() - 1
     ids = number_instances(drop_singletons(clusters))
     _, first = np.unique(clusters, return_index=True)
     return ids[torch.from_numpy(first)]

@@ -7,8 +7,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.masks import MergedMask
 from mvseg.matching.nview.cluster_scores import ClusterScores, members_of
-from mvseg.matching.result import MergedMask
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]

@@ -9,8 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.matching.result import SURE, Matching
-from mvseg.regions import Regions
+from mvseg.masks import SURE, Masks
 
 UNITS = 2000  # across the picture of a view: the numbers of its outlines are whole ones
 TOLERANCE = 1.5  # units that an outline may differ from the mask
@@ -50,16 +49,15 @@ class Outline:
         return asdict(self)
 
 
-def outline_masks(regions: Regions, matching: Matching, *, view: int, box: Box) -> list[Outline]:
+def outline_masks(masks: Masks, *, view: int, box: Box) -> list[Outline]:
     """The masks of one view, large ones first, so that small ones lie on top.
 
     Args:
-        regions: D regions.
-        matching: of the regions.
+        masks: D masks.
         view: index of the view.
         box: xyxy, pixels: the part of the photo that the picture shows. Masks outside are left out.
     """
-    others = {mask.region: mask.other for mask in matching.merged}
+    regions, others = masks.regions, masks.second_ids.tolist()
     members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]
     found = []
@@ -71,18 +69,18 @@ def outline_masks(regions: Regions, matching: Matching, *, view: int, box: Box) 
         if around[2] <= 0 or around[3] <= 0 or around[0] >= UNITS or around[1] >= height:
             continue
         at, thickness = _find_thickest(mask, corner, box=box)
-        score = float(matching.match_scores[region])
+        score = float(masks.match_scores[region])
         found.append(
             Outline(
                 region=region,
-                leaf=int(matching.instance_ids[region]),
+                leaf=int(masks.instance_ids[region]),
                 path=path,
                 box=around,
                 at=at,
                 height=int(np.clip(thickness, LEAST_HEIGHT, LARGEST_HEIGHT)),
                 match_score=round(score, 4),
                 is_sure=score >= SURE,
-                other=others.get(region),
+                other=others[region] if others[region] > 0 else None,
             )
         )
     return found

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import html
 import json
+import math
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
@@ -54,9 +55,9 @@ def describe_result(result: Result, pictures: Sequence[Picture], *, run: Mapping
     """All that the page shows, as its script reads it."""
     scene = result.scene
     views = [{"name": view.name} | picture.as_json() for view, picture in zip(scene.views, pictures, strict=True)]
-    if result.detection_scores is not None:
-        scores = result.detection_scores.tolist()
-        for mask in (mask for view in views for mask in view["masks"]):
+    scores = result.masks.detection_scores.tolist()
+    for mask in (mask for view in views for mask in view["masks"]):
+        if not math.isnan(scores[mask["region"]]):
             mask["detection_score"] = round(scores[mask["region"]], 4)
     return {
         "plant": scene.name,

@@ -11,8 +11,7 @@ import cv2
 import numpy as np
 
 from mvseg.formats.image_file import encode_jpeg
-from mvseg.matching.result import Matching
-from mvseg.regions import Regions
+from mvseg.masks import Masks
 from mvseg.results.overlay import find_plant
 from mvseg.results.report.outlines import Outline, outline_masks
 
@@ -51,25 +50,24 @@ class Picture:
         }
 
 
-def draw_picture(photo: np.ndarray, regions: Regions, matching: Matching, *, view: int) -> Picture:
+def draw_picture(photo: np.ndarray, masks: Masks, *, view: int) -> Picture:
     """The picture of one view; the more views there are, the smaller, so that a page of 60 views can still be sent.
 
     Args:
         photo: (H, W, 3) uint8 RGB, undistorted.
-        regions: D regions.
-        matching: of the regions.
+        masks: D masks.
         view: index of the view.
     """
     height, width = photo.shape[:2]
-    box = x1, y1, x2, y2 = find_plant(regions, matching, view=view, size=(width, height))
+    box = x1, y1, x2, y2 = find_plant(masks, view=view, size=(width, height))
     proportion = (y2 - y1) / (x2 - x1)
-    wide = min(x2 - x1, picture_width(regions.num_views, proportion))
+    wide = min(x2 - x1, picture_width(masks.regions.num_views, proportion))
     return Picture(
         jpeg=_shrink(photo[y1:y2, x1:x2], wide),
         thumbnail=_shrink(photo, min(width, THUMBNAIL_WIDTH)),
         box=(x1 / width, y1 / height, x2 / width, y2 / height),
         proportion=proportion,
-        outlines=outline_masks(regions, matching, view=view, box=box),
+        outlines=outline_masks(masks, view=view, box=box),
     )
 
 

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import re
-from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from mvseg.matching.result import Matching, MergedMask
+from mvseg.masks import Masks, MergedMask
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.report.outlines import UNITS, outline_masks, trace_mask
 
@@ -28,11 +27,8 @@ def draw_path(path: str, height: int) -> np.ndarray:
     return drawn > 0
 
 
-def as_matching(regions: Regions, ids: list[int]) -> Matching:
-    scores = torch.linspace(0.9, 0.2, len(ids))
-    return Matching(
-        instance_ids=torch.tensor(ids), match_scores=scores, num_instances=max(ids), method="nview", support=None
-    )
+def as_masks(regions: Regions, ids: list[int]) -> Masks:
+    return Masks.of(regions, torch.tensor(ids), torch.linspace(0.9, 0.2, len(ids)))
 
 
 def test_a_path_is_its_mask() -> None:
@@ -67,12 +63,12 @@ def test_large_masks_come_first_and_numbers_lie_inside() -> None:
     regions = regions_from_label_maps([labels, labels])
     part = torch.zeros(40, 60, dtype=torch.bool)
     merged = (MergedMask(region=1, own=5, other=2, part=part),)
-    matching = replace(as_matching(regions, [3, 5, -1, 1, 1, 2, 3, 4]), merged=merged)
-    found = outline_masks(regions, matching, view=0, box=BOX)
+    masks = as_masks(regions, [3, 5, -1, 1, 1, 2, 3, 4]).with_merged(merged)
+    found = outline_masks(masks, view=0, box=BOX)
     said = [(outline.region, outline.leaf, outline.other) for outline in found]
     assert said == [(1, 5, 2), (2, -1, None), (0, 3, None)]
     assert [outline.is_sure for outline in found] == [True, True, True]
-    assert [outline.is_sure for outline in outline_masks(regions, matching, view=1, box=BOX)] == [False, False, True]
+    assert [outline.is_sure for outline in outline_masks(masks, view=1, box=BOX)] == [False, False, True]
     for outline, label in zip(found, (2, 3, 1), strict=True):
         x, y = outline.at
         assert labels[int(y / 10 + 20), int(x / 10 + 40)] == label
@@ -83,4 +79,4 @@ def test_a_view_without_masks() -> None:
     labels = np.zeros((20, 30), np.uint16)
     labels[3:9, 3:9] = 1
     regions = regions_from_label_maps([labels, np.zeros_like(labels)])
-    assert outline_masks(regions, as_matching(regions, [1]), view=1, box=(0, 0, 30, 20)) == []
+    assert outline_masks(as_masks(regions, [1]), view=1, box=(0, 0, 30, 20)) == []

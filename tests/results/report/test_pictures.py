@@ -9,7 +9,7 @@ import pytest
 import torch
 from PIL import Image
 
-from mvseg.matching.result import Matching
+from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.report.pictures import ALL_PIXELS, LARGEST_WIDTH, LEAST_WIDTH, draw_picture, picture_width
 
@@ -33,11 +33,8 @@ def test_a_picture_is_the_part_with_the_plant() -> None:
     labels = np.zeros((300, 400), np.uint16)
     labels[100:160, 150:230] = 1
     photo[labels > 0] = (20, 160, 40)
-    regions = regions_from_label_maps([labels])
-    matching = Matching(
-        instance_ids=torch.tensor([1]), match_scores=torch.ones(1), num_instances=1, method="nview", support=None
-    )
-    picture = draw_picture(photo, regions, matching, view=0)
+    masks = Masks.of(regions_from_label_maps([labels]), torch.tensor([1]), torch.ones(1))
+    picture = draw_picture(photo, masks, view=0)
     image, thumbnail = (np.asarray(Image.open(BytesIO(data))) for data in (picture.jpeg, picture.thumbnail))
     assert thumbnail.shape == (96, 128, 3)
     assert image.shape == (67, 90, 3)  # as many pixels as the photo has there

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import replace
+from functools import partial
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
+from matched import matched
 from mvseg.errors import InputWarning
-from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_regions
 from mvseg.matching.outline_gaps import move_cameras
-from mvseg.matching.refine_poses import adjust, fit_poses, held_out_gaps, match_refined
-from mvseg.matching.result import Matching, RefinedPoses
+from mvseg.matching.result import Matching
+from mvseg.poses.refine_poses import RefinedPoses, adjust, fit_poses, held_out_gaps, refine_poses
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.faults import disc
 from synthetic import BallScene, ball_scene, moved, permute_views
-
-REFINED = MatchConfig(refine_poses=True)
 
 
 @pytest.fixture(scope="module")
@@ -55,26 +53,21 @@ def pose_error(cameras: Cameras, scene: BallScene) -> float:
 
 
 def true_matching(scene: BallScene) -> Matching:
-    ids = scene.regions.labels
-    return Matching(instance_ids=ids, match_scores=torch.ones(len(ids)), num_instances=int(ids.max()), method="truth")
+    return matched(scene.regions, scores=1.0)
 
 
 def refine(scene: BallScene, cameras: Cameras, regions: Regions | None = None) -> RefinedPoses:
     """What becomes of the poses when all ids are right from the start."""
     known = replace(scene, regions=regions or scene.regions)
-    every = torch.arange(len(known.regions))
-    _, matching = match_refined(known.regions, cameras, lambda posed: (every, true_matching(known)))
-    assert matching.poses is not None
-    return matching.poses
+    return refine_poses(cameras, lambda posed: true_matching(known))
 
 
 def test_noise_gets_smaller(scene: BallScene, noisy: Cameras) -> None:
-    matching = match_regions(scene.regions, noisy, REFINED)
-    assert matching.poses is not None
-    assert matching.poses.is_refined
-    assert matching.poses.gap_px[1] < 0.3 * matching.poses.gap_px[0]
+    poses = refine_poses(noisy, partial(match_regions, scene.regions))
+    assert poses.is_refined
+    assert poses.gap_px[1] < 0.3 * poses.gap_px[0]
     assert pose_error(noisy, scene) > 2
-    assert pose_error(matching.poses.cameras, scene) < 0.4
+    assert pose_error(poses.cameras, scene) < 0.4
 
 
 def test_masks_drawn_too_large_do_not_mislead(scene: BallScene, noisy: Cameras) -> None:
@@ -91,21 +84,16 @@ def test_masks_drawn_too_large_do_not_mislead(scene: BallScene, noisy: Cameras) 
 
 
 def test_exact_poses_stay(scene: BallScene) -> None:
-    plain = match_regions(scene.regions, scene.cameras)
-    matching = match_regions(scene.regions, scene.cameras, REFINED)
-    assert matching.poses is not None
-    assert not matching.poses.is_refined
-    assert torch.equal(matching.poses.cameras.R, scene.cameras.R)
-    assert torch.equal(matching.poses.cameras.t, scene.cameras.t)
-    assert torch.equal(matching.instance_ids, plain.instance_ids)
-    assert torch.equal(matching.match_scores, plain.match_scores)
+    poses = refine_poses(scene.cameras, partial(match_regions, scene.regions))
+    assert not poses.is_refined
+    assert poses.cameras is scene.cameras
 
 
 def test_order_of_views_does_not_matter(scene: BallScene, noisy: Cameras) -> None:
     order = [3, 0, 5, 1, 4, 2]
     other = permute_views(scene, order)
-    one = fit_poses(adjust(scene.regions, true_matching(scene), noisy))
-    two = fit_poses(adjust(other.regions, true_matching(other), noisy[order]))
+    one = fit_poses(adjust(true_matching(scene).masks, noisy))
+    two = fit_poses(adjust(true_matching(other).masks, noisy[order]))
     assert torch.allclose(one.R[order], two.R, atol=1e-6)
     assert torch.allclose(one.t[order], two.t, atol=1e-5)
 
@@ -114,8 +102,8 @@ def test_the_world_may_be_moved(scene: BallScene, noisy: Cameras) -> None:
     angle = torch.tensor(0.7)
     turn = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]]).double()
     elsewhere = (250.0, turn, torch.tensor([3e4, -2e4, 5e3]).double())
-    one = fit_poses(adjust(scene.regions, true_matching(scene), noisy))
-    two = fit_poses(adjust(scene.regions, true_matching(scene), moved(noisy, *elsewhere)))
+    one = fit_poses(adjust(true_matching(scene).masks, noisy))
+    two = fit_poses(adjust(true_matching(scene).masks, moved(noisy, *elsewhere)))
     expected = moved(one, *elsewhere)
     assert torch.allclose(two.R, expected.R, atol=1e-6)
     assert torch.allclose(two.centers, expected.centers, atol=1e-2)  # of 2500
@@ -123,14 +111,14 @@ def test_the_world_may_be_moved(scene: BallScene, noisy: Cameras) -> None:
 
 def test_the_world_stays_where_it_was(scene: BallScene, noisy: Cameras) -> None:
     """What masks cannot tell, scale and axes, is that of the given poses."""
-    refined = fit_poses(adjust(scene.regions, true_matching(scene), noisy))
+    refined = fit_poses(adjust(true_matching(scene).masks, noisy))
     spread = [(cameras.centers - cameras.centers.mean(0)).norm() for cameras in (noisy, refined)]
     assert float(spread[1] / spread[0]) == pytest.approx(1, abs=0.01)
     assert float((refined.centers.mean(0) - noisy.centers.mean(0)).norm()) < 0.1
 
 
 def test_gaps_of_leaves_left_out_grow_with_exact_poses(scene: BallScene) -> None:
-    before, after = held_out_gaps(scene.regions, true_matching(scene), scene.cameras)
+    before, after = held_out_gaps(true_matching(scene).masks, scene.cameras)
     assert 0 < before < 0.5
     assert before < after < 1
 
@@ -146,29 +134,20 @@ def test_one_camera_that_is_off_is_put_right(scene: BallScene) -> None:
 
 @pytest.mark.parametrize("score", [1.0, 0.5])
 def test_poses_that_make_ids_less_sure_are_not_taken(scene: BallScene, noisy: Cameras, score: float) -> None:
-    """And only the warnings of the answer are heard."""
-    every = torch.arange(len(scene.regions))
+    """And warnings on the way are not heard."""
 
-    def match(cameras: Cameras) -> tuple[Tensor, Matching]:
-        found = true_matching(scene)
-        is_given = cameras is noisy
-        warnings.warn("as given" if is_given else "refined", InputWarning, stacklevel=1)
-        return every, found if is_given else replace(found, match_scores=score * found.match_scores)
+    def match(cameras: Cameras) -> Matching:
+        warnings.warn("on the way", InputWarning, stacklevel=1)
+        return matched(scene.regions, scores=1.0 if cameras is noisy else score)
 
-    with pytest.warns(InputWarning) as heard:
-        _, matching = match_refined(scene.regions, noisy, match)
-    assert [str(each.message) for each in heard] == ["refined" if score == 1 else "as given"]
-    assert matching.poses is not None
-    assert matching.poses.is_refined == (score == 1)
-    assert torch.equal(matching.poses.cameras.R, noisy.R) == (score != 1)
-    assert float(matching.match_scores.mean()) == 1
+    poses = refine_poses(noisy, match)
+    assert poses.is_refined == (score == 1)
+    assert (poses.cameras is noisy) == (score != 1)
 
 
 def test_nothing_to_refine_with(scene: BallScene) -> None:
     empty = regions_from_label_maps([np.zeros_like(labels) for labels in scene.label_maps])
-    with pytest.warns(InputWarning, match="no instances"):
-        poses = match_regions(empty, scene.cameras, REFINED).poses
-    assert poses is not None
+    poses = refine_poses(scene.cameras, partial(match_regions, empty))
     assert not poses.is_refined
     assert all(np.isnan(gap) for gap in poses.gap_px)
     alone = regions_from_label_maps([(labels == 1).astype(np.int64) for labels in scene.label_maps])

@@ -1,4 +1,4 @@
-"""Poses that are a few pixels off, refined with the masks as the only evidence, while these are matched.
+"""Poses that are a few pixels off, refined with the masks as the only evidence.
 
 Every leaf that two views show whole tells by how many pixels their epipolar lines miss (`outline_gaps.py`), and that is
 far more than the six unknowns of each pose. Not in the paper.
@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mvseg.errors import InputWarning
+from mvseg.masks import Masks
 from mvseg.matching.outline_gaps import Gaps, Outlines, find_outlines, measure_gaps, move_cameras, pair_outlines
-from mvseg.matching.result import Matching, RefinedPoses
+from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-Match = Callable[[Cameras], tuple[Tensor, Matching]]
+Match = Callable[[Cameras], Matching]
 
 ROUNDS = 3  # of refining and matching again, at most
 LEAST_GAP = 1.0  # pixels; a smaller gap of the given poses is the masks' own error
@@ -34,53 +34,59 @@ UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit
 FOLDS = 5  # of the instances
 
 
-def match_refined(regions: Regions, cameras: Cameras, match: Match) -> tuple[Tensor, Matching]:
+@dataclass(frozen=True, eq=False)
+class RefinedPoses:
+    """What came of refining the poses with the masks.
+
+    Attributes:
+        cameras: V cameras, the given ones unless they are refined.
+        is_refined: whether refined poses were taken.
+        gap_px: by how many pixels outlines of one leaf miss the same epipolar lines, with the poses as given, and with
+            poses refined without that leaf; NaN where no leaf tells.
+    """
+
+    cameras: Cameras
+    is_refined: bool
+    gap_px: tuple[float, float]
+
+
+def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
     """Match, refine the poses, match with these, and so on until no id changes.
 
     Poses whose gaps are below `LEAST_GAP` stay. Refined ones are taken when they explain leaves that they were not
     fitted to, in turn a fifth of them, clearly better than the given ones do, and ids are as sure as with these.
-    Otherwise all stays as if nothing had been tried.
+    Otherwise the given ones stay as if nothing had been tried. What matching warns of on the way is not passed on.
 
     Args:
-        regions: D regions.
         cameras: V cameras, as they are given.
-        match: from cameras to the (S,) int64 indices of the regions that are matched, and their matching.
-
-    Returns:
-        What `match` gives with the poses that were chosen; `Matching.poses` says which. Of its warnings, those with
-        these poses are passed on.
+        match: from cameras to the matched masks, `partial(match_regions, regions)` for example.
     """
-    given = kept, matching, said = _listen(match, cameras)
-    refined, gap_px = cameras, held_out_gaps(regions.select(kept), matching, cameras)
-    for _ in range(ROUNDS):
-        if not (gap_px[0] >= LEAST_GAP and gap_px[1] < gap_px[0]):
-            break
-        refined = fit_poses(adjust(regions.select(kept), matching, cameras)).to(cameras.device)
-        before = kept, matching
-        kept, matching, said = _listen(match, refined)
-        if torch.equal(kept, before[0]) and torch.equal(matching.instance_ids, before[1].instance_ids):
-            break
-        gap_px = held_out_gaps(regions.select(kept), matching, cameras)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        given = matching = match(cameras)
+        refined, gap_px = cameras, held_out_gaps(matching.masks, cameras)
+        for _ in range(ROUNDS):
+            if not (gap_px[0] >= LEAST_GAP and gap_px[1] < gap_px[0]):
+                break
+            refined = fit_poses(adjust(matching.masks, cameras)).to(cameras.device)
+            before, matching = matching.masks, match(refined)
+            if _is_same(before, matching.masks):
+                break
+            gap_px = held_out_gaps(matching.masks, cameras)
     is_off = gap_px[0] >= LEAST_GAP
-    is_better = is_off and gap_px[1] <= CLEAR * gap_px[0] and mean_score(matching) >= mean_score(given[1]) - LOSS
-    if not is_better:
-        refined, (kept, matching, said) = cameras, given
-    for message in said:
-        warnings.warn(message, stacklevel=3)
-    poses = RefinedPoses(cameras=refined, is_refined=is_better, gap_px=gap_px)
-    return kept, replace(matching, poses=poses)
+    is_better = is_off and gap_px[1] <= CLEAR * gap_px[0] and mean_score(matching) >= mean_score(given) - LOSS
+    return RefinedPoses(cameras=refined if is_better else cameras, is_refined=is_better, gap_px=gap_px)
 
 
-def _listen(match: Match, cameras: Cameras) -> tuple[Tensor, Matching, list[InputWarning]]:
-    """Match, and what was warned of."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        kept, matching = match(cameras)
-    return kept, matching, [each.message for each in caught if isinstance(each.message, InputWarning)]
+def _is_same(before: Masks, after: Masks) -> bool:
+    """Whether two matchings have the same masks with the same ids."""
+    return torch.equal(before.regions.labels, after.regions.labels) and torch.equal(
+        before.instance_ids, after.instance_ids
+    )
 
 
 def mean_score(matching: Matching) -> float:
-    """Mean match score of the matched regions; 0 without any."""
+    """Mean match score of the matched masks; 0 without any."""
     is_matched = matching.instance_ids > 0
     return float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
 
@@ -118,10 +124,10 @@ class Adjustment:
         return gaps.weight / spread**2 / (1 + (left_px / (DOUBTED * spread)) ** 2) ** 2
 
 
-def adjust(regions: Regions, matching: Matching, cameras: Cameras) -> Adjustment:
+def adjust(masks: Masks, cameras: Cameras) -> Adjustment:
     """What poses are fitted to, from the matched masks of V views."""
-    cameras = cameras.to("cpu")
-    outlines = find_outlines(regions, matching, cameras)
+    cameras, regions = cameras.to("cpu"), masks.regions
+    outlines = find_outlines(masks, cameras)
     return Adjustment(
         outlines=outlines,
         pairs=pair_outlines(outlines, cameras),
@@ -183,10 +189,10 @@ def _solve(
     return torch.cholesky_solve(right[:, None], torch.linalg.cholesky(normal))[:, 0]
 
 
-def held_out_gaps(regions: Regions, matching: Matching, cameras: Cameras) -> tuple[float, float]:
+def held_out_gaps(masks: Masks, cameras: Cameras) -> tuple[float, float]:
     """Pixels; mean over the views of the median gap of their leaves: with the given cameras, and with cameras that are
     refined without the leaves that are looked at. NaN where there are no gaps."""
-    problem, parts = adjust(regions, matching, cameras), []
+    problem, parts = adjust(masks, cameras), []
     fold = problem.outlines.instance % FOLDS
     for number in range(FOLDS):
         if (fold == number).any():
