@@ -403,6 +403,17 @@ def test_a_broken_scene_does_not_stop_the_others(
     assert [path.name for path in (tmp_path / "out").iterdir()] == ["plant"]
 
 
+def test_links_name_their_scenes(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for plant in ("basil", "mint"):
+        write_scene(tmp_path / plant / "D00")
+        (tmp_path / f"{plant}-0").symlink_to(tmp_path / plant / "D00")
+    links = [str(tmp_path / "basil-0"), str(tmp_path / "mint-0")]
+    assert main(["match", *links, "--out", str(tmp_path / "out"), "--quiet"]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["basil-0", "mint-0"]
+    assert json.loads((tmp_path / "out" / "mint-0" / "run.json").read_text())["scene"] == "mint-0"
+    capsys.readouterr()
+
+
 def test_scenes_of_one_name_are_refused(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     shutil.copytree(plant, tmp_path / "more" / "plant")
     assert main(["match", str(plant), str(tmp_path / "more" / "plant"), "--out", str(tmp_path / "out")]) == 2
@@ -577,7 +588,7 @@ BAD_INPUT: dict[str, tuple[Break, str]] = {
     "NaN in a pose": (rig(1, t=[0, NAN, 50]), "cameras.json: views[1].t[1]: Input should be a finite number"),
     "infinity in a pose": (rig(1, t=[0, INF, 50]), "cameras.json: views[1].t[1]: Input should be a finite number"),
     "two views of one name": (rig(3, file="images/001.jpg"), "cameras.json: views 1 and 3 have the same name '001'"),
-    "name that leads out": (rig(2, file="../002.png"), "view 2 (../002.png): the file name leads out of the scene"),
+    "name that leads out": (rig(2, file="../a.png"), "view 2 (../a.png): the file name leads out of the scene"),
     "absolute name": (rig(2, file="/etc/passwd"), "view 2 (/etc/passwd): the file name leads out of the scene"),
     "name of a folder": (rig(2, file="images/.."), "view 2 (images/..): this is not the name of a file"),
     "missing mask": (remove("masks/001.png"), "masks/001.png: the mask file is missing (view 1)"),

@@ -92,7 +92,7 @@ def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]
     elif unseeing and share > 0.5:
         point = f"the point that the other {coverage.sees.sum()} look at"
         what = f"{name_views(unseeing, names)} look past {point}: check the pose, or leave the photo out"
-        findings.append(Finding(where="cameras", what=what, level="error", views=unseeing))
+        findings.append(Finding(where="cameras", what=what, level="warning", views=unseeing))
     elif unseeing:
         what = f"no point is seen by more than {coverage.sees.sum()} of {len(names)} cameras: check the poses, unless "
         findings.append(Finding(where="cameras", what=f"{what}the photos show different plants", level="warning"))

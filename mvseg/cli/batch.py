@@ -33,10 +33,11 @@ def add(verbs: Any) -> None:
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.batch.run_batch import run_batch  # keeps --help and wrong options quick
+    from mvseg.formats.photos import scene_name
 
     if args.scheduler is not None and args.num_workers is not None:
         raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
-    out = args.out or DEFAULT_OUT / args.scenes.resolve().stem
+    out = args.out or DEFAULT_OUT / Path(scene_name(args.scenes)).stem
     counts = run_batch(
         args.scenes,
         out,

@@ -30,9 +30,10 @@ def run(args: Namespace) -> int:
     if args.scene is None:
         print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
     scene = args.scene or demo_scene()
-    out = args.out or DEFAULT_OUT / scene.resolve().name
-    from mvseg.system.worker_pool import default_workers  # keeps --help and wrong options quick
+    from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
+    from mvseg.system.worker_pool import default_workers
 
+    out = args.out or DEFAULT_OUT / scene_name(scene)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     run_one_scene(scene, args.masks, out, config=build_run(args), num_workers=num_workers, quiet=args.quiet)
     return 0

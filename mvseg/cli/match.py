@@ -28,7 +28,9 @@ def add(verbs: Any) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    names = [scene.resolve().name for scene in args.scenes]
+    from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
+
+    names = [scene_name(scene) for scene in args.scenes]
     for name in names:
         if names.count(name) > 1:
             raise InputError(f"two scenes are called '{name}', expected different names: each names a folder in --out")

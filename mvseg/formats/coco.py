@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -70,12 +70,13 @@ class Rle(BaseModel):
     counts: str | Items[NonNegativeInt]
 
 
+VIA_MARKS = (b'"_via_', b'"shape_attributes"', b"__VIA_PROJECT_ID__")  # of its versions 2 and 3, projects and JSON
 Crowd = Literal["mask", "ignore"]
 _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(Items[Items[FiniteFloat]] | Rle)
 
 
 def read_coco(
-    path: Path, scene: Scene, *, crowd: Crowd = "mask", categories: Collection[str] = ()
+    path: Path, scene: Scene, *, parts: Sequence[Path] = (), crowd: Crowd = "mask", categories: Collection[str] = ()
 ) -> list[Iterator[tuple[int, np.ndarray]]]:
     """The masks of a COCO file, view by view, as they stand there (in the frame of the photo).
 
@@ -87,8 +88,9 @@ def read_coco(
     file does not list, annotations of images that it does not list, several categories.
 
     Args:
-        path: the file.
+        path: the file; of several, their folder, which messages name.
         scene: gives the views and their sizes.
+        parts: the files, where one was split by photos (Roboflow's train, valid and test).
         crowd: what an annotation with `iscrowd` is: "mask", one like all others (supervision writes so for every mask
             with holes or several parts, datumaro for all masks), or "ignore", left out as COCO's own evaluation does.
         categories: names of the categories that are taken; all, if empty. A category without a name goes by its id.
@@ -99,9 +101,10 @@ def read_coco(
 
     Raises:
         InputError: the file is broken, none of its images is in the scene, an entry fits several views or has another
-            size than its camera, or a category is not there. From the iterators: a segmentation cannot be decoded.
+            size than its camera, two parts list one image, or a category is not there. From the iterators: a
+            segmentation cannot be decoded.
     """
-    coco = _read_file(path, scene)
+    coco = _merge([(part, _read_file(part, scene)) for part in parts]) if len(parts) > 1 else _read_file(path, scene)
     view_of = _find_images(path, coco, scene)
     names = {str(category.id): category.name for category in coco.categories}
     has_ids = all(isinstance(annotation.id, int) for annotation in coco.annotations)
@@ -143,7 +146,13 @@ def _read_file(path: Path, scene: Scene) -> _MaskFile:
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     if not is_list:
-        return read_json(path, _MaskFile)
+        try:
+            return read_json(path, _MaskFile)
+        except InputError:
+            if any(mark in path.read_bytes() for mark in VIA_MARKS):
+                expected = "expected its COCO export (Annotation > Export Annotations (COCO format))"
+                raise InputError(f"{path}: is a project or the annotations of VIA, {expected}") from None
+            raise
     results = read_json(path, _Results).root
     stems = [base_name(view.name) for view in scene.views]
     by_number = {int(stem): view.name for stem, view in zip(stems, scene.views, strict=True) if stem.isdecimal()}
@@ -157,6 +166,25 @@ def _read_file(path: Path, scene: Scene) -> _MaskFile:
     for image, view in zip(images, views, strict=True):
         image.width, image.height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
     return _MaskFile(images=images, annotations=results)
+
+
+def _merge(parts: list[tuple[Path, _MaskFile]]) -> _MaskFile:
+    """One file of several, each with ids of its own: categories go by their names, annotations by their places."""
+    merged, part_of = _MaskFile(images=[], annotations=[]), dict[str, Path]()
+    for number, (path, part) in enumerate(parts):
+        names = {str(category.id): category.name for category in part.categories}
+        merged.categories += [_Category(id=name, name=name) for name in names.values()]
+        for image in part.images:
+            if part_of.setdefault(image.file_name, path) is not path:
+                message = f"{part_of[image.file_name]} and {path} both list {image.file_name}"
+                raise InputError(f"{message}, expected the path of one of them")
+            image.id = f"{number}/{image.id}"
+        for annotation in part.annotations:
+            annotation.id, annotation.image_id = None, f"{number}/{annotation.image_id}"
+            annotation.category_id = names.get(str(annotation.category_id), annotation.category_id)
+        merged.images += part.images
+        merged.annotations += part.annotations
+    return merged
 
 
 def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | None]:
@@ -206,7 +234,8 @@ def _decode_all(
 
 
 def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarray:
-    """(height, width) bool mask of an annotation's "segmentation": polygons, run lengths, or compressed run lengths.
+    """(height, width) bool mask of an annotation's "segmentation": polygons, run lengths, or compressed run lengths; or
+    a single polygon without a list around it, as VIA writes.
 
     Args:
         segmentation: as json read it, unchecked.
@@ -217,6 +246,8 @@ def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarra
         InputError: another form, a number that is not finite, another size, run lengths that do not add up to the
             image, or polygons far larger than it. The message is a reason, without the annotation's id.
     """
+    if isinstance(segmentation, list) and segmentation and not isinstance(segmentation[0], list):
+        segmentation = [segmentation]
     try:
         checked = _SEGMENTATION.validate_python(segmentation)
     except ValidationError:

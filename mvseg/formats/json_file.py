@@ -45,4 +45,5 @@ def read_json(path: Path, model: type[Model]) -> Model:
     except ValidationError as error:
         first = error.errors()[0]
         key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
-        raise InputError(f"{path}: {key + ': ' if key else ''}{first['msg']}") from None
+        message = first["msg"].partition(" or instance of ")[0]  # of a class that users never see
+        raise InputError(f"{path}: {key + ': ' if key else ''}{message}") from None

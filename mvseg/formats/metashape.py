@@ -59,7 +59,7 @@ def read_metashape(path: Path) -> Scene:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     photos, num_left_out = [], 0
-    for index, camera in enumerate(chunk.iter("camera")):
+    for index, camera in enumerate(_list_cameras(chunk)):
         text = camera.findtext("transform")
         if text is None or camera.get("enabled") in ("0", "false"):
             num_left_out += 1
@@ -90,16 +90,21 @@ def _read_chunk(path: Path) -> ElementTree.Element:
         document = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise InputError(f"{path}: not a whole XML file ({error})") from None
-    chunks = document.findall("chunk")
+    chunks = document.findall("chunk") or document.findall("chunks/chunk")  # an export, or PhotoScan's project
     if document.tag != "document" or len(chunks) != 1:
         raise InputError(f"{path}: holds {len(chunks)} chunks, expected the cameras of one chunk of Metashape")
     return chunks[0]
 
 
+def _list_cameras(chunk: ElementTree.Element) -> list[ElementTree.Element]:
+    """Those in groups, too; not the photos of a project's frames."""
+    return chunk.findall("cameras//camera")
+
+
 def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float] | None:
     """R, T and scale of world_from_chunk: X = scale R x + T; None if the chunk has no scale of its own."""
     components = chunk.findall("components/component")
-    used = {camera.get("component_id") for camera in chunk.iter("camera") if camera.find("transform") is not None}
+    used = {camera.get("component_id") for camera in _list_cameras(chunk) if camera.find("transform") is not None}
     if len(used) > 1:
         raise InputError(f"the cameras are of {len(used)} components, expected one that holds all")
     owners = [each for each in components if each.get("id") in used] or [chunk]
@@ -160,6 +165,8 @@ def _read_sensor(sensor: ElementTree.Element) -> tuple[int, int, dict[str, float
     calibration = found.get("adjusted", next(iter(found.values()), None))
     if calibration is None:
         raise InputError("its sensor has no calibration")
+    if calibration.find("f") is None:
+        raise InputError("its calibration has no f (old PhotoScan writes fx and fy), expected one of Metashape's")
     size = calibration.find("resolution")
     size = sensor.find("resolution") if size is None else size
     if size is None:

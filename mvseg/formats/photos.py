@@ -58,7 +58,7 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
     """The scene of a folder from its photos.
 
     Args:
-        folder: the scene; its name becomes that of the scene.
+        folder: the scene; see `scene_name`.
         photos: one per view.
         unit: of the world, "" when unknown.
         source: the file or folder that the cameras come from; messages name it.
@@ -89,25 +89,28 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         sizes=torch.tensor([[photo.width, photo.height] for photo in photos]),
     )
     try:
-        return Scene(name=folder.resolve().name, views=views, cameras=cameras, unit=unit, source=source)
+        return Scene(name=scene_name(folder), views=views, cameras=cameras, unit=unit, source=source)
     except InputError as error:
         raise InputError(f"{source}: {error}") from None
+
+
+def scene_name(folder: Path) -> str:
+    """The name of a scene: that of its folder or, for a symbolic link, of the link."""
+    return Path(os.path.abspath(folder)).name
 
 
 def find_photo(folder: Path, file: str) -> str:
     """The photo that a camera file means, as a path relative to the scene folder.
 
     It is the file of this path; or the one there with the same name in other capitals, or with a suffix where the name
-    has none (nerfstudio, Blender); or, for a path of another machine, the only photo of this name in the scene folder
-    or below its `images/`.
+    has none (nerfstudio, Blender); or, for a path of another machine or one that leads out of the scene folder
+    (colmap2nerf's start where it ran), the only photo of this name in the scene folder or below its `images/`.
 
     Returns:
         The path; `file` itself, if there is no such photo.
     """
-    name, problem = file.replace("\\", "/").rsplit("/", 1)[-1].lower(), file_name_problem(file)
-    if problem and not os.path.isabs(file):
-        return file
-    if not problem:
+    name = file.replace("\\", "/").rsplit("/", 1)[-1].lower()
+    if not file_name_problem(file):
         if (folder / file).is_file():
             return file
         parent = (folder / file).parent

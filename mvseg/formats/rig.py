@@ -56,6 +56,16 @@ class _Rig(BaseModel):
     views: Items[_RigView]
 
 
+def is_rig(path: Path) -> bool:
+    """Whether a cameras.json is meant as a rig file, sound or not; other programs (3D Gaussian splatting) have files of
+    this name, too."""
+    try:
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
+    except (OSError, ValueError, RecursionError):
+        return True  # `read_rig` says what is wrong
+    return isinstance(content, dict) and ("views" in content or str(content.get("format")).startswith("mvseg"))
+
+
 def read_rig(path: Path) -> Scene:
     """The scene of a rig file; photos are looked for beside it. Warns (InputWarning) of unknown keys: a misspelt
     "distortion" must not pass unseen.

@@ -14,11 +14,12 @@ from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
 from mvseg.formats.find_views import list_some
 from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
+from mvseg.formats.masks.class_numbers import check_numbers
 from mvseg.formats.masks.read_views import read_views
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
 from mvseg.formats.masks.view_regions import stack_views
 from mvseg.formats.metashape import find_metashape, read_metashape
-from mvseg.formats.rig import read_rig
+from mvseg.formats.rig import is_rig, read_rig
 from mvseg.formats.transforms_json import read_transforms
 from mvseg.formats.turntable import read_turntable
 from mvseg.regions import Regions
@@ -35,7 +36,8 @@ def load_scene(folder: Path | str) -> Scene:
 
     Cameras come from the first of these that is there: `cameras.json` (rig file), a COLMAP model in `sparse/` or
     `colmap/sparse/` (see `find_colmap_model`), `transforms.json` or `transforms_train.json` (nerfstudio, instant-ngp,
-    Blender), `turntable.json`, an XML file of Metashape, `scene_camera.json` (BOP).
+    Blender), `turntable.json`, an XML file of Metashape, `scene_camera.json` (BOP). Another program's `cameras.json`
+    is left out where another of these is there, which an InputWarning says.
 
     Raises:
         InputError: the folder is missing or holds no cameras, or they are not sound; see the readers.
@@ -44,8 +46,21 @@ def load_scene(folder: Path | str) -> Scene:
     if not folder.is_dir():
         problem = "is a file, expected the scene's folder" if folder.exists() else "no such scene folder"
         raise InputError(f"{folder}: {problem}")
-    if (folder / "cameras.json").is_file():
-        return read_rig(folder / "cameras.json")
+    rig = folder / "cameras.json"
+    is_own = rig.is_file() and is_rig(rig)
+    scene = None if is_own else _read_others(folder)
+    if scene is not None:
+        if rig.is_file():
+            message = f"is no rig file, and not used; the cameras are those of {scene.source}"
+            warnings.warn(f"{rig}: {message}", InputWarning, stacklevel=2)
+        return scene
+    if rig.is_file():
+        return read_rig(rig)  # also another program's: it says what is missing
+    raise InputError(f"{folder}: no cameras, {EXPECTED}; {_describe(folder)}")
+
+
+def _read_others(folder: Path) -> Scene | None:
+    """The scene of the first kind of cameras but a rig file; None if there is none."""
     model = find_colmap_model(folder)
     if model is not None:
         return read_colmap(model, folder)
@@ -59,7 +74,7 @@ def load_scene(folder: Path | str) -> Scene:
         return read_metashape(metashape)
     if (folder / "scene_camera.json").is_file():
         return read_bop(folder / "scene_camera.json")
-    raise InputError(f"{folder}: no cameras, {EXPECTED}; {_describe(folder)}")
+    return None
 
 
 def _describe(folder: Path) -> str:
@@ -91,7 +106,8 @@ def load_masks(
 
     Returns:
         Regions in the undistorted frame; `labels` holds the numbers of the masks in their files. Warns (InputWarning)
-        of everything that is left out or told by a loose rule, and of label images that hold 0 and 255 only.
+        of everything that is left out or told by a loose rule, and of label images that hold 0 and 255 only, or a
+        number per class.
 
     Raises:
         InputError: a file is missing, broken, or does not fit its view, or a category is not there; see the readers.
@@ -106,10 +122,14 @@ def read_masks(
     if categories and found.kind not in ("COCO", "labelme", "YOLO"):
         raise InputError(f"{found.source}: holds {found.kind}, which have no categories to select from")
     if found.kind == "COCO":
-        path = found.files[0][0]
-        return stack_views(read_coco(path, scene, crowd=crowd, categories=categories), scene, source=path)
+        parts = found.files[0]
+        path = parts[0] if len(parts) == 1 else found.source
+        views = read_coco(path, scene, parts=parts, crowd=crowd, categories=categories)
+        return stack_views(views, scene, source=path)
     regions = stack_views(read_views(scene, found, wanted=categories), scene, source=found.source)
     if found.kind == "label images" and len(regions) and bool((regions.labels == BINARY).all()):
         message = "holds 0 and 255 only, so that each photo shows one instance; leaves need a number each"
         warnings.warn(f"{found.source}: {message}", InputWarning, stacklevel=3)
+    elif found.kind in ("label images", "NumPy arrays"):
+        check_numbers(regions, source=found.source)
     return regions

@@ -103,6 +103,32 @@ def test_all_three_encodings_give_one_mask(scene: Scene, tmp_path: Path) -> None
         np.testing.assert_array_equal(mask, expected)
 
 
+def test_a_polygon_without_a_list_around_it(scene: Scene, tmp_path: Path) -> None:
+    """VIA writes so, with the image's id as text."""
+    expected = read_one(tmp_path, scene, [POLYGON])
+    np.testing.assert_array_equal(read_one(tmp_path, scene, POLYGON), expected)
+    path = write(tmp_path, [{"segmentation": POLYGON, "image_id": "10"}])
+    np.testing.assert_array_equal(read_all(path, scene)[0][0][1], expected)
+    with pytest.raises(InputError, match=r"annotation 1: its segmentation is not of the expected polygons"):
+        read_one(tmp_path, scene, POLYGON[:4])
+
+
+VIA_REGION = {"shape_attributes": {"name": "polygon", "all_points_x": [1, 5, 3], "all_points_y": [1, 2, 4]}}
+VIA_IMAGE = {"a.jpg9": {"filename": "a.jpg", "size": 9, "regions": [VIA_REGION], "file_attributes": {}}}
+VIA = [
+    {"_via_settings": {}, "_via_img_metadata": VIA_IMAGE, "_via_attributes": {}},  # a project of VIA 2
+    VIA_IMAGE,  # its annotations, as JSON
+    {"project": {"pid": "__VIA_PROJECT_ID__"}, "file": {}, "metadata": {}},  # a project of VIA 3
+]
+
+
+@pytest.mark.parametrize("content", VIA)
+def test_files_of_via_that_are_no_coco(content: dict[str, Any], scene: Scene, tmp_path: Path) -> None:
+    (tmp_path / "via.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=r"via.json: is a project or the annotations of VIA, expected its COCO export"):
+        read_coco(tmp_path / "via.json", scene)
+
+
 def test_annotations_go_to_their_views(scene: Scene, tmp_path: Path) -> None:
     rles = [encode_mask(random_mask(seed)) for seed in range(4)]
     annotations: list[dict[str, Any]] = [

@@ -39,7 +39,10 @@ def test_the_first_of_many_faults_is_named(content: object, key: str, tmp_path: 
 def test_cameras_stop_at_the_first_fault_too(tmp_path: Path) -> None:
     path = tmp_path / "cameras.json"
     path.write_text(json.dumps({"format": "mvseg-rig/1", "views": [1] * FAULTS}))
-    with pytest.raises(InputError, match=r"views\[0\]: Input should be"):
+    with pytest.raises(InputError, match=r"views\[0\]: Input should be a valid dictionary$"):
+        read_rig(path)
+    path.write_text("[]")
+    with pytest.raises(InputError, match=r"cameras.json: Input should be a valid dictionary$"):
         read_rig(path)
     path.write_text(json.dumps({"frames": [1] * FAULTS}))
     with pytest.raises(InputError, match=r"frames\[0\]: Input should be"):

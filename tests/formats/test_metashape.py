@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -136,6 +137,54 @@ BAD = [
 def test_bad_files_are_named(replace: tuple[str, str], message: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=rf"cameras.xml: {message}"):
         read_metashape(write(tmp_path, replace=replace))
+
+
+@pytest.mark.filterwarnings("ignore:.*not aligned:mvseg.errors.InputWarning")
+def test_a_project_of_photoscan(tmp_path: Path) -> None:
+    """Its doc.xml holds its chunks in <chunks>, and the photos once more, in <frames>."""
+    expected = read_metashape(write(tmp_path)).cameras
+    content = (tmp_path / "cameras.xml").read_text()
+    frames = '<frames><frame id="0"><cameras><camera camera_id="0"/></cameras></frame></frames>'
+    project = content.replace("<chunk ", '<chunks next_id="1" active_id="0"><chunk id="0" ')
+    project = project.replace("</chunk>", f"{frames}</chunk></chunks>")
+    path = tmp_path / "doc.xml"
+    path.write_text(project)
+    (tmp_path / "cameras.xml").unlink()
+    with pytest.warns(InputWarning, match=r"doc.xml: 1 cameras are not aligned"):
+        scene = load_scene(tmp_path)
+    assert torch.equal(scene.cameras.t, expected.t)
+    path.write_text(project.replace("</chunks>", "<chunk/></chunks>"))
+    with pytest.raises(InputError, match=r"doc.xml: holds 2 chunks, expected the cameras of one chunk"):
+        load_scene(tmp_path)
+    path.write_text(project.replace("<f>150.0</f>", "<fx>150.0</fx><fy>150.0</fy>"))
+    with pytest.raises(InputError, match=r"doc.xml: camera IMG_0: its calibration has no f \(old PhotoScan writes fx"):
+        load_scene(tmp_path)
+
+
+FOREIGN = [
+    [{"id": 0, "img_name": "IMG_0", "width": 128, "height": 96, "position": [0, 0, 0], "rotation": [[1, 0, 0]] * 3}],
+    {"cameras": {"cam_0": {"K": [[1, 0, 0]] * 3}}},
+]
+
+
+@pytest.mark.filterwarnings("ignore:.*not aligned:mvseg.errors.InputWarning")
+@pytest.mark.parametrize("foreign", FOREIGN)
+def test_another_programs_cameras_json_hides_nothing(foreign: object, tmp_path: Path) -> None:
+    write(tmp_path)
+    (tmp_path / "cameras.json").write_text(json.dumps(foreign))
+    with pytest.warns(InputWarning, match=r"cameras.json: is no rig file, and not used; the cameras are .*cameras.xml"):
+        assert load_scene(tmp_path).source == tmp_path / "cameras.xml"
+    (tmp_path / "cameras.xml").unlink()
+    with pytest.raises(InputError, match=r"cameras.json: (format: Field required|Input should be a valid dictionary$)"):
+        load_scene(tmp_path)
+
+
+def test_a_rig_file_that_is_broken_is_still_the_scenes(tmp_path: Path) -> None:
+    write(tmp_path)
+    for text_of_rig, reason in (("{", "not a whole JSON file"), ('{"views": []}', "format: Field required")):
+        (tmp_path / "cameras.json").write_text(text_of_rig)
+        with pytest.raises(InputError, match=rf"cameras.json: {reason}"):
+            load_scene(tmp_path)
 
 
 def test_other_xml_files_are_no_cameras(tmp_path: Path) -> None:

@@ -56,6 +56,15 @@ def test_cameras_json_goes_first_then_transforms(tmp_path: Path) -> None:
     assert (len(scene.views), scene.source) == (2, folder / "transforms.json")
 
 
+def test_a_link_names_the_scene(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for plant in ("basil", "mint"):
+        write_scene(tmp_path / "days" / plant / "D00")
+        (tmp_path / plant).symlink_to(tmp_path / "days" / plant / "D00")
+    assert [load_scene(tmp_path / plant).name for plant in ("basil", "mint")] == ["basil", "mint"]
+    monkeypatch.chdir(tmp_path / "days" / "mint" / "D00")
+    assert [load_scene(path).name for path in (".", "../D00", "../../../mint/")] == ["D00", "D00", "mint"]
+
+
 def test_binary_masks_are_warned_of(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
     for path in (folder / "masks").iterdir():

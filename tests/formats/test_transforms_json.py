@@ -268,6 +268,14 @@ def test_paths_of_another_machine(tmp_path: Path) -> None:
         scene = read(tmp_path, content)
     assert [view.name for view in scene.views] == ["a", "b", "c"]
     assert all(view.path.is_file() for view in scene.views)
+    for place in ("../photos\\", "./../../data/", "..\\..\\"):  # colmap2nerf's, from where it ran
+        for name, frame in zip("abc", content["frames"], strict=True):
+            frame["file_path"] = f"{place}{name}.png"
+        del content["w"], content["h"]
+        with pytest.warns(InputWarning, match=r"3 photos are told by their names alone, the first is images/a"):
+            scene = read(tmp_path, content)
+        assert all(view.path.is_file() for view in scene.views)
+        content |= {"w": 200, "h": 120}
     content["frames"][2]["file_path"] = "/home/me/d.png"
     with pytest.raises(InputError, match=r"view 2 \(/home/me/d.png\): the file name leads out of the scene folder"):
         read(tmp_path, content)

@@ -1,6 +1,7 @@
 """labelme: one JSON file per photo, with polygons, rectangles, circles, or masks as small PNGs.
 
-Shapes of one label and one `group_id` are parts of one leaf. Points are continuous, the corner of the top-left pixel is
+Shapes of one label and one `group_id` are parts of one leaf. labelme's own scripts leave out shapes that are called
+`__ignore__` or `_background_`, and so does this reader. Points are continuous, the corner of the top-left pixel is
 (0, 0), as in COCO, whose polygon codec is used.
 """
 
@@ -21,6 +22,7 @@ from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.masks.found_mask import FoundMask
 
 CIRCLE_CORNERS = 64
+NO_MASKS = ("__ignore__", "_background_")
 
 
 class _Shape(BaseModel):
@@ -40,7 +42,8 @@ class LabelmeFile(BaseModel):
 
 
 def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
-    """The masks of a photo, numbered from 1 in the order of their first shapes; lines and points have no mask.
+    """The masks of a photo, numbered from 1 in the order of their first shapes; lines, points and shapes that
+    are to be ignored have no mask.
 
     Raises:
         InputError: the file is broken, is of a photo of another size, or a shape is malformed.
@@ -65,7 +68,7 @@ def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
 def _draw(shape: _Shape, width: int, height: int) -> np.ndarray | None:
     """(height, width) bool; None for a shape without area."""
     kind = shape.shape_type or "polygon"
-    if kind in ("line", "linestrip", "point", "points"):
+    if kind in ("line", "linestrip", "point", "points") or shape.label in NO_MASKS:
         return None
     points = np.array(shape.points, np.float64).reshape(-1, 2)
     if kind in ("rectangle", "circle", "mask") and len(points) not in ((2, 4) if kind == "rectangle" else (2,)):

@@ -47,7 +47,7 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
         num_boxes += len(content) - sum(of_view.values())
         yield [(each.label, each.mask) for each in masks if each.mask is not None]
     if num_boxes:
-        message = f"{num_boxes} entries are boxes, lines or points without a mask and are left out"
+        message = f"{num_boxes} entries are boxes, lines, points or to be ignored, and are left out"
         warnings.warn(f"{found.source}: {message}", InputWarning, stacklevel=4)
     if any(map(bool, counts)) or wanted:
         check_categories(counts, wanted, source=found.source)

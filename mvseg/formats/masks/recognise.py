@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import filecmp
 import re
 import warnings
 from collections import defaultdict
@@ -9,13 +10,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.find_views import find_views, list_some, warn_of_base_names
+from mvseg.formats.find_views import base_name, find_views, list_some, warn_of_base_names
 from mvseg.scene import Scene
 
 # Endings of files that are called as their photo; longer ones first, since `_seg.npy` ends on `.npy`.
 ENDINGS = {
-    "_cp_masks.png": "label images",
-    "_cp_masks.tif": "label images",
+    "_cp_masks.png": "cellpose's label images",
+    "_cp_masks.tif": "cellpose's label images",
     "_seg.npy": "cellpose",
     ".png": "label images",
     ".tif": "label images",
@@ -25,9 +26,10 @@ ENDINGS = {
     ".txt": "YOLO",
 }
 ONE_PER_MASK = "one image per mask"
-# The first of several that fit as many photos is taken.
-KINDS = ("label images", "NumPy arrays", "cellpose", "JSON", "YOLO", ONE_PER_MASK)
-COMPLETE = ("label images", "NumPy arrays", "cellpose")  # a photo without leaves has a file there, too
+# The first of several that fit as many photos is taken: plain images come late, since they may be photos.
+KINDS = ("NumPy arrays", "cellpose", "cellpose's label images", "JSON", "YOLO", "label images", ONE_PER_MASK)
+# A photo without leaves has a file there, too.
+COMPLETE = ("NumPy arrays", "cellpose", "cellpose's label images", "label images")
 NUMBERED = re.compile(r"(?P<photo>.+?)[_-](?:mask[_-]?)?\d+$", re.IGNORECASE)
 EXPECTED = "expected a folder of label PNGs or a COCO .json file, or another kind of docs/formats.md"
 
@@ -40,7 +42,7 @@ class MaskFiles:
         source: the path that was given; messages name it.
         kind: "COCO", "label images", "NumPy arrays", "cellpose", "labelme", "SAM", "YOLO" or "one image per mask".
         files: V tuples of paths, one per photo but for "one image per mask"; empty for a photo without masks. For COCO
-            the same file V times.
+            the same V times: its file, or the parts of one that was split.
     """
 
     source: Path
@@ -52,10 +54,11 @@ def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
     """The kind of masks that fits most photos of a scene, and its files.
 
     Warns (InputWarning) where there is more than one kind, of photos without a file, and of files that fit a photo by
-    their base name only. The photos themselves are no masks, wherever they lie.
+    their base name only. The photos themselves and their copies are no masks, wherever they lie.
 
     Raises:
-        InputError: there is nothing at the path, or nothing there fits a photo; the message says what is there.
+        InputError: there is nothing at the path, or nothing there fits a photo, or several files of each kind fit the
+            same one; the message says what is there.
     """
     if masks.is_file() and masks.suffix.lower() == ".json":
         return MaskFiles(masks, "COCO", ((masks,),) * len(scene.views))
@@ -63,20 +66,44 @@ def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
         what = "not a kind of masks that is known" if masks.is_file() else "no such masks"
         raise InputError(f"{masks}: {what}, {EXPECTED}")
     folder = masks / "SegmentationObject" if (masks / "SegmentationObject").is_dir() else masks  # VOC
-    photos = {view.path.resolve() for view in scene.views}
-    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.resolve() not in photos]
-    by_kind = {kind: files for kind, names in _group(folder, paths).items() if any(files := _fit(names, scene, folder))}
-    if not by_kind:
-        return _lone_coco(scene, masks, paths)
-    counts = {kind: sum(map(bool, by_kind[kind])) for kind in KINDS if kind in by_kind}
+    paths = _list_files(folder, scene)
+    groups = _group(folder, paths)
+    by_kind, unclear = {}, {}
+    for kind in (each for each in KINDS if each in groups):
+        try:
+            by_kind[kind] = _fit(groups[kind], scene, folder, kind=kind)
+        except InputError as error:
+            unclear[kind] = str(error)
+    counts = {kind: count for kind, files in by_kind.items() if (count := sum(map(bool, files)))}
+    if not counts:
+        return _lone_coco(scene, masks, paths, unclear=tuple(unclear.values()))
     kind = max(counts, key=lambda each: counts[each])
     others = [f"{each} for {count}" for each, count in counts.items() if each != kind]
+    others += [f"{each} ({reason})" for each, reason in unclear.items()]
     if others:
         message = f"{kind} for {counts[kind]} photos are taken, and not {', '.join(others)}"
         warnings.warn(f"{masks}: {message}", InputWarning, stacklevel=3)
-    _warn_of_loose_names(_group(folder, paths)[kind], scene, folder)
+    _warn_of_loose_names(groups[kind], scene, folder)
     files = _complete(scene, folder, kind=kind, files=by_kind[kind])
-    return MaskFiles(masks, _name_json(kind, by_kind[kind]), files)
+    return MaskFiles(masks, _name_kind(kind, by_kind[kind]), files)
+
+
+def _list_files(folder: Path, scene: Scene) -> list[Path]:
+    """The files below a folder that are neither the scene's cameras nor its photos, nor copies of these."""
+    photos = [view.path for view in scene.views if view.path.is_file()]
+    known = {path.resolve() for path in (*photos, scene.source) if path is not None}
+    of_size: dict[int, list[Path]] = defaultdict(list)
+    for photo in photos:
+        of_size[photo.stat().st_size].append(photo)
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and path.resolve() not in known]
+    return [path for path in paths if not any(_is_copy(path, photo) for photo in of_size[path.stat().st_size])]
+
+
+def _is_copy(path: Path, photo: Path) -> bool:
+    try:
+        return filecmp.cmp(path, photo, shallow=False)
+    except OSError:  # not readable: who reads it next will say so
+        return False
 
 
 def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:
@@ -89,7 +116,7 @@ def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:
             continue
         stem = name[: -len(ending)]
         groups[ENDINGS[ending]][stem].append(path)
-        if ENDINGS[ending] == "label images":
+        if "label images" in ENDINGS[ending]:
             numbered = NUMBERED.match(stem.rpartition("/")[2])
             if "/" in stem:
                 groups[ONE_PER_MASK][stem.rpartition("/")[0]].append(path)
@@ -98,16 +125,32 @@ def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:
     return groups
 
 
-def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path) -> tuple[tuple[Path, ...], ...]:
-    """The files of each view; none at all where names cannot be told apart."""
+def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str) -> tuple[tuple[Path, ...], ...]:
+    """The files of each view.
+
+    Raises:
+        InputError: several files fit one view, and none of them is called exactly so (a folder of photos beside one of
+            masks). The message is a reason.
+    """
     files: list[list[Path]] = [[] for _ in scene.views]
+    stems, problem = [f"{name}.png" for name in names], None
+    views: list[int | None] = [None] * len(stems)
     try:
-        views = find_views([f"{name}.png" for name in names], scene, source=folder)
-    except InputError:
-        return ((),) * len(files)
-    for view, paths in zip(views, names.values(), strict=True):
-        if view is not None:
-            files[view] += paths
+        views = find_views(stems, scene, source=folder)
+    except InputError as error:
+        problem = str(error).removeprefix(f"{folder}: ")
+    bases = [base_name(view.name) for view in scene.views]
+    by_base = {base: view for view, base in enumerate(bases) if kind != ONE_PER_MASK and bases.count(base) == 1}
+    for (name, paths), stem, view in zip(names.items(), stems, views, strict=True):
+        claimed = by_base.get(base_name(stem)) if view is None else view
+        if claimed is not None and (name == scene.views[claimed].name or scene.views[claimed].name not in names):
+            files[claimed] += paths
+    several = next((paths for paths in files if len(paths) > 1 and kind != ONE_PER_MASK), None)
+    if several:
+        first, second = (path.relative_to(folder).as_posix() for path in several[:2])
+        problem = f"both {first} and {second} fit one photo, expected the folder of one of them"
+    if problem:
+        raise InputError(problem)
     return tuple(map(tuple, files))
 
 
@@ -122,19 +165,19 @@ def _complete(
     """Photos without a file: the reader will miss it where each photo must have one; elsewhere they show nothing."""
     missing = [view for view, paths in enumerate(files) if not paths]
     if missing and kind in COMPLETE:
-        ending = next(ending for ending, each in ENDINGS.items() if each == kind and "_cp" not in ending)
-        return tuple(paths[:1] or (folder / f"{scene.views[view].name}{ending}",) for view, paths in enumerate(files))
+        ending = next(ending for ending, each in ENDINGS.items() if each == kind)
+        return tuple(paths or (folder / f"{scene.views[view].name}{ending}",) for view, paths in enumerate(files))
     if missing:
         first = f"view {missing[0]} ({scene.views[missing[0]].name})"
         message = f"{len(missing)} photos have no file and no masks, the first is {first}"
         warnings.warn(f"{folder}: {message}", InputWarning, stacklevel=4)
-    return files if kind == ONE_PER_MASK else tuple(paths[:1] for paths in files)
+    return files
 
 
-def _name_json(kind: str, files: tuple[tuple[Path, ...], ...]) -> str:
-    """labelme's files have shapes, those of Segment Anything have not."""
+def _name_kind(kind: str, files: tuple[tuple[Path, ...], ...]) -> str:
+    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything have not."""
     if kind != "JSON":
-        return kind
+        return "label images" if kind == "cellpose's label images" else kind
     first = next(paths[0] for paths in files if paths)
     try:
         return "labelme" if b'"shapes"' in first.read_bytes() else "SAM"
@@ -142,11 +185,18 @@ def _name_json(kind: str, files: tuple[tuple[Path, ...], ...]) -> str:
         raise InputError(f"{first}: cannot be read ({error.strerror})") from None
 
 
-def _lone_coco(scene: Scene, masks: Path, paths: list[Path]) -> MaskFiles:
-    """A folder that fits no photo may hold one COCO file, as exports of CVAT and Roboflow do."""
+def _lone_coco(scene: Scene, masks: Path, paths: list[Path], *, unclear: tuple[str, ...]) -> MaskFiles:
+    """A folder that fits no photo may hold one COCO file, as exports of CVAT do, or one in each of its folders, as
+    Roboflow's (train, valid, test)."""
     jsons = [path for path in paths if path.suffix.lower() == ".json"]
-    if len(jsons) == 1:
-        return MaskFiles(masks, "COCO", ((jsons[0],),) * len(scene.views))
+    if len({path.name for path in jsons}) == 1:
+        return MaskFiles(masks, "COCO", (tuple(jsons),) * len(scene.views))
+    if unclear:
+        raise InputError(f"{masks}: {unclear[0]}")
+    if jsons:
+        found = list_some([path.relative_to(masks).as_posix() for path in jsons])
+        message = f"holds {len(jsons)} JSON files ({found}), none of them called as a photo"
+        raise InputError(f"{masks}: {message}; expected the path of the COCO file")
     jpegs = [path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")]
     if jpegs:
         raise InputError(f"{jpegs[0]}: is a JPEG, which blurs the numbers of masks: export PNG instead")

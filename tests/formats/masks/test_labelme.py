@@ -87,6 +87,15 @@ def test_bad_files_are_named(tmp_path: Path) -> None:
         read_labelme(write(tmp_path, {"points": [[1]]}), 30, 20)
 
 
+def test_shapes_that_labelmes_scripts_leave_out(tmp_path: Path) -> None:
+    """Parts of one group too; a rectangle called so must not be a mask, nor cover one."""
+    shapes = [{"label": "__ignore__"}, {}, {"label": "_background_"}, {"label": "__ignore__", "group_id": 1}]
+    found = read_labelme(write(tmp_path, *({"points": CORNERS} | shape for shape in shapes)), 30, 20)
+    assert [(each.category, each.mask is None) for each in found] == [
+        ("__ignore__", True), ("leaf", False), ("_background_", True), ("__ignore__", True)
+    ]  # fmt: skip
+
+
 def test_categories_and_lines_are_said(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
     scene = load_scene(folder)
@@ -94,7 +103,7 @@ def test_categories_and_lines_are_said(tmp_path: Path) -> None:
     for view in range(4):
         (folder / "lm" / f"{view:03d}.json").write_bytes((EXAMPLE / "000.json").read_bytes())
     with (
-        pytest.warns(InputWarning, match=r"lm: 4 entries are boxes, lines or points without a mask and are left out"),
+        pytest.warns(InputWarning, match=r"lm: 4 entries are boxes, lines, points or to be ignored, and are left out"),
         pytest.warns(InputWarning, match=r"masks of 2 categories are taken alike \(16 leaf, 4 pot\); --categories"),
     ):
         assert len(load_masks(scene, folder / "lm")) == 20

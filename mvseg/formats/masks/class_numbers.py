@@ -1,0 +1,57 @@
+"""Label images with a number per class, where one per leaf is expected, and photos: numbers with pieces far apart."""
+
+from __future__ import annotations
+
+import warnings
+from collections import Counter
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.regions import Regions
+
+SIDE = 256  # pixels: larger masks are looked at so small
+COMPARABLE = 0.2  # of the largest piece's area: smaller ones are crumbs
+FAR = 0.5  # gap between pieces, in the square root of the smaller one's area
+MANY = 0.5  # share of the photos, or of the numbers of one
+PHOTO = 50  # numbers of a label image: with more, it may be a photo
+
+
+def check_numbers(regions: Regions, *, source: Path) -> None:
+    """Warn (InputWarning) if a number of label images has pieces far apart in most of the photos with masks.
+
+    A leaf that others hide in part has pieces, too, but near each other or in few photos: on basil and maize with a
+    number per leaf, in less than a third of the photos.
+
+    Raises:
+        InputError: most of the many numbers of a view have pieces far apart, as the grey values of a photo have.
+    """
+    is_apart = [has_pieces_apart(regions.crop(index).numpy()) for index in range(len(regions))]
+    in_view = Counter(view for view, apart in zip(regions.view_index.tolist(), is_apart, strict=True) if apart)
+    for view, total in enumerate(regions.num_per_view.tolist()):
+        if total > PHOTO and in_view[view] > MANY * total:
+            reason = f"holds {total} numbers whose pieces lie far apart: is it a photo? expected one number per leaf"
+            raise InputError(f"{source}: the label image of view {view} {reason}")
+    with_number = Counter(number for number, apart in zip(regions.labels.tolist(), is_apart, strict=True) if apart)
+    num_photos = int((regions.num_per_view > 0).sum())
+    number, count = with_number.most_common(1)[0] if with_number else (0, 0)
+    if count > max(1, MANY * num_photos):
+        message = f"the number {number} has pieces far apart in {count} of {num_photos} photos, as one of a class has"
+        advice = "export a number per leaf (VOC's SegmentationObject, not SegmentationClass), or COCO"
+        warnings.warn(f"{source}: {message}: {advice}", InputWarning, stacklevel=4)
+
+
+def has_pieces_apart(mask: np.ndarray) -> bool:
+    """Whether (h, w) bool holds two pieces of comparable size with a gap between them."""
+    scale = min(1.0, SIDE / max(mask.shape))
+    size = (max(1, round(scale * mask.shape[1])), max(1, round(scale * mask.shape[0])))
+    small = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
+    _, pieces, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
+    areas = stats[:, cv2.CC_STAT_AREA].copy()
+    areas[0] = 0
+    largest = int(areas.argmax())
+    distance = cv2.distanceTransform((pieces != largest).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    others = [piece for piece in np.flatnonzero(areas >= COMPARABLE * areas[largest]) if piece != largest]
+    return any(distance[pieces == piece].min() > FAR * areas[piece] ** 0.5 for piece in others[:SIDE])
