@@ -8,7 +8,7 @@ their place, single photos, or every n-th of them, answer the first question. Th
    those that score `--min_score` or more, symmetric best Dice and the difference in count, see `count_and_dice`; and
    the processor time, with reading the photos and writing down the masks.
 2. The loop, for detections with a score of `--min_score` or more: plain NMS against cluster-aware NMS after 1, 2, 3
-   iterations, and after one with the other views as witnesses. Mask AP, precision, recall of all leaves, and recall of
+   iterations, and after one with cross-view verification. Mask AP, precision, recall of all leaves, and recall of
    leaves that are less than half visible (visible pixels against the silhouette that the leaf would have alone). What
    lies mostly where the truth ignores it counts for nothing.
 3. The ids of the detections: s_match, e_k and ARI over those that find a leaf (see `found_leaves`), pair F1 over all
@@ -108,7 +108,7 @@ def annotate(masks: Masks, sizes: list[list[int]], first_image: int) -> list[dic
 
 def build_model(args: argparse.Namespace, row: str) -> MultiViewMaskRCNN:
     """The model of a row of the table: "plain 0.5" is NMS without clusters, a number is that many iterations, and with
-    "witnesses" behind it the other views correct what they leave."""
+    "verified" behind it the other views correct what they leave."""
     detector = load_detector(args.weights, image_size=args.image_size, min_score=args.min_score)
     is_plain, number = row.startswith("plain"), row.removeprefix("plain").split()[0]
     return MultiViewMaskRCNN(
@@ -116,7 +116,7 @@ def build_model(args: argparse.Namespace, row: str) -> MultiViewMaskRCNN:
         num_iterations=0 if is_plain else int(number),
         cluster_iou=float(number) if is_plain else 0.3,
         scales=args.scales,
-        witnesses=row.endswith("witnesses"),
+        verify=row.endswith("verified"),
     )
 
 
@@ -153,7 +153,7 @@ def count_found(masks: Masks, truth: SceneTruth) -> dict[str, float]:
 
 def measure_loop(folders: list[Path], args: argparse.Namespace) -> dict[str, dict[str, float | None]]:
     """Mask AP, precision and recalls of every row, pooled over the scenes, and the means of `MEANS` over them."""
-    rows = ["plain 0.3", "plain 0.5", *[str(n) for n in range(1, args.iterations + 1)], "1 witnesses"]
+    rows = ["plain 0.3", "plain 0.5", *[str(n) for n in range(1, args.iterations + 1)], "1 verified"]
     totals: dict[str, Counter[str]] = {row: Counter() for row in rows}
     truths: list[dict[str, Any]] = []
     detections: dict[str, list[dict[str, Any]]] = {row: [] for row in rows}

@@ -143,7 +143,7 @@ def list_stages(config: RunConfig, *, has_masks: bool) -> dict[str, Stage]:
     leaves. What a detector found is cut before surfaces are fitted to it.
     """
     shapes = config.reconstruct
-    is_verified = not has_masks and config.detect.witnesses
+    is_verified = not has_masks and config.detect.verify
     is_checked = shapes is not None and shapes.check_ids and shapes.shape != "voxels" and not is_verified
     stages = {
         "detect": None if has_masks else detect,
@@ -384,6 +384,6 @@ def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: s
 
     weights = find_weights(detect.weights) or Path(detect.weights)
     options = asdict(detect) | {"weights": hash_files(weights)}
-    options |= {"num_iterations": None, "witnesses": None, "crop": None}
+    options |= {"num_iterations": None, "verify": None, "crop": None}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "mvseg": __version__}
     return json.dumps(options | {"torch": torch.__version__, "device": device})

@@ -136,11 +136,11 @@ def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor], dev
     assert torch.equal(found.instance_ids, expected.instance_ids)
 
 
-def test_witnesses_are_heard_on_the_cpu(
+def test_masks_are_verified_on_the_cpu(
     model: MaskRCNN, photos: list[Tensor], device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And their answer is where the images are."""
-    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, witnesses=True)
+    wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, verify=True)
 
     def verify(masks: Masks, **given: Any) -> tuple[Masks, dict[int, LeafSurface]]:
         assert given["cameras"].K.device.type == masks.view_index.device.type == "cpu"

@@ -275,9 +275,9 @@ def test_masks_are_cut_once_the_surfaces_were_heard_and_both_leaves_are_fitted_a
     assert fits == ([(whole, []), (ids, left)] if is_checked else [(ids, [])])
 
 
-@pytest.mark.parametrize("witnesses", [True, False])
+@pytest.mark.parametrize("verifies", [True, False])
 def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
-    plant: Path, monkeypatch: pytest.MonkeyPatch, witnesses: bool
+    plant: Path, monkeypatch: pytest.MonkeyPatch, verifies: bool
 ) -> None:
     """Before the other views judge them."""
     regions = load_masks(load_scene(plant), plant / "masks")
@@ -297,11 +297,11 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
 
     monkeypatch.setattr(mvseg.pipeline, "detect", detect)
     monkeypatch.setattr("mvseg.verification.other_views.verify_masks", verify)
-    config = replace(IDS_ONLY, split_merged=True, detect=DetectConfig(witnesses=witnesses))
+    config = replace(IDS_ONLY, split_merged=True, detect=DetectConfig(verify=verifies))
     result = run_scene(plant, None, config)
     assert len(result.masks) == len(regions) + 1
     assert result.masks.merged == ()
-    assert [len(masks) for masks in asked] == [len(regions) + 1] * witnesses
+    assert [len(masks) for masks in asked] == [len(regions) + 1] * verifies
     whole = run_scene(plant, None, replace(config, split_merged=False))
     assert len(whole.masks) == len(regions)
     assert len(whole.masks.merged) == 1

@@ -26,7 +26,7 @@ class DetectConfig:
         crop: auto: where the plant fills a small part of large photos, they are cut to it after a first look and looked
             at again: leaves are seen larger. off: one look at whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
-        witnesses: let surfaces that are fitted to the matched masks correct them: the other views show which masks are
+        verify: let surfaces that are fitted to the matched masks correct them: the other views show which masks are
             no leaves or pieces of one, and which leaves were missed (`mvseg.verification.other_views`). Finds leaves:
             not for other things.
     """
@@ -37,7 +37,7 @@ class DetectConfig:
     scales: tuple[float, ...] = (1.0,)
     crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
-    witnesses: bool = True
+    verify: bool = True
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_score <= 1:

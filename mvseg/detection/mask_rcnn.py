@@ -37,7 +37,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        survivors again. Masks that resemble no map form one more group.
     4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
        better one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
-    5. With `witnesses`, surfaces fitted to what is matched correct it: for leaves only (`verification.other_views`).
+    5. With `verify`, surfaces fitted to what is matched correct it: for leaves only (`verification.other_views`).
 
     Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
     here, where `match` selects "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the
@@ -54,7 +54,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         scales: factors of the size at which the detector sees photos; at several, what most of them show scores best
             (`mvseg.detectors.scales`).
         match: how regions are matched; a given number of instances applies to each class.
-        witnesses: let the other views correct what is found. All photos are then in memory, 3 bytes a pixel.
+        verify: let the other views correct what is found. All photos are then in memory, 3 bytes a pixel.
 
     Raises:
         InputError: the detector has no mask head.
@@ -70,7 +70,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         proposals_per_view: int = 300,
         scales: Sequence[float] = (1.0,),
         match: MatchConfig = MatchConfig(),
-        witnesses: bool = False,
+        verify: bool = False,
     ) -> None:
         if not (isinstance(detector, GeneralizedRCNN) and detector.roi_heads.has_mask()):
             raise InputError(f"{type(detector).__name__} has no mask head, expected a torchvision Mask R-CNN")
@@ -81,7 +81,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         self.proposals_per_view = proposals_per_view
         self.scales = tuple(scales)
         self.match = match
-        self.witnesses = witnesses
+        self.verify = verify
         self.train(detector.training)
 
     def forward(
@@ -102,7 +102,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`
             (probabilities, to be cut at 0.5); with cameras also `instance_ids` (int64, the same number for the same
             instance in every view, -1 = matched to nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
-            With witnesses, masks are 0 or 1, and `from_views` (bool) marks those that only the other views show.
+            With `verify`, masks are 0 or 1, and `from_views` (bool) marks those that only the other views show.
 
         Raises:
             InputError: fewer than two images, not one camera per image, or an image of another size than its camera.
@@ -111,7 +111,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return super().forward(images, targets)
         sizes = [[image.shape[-1], image.shape[-2]] for image in images]
         _check_cameras(cameras, sizes)
-        if self.witnesses:
+        if self.verify:
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
             detections = [self._propose(image) for image in images]
@@ -132,7 +132,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             progress: show progress bars while the detections are matched.
 
         Returns:
-            The D detections that are kept, matched, on the CPU, ordered by view and by falling score (with witnesses:
+            The D detections that are kept, matched, on the CPU, ordered by view and by falling score (with `verify`:
             by view and instance).
 
         Raises:
@@ -142,11 +142,11 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         for image in images:
             detections.append(self.detect(image))
             sizes.append([image.shape[-1], image.shape[-2]])
-            if self.witnesses:
+            if self.verify:
                 photos.append((255 * image.detach().cpu()).round().to(torch.uint8).permute(1, 2, 0).numpy())
         _check_cameras(cameras, sizes)
         matching = self.match_detections(detections, cameras, progress=progress)
-        if self.witnesses:
+        if self.verify:
             posed = cameras.to("cpu")
             masks, surfaces = verify_masks(
                 matching.masks, cameras=posed, photos=photos.__getitem__, progress=progress

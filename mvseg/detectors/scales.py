@@ -78,15 +78,15 @@ def look(model: GeneralizedRCNN, photo: Tensor, number: int, *, side: int, **lim
         limits: for `run_heads`.
 
     Returns:
-        Also "scale" (D,), the number; and "is_witness" (D,) bool, those that may speak for detections of another scale:
+        Also "scale" (D,), the number; and "is_plain" (D,) bool, those that may speak for detections of another scale:
         the survivors of plain NMS. (Of the many that a large threshold leaves, some one agrees with anything.)
     """
     own = model.transform
     transform = GeneralizedRCNNTransform(max(1, side), max(1, side), own.image_mean, own.image_std, own.size_divisible)
     found = run_heads(model, photo, **limits, transform=transform, score_thresh=LEAST_SCORE)
     plain = batched_nms(found["boxes"], found["scores"], found["labels"], model.roi_heads.nms_thresh)
-    is_witness = torch.zeros_like(found["labels"], dtype=torch.bool).index_fill_(0, plain, True)
-    return found | {"scale": torch.full_like(found["labels"], number), "is_witness": is_witness}
+    is_plain = torch.zeros_like(found["labels"], dtype=torch.bool).index_fill_(0, plain, True)
+    return found | {"scale": torch.full_like(found["labels"], number), "is_plain": is_plain}
 
 
 def agree(detections: dict[str, Tensor], *, num_scales: int) -> Tensor:
@@ -97,17 +97,17 @@ def agree(detections: dict[str, Tensor], *, num_scales: int) -> Tensor:
         num_scales: of which none may have found anything.
 
     Returns:
-        (N,) float64, the mean, over the scales, of the best score among witnesses of the same class with an IoU above
+        (N,) float64, the mean, over the scales, of the best score among plain ones of the same class with an IoU above
         0.5; 0 for a scale without any, and the detection's own score for its own scale.
     """
     scores, labels, scale = detections["scores"].double(), detections["labels"], detections["scale"]
     best = scores.new_zeros((len(scores), num_scales))
     best[torch.arange(len(scores)), scale] = scores
     is_near = box_iou(detections["boxes"], detections["boxes"]) > NEAR_IOU
-    is_near &= (scale[:, None] != scale) & (labels[:, None] == labels) & detections["is_witness"]
+    is_near &= (scale[:, None] != scale) & (labels[:, None] == labels) & detections["is_plain"]
     pairs = is_near.nonzero()
-    detection, witness = pairs[mask_iou(detections["boxes"], detections["masks"], pairs) > SAME_IOU].T
-    best.view(-1).scatter_reduce_(0, detection * num_scales + scale[witness], scores[witness], "amax")
+    detection, plain = pairs[mask_iou(detections["boxes"], detections["masks"], pairs) > SAME_IOU].T
+    best.view(-1).scatter_reduce_(0, detection * num_scales + scale[plain], scores[plain], "amax")
     return best.mean(1)
 
 

@@ -28,8 +28,8 @@ class ReconstructConfig:
             missing are done without.
         jackknife: standard deviations of surfaces from fits without each view in turn; takes many times longer.
         check_ids: masks that show another instance's surface than their own get its id, surfaces that lost or won masks
-            are fitted again, and masks that show two surfaces are listed, see docs/matching.md; not where witnesses
-            were heard (`detect.witnesses`), nor without surfaces.
+            are fitted again, and masks that show two surfaces are listed, see docs/matching.md; not where masks
+            are verified (`detect.verify`), nor without surfaces.
     """
 
     shape: Literal["surface", "voxels", "both"] = "surface"

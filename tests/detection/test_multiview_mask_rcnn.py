@@ -316,7 +316,7 @@ def test_the_other_views_are_heard_where_that_is_asked_for(tmp_path: Path, monke
     detected = Masks.of(
         regions, regions.labels, found.match_scores, detection_scores=found.match_scores / 2, origin=Origin.DETECTED
     )
-    wrapped = MultiViewMaskRCNN(tiny_detector(), witnesses=True)
+    wrapped = MultiViewMaskRCNN(tiny_detector(), verify=True)
     monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: found.with_masks(detected))
     images, cameras = load_photos(leafy.scene), leafy.scene.cameras
     heard = verify_masks(detected, cameras=cameras, photos=partial(read_photo, leafy.scene))

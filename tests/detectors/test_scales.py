@@ -80,12 +80,12 @@ def test_masks_are_surer_where_scales_agree() -> None:
         "scores": torch.tensor([0.9, 0.6, 0.3, 0.8, 0.5, 0.2]),
         "masks": torch.stack([whole, whole, whole, whole, whole, upper]),
         "scale": torch.tensor([0, 1, 2, 1, 1, 2]),
-        "is_witness": torch.ones(6, dtype=torch.bool),
+        "is_plain": torch.ones(6, dtype=torch.bool),
     }
     expected = torch.tensor([0.9 + 0.6 + 0.3, 0.9 + 0.6 + 0.3, 0.9 + 0.6 + 0.3, 0.8, 0.5, 0.2]).double()
     for num_scales in (3, 4):
         torch.testing.assert_close(agree(detections, num_scales=num_scales), expected / num_scales)
-    detections["is_witness"][0] = False
+    detections["is_plain"][0] = False
     without = torch.tensor([0.9 + 0.6 + 0.3, 0.6 + 0.3, 0.6 + 0.3, 0.8, 0.5, 0.2]).double()
     torch.testing.assert_close(agree(detections, num_scales=3), without / 3)
 
@@ -97,7 +97,7 @@ def test_of_two_masks_of_one_scale_the_better_one_counts() -> None:
         "scores": torch.tensor([0.4, 0.9, 0.7]),
         "masks": torch.ones(3, 1, 28, 28),
         "scale": torch.tensor([0, 1, 1]),
-        "is_witness": torch.ones(3, dtype=torch.bool),
+        "is_plain": torch.ones(3, dtype=torch.bool),
     }
     torch.testing.assert_close(agree(detections, num_scales=2), torch.tensor([0.65, 0.65, 0.55]).double())
 
