@@ -115,7 +115,6 @@ def build_model(args: argparse.Namespace, row: str) -> MultiViewMaskRCNN:
         detector,
         num_iterations=0 if is_plain else int(number),
         cluster_iou=float(number) if is_plain else 0.3,
-        scales=args.scales,
         verify=row.endswith("verified"),
     )
 
@@ -191,7 +190,6 @@ def main() -> None:
     parser.add_argument("--every", type=int, default=1, help="every n-th of --photos only, see hold_out_every")
     parser.add_argument("--weights", default=DetectConfig.weights)
     parser.add_argument("--image_size", type=int, help="longer side of scaled photos (default: as the weights say)")
-    parser.add_argument("--scales", type=float, nargs="+", default=[1.0], help="factors of it, in the loop")
     parser.add_argument("--min_score", type=float, default=DetectConfig.min_score, help="of detections in the loop")
     parser.add_argument("--iterations", type=int, default=3, help="of the loop at most; 0 for average precision alone")
     parser.add_argument("--json", type=Path, help="write the figures here")

@@ -197,7 +197,7 @@ def detect(state: State) -> State:
     detector = load_detector(options.weights, image_size=options.image_size, min_score=options.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(
-        detector, num_iterations=options.num_iterations, scales=options.scales, match=state.config.match
+        detector, num_iterations=options.num_iterations, match=state.config.match
     ).to(device)
     kept = None if state.keep is None else KeptDetections(state.keep, _describe_detector(options, model, device))
     found, names = _look(model, state, kept=kept)

@@ -16,7 +16,6 @@ from mvseg import MultiViewMaskRCNN
 from mvseg.detectors.mask_cut import decide_masks
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.run import detect, leave_autocast, run_heads
-from mvseg.detectors.scales import look, run_scales
 from mvseg.detectors.small import SMALL_ARCHITECTURES
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -76,10 +75,8 @@ def test_each_small_detector(arch: str, device: torch.device) -> None:
 
 
 @torch.no_grad()
-def test_one_photo_at_one_scale_and_at_several(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
+def test_one_photo(model: MaskRCNN, photos: list[Tensor], device: torch.device) -> None:
     moved, photo = there(model, device), photos[0]
-    check(run_scales(moved, photo.to(device), (0.5, 1.0)), run_scales(model, photo, (0.5, 1.0)), device)
-    check(look(moved, photo.to(device), 1, side=48), look(model, photo, 1, side=48), device)
     found, masks = detect(moved, photo.to(device))
     expected, pasted = detect(model, photo)
     check(found | {"masks": torch.stack(list(masks))}, expected | {"masks": torch.stack(list(pasted))}, device)

@@ -44,8 +44,6 @@ def add(verbs: Any) -> None:
         "photo,angle, or the degrees from one photo to the next"
     )
     parser.add_argument("--angles", type=float | Path | None, help=help_angles)
-    help_refine = "with a turntable.json: refine cameras and angles with the features of the plant's own photos"
-    parser.add_argument("--refine", type=bool, default=False, help=help_refine)
     verbs.add_subcommand("pose", parser, help="a scene folder from photos alone")
 
 
@@ -59,10 +57,8 @@ def run(args: Namespace) -> int:
         unit=args.unit or "",
     )
     config = build_options(PoseConfig, args)
-    if args.turntable in (None, "board"):
-        useless = [f"--{name}" for name in ("angles", "refine") if getattr(args, name) not in (None, False)]
-        if useless:
-            raise InputError(f"{', '.join(useless)}: of no use without --turntable and a turntable.json")
+    if args.turntable in (None, "board") and args.angles is not None:
+        raise InputError("--angles: of no use without --turntable and a turntable.json")
     if args.turntable is not None:
         _run_turntable(args, known, config)
         return 0
@@ -90,7 +86,6 @@ def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
             args.out,
             turntable=Path(args.turntable),
             angles=args.angles,
-            refine=args.refine,
             quiet=args.quiet,
         )
     elif known.board is None:

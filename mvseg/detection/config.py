@@ -8,7 +8,6 @@ from typing import Literal
 from mvseg.errors import InputError
 
 MAX_IMAGE_SIZE = 16_384  # pixels, as in a file of weights; this module is imported for --help, and loads no torch
-MAX_SCALE = 4
 
 
 @dataclass(frozen=True)
@@ -21,8 +20,6 @@ class DetectConfig:
             sees a leaf, times the expected IoU of its mask.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the
             size given with the weights, smaller ones stay as they are.
-        scales: factors of this size. At several, every photo is looked at once for each, and a mask scores best that
-            most of them show; [0.5, 1, 2] takes three to four times as long as [1].
         crop: auto: where the plant fills a small part of large photos, they are cut to it after a first look and looked
             at again: leaves are seen larger. off: one look at whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
@@ -34,7 +31,6 @@ class DetectConfig:
     weights: str = "leaf-lite"
     min_score: float = 0.3
     image_size: int | None = None
-    scales: tuple[float, ...] = (1.0,)
     crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
     verify: bool = True
@@ -44,7 +40,5 @@ class DetectConfig:
             raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
         if self.image_size is not None and not 32 <= self.image_size <= MAX_IMAGE_SIZE:
             raise InputError(f"detect.image_size is {self.image_size}, expected at least 32, at most {MAX_IMAGE_SIZE}")
-        if not self.scales or not all(0 < scale <= MAX_SCALE for scale in self.scales):
-            raise InputError(f"detect.scales is {list(self.scales)}, expected factors above 0 and up to {MAX_SCALE}")
         if self.num_iterations < 0:
             raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -11,7 +11,7 @@ from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.proposals import Proposals, gather_proposals
-from mvseg.detectors.scales import run_scales
+from mvseg.detectors.run import run_heads
 from mvseg.errors import InputError
 from mvseg.masks import Masks, Origin
 from mvseg.matching.config import MatchConfig
@@ -51,8 +51,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         proposal_iou: NMS threshold of the excessive set.
         cluster_iou: NMS threshold inside a cluster, and of the set that is matched first.
         proposals_per_view: size of the excessive set; the best scores are kept.
-        scales: factors of the size at which the detector sees photos; at several, what most of them show scores best
-            (`mvseg.detectors.scales`).
         match: how regions are matched; a given number of instances applies to each class.
         verify: let the other views correct what is found. All photos are then in memory, 3 bytes a pixel.
 
@@ -68,7 +66,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         proposal_iou: float = 0.7,
         cluster_iou: float = 0.3,
         proposals_per_view: int = 300,
-        scales: Sequence[float] = (1.0,),
         match: MatchConfig = MatchConfig(),
         verify: bool = False,
     ) -> None:
@@ -79,7 +76,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         self.proposal_iou = proposal_iou
         self.cluster_iou = cluster_iou
         self.proposals_per_view = proposals_per_view
-        self.scales = tuple(scales)
         self.match = match
         self.verify = verify
         self.train(detector.training)
@@ -182,10 +178,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         )
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
-        """One view's excessive set, as from `run_scales`, without masks that score too low once they are cut."""
-        detections = run_scales(
-            self, image, self.scales, nms_thresh=self.proposal_iou, detections_per_img=self.proposals_per_view
-        )
+        """One view's excessive set, as from `run_heads`, without masks that score too low once they are cut."""
+        detections = run_heads(self, image, nms_thresh=self.proposal_iou, detections_per_img=self.proposals_per_view)
         frame, is_good = detections.pop("frame"), detections["scores"] >= self.roi_heads.score_thresh
         return {key: value[is_good] for key, value in detections.items()} | {"frame": frame}
 

@@ -21,7 +21,6 @@ from mvseg.poses.board_calibration import calibrate_turntable
 from mvseg.poses.photo_files import PhotoFile, copy_photos
 from mvseg.poses.scene_files import IMAGES
 from mvseg.poses.table_fit import TableCamera
-from mvseg.poses.table_refinement import Refinement, Shots, Table, find_tracks, refine_table
 from mvseg.runs.pose_folder import check_folders, new_scene_folder, write_pose_file
 from mvseg.scene import Scene
 
@@ -74,7 +73,7 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
 
 
 def pose_turntable_photos(
-    photos: Path, out: Path, *, turntable: Path, angles: Angles = None, refine: bool = False, quiet: bool = False
+    photos: Path, out: Path, *, turntable: Path, angles: Angles = None, quiet: bool = False
 ) -> Scene:
     """The scene folder of photos from a turntable that was calibrated before.
 
@@ -84,7 +83,6 @@ def pose_turntable_photos(
         turntable: a turntable file.
         angles: CSV file of `read_photo_angles`; or the degrees from one photo of a camera to its next one; None: those
             of the file, which then has as many views of each camera as there are photos.
-        refine: let the plant's own features refine cameras and angles, see `refine_table`.
         quiet: no progress bars and no line at the end.
 
     Raises:
@@ -103,15 +101,6 @@ def pose_turntable_photos(
                 given = f"{size[0]} x {size[1]} pixels, the turntable's camera {expected[0]} x {expected[1]}"
                 raise InputError(f"{file.name} has {given}, expected photos of that camera")
         run: dict[str, Any] = {"photos": len(files), "turntable": str(turntable), "unit": unit}
-        if refine:
-            used = {name: cameras[name] for name in cameras if name in camera_of}
-            found, distinct = _refine(folder, files, used, camera_of=camera_of, angle_of=angle_of, quiet=quiet)
-            run["refinement"] = _describe_refinement(found)
-            if found.is_taken:
-                refined = zip(used, found.table.cameras, strict=True)
-                cameras = {name: used[name] | _pose_of(camera) for name, camera in refined}
-                of_angle = dict(zip(distinct, found.table.angles.tolist(), strict=True))
-                angle_of = [round(of_angle[angle], 6) for angle in angle_of]
         views = [
             (f"{IMAGES}/{file.name}", camera, angle)
             for file, camera, angle in zip(files, camera_of, angle_of, strict=True)
@@ -123,9 +112,6 @@ def pose_turntable_photos(
         has_step = isinstance(angles, float)
         described = f"steps of {angles:g} degrees" if has_step else f"the angles of {angles or turntable}"
         print(f"{out}: {len(files)} photos at {described}")
-    if refine and (not quiet or not found.is_taken):
-        verb = "refined" if found.is_taken else "not refined"
-        print(f"  {verb}: {found.reason}{_say_residuals(found)}")
     return replace(scene, source=out / TURNTABLE_FILE)
 
 
@@ -182,42 +168,6 @@ def _angles_of(
     return [of_camera[camera][index] for camera, index in zip(camera_of, places, strict=True)]
 
 
-def _refine(
-    folder: Path,
-    files: Sequence[PhotoFile],
-    cameras: dict[str, dict[str, Any]],
-    *,
-    camera_of: Sequence[str],
-    angle_of: Sequence[float],
-    quiet: bool,
-) -> tuple[Refinement, list[float]]:
-    """What becomes of the cameras, in their order, and of the distinct angles, which are the second."""
-    names, distinct = list(cameras), list(dict.fromkeys(angle_of))
-    table = Table([_read_camera(camera) for camera in cameras.values()], np.array(distinct))
-    shots = Shots(
-        camera=np.array([names.index(camera) for camera in camera_of]),
-        angle=np.array([distinct.index(angle) for angle in angle_of]),
-    )
-    of_photo = [table.cameras[index] for index in shots.camera]
-    tracks = find_tracks(folder / IMAGES, files, of_photo, work=folder, progress=not quiet)
-    return refine_table(table, shots, tracks), distinct
-
-
-def _describe_refinement(found: Refinement) -> dict[str, Any]:
-    before, after = (None, None) if found.held_out_px is None else (round(each, 4) for each in found.held_out_px)
-    return {
-        "taken": found.is_taken,
-        "reason": found.reason,
-        "points": found.num_points,
-        "held_out_px_before": before,
-        "held_out_px_after": after,
-    }
-
-
-def _say_residuals(found: Refinement) -> str:
-    return "" if found.held_out_px is None else " ({:.2f} px before, {:.2f} px after)".format(*found.held_out_px)
-
-
 def _read_grey(folder: Path, files: Sequence[PhotoFile], *, quiet: bool) -> list[np.ndarray]:
     bar = tqdm(files, desc="board", unit="photo", disable=quiet)
     return [cv2.cvtColor(read_rgb(folder / IMAGES / file.name), cv2.COLOR_RGB2GRAY) for file in bar]
@@ -227,15 +177,3 @@ def _describe_camera(camera: TableCamera) -> dict[str, Any]:
     arrays = {"K": camera.K, "R": camera.R, "t": camera.t, "distortion": camera.distortion}
     described: dict[str, Any] = {"width": camera.size[0], "height": camera.size[1]}
     return described | {name: each.tolist() for name, each in arrays.items()}
-
-
-def _pose_of(camera: TableCamera) -> dict[str, Any]:
-    return {"R": camera.R.tolist(), "t": camera.t.tolist()}
-
-
-def _read_camera(camera: dict[str, Any]) -> TableCamera:
-    distortion = np.zeros(5)
-    given = camera.get("distortion", [])
-    distortion[: len(given)] = given
-    K, R, t = (np.array(camera[name], float) for name in ("K", "R", "t"))
-    return TableCamera(K=K, distortion=distortion, R=R, t=t, size=(camera["width"], camera["height"]))

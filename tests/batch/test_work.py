@@ -104,13 +104,13 @@ def test_detections_are_kept_for_other_options_of_later_stages(
     scene: BatchScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looked: list[object] = []
-    run_scales = mask_rcnn.run_scales
+    run_heads = mask_rcnn.run_heads
 
     def count(*arguments: object, **options: object) -> object:
         looked.append(arguments)
-        return run_scales(*arguments, **options)  # type: ignore[arg-type]
+        return run_heads(*arguments, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(mask_rcnn, "run_scales", count)
+    monkeypatch.setattr(mask_rcnn, "run_heads", count)
     out, scene = tmp_path / "out", replace(scene, masks=None)
     config = replace(CONFIG, detect=DetectConfig(min_score=0.05))
     assert not work_on_scene(out, config, scene).is_kept

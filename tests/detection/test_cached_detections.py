@@ -82,15 +82,15 @@ def test_a_run_that_was_cut_off_goes_on_from_its_detections(
     whole = detect_regions(scene, config).masks
     assert len(whole.regions)
     ran: list[tuple[int, ...]] = []
-    run_scales = mask_rcnn.run_scales
+    run_heads = mask_rcnn.run_heads
 
-    def count(model: object, photo: torch.Tensor, scales: object, **options: object) -> dict[str, torch.Tensor]:
+    def count(model: object, photo: torch.Tensor, **options: object) -> dict[str, torch.Tensor]:
         ran.append(tuple(photo.shape))
         if len(ran) == 3:
             raise KeyboardInterrupt
-        return run_scales(model, photo, scales, **options)  # type: ignore[arg-type]
+        return run_heads(model, photo, **options)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(mask_rcnn, "run_scales", count)
+    monkeypatch.setattr(mask_rcnn, "run_heads", count)
     with pytest.raises(KeyboardInterrupt):
         detect_regions(scene, config, keep=keep)
     assert len(list(keep.iterdir())) == 2

@@ -15,7 +15,6 @@ from torchvision.ops import box_iou
 import mvseg.detection.mask_rcnn
 from leafy_scene import write_leafy_scene
 from matched import matched
-from mvseg.detection.config import DetectConfig
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detection.nms import cluster_aware_nms
@@ -367,26 +366,6 @@ def test_autocast_reaches_the_heads_but_not_the_counts() -> None:
     boxes = torch.cat([result["boxes"] for result in results])
     boxes = boxes[boxes > 16]
     assert not torch.equal(boxes, boxes.bfloat16().float())
-
-
-def test_every_photo_is_seen_at_every_scale() -> None:
-    wrapped, images, cameras = MultiViewMaskRCNN(
-        tiny_detector(), scales=(0.5, 1.0), proposals_per_view=40
-    ), some_images(), small_cameras()
-    seen: list[int] = []
-    wrapped.backbone.register_forward_hook(lambda module, inputs, output: seen.append(inputs[0].shape[-1]))
-    scores = wrapped.find_regions(iter(images), cameras).masks.detection_scores
-    assert seen[0::2] == [seen[0]] * 3
-    assert seen[1::2] == [2 * seen[0]] * 3
-    results = wrapped(images, cameras=cameras)
-    assert torch.equal(scores, torch.cat([result["scores"] for result in results]))
-    assert (scores >= wrapped.roi_heads.score_thresh).all()
-
-
-@pytest.mark.parametrize("scales", [(), (0.0, 1.0), (5.0,), (float("nan"),)])
-def test_scales_have_a_range(scales: tuple[float, ...]) -> None:
-    with pytest.raises(InputError, match=r"detect\.scales is \[.*\], expected factors above 0 and up to 4"):
-        DetectConfig(scales=scales)
 
 
 def test_regions_are_those_of_forward_in_order_and_without_empty_masks() -> None:
