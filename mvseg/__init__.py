@@ -9,11 +9,10 @@ Names are imported when they are first used, so that `import mvseg` and `mvseg -
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
 
-from mvseg._version import __version__
-
+TYPE_CHECKING = False  # type checkers take it for true; to import `typing` takes longer than all of this
 if TYPE_CHECKING:
+    __version__: str
     from mvseg.checks.check_scene import Check as Check
     from mvseg.checks.check_scene import check_scene as check_scene
     from mvseg.checks.finding import Finding as Finding
@@ -63,6 +62,7 @@ if TYPE_CHECKING:
 
 # The public names, by room.
 _HOME = {
+    "_version": ("__version__",),
     "errors": ("InputError", "InputWarning"),
     "scene": ("Cameras", "Scene"),
     "regions": ("Regions", "regions_from_label_maps"),
@@ -98,10 +98,10 @@ _HOME = {
     "pipeline": ("run_scene",),
     "system.worker_pool": ("start_workers",),
 }
-__all__ = ["__version__", *(name for names in _HOME.values() for name in names)]
+__all__ = [name for names in _HOME.values() for name in names]
 
 
-def __getattr__(name: str) -> Any:
+def __getattr__(name: str) -> object:
     for module, names in _HOME.items():
         if name in names:
             return getattr(import_module(f"mvseg.{module}"), name)

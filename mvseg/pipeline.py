@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from tqdm import tqdm
 
-from mvseg._version import __version__
+from mvseg._version import code_hash
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
 from mvseg.detection.config import DetectConfig
@@ -385,5 +385,5 @@ def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: s
     weights = find_weights(detect.weights) or Path(detect.weights)
     options = asdict(detect) | {"weights": hash_files(weights)}
     options |= {"num_iterations": None, "verify": None, "crop": None}
-    options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "mvseg": __version__}
+    options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
     return json.dumps(options | {"torch": torch.__version__, "device": device})

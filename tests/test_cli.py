@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import re
 import runpy
 import shutil
 import struct
@@ -293,11 +294,13 @@ def test_no_stage_is_silent(plant: Path, tmp_path: Path, capsys: pytest.CaptureF
 def test_detections_of_a_run_that_was_cut_off_are_announced_and_deleted(
     plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kept = tmp_path / "out.detections"
+    kept, said = tmp_path / "out.detections", "mvseg: going on from the detections in"
     kept.mkdir()
-    assert main(["infer", str(plant), "--quiet", "--out", str(tmp_path / "out"), *COARSE]) == 0
-    assert f"going on from the detections that a run left in {kept}" in capsys.readouterr().err
-    assert not kept.exists()
+    (kept / f"{'0' * 64}.safetensors").touch()
+    for holds_some in (True, False):
+        assert main(["infer", str(plant), "--quiet", "--out", str(tmp_path / "out"), *COARSE]) == 0
+        assert (f"{said} {kept}, for equal photos and options" in capsys.readouterr().err) == holds_some
+        assert not kept.exists()
 
 
 def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
@@ -643,8 +646,8 @@ def test_the_same_scene_whole_is_fine(plant: Path, tmp_path: Path) -> None:
     colmap()(tmp_path / "colmap")
     coco(json.dumps({"images": IMAGES, "annotations": []}))(plant)
     for scene, masks in ((plant, "masks"), (tmp_path / "colmap", "masks"), (plant, "masks.json")):
-        arguments = ["infer", str(scene), "--masks", masks, "--out", str(tmp_path / "out"), "--quiet", *COARSE]
-        assert main(arguments) == 0
+        out = tmp_path / f"{scene.name}-{masks}"
+        assert main(["infer", str(scene), "--masks", masks, "--out", str(out), "--quiet", *COARSE]) == 0
     transforms()(plant)
     assert main(["match", str(plant), "--out", str(tmp_path / "other"), "--quiet"]) == 0
 
@@ -738,6 +741,92 @@ def test_an_earlier_result_is_not_replaced_in_silence(
     assert capsys.readouterr().out.endswith("in 4 views\n")
     assert main(arguments) == 0
     assert capsys.readouterr().out.endswith("in 4 views (in place of an earlier result)\n")
+
+
+@pytest.mark.parametrize("verb", ["match", "infer"])
+def test_another_scenes_result_is_replaced_only_when_asked_for(
+    verb: str, plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    other = write_scene(tmp_path / "day-2" / "plant", 3)  # of the same name
+    command = [verb, "--masks", "masks", "--out", "out", "--quiet", *(COARSE if verb == "infer" else [])]
+    place = Path("out", *(["plant"] if verb == "match" else []))
+    assert main([*command, "plant"]) == 0
+    before = (place / "run.json").read_bytes()
+    capsys.readouterr()
+    assert main([*command, str(other)]) == 2
+    message = f"{place}: holds the result of another scene, {plant}, not of {other}"
+    assert complaint(capsys) == f"{message}; expected another --out, or --overwrite true"
+    assert (place / "run.json").read_bytes() == before
+    (tmp_path / "link").symlink_to(plant)
+    if verb == "infer":
+        assert main([*command, "link"]) == 0  # the same scene, by another path
+    assert main([*command, str(other), "--overwrite", "true"]) == 0
+    assert json.loads((place / "run.json").read_text())["config"]["scene"] == str(other)
+
+
+def test_a_second_run_does_not_take_the_detections_of_the_first(
+    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept, command = tmp_path / "out.detections", ["infer", "--quiet", "--out", str(tmp_path / "out"), *COARSE]
+
+    def interrupt(*_: object, **__: object) -> None:
+        assert main([*command, str(plant)]) == 2
+        assert complaint(capsys) == f"{kept}: another run is writing to this folder, expected one at a time"
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("mvseg.runs.one_scene.save_scene", interrupt)
+        assert main([*command, str(plant)]) == 130
+    before = sorted(kept.iterdir())
+    assert len(before) == 4 + 1
+    other = write_scene(tmp_path / "other", 2)
+    capsys.readouterr()
+    assert main([*command, str(other)]) == 2
+    assert f"found in the photos of {plant}, not of {other}; expected another --out" in complaint(capsys)
+    assert sorted(kept.iterdir()) == before
+    assert main([*command, str(other), "--overwrite", "true"]) == 0
+    assert not kept.exists()
+
+
+def test_a_scene_is_called_as_its_link(plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("basil", "fern"):
+        (tmp_path / name / "D00").parent.mkdir()
+        shutil.copytree(plant, tmp_path / name / "D00")
+        (tmp_path / f"{name}-link").symlink_to(Path(name, "D00"))
+    assert main(["match", "basil-link", "fern-link/", "--out", "out", "--quiet"]) == 0
+    assert sorted(path.name for path in (tmp_path / "out").iterdir()) == ["basil-link", "fern-link"]
+    assert json.loads((tmp_path / "out" / "fern-link" / "run.json").read_text())["scene"] == "fern-link"
+    monkeypatch.chdir("fern-link")
+    assert main(["infer", "../D00", "--masks", "masks", "--quiet", *COARSE]) == 0
+    assert (tmp_path / "fern" / "D00" / "results" / "D00" / "run.json").is_file()
+
+
+@pytest.mark.parametrize("verb", ["infer", "match", "batch", "pose"])
+def test_an_output_that_links_to_itself(
+    verb: str, plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "self").symlink_to("self")
+    given = {"pose": plant / "images", "batch": tmp_path}.get(verb, plant)
+    assert main([verb, str(given), "--out", str(tmp_path / "self"), "--quiet"]) == 2
+    assert "self" in (said := complaint(capsys))
+    assert said.endswith("its links lead in a circle, expected a folder or a new name")
+
+
+def test_a_full_disk_while_detecting_is_named(
+    plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def fill(path: Path, content: bytes) -> int:
+        if ".safetensors." in path.name:
+            raise OSError(28, "No space left on device")
+        with path.open("wb") as file:
+            return file.write(content)
+
+    monkeypatch.setattr(Path, "write_bytes", fill)
+    assert main(["infer", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+    said = complaint(capsys)
+    assert re.fullmatch(rf"{tmp_path}/out\.detections/[0-9a-f]{{64}}\.safetensors: No space left on device", said)
 
 
 def test_masks_that_show_no_true_leaf_are_counted(
@@ -910,6 +999,66 @@ def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytes
     monkeypatch.setattr("mvseg.cli.infer.run_one_scene", stop)
     assert main(["infer", str(plant)]) == 130
     assert capsys.readouterr().err == "mvseg: interrupted\n"
+
+
+def test_an_interruption_that_a_library_makes_another_error_of(
+    monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: object, **__: object) -> None:
+        try:
+            raise KeyboardInterrupt
+        except KeyboardInterrupt as error:
+            raise ImportError("cannot load C++") from error
+
+    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", stop)
+    assert main(["infer", str(plant)]) == 130
+    assert capsys.readouterr().err == "mvseg: interrupted\n"
+    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", lambda *_, **__: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        main(["infer", str(plant)])
+
+
+INTERRUPTED_IMPORT = """
+import os, signal, sys
+
+class Interrupt:
+    def find_spec(self, name, path, target=None):
+        if name == sys.argv[1]:
+            sys.meta_path.remove(self)
+            os.kill(os.getpid(), signal.SIGINT)
+
+sys.meta_path.insert(0, Interrupt())
+from mvseg.cli import main
+
+sys.exit(main(["models"]))
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
+@pytest.mark.parametrize("library", ["mvseg.system.sigterm", "jsonargparse", "pycolmap", "pycolmap._core", "torch"])
+def test_an_interruption_while_libraries_are_loaded(library: str) -> None:
+    command = [sys.executable, "-c", INTERRUPTED_IMPORT, library]
+    checkout = os.environ | {"PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, env=checkout, capture_output=True, text=True, timeout=120, check=False)
+    assert (done.stderr, done.returncode) == ("mvseg: interrupted\n", 130)
+
+
+def test_a_warning_is_one_line(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also in verbs that do not gather them, as adapt."""
+
+    def warn(*_: object, **__: object) -> None:
+        warnings.warn("odd", InputWarning, stacklevel=1)
+        warnings.warn("for developers", UserWarning, stacklevel=1)
+
+    said = io.StringIO()
+    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", warn)
+    monkeypatch.setattr(sys, "stderr", said)
+    with warnings.catch_warnings():
+        warnings.simplefilter("default")
+        assert main(["infer", str(plant)]) == 0
+    first, *others = said.getvalue().splitlines()
+    assert first == "mvseg: warning: odd"
+    assert others[0].endswith("UserWarning: for developers")
 
 
 def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

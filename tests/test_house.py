@@ -6,6 +6,7 @@ import ast
 import inspect
 import os
 import re
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -19,6 +20,7 @@ import yaml
 
 import mvseg
 import mvseg.matching
+from mvseg._version import code_hash, made_by
 from mvseg.cli.command import build_parser
 from mvseg.simulation.demo_plant import write_demo_plant
 from mvseg.training.config import TrainConfig
@@ -152,6 +154,46 @@ def test_public_names_come_from_where_type_checkers_look(package: ModuleType) ->
 def test_importing_the_package_is_cheap() -> None:
     code = "import sys, mvseg, mvseg.cli; sys.exit(int('torch' in sys.modules))"
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_importing_the_name_alone_takes_no_time() -> None:
+    slow = {"typing", "importlib.metadata", "mvseg._version"}
+    code = f"import sys, mvseg; sys.exit(len({slow} & {{*sys.modules}}))"
+    assert subprocess.run([sys.executable, "-S", "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+def test_changed_code_has_another_hash(tmp_path: Path) -> None:
+    """Also in a checkout that has moved on since it was installed, and without git."""
+
+    def note() -> str:
+        return code_hash.__wrapped__(tmp_path)
+
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "step.py").write_text("x = 1")
+    (tmp_path / "page.html").write_text("<p>")
+    hashes = [note()]
+    for change in (
+        lambda: (tmp_path / "room" / "step.py").write_text("x = 2"),
+        lambda: (tmp_path / "page.html").write_text("<b>"),
+        lambda: (tmp_path / "room" / "other.py").touch(),
+        lambda: (tmp_path / "room" / "other.py").rename(tmp_path / "other.py"),
+    ):
+        change()
+        hashes.append(note())
+    assert len({*hashes}) == 5
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "room" / "__pycache__").mkdir()
+    (tmp_path / "room" / "__pycache__" / "step.pyc").touch()
+    assert note() == hashes[-1]
+    assert re.fullmatch("[0-9a-f]{16}", code_hash())
+    assert made_by() == {"mvseg": mvseg.__version__, "code": code_hash()}
+
+
+def test_sources_that_nobody_installed_have_a_version(tmp_path: Path) -> None:
+    shutil.copytree(PACKAGE, tmp_path / "mvseg", ignore=shutil.ignore_patterns("demo_plant", "__pycache__"))
+    code = "import mvseg, mvseg._version; print(mvseg.__version__, mvseg._version.code_hash())"
+    said = subprocess.run([sys.executable, "-S", "-c", code], cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert said.stdout.split() == ["0+unknown", code_hash()]
 
 
 @pytest.mark.slow

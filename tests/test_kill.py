@@ -116,8 +116,9 @@ def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: 
     plant, out = write_scene(tmp_path / "plant", 3), tmp_path / "out"
     place = out / "plant"
     coarse = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--out", str(place), "--quiet"]
+    coarse += ["--overwrite", "true"]  # the earlier result is of another folder
     run = {
-        "match": ["match", str(plant), "--out", str(out), "--quiet"],
+        "match": ["match", str(plant), "--out", str(out), "--quiet", "--overwrite", "true"],
         "infer": ["infer", str(plant), "--masks", "masks", *coarse],
         "detect": ["infer", str(plant), *coarse],
     }[verb]

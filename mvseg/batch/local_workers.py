@@ -11,8 +11,8 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Callable, Generator, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -22,7 +22,7 @@ from tqdm import tqdm
 
 from mvseg.batch.lost import Lost
 from mvseg.errors import InputError
-from mvseg.system.sigterm import Terminated, end_with_parent, stopped_by_sigterm
+from mvseg.system.sigterm import Terminated, end_with_parent, held_back, stopped_by_sigterm
 from mvseg.system.worker_pool import one_thread
 
 Item = TypeVar("Item")
@@ -119,23 +119,11 @@ def _start_worker(work: Callable[[Any], Any]) -> _Worker:
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(there, work), daemon=True)
-    with one_thread(), _signals_held_back():
+    # not to be torn apart while a process is started; it inherits this: Ctrl-C is for the parent alone to hear
+    with one_thread(), held_back(signal.SIGINT, signal.SIGTERM):
         process.start()
     there.close()  # so that this process hears when the other end is gone
     return _Worker(process, here)
-
-
-@contextmanager
-def _signals_held_back() -> Iterator[None]:
-    """Not to be torn apart while a process is started. It inherits this: Ctrl-C is for the parent alone to hear."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGTERM})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
 
 
 def _serve(connection: Connection, work: Callable[[Any], Any]) -> None:

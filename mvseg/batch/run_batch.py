@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from mvseg._version import __version__
+from mvseg._version import made_by
 from mvseg.batch.dask_workers import connect, run_on_dask
 from mvseg.batch.local_workers import run_locally
 from mvseg.batch.lost import Lost
@@ -24,7 +24,7 @@ from mvseg.config import RunConfig
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.results.earlier import check_out
-from mvseg.system.atomic import is_partial, lock_folder, sweep_abandoned
+from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
 
 Started = Callable[[int], object]
 Engine = Callable[[dict[int, BatchScene], int | None, Started], Generator[tuple[int, Any], None, None]]
@@ -72,7 +72,7 @@ def run_batch(
     scenes = list_scenes(source, out, masks)
     if any(scene.masks is None for scene in scenes):
         config = _find_weights(config)
-    place = out.resolve()
+    place = resolve_place(out)
     with _engine(partial(work_on_scene, place, config), num_workers, scheduler) as engine:
         _claim(out, resume=resume)
         with lock_folder(place):
@@ -82,7 +82,7 @@ def run_batch(
                     sweep_abandoned(scene_result(place, scene.name))
             finished = _work_on_all(scenes, engine, place, quiet=quiet)
             rows = [(scene, finished[index].status) for index, scene in enumerate(scenes)]
-            run = {"mvseg": __version__, "source": str(source), "masks": masks and str(masks)}
+            run = {**made_by(), "source": str(source), "masks": masks and str(masks)}
             has_parquet = write_tables(
                 tables_folder(place), place, rows, run={**run, "config": asdict(config)}
             )

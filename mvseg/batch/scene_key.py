@@ -9,7 +9,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from mvseg._version import __version__
+from mvseg._version import code_hash
 from mvseg.batch.status import FileHash
 from mvseg.config import RunConfig
 from mvseg.detectors.zoo import find_weights
@@ -25,7 +25,7 @@ def scene_key(
     """The hash of a scene's inputs and options, and the files that it was made from.
 
     It covers the cameras as they were understood, the photos, the masks or else the detector's weights, all options
-    and mvseg's version; not where the files lie. Hidden files count for nothing.
+    and mvseg's code; not where the files lie. Hidden files count for nothing.
 
     Args:
         scene: the scene.
@@ -48,7 +48,7 @@ def scene_key(
     else:
         options["detect"]["weights"] = None  # their hash counts, not their name
     told = {
-        "mvseg": __version__,
+        "code": code_hash(),
         "scene": _describe_scene(scene),
         "photos": [[view.name, hashes[str(view.path)][2]] for view in scene.views if str(view.path) in hashes],
         "others": [[_name_below(path, masks), hashes[str(path)][2]] for path in others],

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mvseg.batch.places import RESERVED
 from mvseg.errors import InputError
+from mvseg.system.atomic import resolve_place
 
 OWN_COLUMNS = ("scene", "name", "masks")
 MAX_BYTES = 1 << 26
@@ -68,7 +69,7 @@ def _list_folders(source: Path, out: Path, masks: Path | None) -> tuple[BatchSce
     if (source / "cameras.json").is_file():
         raise InputError(f"{source}: is itself a scene, expected a folder of scenes; use mvseg infer for one scene")
     folders = [path for path in sorted(source.iterdir()) if path.is_dir() and not path.name.startswith(".")]
-    folders = [path for path in folders if path.resolve() != out.resolve()]
+    folders = [path for path in folders if path.resolve() != resolve_place(out)]
     if not folders:
         raise InputError(f"{source}: has no sub-folders, expected a scene in each, or a CSV table of scenes")
     return tuple(

@@ -1,5 +1,40 @@
 """The command `mvseg <verb>`: one file per verb."""
 
-from mvseg.cli.command import main
+from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
+
+INTERRUPTED = 130
 __all__ = ["main"]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one verb, see `mvseg.cli.command.main`. Ctrl-C is one sentence from the first moment on.
+
+    Libraries that are being imported may swallow the exception of Ctrl-C, or turn it into another one.
+    """
+    try:
+        import signal
+
+        from mvseg.system.sigterm import held_back
+
+        with held_back(signal.SIGINT):
+            from mvseg.cli.command import main as run_command
+        return run_command(argv)
+    except KeyboardInterrupt:
+        pass
+    except Exception as error:
+        if not _is_interruption(error):
+            raise
+    if "mvseg.system.atomic" in sys.modules:
+        sys.modules["mvseg.system.atomic"].clear_begun()
+    print("mvseg: interrupted", file=sys.stderr)
+    return INTERRUPTED
+
+
+def _is_interruption(error: BaseException | None) -> bool:
+    """Whether an exception came of a KeyboardInterrupt."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None

@@ -7,6 +7,7 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from typing import TextIO
 
 from jsonargparse import ArgumentParser, Namespace
 
@@ -19,7 +20,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.system.atomic import clear_begun
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
-INTERRUPTED, TERMINATED = 130, 143
+TERMINATED = 143
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
 VERBS = {
     "pose": pose,
@@ -42,7 +43,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
     Returns:
         The exit code: 0, or 2 after one sentence on stderr that says what was wrong with the input; 1 where `check`
-        found an error; 3 when scenes of a batch have failed; 130 after Ctrl-C, 143 after SIGTERM.
+        found an error; 3 when scenes of a batch have failed; 143 after SIGTERM.
+
+    Raises:
+        KeyboardInterrupt: after Ctrl-C; `mvseg.cli.main` makes 130 of it.
     """
     # Let idle threads sleep: on a shared machine, spinning ones slow small tensor operations tenfold. Must be set
     # before torch is loaded, which the verbs do when they start.
@@ -51,6 +55,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
+            warnings.showwarning = _show_warning
             args = _parse(join_up(sys.argv[1:] if argv is None else argv))
             with stopped_by_sigterm():
                 return VERBS[args.verb].run(args[args.verb])
@@ -63,20 +68,31 @@ def main(argv: Sequence[str] | None = None) -> int:
         return complain(error)
     except MemoryError as error:
         return complain(InputError(f"there is not enough memory ({str(error) or 'no more is known'})"))
-    except KeyboardInterrupt:
-        clear_begun()
-        print("mvseg: interrupted", file=sys.stderr)
-        return INTERRUPTED
     except Terminated:
         clear_begun()
         print("mvseg: stopped by SIGTERM", file=sys.stderr)
         return TERMINATED
 
 
+def _show_warning(
+    message: Warning | str,
+    category: type[Warning],
+    filename: str,
+    lineno: int,
+    file: TextIO | None = None,
+    line: str | None = None,
+) -> None:
+    """What is odd about the input, without the line of code that says it; other warnings are for developers."""
+    text = f"mvseg: warning: {message}\n"
+    if not issubclass(category, InputWarning):
+        text = warnings.formatwarning(message, category, filename, lineno, line)
+    print(text, end="", file=sys.stderr if file is None else file)
+
+
 def _parse(arguments: Sequence[str]) -> Namespace:
     try:
         args = build_parser().parse_args(list(arguments))
-        for name in ("quiet", "report", "split_merged", "coco_crowd"):
+        for name in ("quiet", "report", "split_merged", "coco_crowd", "overwrite"):
             if args.verb and name in args[args.verb] and args[args.verb][name] is None:
                 raise InputError(f"{name} is null, expected a value")
         return args

@@ -8,7 +8,7 @@ from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.cli.options import DEFAULT_OUT, add_run_options, build_run
+from mvseg.cli.options import DEFAULT_OUT, add_overwrite, add_run_options, build_run
 from mvseg.demo import demo_scene
 from mvseg.runs.one_scene import run_one_scene
 
@@ -20,6 +20,7 @@ def add(verbs: Any) -> None:
     help_scene = "scene folder (photos, cameras of any kind in docs/formats.md); without it, the plant that ships"
     parser.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     add_run_options(parser)
+    add_overwrite(parser)
     help_workers = "processes that fit surfaces (default: one per core, but at most 4)"
     parser.add_argument("--num_workers", type=int | None, help=help_workers)
     verbs.add_subcommand("infer", parser, help="ids and 3D shapes of one scene")
@@ -35,5 +36,13 @@ def run(args: Namespace) -> int:
 
     out = args.out or DEFAULT_OUT / scene_name(scene)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
-    run_one_scene(scene, args.masks, out, config=build_run(args), num_workers=num_workers, quiet=args.quiet)
+    run_one_scene(
+        scene,
+        args.masks,
+        out,
+        config=build_run(args),
+        num_workers=num_workers,
+        overwrite=args.overwrite,
+        quiet=args.quiet,
+    )
     return 0

@@ -8,7 +8,7 @@ from typing import Any
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.complain import complain
-from mvseg.cli.options import DEFAULT_OUT, add_matching_options, build_options
+from mvseg.cli.options import DEFAULT_OUT, add_matching_options, add_overwrite, build_options
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
@@ -21,6 +21,7 @@ def add(verbs: Any) -> None:
     parser = ArgumentParser(exit_on_error=False, description="Ids only, of any number of scenes.")
     parser.add_argument("scenes", nargs="+", type=Path, help="scene folders")
     add_matching_options(parser, masks=Path("masks"))
+    add_overwrite(parser)
     help_reconstruct = "has no effect; it lets infer and match share their YAML files"
     parser.add_argument("--reconstruct", type=ReconstructConfig | None, help=help_reconstruct)
     verbs.add_subcommand("match", parser, help="ids only, of any number of scenes")
@@ -48,7 +49,7 @@ def run(args: Namespace) -> int:
     )
     for scene, name in zip(args.scenes, names, strict=True):
         try:
-            run_one_scene(scene, args.masks, out / name, config=config, quiet=args.quiet)
+            run_one_scene(scene, args.masks, out / name, config=config, overwrite=args.overwrite, quiet=args.quiet)
         except InputError as error:  # the other scenes still get their results
             code = complain(error)
     return code

@@ -92,6 +92,12 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
     parser.add_class_arguments(MatchConfig, "match")
 
 
+def add_overwrite(parser: ArgumentParser) -> None:
+    """The option of the verbs that write the result of one scene."""
+    help_overwrite = "replace the result in --out also where it is another scene's"
+    parser.add_argument("--overwrite", type=bool, default=False, help=help_overwrite)
+
+
 def add_run_options(parser: ArgumentParser) -> None:
     """The options of a whole run, from photos or masks to traits; `build_run` reads them."""
     add_matching_options(parser, masks=None)

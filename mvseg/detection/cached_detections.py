@@ -3,25 +3,29 @@
 One .safetensors file per photo, in a folder that `mvseg infer` deletes when the result is there, and that `mvseg batch`
 keeps for the next batch. Its name is a hash of everything that the detections depend on: the photo, its camera, the
 weights and the options. A changed photo or option gets another name, so that detections are used again only where they
-would be the same.
+would be the same. A hidden file says whose photos they are of.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import safetensors.torch
 from torch import Tensor
 
+from mvseg.errors import InputError
 from mvseg.scene import Scene
-from mvseg.system.atomic import is_partial, write_whole
+from mvseg.system.atomic import delete_abandoned, is_partial, lock_folder, write_whole
 
 KEPT_NAME = re.compile(r"[0-9a-f]{64}\.safetensors")
+SCENE_FILE = ".scene"
 FIELDS = {"boxes", "labels", "scores", "masks", "frame"}
 
 
@@ -71,8 +75,44 @@ def delete_kept(folder: Path, *, but: Collection[str] = ()) -> None:
     for path in [*folder.iterdir()]:
         if path.name in but:
             continue
-        is_half = is_partial(path) and KEPT_NAME.match(path.name[1:]) is not None
-        if KEPT_NAME.fullmatch(path.name) or is_half:
+        if is_partial(path) and KEPT_NAME.match(path.name[1:]):
+            delete_abandoned(path)
+        elif KEPT_NAME.fullmatch(path.name) or (path.name == SCENE_FILE and not but):
             path.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
+
+
+@contextmanager
+def claim_kept(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterator[bool]:
+    """Have the folder of kept detections of a scene for one run, which may delete it; gives whether it holds some.
+
+    Args:
+        folder: made if it is missing; deleted in the end if nothing was kept.
+        scene: the scene folder.
+        overwrite: take it also when it holds what was found in another scene's photos.
+
+    Raises:
+        InputError: another run works with it, or it is another scene's.
+    """
+    made = [parent for parent in folder.parents if not parent.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    with lock_folder(folder):
+        try:
+            owner, place = folder / SCENE_FILE, os.fsencode(os.path.realpath(scene))
+            earlier = owner.read_bytes() if owner.is_file() else place
+            if earlier != place and not overwrite:
+                message = f"keeps what a run that was cut off found in the photos of {os.fsdecode(earlier)}, not of"
+                raise InputError(f"{folder}: {message} {scene}; expected another --out, or --overwrite true")
+            write_whole(owner, lambda partial: partial.write_bytes(place))
+            yield _holds_some(folder)
+        finally:
+            if not _holds_some(folder):
+                delete_kept(folder)
+                with suppress(OSError):  # something else is in there meanwhile
+                    for parent in made:
+                        parent.rmdir()
+
+
+def _holds_some(folder: Path) -> bool:
+    return folder.is_dir() and any(KEPT_NAME.fullmatch(path.name) for path in folder.iterdir())

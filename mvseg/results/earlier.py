@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mvseg.errors import InputError
 from mvseg.results.provenance import hash_files
+from mvseg.system.atomic import resolve_place
 
 RUN_FILE = "run.json"
 
@@ -24,7 +25,7 @@ def check_out(out: Path, run_file: str = RUN_FILE) -> None:
         InputError: `out` is a file, lies where nothing can be written, or is a folder that is neither empty nor an
             earlier result, or an earlier result in which a file was changed.
     """
-    resolved = out.resolve()
+    resolved = resolve_place(out)
     if out.is_dir():
         if not os.access(resolved, os.R_OK):
             raise InputError(f"{out}: cannot be read, expected a new or empty folder, or an earlier result")
@@ -35,6 +36,21 @@ def check_out(out: Path, run_file: str = RUN_FILE) -> None:
     nearest = next((parent for parent in resolved.parents if parent.exists()), resolved)
     if not os.access(nearest, os.W_OK | os.X_OK):
         raise InputError(f"{out}: the output folder is not writable (no permission to write in {nearest})")
+
+
+def check_same_scene(out: Path, scene: Path) -> None:
+    """Check that `out` does not hold a result of another scene; one that does not say where its scene lay passes.
+
+    Raises:
+        InputError: it was made from another scene folder.
+    """
+    try:
+        earlier = os.path.realpath(json.loads((out / RUN_FILE).read_text(encoding="utf-8"))["config"]["scene"])
+    except (OSError, ValueError, KeyError, TypeError):
+        return
+    if earlier != os.path.realpath(scene):
+        message = f"holds the result of another scene, {earlier}, not of {scene}"
+        raise InputError(f"{out}: {message}; expected another --out, or --overwrite true")
 
 
 def list_files(folder: Path, run_file: str = RUN_FILE) -> dict[str, str]:

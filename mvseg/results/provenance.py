@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from mvseg._version import __version__
+from mvseg._version import made_by
 from mvseg.config import RunConfig
 from mvseg.results.result import Result
 
@@ -35,7 +35,7 @@ def describe_run(
             del options[name]
     source = masks or _weights_of(config)
     return {
-        "mvseg": __version__,
+        **made_by(),
         "torch": torch.__version__,
         "python": platform.python_version(),
         "scene": result.scene.name,

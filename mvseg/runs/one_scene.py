@@ -6,6 +6,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,27 +20,44 @@ if TYPE_CHECKING:
 
 
 def run_one_scene(
-    scene: Path, masks: Path | None, out: Path, *, config: RunConfig, num_workers: int = 1, quiet: bool
+    scene: Path,
+    masks: Path | None,
+    out: Path,
+    *,
+    config: RunConfig,
+    num_workers: int = 1,
+    overwrite: bool = False,
+    quiet: bool,
 ) -> None:
-    """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json."""
-    from mvseg.detection.cached_detections import delete_kept
-    from mvseg.results.earlier import check_out
-    from mvseg.system.atomic import sweep_abandoned
+    """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json.
+
+    Raises:
+        InputError: bad input; `out` holds a result of another scene, or what a run found in its photos, and `overwrite`
+            is not set; or another run detects for `out` now.
+    """
+    from mvseg.detection.cached_detections import claim_kept, delete_kept
+    from mvseg.results.earlier import check_out, check_same_scene
+    from mvseg.system.atomic import resolve_place, sweep_abandoned
     from mvseg.system.worker_pool import start_workers
 
     sweep_abandoned(out)
     check_out(out)
+    if not overwrite:
+        check_same_scene(out, scene)
     replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
     masks = None if masks is None else find_masks(scene, masks)
-    keep = out.resolve().with_name(f"{out.resolve().name}.detections")
-    if masks is None and keep.is_dir():
-        print(f"mvseg: going on from the detections that a run left in {keep}", file=sys.stderr)
-    with start_workers(num_workers) as workers:
-        result, messages = solve_scene(scene, masks, config, keep=keep, workers=workers, progress=not quiet)
-    for message in messages:
-        print(f"mvseg: warning: {message}", file=sys.stderr)
-    save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)
-    delete_kept(keep)
+    place = resolve_place(out)
+    keep = place.with_name(f"{place.name}.detections")
+    with ExitStack() as stack:
+        if masks is None and stack.enter_context(claim_kept(keep, scene, overwrite=overwrite)):
+            print(f"mvseg: going on from the detections in {keep}, for equal photos and options", file=sys.stderr)
+        with start_workers(num_workers) as workers:
+            result, messages = solve_scene(scene, masks, config, keep=keep, workers=workers, progress=not quiet)
+        for message in messages:
+            print(f"mvseg: warning: {message}", file=sys.stderr)
+        save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)
+        if masks is None:
+            delete_kept(keep)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
     print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
@@ -85,7 +103,7 @@ def save_scene(
     from mvseg.results.provenance import describe_run
 
     run = describe_run(result, masks, config, messages=messages)
-    run["config"] = {"scene": str(scene), "out": str(out)} | run["config"]
+    run["config"] = {"scene": str(scene.resolve()), "out": str(out)} | run["config"]
     if config.report:
         run["checks"] = [asdict(finding) for finding in check_scene(result.scene, result.regions).findings]
     save_result(result, out, run, progress=progress, draw_rims=config.draw_rims, report=config.report)

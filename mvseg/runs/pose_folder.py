@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from mvseg._version import __version__
+from mvseg._version import made_by
 from mvseg.errors import InputError
 from mvseg.poses.photo_files import list_photos
 from mvseg.results.earlier import check_out, keep_user_files, list_files
@@ -47,6 +47,6 @@ def new_scene_folder(out: Path) -> Iterator[Path]:
 
 def write_pose_file(folder: Path, out: Path, run: Mapping[str, Any]) -> None:
     """Write pose.json into the new folder, last of mvseg's files, and take over the user's files from `out`."""
-    content = {"mvseg": __version__, **run, "files": list_files(folder, POSE_FILE)}
+    content = {**made_by(), **run, "files": list_files(folder, POSE_FILE)}
     (folder / POSE_FILE).write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
     keep_user_files(out, folder, POSE_FILE)

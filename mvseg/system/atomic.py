@@ -1,19 +1,20 @@
 """Replace on finish: a file or folder appears complete under its name, or not at all.
 
-What is being written has a temporary name beside its place, `.<name>.<machine>-<process>-<number>.partial`. A process
-that is killed leaves that behind, and never a part under the final name; the next write to the same name deletes it.
+What is being written has a temporary name beside its place, `.<name>.<machine>-<random>.partial`, and is locked. A
+process that is killed leaves that behind, unlocked, and never a part under the final name; the next write to the same
+name deletes it. Numbers of processes would not do: two containers have the same.
 """
 
 from __future__ import annotations
 
 import ctypes
 import errno
-import itertools
 import os
 import platform
 import re
 import shutil
 import sys
+import time
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -25,17 +26,25 @@ from mvseg.errors import InputError
 if sys.platform != "win32":
     import fcntl
 
+
+def _machine() -> str:
+    """What has locks in common, as far as one can be sure: a disk may be shared, and its locks may be not."""
+    try:
+        name = Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii")  # containers share it
+    except (OSError, ValueError):
+        name = platform.node()
+    return f"{zlib.crc32(name.encode()):08x}"
+
+
 SUFFIX, EARLIER = ".partial", ".earlier"
 AT_FDCWD, RENAME_EXCHANGE = -100, 2  # of Linux; paths are absolute or start where the process runs
-MACHINE = f"{zlib.crc32(platform.node().encode()):08x}"  # disks are shared: the number of a process is not enough
-WRITER = re.compile(rf"\.([0-9a-f]{{8}})-(\d{{1,10}})-\d+(?:\{EARLIER})?\{SUFFIX}$")
+MACHINE = _machine()
+LONG_AGO = 24 * 3600  # seconds without a change, after which nobody is writing any more
 TAKEN = (errno.ENOTEMPTY, errno.EEXIST)
 MOVES = 10_000  # attempts, before a place that other processes keep taking is given up
 
-_numbers = itertools.count()
-_in_use: set[str] = set()  # temporary names of this process
 _begun: set[Path] = set()  # temporary files and folders of this process that may still be there
-_locked: set[int] = set()  # handles of folders that this process has locked
+_locked: set[int] = set()  # handles of what this process has locked
 
 
 def _let_go() -> None:
@@ -56,11 +65,22 @@ def clear_begun() -> None:
     For the end of a process that a signal stops: its exception may come while another one is being cleared up.
     """
     for partial in [*_begun]:
-        if partial.is_dir() and not partial.is_symlink():
-            shutil.rmtree(partial, ignore_errors=True)
-        else:
-            partial.unlink(missing_ok=True)
+        _delete(partial)
     _begun.clear()
+
+
+def resolve_place(place: Path) -> Path:
+    """The absolute path of a place that need not exist, without links.
+
+    Raises:
+        InputError: its links lead in a circle.
+    """
+    try:
+        place.stat()
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise InputError(f"{place}: its links lead in a circle, expected a folder or a new name") from None
+    return place.resolve()
 
 
 def is_partial(path: Path) -> bool:
@@ -68,44 +88,50 @@ def is_partial(path: Path) -> bool:
     return path.name.startswith(".") and path.name.endswith(SUFFIX)
 
 
-def is_abandoned(path: Path) -> bool:
-    """Whether a path is what a killed process of this machine left behind.
+def delete_abandoned(path: Path) -> None:
+    """Delete a temporary file or folder unless somebody may still be writing it.
 
-    What a process of another machine is writing to a shared disk never is.
+    On this machine the lock tells. Where there are no locks, and on a disk that another machine writes to, whose locks
+    may not be seen here, only what has not changed for a day is deleted.
     """
-    writer = WRITER.search(path.name)
-    if not path.name.startswith(".") or writer is None or writer[1] != MACHINE or path.name in _in_use:
-        return False
-    process = int(writer[2])
-    if process == os.getpid():
-        return True
-    if sys.platform == "win32":  # which has no harmless signal
-        return False
+    is_here = f".{MACHINE}-" in path.name
+    handle = None
     try:
-        os.kill(process, 0)
-    except ProcessLookupError:
-        return True
-    except (OSError, OverflowError):  # somebody else's process
-        return False
-    return False
+        if sys.platform != "win32":
+            handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
+        is_free = None if handle is None else _lock(handle)
+        if (is_free and is_here) or (is_free is not False and time.time() - _last_change(path) > LONG_AGO):
+            _delete(path)
+    except OSError:  # it is gone, or somebody else's
+        return
+    finally:
+        if handle is not None:
+            os.close(handle)
 
 
 def sweep_abandoned(place: Path) -> None:
     """Delete what killed runs left beside `place` while they were writing it.
 
     One that was killed between the two steps of a move (where the system cannot exchange folders) left nothing at
-    `place`: then its earlier folder comes back.
+    `place`: then its earlier folder comes back. To one that is between them now, this is a newer folder at `place`.
+
+    Raises:
+        InputError: see `resolve_place`.
     """
-    place = place.resolve()
-    left = [path for path in place.parent.glob(f".{_escape(place.name)}.*{SUFFIX}") if is_abandoned(path)]
-    for path in left:
-        if path.name.endswith(EARLIER + SUFFIX) and not os.path.lexists(place):
+    place = resolve_place(place)
+    try:
+        names = os.listdir(place.parent)
+    except OSError:  # it is not there, or not to be read
+        return
+    ours = re.compile(rf"\.{re.escape(place.name)}\.[0-9a-f]{{8}}-[0-9a-f]{{12}}(\{EARLIER})?\{SUFFIX}")
+    for path in [place.parent / name for name in names if ours.fullmatch(name)]:
+        if not path.name.endswith(EARLIER + SUFFIX):
+            delete_abandoned(path)
+        elif os.path.lexists(place):
+            _delete(path)
+        else:
             with suppress(OSError):  # another process was quicker
                 path.rename(place)
-        elif path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            path.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -123,23 +149,28 @@ def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
         yield
         return
     handle = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BaseException as error:
-        os.close(handle)
-        if not isinstance(error, OSError):  # a signal, while it waits
-            raise
-        if error.errno not in (errno.EAGAIN, errno.EACCES):  # a disk without locks
-            yield
-            return
-        raise InputError(f"{folder}: another run is writing to this folder, expected one at a time") from None
     _locked.add(handle)
     try:
+        if _lock(handle, wait=wait) is False:  # not: a disk without locks
+            raise InputError(f"{folder}: another run is writing to this folder, expected one at a time")
         yield
     finally:
-        if handle in _locked:  # not in a process that was forked off meanwhile
-            _locked.discard(handle)
-            os.close(handle)
+        _unlock(handle)
+
+
+def _lock(handle: int, *, wait: bool = False) -> bool | None:
+    """Lock an open file or folder. False where it is locked already, None on a disk without locks."""
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
+    except OSError as error:
+        return False if error.errno in (errno.EAGAIN, errno.EACCES) else None
+    return True
+
+
+def _unlock(handle: int) -> None:
+    if handle in _locked:  # not in a process that was forked off meanwhile
+        _locked.discard(handle)
+        os.close(handle)
 
 
 def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
@@ -151,14 +182,11 @@ def write_whole(path: Path, write: Callable[[Path], Any]) -> None:
         OSError: the file cannot be written; nothing is left behind.
     """
     sweep_abandoned(path)
-    with _beside(path) as partial:
-        try:
-            write(partial)
-            with partial.open("rb+") as file:
-                os.fsync(file.fileno())
-            os.replace(partial, path)
-        finally:
-            partial.unlink(missing_ok=True)
+    with _beside(path, lambda partial: partial.touch(exist_ok=False)) as partial:
+        write(partial)
+        with partial.open("rb+") as file:
+            os.fsync(file.fileno())
+        os.replace(partial, path)
 
 
 def write_text_whole(path: Path, text: str) -> None:
@@ -174,38 +202,73 @@ def folder_whole(place: Path) -> Iterator[Path]:
     do so at once: the last one to finish wins.
 
     Raises:
+        InputError: see `resolve_place`.
         OSError: the folder cannot be made or moved.
     """
-    place = place.resolve()
+    place = resolve_place(place)
     place.parent.mkdir(parents=True, exist_ok=True)
     sweep_abandoned(place)
-    with _beside(place) as partial:
-        partial.mkdir()
-        try:
-            yield partial
-            _move(partial, place)
-        finally:
-            shutil.rmtree(partial, ignore_errors=True)
+    with _beside(place, Path.mkdir) as partial:
+        yield partial
+        _move(partial, place)
 
 
 @contextmanager
-def _beside(path: Path, kind: str = "") -> Iterator[Path]:
-    """A temporary name that nobody else uses."""
-    partial = path.with_name(f".{path.name}.{MACHINE}-{os.getpid()}-{next(_numbers)}{kind}{SUFFIX}")
-    _in_use.add(partial.name)
-    if not kind:  # an earlier result is not to be deleted
-        _begun.add(partial)
+def _beside(path: Path, make: Callable[[Path], None]) -> Iterator[Path]:
+    """A new file or folder that is locked, under a temporary name; deleted at the end, if it is still there.
+
+    Raises:
+        OSError: as raised inside; it names `path` where it names nothing (a full disk) or the temporary name.
+    """
     try:
-        yield partial
-    finally:
-        _in_use.discard(partial.name)
-        if not os.path.lexists(partial):
-            _begun.discard(partial)
+        partial, handle = _begin(path, make)
+        try:
+            yield partial
+        finally:
+            try:
+                _delete(partial)
+                _begun.discard(partial)
+            finally:
+                _unlock(handle)
+    except OSError as error:
+        if error.errno is not None and (error.filename is None or is_partial(Path(str(error.filename)))):
+            error.filename = str(path)
+        raise
 
 
-def _escape(name: str) -> str:
-    """A name as a pattern that only fits itself."""
-    return re.sub(r"([*?[])", r"[\1]", name)
+def _begin(path: Path, make: Callable[[Path], None]) -> tuple[Path, int]:
+    """Make a file or folder under a new temporary name, and lock it; on Windows without a lock, and no handle (-1)."""
+    while True:
+        partial = _temporary(path)
+        _begun.add(partial)
+        make(partial)
+        handle = -1
+        if sys.platform == "win32":
+            return partial, handle
+        with suppress(FileNotFoundError):
+            handle = os.open(partial, os.O_RDONLY)
+            _locked.add(handle)
+            if _lock(handle) is not False and partial.exists():
+                return partial, handle
+        _begun.discard(partial)  # another process took it for abandoned, before it was locked
+        _unlock(handle)
+
+
+def _temporary(path: Path, kind: str = "") -> Path:
+    """A name that nobody else uses."""
+    return path.with_name(f".{path.name}.{MACHINE}-{os.urandom(6).hex()}{kind}{SUFFIX}")
+
+
+def _last_change(path: Path) -> float:
+    """When a file, or anything in a folder, changed last; seconds since 1970."""
+    return max(each.lstat().st_mtime for each in (path, *path.rglob("*")))
+
+
+def _delete(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+    else:
+        path.unlink(missing_ok=True)
 
 
 def _move(folder: Path, place: Path) -> None:
@@ -235,15 +298,15 @@ def _exchange(first: Path, second: Path) -> bool:
 
 def _move_in_two_steps(folder: Path, place: Path) -> None:
     """The name is missing for a moment: a process that is killed then leaves both folders under temporary names."""
-    with _beside(place, EARLIER) as earlier:
-        place.rename(earlier)
+    earlier = _temporary(place, EARLIER)
+    place.rename(earlier)
+    try:
+        folder.rename(place)
+    except BaseException:  # Ctrl-C, too
         try:
-            folder.rename(place)
-        except BaseException:  # Ctrl-C, too
-            try:
-                earlier.rename(place)
-            except OSError as error:
-                if error.errno in TAKEN:  # by another process: there is a newer one
-                    shutil.rmtree(earlier, ignore_errors=True)
-            raise
-        shutil.rmtree(earlier, ignore_errors=True)
+            earlier.rename(place)
+        except OSError as error:
+            if error.errno in TAKEN:  # by another process: there is a newer one
+                shutil.rmtree(earlier, ignore_errors=True)
+        raise
+    shutil.rmtree(earlier, ignore_errors=True)

@@ -3,13 +3,12 @@ workers, which end with the process that started them."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from typing import Any
+from functools import partial
 
 AGAIN = 0.05  # seconds
 
@@ -23,48 +22,62 @@ def stopped_by_sigterm() -> Iterator[None]:
     """SIGTERM raises `Terminated` in this block, which belongs to the main thread.
 
     pycolmap brings a handler of its own, which prints a C++ trace and may hang: so pycolmap is imported here, with the
-    signal held back, before ours is set.
+    signal held back, before ours is set. Ctrl-C is held back, too: pycolmap would say that it is not installed.
     """
-    mask = getattr(signal, "pthread_sigmask", None)
-    try:
-        if mask is not None:
-            mask(signal.SIG_BLOCK, {signal.SIGTERM})
+    earlier_hook = sys.unraisablehook
+    with held_back(signal.SIGTERM, signal.SIGINT):
         import pycolmap  # noqa: F401
 
-        earlier, earlier_hook = signal.signal(signal.SIGTERM, _terminate), sys.unraisablehook
+        earlier = signal.signal(signal.SIGTERM, partial(_end, Terminated))
         sys.unraisablehook = _Insist(earlier_hook)
-    finally:
-        if mask is not None:
-            mask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     try:
+        if hasattr(signal, "pthread_sigmask"):
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # a worker is started with it held back
         yield
     finally:
         sys.unraisablehook = earlier_hook
         signal.signal(signal.SIGTERM, signal.SIG_DFL if earlier is None else earlier)
 
 
+@contextmanager
+def held_back(*signals: signal.Signals) -> Iterator[None]:
+    """What comes of these signals in this block comes at its end, as long as no library has started threads before:
+    they would hear it. (Windows cannot hold signals back.)"""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    earlier = signal.pthread_sigmask(signal.SIG_BLOCK, signals)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
+
+
 def end_with_parent() -> None:
     """Wait until the parent process is gone, then end this one at once; for a thread of a `multiprocessing` process."""
+    import multiprocessing
+
     parent = multiprocessing.parent_process()
     assert parent is not None
     parent.join()
     os._exit(1)
 
 
-def _terminate(*_: object) -> None:
-    raise Terminated
+def _end(how: type[BaseException], *_: object) -> None:
+    raise how
 
 
 class _Insist:
     """Python swallows what is raised in a finaliser, or in the hooks around a fork (data loaders fork), and reports it
     here: then the signal comes once more."""
 
-    def __init__(self, report: Any) -> None:
+    def __init__(self, report: Callable[[sys.UnraisableHookArgs], object]) -> None:
         self.report = report
 
-    def __call__(self, unraisable: Any) -> None:
-        if not issubclass(unraisable.exc_type, Terminated) or not hasattr(signal, "setitimer"):
+    def __call__(self, unraisable: sys.UnraisableHookArgs) -> None:
+        how = unraisable.exc_type
+        if not issubclass(how, (Terminated, KeyboardInterrupt)) or not hasattr(signal, "setitimer"):
             self.report(unraisable)
             return
-        signal.signal(signal.SIGALRM, _terminate)
+        signal.signal(signal.SIGALRM, partial(_end, how))
         signal.setitimer(signal.ITIMER_REAL, AGAIN)

@@ -99,6 +99,12 @@ def test_other_options_are_done_again(scene: BatchScene, tmp_path: Path) -> None
     assert done[2].status.warnings == ["the cameras are in mm: unit cm without a scale only renames it"]
 
 
+def test_other_code_does_it_again(scene: BatchScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for code, is_kept in (("one", False), ("one", True), ("other", False)):
+        monkeypatch.setattr("mvseg.batch.scene_key.code_hash", lambda code=code: code)
+        assert work_on_scene(tmp_path / "out", CONFIG, scene).is_kept == is_kept
+
+
 @pytest.mark.slow
 def test_detections_are_kept_for_other_options_of_later_stages(
     scene: BatchScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

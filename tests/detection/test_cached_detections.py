@@ -9,11 +9,13 @@ import torch
 
 from mvseg.config import RunConfig
 from mvseg.detection import mask_rcnn
-from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
+from mvseg.detection.cached_detections import KeptDetections, claim_kept, delete_kept, read_detections, write_detections
 from mvseg.detection.config import DetectConfig
+from mvseg.errors import InputError
 from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.pipeline import detect_regions
+from mvseg.system.atomic import MACHINE, write_whole
 from scene_folders import edit_rig, write_image, write_scene
 
 FOUND = {
@@ -65,13 +67,65 @@ def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     delete_kept(kept)
     write_detections(kept / f"{'0' * 64}.safetensors", FOUND)
-    (kept / f".{'0' * 64}.safetensors.00000000-1-0.partial").touch()
+    (kept / f".{'0' * 64}.safetensors.{MACHINE}-0123456789ab.partial").touch()
     (kept / "notes.txt").touch()
     delete_kept(kept)
     assert [path.name for path in kept.iterdir()] == ["notes.txt"]
     (kept / "notes.txt").unlink()
     delete_kept(kept)
     assert not kept.exists()
+
+
+def test_another_run_keeps_what_it_is_writing(tmp_path: Path) -> None:
+    def delete(partial: Path) -> None:
+        delete_kept(tmp_path)
+        partial.write_text("whole")
+
+    write_whole(tmp_path / f"{'0' * 64}.safetensors", delete)
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["whole"]
+
+
+class TestClaim:
+    NAME = f"{'0' * 64}.safetensors"
+
+    def test_only_of_the_same_scene(self, tmp_path: Path) -> None:
+        kept, scene = tmp_path / "kept", tmp_path / "a"
+        with claim_kept(kept, scene) as holds_some:
+            assert not holds_some
+            write_detections(kept / self.NAME, FOUND)
+        with claim_kept(kept, scene) as holds_some:
+            assert holds_some
+        message = rf"kept: keeps what .* found in the photos of {scene}, not of .*b; expected another --out, or"
+        with pytest.raises(InputError, match=message):
+            claim_kept(kept, tmp_path / "b").__enter__()
+        assert (kept / self.NAME).is_file()
+        with claim_kept(kept, tmp_path / "b", overwrite=True):
+            delete_kept(kept)
+        assert list(tmp_path.iterdir()) == []
+
+    def test_by_one_run_at_a_time(self, tmp_path: Path) -> None:
+        with claim_kept(tmp_path / "kept", tmp_path), pytest.raises(InputError, match="another run is writing"):
+            claim_kept(tmp_path / "kept", tmp_path).__enter__()
+
+    def test_a_run_that_fails_before_leaves_nothing(self, tmp_path: Path) -> None:
+        with pytest.raises(InputError), claim_kept(tmp_path / "new" / "er" / "kept", tmp_path):
+            raise InputError
+        assert list(tmp_path.iterdir()) == []
+        (tmp_path / "kept").mkdir()
+        (tmp_path / "kept" / "notes.txt").touch()
+        with claim_kept(tmp_path / "kept", tmp_path):
+            pass
+        assert [path.name for path in (tmp_path / "kept").iterdir()] == ["notes.txt"]
+
+
+def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, names = load_scene(write_scene(tmp_path / "plant", 2)), []
+    for code in ("one", "other"):
+        monkeypatch.setattr("mvseg.pipeline.code_hash", lambda code=code: code)
+        detect_regions(scene, RunConfig(detect=DetectConfig(min_score=0.05)), keep=tmp_path / "kept")
+        names.append({path.name for path in (tmp_path / "kept").iterdir()})
+    assert [len(each) for each in names] == [2, 2]
+    assert not names[0] & names[1]
 
 
 def test_a_run_that_was_cut_off_goes_on_from_its_detections(

@@ -29,17 +29,26 @@ def test_it_is_raised_and_the_earlier_handler_comes_back() -> None:
 
 
 class Dying:
-    """Gets SIGTERM in its finaliser."""
+    """Gets a signal in its finaliser."""
+
+    def __init__(self, number: signal.Signals) -> None:
+        self.number = number
 
     def __del__(self) -> None:
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), self.number)
         time.sleep(0.01)
 
 
-def test_it_is_not_lost_where_python_swallows_exceptions() -> None:
-    with pytest.raises(Terminated), stopped_by_sigterm():  # noqa: PT012
-        Dying()
-        time.sleep(10)
+@pytest.mark.parametrize(("number", "raised"), [(signal.SIGTERM, Terminated), (signal.SIGINT, KeyboardInterrupt)])
+def test_it_is_not_lost_where_python_swallows_exceptions(number: signal.Signals, raised: type[BaseException]) -> None:
+    """Nor is Ctrl-C."""
+    earlier = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(raised), stopped_by_sigterm():  # noqa: PT012
+            Dying(number)
+            time.sleep(10)
+    finally:
+        signal.signal(signal.SIGINT, earlier)
 
 
 FORK = """
