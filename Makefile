@@ -2,7 +2,7 @@
 VENV := .venv
 PYTHON := $(VENV)/bin/python
 
-.PHONY: demo test slow fuzz bench lint docs clean
+.PHONY: demo test slow processors fuzz bench lint docs clean
 
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
@@ -16,6 +16,10 @@ test: $(VENV)/installed
 # whole commands, killed workers, notebooks: about three minutes
 slow: $(VENV)/installed
 	$(PYTHON) -m pytest -n 2 -m slow
+
+# the numeric tests in the arithmetic of other processors; ARITHMETICS="sse avx2" tries two of them
+processors: $(VENV)/installed
+	$(PYTHON) .ci/processors.py $(ARITHMETICS)
 
 # about ten minutes: broken files for every reader, and runs that are killed at random moments
 fuzz: $(VENV)/installed

@@ -16,7 +16,8 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 ROOT = Path(__file__).parent.parent
-torch.set_num_threads(1)  # deterministic sums, and no spinning beside other tests
+if "OMP_NUM_THREADS" not in os.environ:
+    torch.set_num_threads(1)  # deterministic sums, and no spinning beside other tests
 
 
 @pytest.fixture(scope="session")

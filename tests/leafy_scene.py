@@ -27,10 +27,12 @@ class LeafyScene:
     vertices: Tensor
 
 
-def write_leafy_scene(folder: Path, *, num_leaves: int = 4, num_views: int = 10, size: int = 320) -> LeafyScene:
-    """Views evenly spread over 45 degrees of azimuth, at one height; `folder` must be there."""
+def write_leafy_scene(
+    folder: Path, *, num_leaves: int = 4, num_views: int = 10, size: int = 320, span_deg: float = 45
+) -> LeafyScene:
+    """Views evenly spread over so many degrees of azimuth, at one height; `folder` must be there."""
     plant = grow_plant("ovate", num_leaves, 18)  # hardly any leaf hides another
-    cameras = arc_cameras(num_views, plant, span_deg=45, elevations_deg=(40,), width=size, height=size)
+    cameras = arc_cameras(num_views, plant, span_deg=span_deg, elevations_deg=(40,), width=size, height=size)
     stage = build_stage(plant, seed=12)
     stage = replace(stage, look=replace(stage.look, spots=2.0, quilting=0.15, gloss=0.0, noise=0.004))
     views, labels, depths = [], [], []

@@ -308,7 +308,7 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
 
 
 def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
-    leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160)
+    leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160, span_deg=180)
     missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
     regions = leafy.regions.select(~missed)
     found = Masks.of(

@@ -90,6 +90,8 @@ def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Te
     )
     num_pixels, num_lines = (tuple(each.sum(1).clamp(min=1) for each in counts) for counts in (pixels, lines))
     j_from_i, i_from_j = (
-        inside[side] / num_pixels[1 - side] * (through[side] / num_lines[side][:, None]) for side in (0, 1)
+        # shares of pixels in float32: their sums are 1 up to rounding where all of them are inside
+        (inside[side] / num_pixels[1 - side] * (through[side] / num_lines[side][:, None])).clamp_(max=1)
+        for side in (0, 1)
     )
     return j_from_i, i_from_j

@@ -180,13 +180,18 @@ def fit_poses(problem: Adjustment) -> Cameras:
 def _solve(
     columns: Tensor, slopes: Tensor, left: Tensor, *, weights: Tensor, prior: Tensor, state: Tensor
 ) -> Tensor:
-    """(P,) one step of Gauss-Newton for T residuals, each with derivatives (T, C) by the unknowns `columns` (T, C)."""
+    """(P,) one step of Gauss-Newton for T residuals, each with derivatives (T, C) by the unknowns `columns` (T, C).
+
+    No step where the equations are singular but for rounding: lines of sight along a baseline have derivatives beside
+    which the prior counts nothing.
+    """
     weighted = weights[:, None] * slopes
     normal, right = torch.diag(prior), -prior * state
     products = weighted[:, :, None] * slopes[:, None, :]
     normal.index_put_((columns[:, :, None], columns[:, None, :]), products, accumulate=True)
     right.index_put_((columns,), -weighted * left[:, None], accumulate=True)
-    return torch.cholesky_solve(right[:, None], torch.linalg.cholesky(normal))[:, 0]
+    factor, info = torch.linalg.cholesky_ex(normal)
+    return torch.zeros_like(right) if info else torch.cholesky_solve(right[:, None], factor)[:, 0]
 
 
 def held_out_gaps(masks: Masks, cameras: Cameras) -> tuple[float, float]:
@@ -221,4 +226,6 @@ def _remaining_gaps(problem: Adjustment, cameras: Cameras) -> Tensor:
 
 def _mean_of_views(gaps: Tensor) -> float:
     px, views = gaps[0], gaps[1:]
+    if not len(px):
+        return float("nan")
     return float(torch.stack([px[(views == view).any(0)].median() for view in views.unique()]).mean())

@@ -18,6 +18,7 @@ END = 0.25  # share of the midrib whose direction counts as that of its base or 
 MIDDLE = np.linspace(0.4, 0.6, 5)  # where the fold is measured
 VAGUE_DEG = 60.0  # standard deviation from which an azimuth says nothing
 PARALLEL = 1e-9  # sine of the angle between directions that span no plane
+FULL_TURN_DEG = 360 - 5e-4  # what is larger is written as 360, with six digits
 
 
 @dataclass(frozen=True)
@@ -88,7 +89,7 @@ def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 
     sds = dict(zip(values, surface.deviation(measure).tolist(), strict=True))
     if frame is not None:
         values["inclination"] = min(values["inclination"], 180 - values["inclination"])
-        values["azimuth"] %= 360
+        values["azimuth"] = wrap_azimuth(values["azimuth"])
         values |= {"base_inclination": 90 - values["insertion_angle"], "tip_inclination": 90 - values.pop("tip_angle")}
         sds |= {"base_inclination": sds["insertion_angle"], "tip_inclination": sds.pop("tip_angle")}
     numbers = {name: Measurement(float(value), sds[name], "surface") for name, value in values.items()}
@@ -99,6 +100,12 @@ def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 
     if frame is None:
         numbers |= dict.fromkeys(NEED_UP, UP_UNKNOWN)
     return numbers
+
+
+def wrap_azimuth(degrees: float) -> float:
+    """In [0, 360), in six digits as well: just below 0 or 360 it is 0. NaN stays NaN."""
+    turned = degrees % 360  # of -1e-15 that is 360
+    return 0.0 if turned >= FULL_TURN_DEG else turned
 
 
 def cell_normals(points: Floats) -> Floats:

@@ -49,7 +49,7 @@ def measure_whole(
         covered = sum(cells[instance].projected_area for instance in surfaces)
         height, height_slopes = height_of(grids, frame[2])
         slopes.append(height_slopes)
-        values |= {"height": height, "projected_area": covered, "light_interception": covered / areas.sum()}
+        values |= {"height": height, "projected_area": covered, "light_interception": min(covered / areas.sum(), 1.0)}
 
     sds = []
     for index, (instance, surface) in enumerate(surfaces.items()):

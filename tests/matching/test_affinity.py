@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from mvseg.matching.affinity import region_affinity
+from mvseg.matching.affinity import pairwise_affinity, region_affinity
+from mvseg.matching.epipolar import Bins
 from mvseg.matching.samples import view_samples
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene
@@ -141,6 +142,18 @@ def test_pairs_without_baseline_are_skipped() -> None:
     )
     edges = region_affinity(regions, cameras).edges.tolist()
     assert sorted(edges) == [[0, 2], [1, 2]]
+
+
+def test_sums_of_shares_of_pixels_never_exceed_1(demo_scene: Scene, demo_regions: Regions) -> None:
+    """Regions whose bands hold all of each other: rounded sums in two orders, a quotient of 1 or a little more."""
+    weights = region_affinity(demo_regions, demo_scene.cameras).weights
+    assert 0.999 < weights.max() <= 1
+    bins = Bins(low=0.0, per_unit=1.0, num_bins=999, half_line=(1, 1), half_pixel=(1, 1))
+    pixels = tuple(torch.rand(50, 999, generator=torch.Generator().manual_seed(seed)) for seed in (0, 1))
+    lines = tuple(each.clone() for each in pixels)
+    for w in pairwise_affinity(bins, (pixels[0], pixels[1]), (lines[0], lines[1])):
+        assert w.max() <= 1
+        assert w.min() > 0.999
 
 
 def test_no_regions_no_edges() -> None:

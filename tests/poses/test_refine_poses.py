@@ -20,7 +20,7 @@ from mvseg.poses.refine_poses import RefinedPoses, adjust, fit_poses, held_out_g
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.faults import disc
-from synthetic import BallScene, ball_scene, moved, permute_views
+from synthetic import BallScene, ball_scene, cameras_at, moved, permute_views
 
 
 @pytest.fixture(scope="module")
@@ -152,3 +152,21 @@ def test_nothing_to_refine_with(scene: BallScene) -> None:
     assert all(np.isnan(gap) for gap in poses.gap_px)
     alone = regions_from_label_maps([(labels == 1).astype(np.int64) for labels in scene.label_maps])
     assert not refine(scene, scene.cameras, alone).is_refined
+
+
+def test_equations_that_are_singular_move_no_camera(scene: BallScene, noisy: Cameras) -> None:
+    """Rays that are all but parallel meet so far away that a step of a pixel outweighs every prior."""
+    problem = adjust(scene.regions, true_matching(scene), noisy)
+    stayed = fit_poses(replace(problem, world_per_px=1e200 * problem.world_per_px))
+    assert torch.equal(stayed.R, noisy.R)
+    assert torch.equal(stayed.t, noisy.t)
+
+
+def test_a_leaf_that_no_pair_of_views_tells_anything_of() -> None:
+    """Two cameras, one before the other: the masks around the line through both have no ends that could miss."""
+    cameras = cameras_at(torch.tensor([[0.0, 0.0, -20.0], [0.0, 0.0, -10.0]], dtype=torch.float64))
+    labels = np.zeros((240, 320), np.int64)
+    labels[100:140, 140:180] = 1
+    regions = regions_from_label_maps([labels, labels])
+    matching = Matching(instance_ids=regions.labels, match_scores=torch.ones(2), num_instances=1, method="truth")
+    assert np.isnan(held_out_gaps(regions, matching, cameras)).all()

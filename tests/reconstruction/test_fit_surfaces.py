@@ -223,6 +223,17 @@ def test_masks_without_a_common_point_give_no_surface() -> None:
     assert surface.quality.reasons == ("its masks agree on no point",)
 
 
+def test_a_start_that_no_mask_is_near_gives_no_surface() -> None:
+    """Nothing but the prior is left, whose equations are singular: that is an answer, and no exception."""
+    regions, ids = as_regions(blade_masks(FLAT, CAMERAS[:4]))
+    far = flat_leaf(at=(500.0, 0.0, 0.0))
+    for jackknife in (False, True):
+        surface = fit_surfaces(regions, ids, CAMERAS[:4], starts={1: far}, jackknife=jackknife)[1]
+        assert not surface.exists
+        assert not surface.is_credible
+        assert surface.quality.reasons == ("its masks do not tell its shape",)
+
+
 def test_no_regions_give_no_surfaces() -> None:
     regions, ids = as_regions([np.zeros((SIZE, SIZE), bool)] * 2)
     assert fit_surfaces(regions, ids, CAMERAS[[0, 1]]) == {}

@@ -134,6 +134,21 @@ def test_start_follows_a_strip_from_end_to_end(bend: float) -> None:
     assert size.half_width == pytest.approx(0.1, rel=0.35)
 
 
+def test_starts_do_not_turn_on_which_of_equally_near_voxels_is_nearest() -> None:
+    """A bent strip of voxels: on a lattice most distances tie, and rounding decides nothing."""
+    x, y, z = (a.ravel() for a in np.meshgrid(np.arange(60), np.arange(9), np.arange(12), indexing="ij"))
+    is_blade = np.abs(z - 10 * np.sin(x / 59 * np.pi)) < 1.5
+    voxels = 0.1 * np.stack([x, y, z], 1)[is_blade]
+    given = start_patches(voxels)
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        moved = start_patches(voxels + rng.uniform(-1e-12, 1e-12, voxels.shape))
+        assert len(moved) == len(given)
+        for first, second in zip(moved, given, strict=True):
+            points, others = (patch_grid(12, 5).points(patch) for patch in (first, second))
+            assert min(np.abs(points - mirrored).max() for mirrored in (others, others[:, ::-1])) < 1e-6
+
+
 def test_round_clouds_have_two_starts_and_tiny_ones_none() -> None:
     angle, radius = (a.ravel() for a in np.meshgrid(np.linspace(0, 6.2, 40), np.linspace(0.1, 1, 9)))
     disc = np.stack([radius * np.cos(angle), 0.9 * radius * np.sin(angle), 0 * angle], 1)

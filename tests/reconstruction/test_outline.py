@@ -7,8 +7,17 @@ import numpy as np
 import pytest
 
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
-from mvseg.reconstruction.surface.fit_patch import NUM_WARM_STEPS, fit_patch
-from mvseg.reconstruction.surface.leaf_patch import COUNTS, MIDRIB, NUM_COEFFICIENTS, SIDE, Floats, patch_grid
+from mvseg.reconstruction.surface.fit_patch import NUM_WARM_STEPS, fit_patch, invert_normal, jackknife_covariance
+from mvseg.reconstruction.surface.leaf_patch import (
+    COUNTS,
+    MIDRIB,
+    NUM_COEFFICIENTS,
+    SIDE,
+    Floats,
+    measure_patch,
+    patch_grid,
+    patch_prior,
+)
 from mvseg.reconstruction.surface.mask_stack import FRAME, MaskStack, stack_masks
 from mvseg.reconstruction.surface.outline import outline_distances, outline_samples
 from mvseg.reconstruction.surface.patch_image import (
@@ -239,3 +248,21 @@ def test_a_patch_that_no_mask_is_near_is_fitted_to_nothing() -> None:
     assert np.isfinite(fit.coefficients).all()
     assert np.isnan(fit.residual_px).all()
     assert np.isnan(fit.offsets_px).all()
+    assert np.isnan(fit.covariance).all()
+    assert np.isnan(jackknife_covariance(stack(), fit, errors=None)).all()
+    assert np.isfinite(fit_patch(stack(), ellipse(), num_steps=NUM_WARM_STEPS).covariance).all()
+
+
+def test_the_prior_alone_has_no_inverse_on_any_processor() -> None:
+    """Moving a patch as a whole costs nothing; whether elimination stops at a pivot of 0 is a matter of rounding."""
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        patch = ellipse(1.0, rng.uniform(0.05, 0.5)) + rng.normal(0, rng.uniform(0, 0.3), (NUM_COEFFICIENTS, 3))
+        prior, _ = patch_prior(patch, measure_patch(patch), noise=1.0)
+        normal = prior.T @ prior
+        assert np.isnan(invert_normal(normal)).all()
+        rows = GRID.basis[:: len(GRID.basis) // 12]  # a dozen points are held in their places
+        held = normal + np.kron(rows.T @ rows, np.eye(3))
+        assert np.abs(invert_normal(held) @ held - np.eye(len(held))).max() < 1e-6
+    assert np.isnan(invert_normal(np.zeros((3, 3)))).all()
+    assert np.isnan(invert_normal(np.full((3, 3), np.inf))).all()

@@ -17,8 +17,9 @@ from known_leaves import (
 )
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
-from mvseg.traits.leaf import END, NEED_BASE, NEED_UP, Measurement, measure_leaf, measure_voxels
+from mvseg.traits.leaf import END, NEED_BASE, NEED_UP, Measurement, measure_leaf, measure_voxels, wrap_azimuth
 from mvseg.traits.ontology import SURFACE_TRAITS, VOXEL_TRAITS
+from mvseg.traits.table import format_number
 from mvseg.traits.up import level_frame
 
 FRAME = level_frame((0.0, 0.0, 1.0))
@@ -101,6 +102,17 @@ def test_turning_about_up_changes_the_azimuth_only(degrees: float) -> None:
         if name != "azimuth":
             assert second[name].value == pytest.approx(number.value, rel=1e-6, abs=1e-6)
         assert second[name].sd == pytest.approx(number.sd, rel=1e-3)
+
+
+@pytest.mark.parametrize("degrees", [-1e-15, 360.0, -1e-6, 359.9997, 720 - 1e-12])
+def test_azimuths_just_below_a_full_turn_are_0_as_they_are_written_too(degrees: float) -> None:
+    assert format_number(wrap_azimuth(degrees)) == "0"
+
+
+@pytest.mark.parametrize(("degrees", "written"), [(-90, "270"), (-0.001, "359.999"), (359.9994, "359.999"), (12, "12")])
+def test_other_azimuths_are_wrapped_only(degrees: float, written: str) -> None:
+    assert format_number(wrap_azimuth(degrees)) == written
+    assert np.isnan(wrap_azimuth(float("nan")))
 
 
 def test_azimuth_counts_from_x_to_y() -> None:

@@ -41,6 +41,14 @@ def test_it_agrees_with_meshes() -> None:
     assert 0.5 < share < 0.95
 
 
+@pytest.mark.parametrize("seed", [15, 51])  # of 60 leaves, two of the four for which this was 1 + 4e-16
+def test_flat_leaves_side_by_side_intercept_no_more_than_all_light(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    leaf = flat_leaf(length=rng.uniform(10, 50), half_width=rng.uniform(3, 10))
+    found = measure({1: leaf, 2: flat_leaf(length=20, half_width=5, at=(200, 0, 0))}, num_leaves=2)
+    assert 0.999 < found["light_interception"].value <= 1
+
+
 def test_deviations_are_those_of_independent_leaves() -> None:
     leaves = some_leaves()
     found = measure(leaves)

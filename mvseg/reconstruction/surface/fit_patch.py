@@ -36,6 +36,8 @@ LEAST_JACKKNIFED = 4  # views
 # Of the covariance.
 FIT_FACTOR, QUIET_PX = 2.0, 0.3  # of the deviations; they grow with the distances from this rms on
 CENTRE_FACTOR, LEAST_CENTRE_SD = 1.5, 0.1  # of what all masks may be too large by, pixels
+# Of the scaled normal matrix. Leaves have 1e-4 and more; where nothing holds a patch in its place, rounding makes 1e-15
+LEAST_EIGENVALUE = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,7 +46,7 @@ class PatchFit:
 
     Attributes:
         coefficients: (26, 3).
-        covariance: (78, 78).
+        covariance: (78, 78); NaN where the masks do not tell the coefficients: hardly any edge was met.
         residual_px: (S,) root mean square distance per view, robustly weighted.
         offsets_px: (S,) by how much the mask of each view is too large; NaN where none of its edges was met.
     """
@@ -127,9 +129,9 @@ def fit_patch(
 def jackknife_covariance(masks: MaskStack, fit: PatchFit, *, errors: MaskErrors | None) -> Floats:
     """(78, 78) covariance of a fit from the fits without each of its S views in turn.
 
-    With fewer than four views the fit's own: three views less one say little.
+    With fewer than four views the fit's own: three views less one say little. So where it is NaN.
     """
-    if len(masks) < LEAST_JACKKNIFED:
+    if len(masks) < LEAST_JACKKNIFED or not np.isfinite(fit.covariance).all():
         return fit.covariance
     parts = []
     for index in range(len(masks)):
@@ -155,9 +157,9 @@ class _Equations:
 def _covariance(coefficients: Floats, equations: _Equations, stack: NDArray, *, centre_sd: float) -> Floats:
     """(78, 78): the fit's own, what the views contradict each other by, and what all masks may share.
 
-    The factors were found on simulated leaves, see docs/surfaces.md.
+    NaN where the normal matrix is singular. The factors were found on simulated leaves, see docs/surfaces.md.
     """
-    inverse = np.asarray(np.linalg.inv(_normal_matrix(coefficients, equations)[0]), dtype=float)
+    inverse = invert_normal(_normal_matrix(coefficients, equations)[0])
     weight, px = equations.weight, equations.px
     num_views = int(stack.max(initial=0)) + 1
     pulls = np.zeros((num_views, len(inverse)))
@@ -169,6 +171,20 @@ def _covariance(coefficients: Floats, equations: _Equations, stack: NDArray, *, 
     shared = CENTRE_FACTOR * few * max(centre_sd, LEAST_CENTRE_SD)
     fitted = (FIT_FACTOR * max(1.0, rms / QUIET_PX)) ** 2 * inverse
     return fitted + between @ between.T + shared**2 * np.outer(growth, growth)
+
+
+def invert_normal(matrix: Floats) -> Floats:
+    """The inverse of a normal matrix (n, n); NaN where it is singular but for rounding.
+
+    Its eigenvalues tell, after its diagonal is scaled to 1: whether elimination stops at a pivot of exactly 0 depends
+    on how a processor rounds, and where it does not stop the inverse is noise.
+    """
+    scale = np.sqrt(np.maximum(np.diag(matrix), 0))
+    if not np.isfinite(matrix).all() or not scale.all():
+        return np.full_like(matrix, np.nan)
+    if np.linalg.eigvalsh(matrix / scale / scale[:, None])[0] < LEAST_EIGENVALUE:
+        return np.full_like(matrix, np.nan)
+    return np.asarray(np.linalg.inv(matrix), dtype=float)
 
 
 def _weigh(distances: Distances, offsets: Floats, *, scale_px: float) -> _Equations:

@@ -313,6 +313,8 @@ def _jackknife(errors: MaskErrors | None, asked: tuple[MaskStack, PatchFit]) -> 
 
 
 def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
+    if not np.isfinite(fit.covariance).all():
+        return LeafSurface.none(torch.from_numpy(masks.views), "its masks do not tell its shape")
     points = patch_grid(*FIT_GRID).points(fit.coefficients)
     iou = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
     surface = LeafSurface(

@@ -26,6 +26,7 @@ BENT = 1.35  # or from this ratio of the way along the leaf to the straight one;
 ROUND = 1.6  # ratio below which the midrib may as well run along the shorter axis
 TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # of the side about the midrib, where it is not clear
 LEAST_POINTS = 12
+TIE = 1e-6  # relative; distances on a lattice that differ by less are equal but for rounding
 
 
 def start_patches(points: Floats, *, is_clear: bool = True) -> list[Floats]:
@@ -81,20 +82,27 @@ def _geodesic_places(points: Floats) -> Floats:
 
     Loose pieces are joined by the straight distance to the nearest point of the largest piece.
     """
-    distance, neighbour = cKDTree(points).query(points, k=min(NEIGHBOURS + 1, len(points)))
-    rows = np.repeat(np.arange(len(points)), neighbour.shape[1] - 1)
-    shape = (len(points), len(points))
-    graph = csr_matrix((np.maximum(distance[:, 1:].ravel(), 1e-12), (rows, neighbour[:, 1:].ravel())), shape)
+    tree = cKDTree(points)
+    reach = tree.query(points, k=min(NEIGHBOURS + 1, len(points)))[0][:, -1]
+    near = tree.query_ball_point(points, reach * (1 + TIE))  # of voxels that are equally near, all
+    rows, columns = np.repeat(np.arange(len(points)), [len(each) for each in near]), np.concatenate(near).astype(int)
+    distance = np.maximum(np.linalg.norm(points[rows] - points[columns], axis=1), 1e-12)
+    graph = csr_matrix((distance, (rows, columns)), (len(points), len(points)))
     _, piece = connected_components(graph, directed=False)
     largest = np.flatnonzero(piece == np.bincount(piece).argmax())
-    start = largest[np.linalg.norm(points[largest] - points[largest].mean(0), axis=1).argmax()]
+    start = largest[_first_largest(np.linalg.norm(points[largest] - points[largest].mean(0), axis=1))]
     first = dijkstra(graph, directed=False, indices=start)
-    end = largest[first[largest].argmax()]
+    end = largest[_first_largest(first[largest])]
     places = dijkstra(graph, directed=False, indices=end)
     loose = ~np.isfinite(places)
     if loose.any():
         places[loose] = places[largest[cKDTree(points[largest]).query(points[loose])[1]]]
     return places
+
+
+def _first_largest(values: Floats) -> int:
+    """Place of the first of the largest values (P,), of those that tie."""
+    return int((values >= values.max() * (1 - TIE)).argmax())
 
 
 def _windows(points: Floats, t: Floats, side: Floats, *, turn_deg: float) -> tuple[Floats, Floats]:
