@@ -22,7 +22,8 @@ class RunConfig:
         match: how regions are matched across views.
         reconstruct: how instances become shapes; None for ids only.
         traits: which instances count as leaves in the tables of traits.
-        scale: the world's lengths are multiplied by this; None leaves them.
+        scale: the world's lengths are multiplied by this; None leaves them. Cameras that say their unit need `unit`
+            with it.
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
             level, "board" from ArUco markers that lie flat; None for that of the scene.

@@ -331,19 +331,28 @@ def recut(state: State) -> State:
 def place_scene(scene: Scene, config: RunConfig) -> Scene:
     """The scene in the world that the user asks for: scale, unit and direction of up.
 
-    Warns (InputWarning) of a unit that contradicts the scene's and comes without a scale.
+    Warns (InputWarning) of a unit that contradicts the scene's and comes without a scale, and of an up that the cameras
+    contradict (`Scene.seems_upside_down`).
 
     Raises:
-        InputError: up cannot be found, see `find_up`.
+        InputError: a scale of cameras that say their unit, without the unit of the lengths after it; up cannot be
+            found, see `find_up`.
     """
     if config.scale is not None:
+        if config.unit is None and scene.unit and config.scale != 1:
+            problem = f"scale is {config.scale:g} without a unit, but the cameras are in {scene.unit}"
+            raise InputError(f"{problem}: expected the unit of the scaled lengths, too, as in --unit {scene.unit}")
         scene = replace(scene, cameras=scene.cameras.scale(config.scale))
     if config.unit is not None:
         if scene.unit not in ("", config.unit) and config.scale is None:
             message = f"the cameras are in {scene.unit}: unit {config.unit} without a scale only renames it"
             warnings.warn(message, InputWarning, stacklevel=3)
         scene = replace(scene, unit=config.unit)
-    return find_up(scene, config.up)
+    scene = find_up(scene, config.up)
+    if scene.seems_upside_down:
+        message = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
+        warnings.warn(message, InputWarning, stacklevel=3)
+    return scene
 
 
 def detect_regions(

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 ROTATION_TOLERANCE = 1e-4  # |R R^T - I|; hand-typed rig files carry about six digits
 MIN_FOCAL, MAX_PX = 1e-3, 1e9  # of K, pixels; far beyond any lens, and products of them are still numbers
+LEVEL, UPSIDE_DOWN = 0.17, -0.7  # means: sine of the pitch of level cameras, cosine between their up and the world's
 MAX_WORLD = 1e12  # of t, world units: millimetres on a map of the whole earth fit
 
 
@@ -199,3 +200,17 @@ class Scene:
             if view.name in first_with:
                 raise InputError(f"views {first_with[view.name]} and {index} have the same name '{view.name}'")
             first_with[view.name] = index
+
+    @property
+    def seems_upside_down(self) -> bool:
+        """Do the cameras contradict `up`? False where it is not known.
+
+        People and gantries look down on plants, or at them from the side with the camera upright. Here the cameras look
+        up by more than ten degrees in the mean, or are level and hang upside down. The leaves cannot tell: which of
+        their sides is the upper one is told by the cameras, too.
+        """
+        if self.up is None:
+            return False
+        up = torch.tensor(self.up).to(self.cameras.R)
+        own, ahead = (float((sign * self.cameras.R[:, row] @ up).mean()) for sign, row in ((-1, 1), (1, 2)))
+        return ahead > LEVEL or (ahead > -LEVEL and own < UPSIDE_DOWN)

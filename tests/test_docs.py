@@ -1,11 +1,9 @@
-"""The documents: commands and notebooks run, the site is built from files alone, and nothing public is left out."""
+"""The documents: notebooks run, the site is built from files alone, and nothing public is left out."""
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -18,7 +16,6 @@ import pytest
 
 import mvseg
 import mvseg.matching
-from mvseg.cli import main
 from mvseg.cli.options import find_config
 from mvseg.errors import InputError
 
@@ -37,43 +34,6 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     pytest.importorskip("nbconvert")
     monkeypatch.syspath_prepend(str(ROOT / ".ci"))
     return import_module("mkdocs_pages")
-
-
-@pytest.mark.slow
-def test_the_guides_commands_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All of them, as they stand, one after the other; on five of the nine photos, which is quicker."""
-    blocks = re.findall(r"```\n(.*?)```", (DOCS / "guide.md").read_text(encoding="utf-8"), re.DOTALL)
-    lines = [line for block in blocks for line in block.strip().splitlines()]
-    assert len(lines) == 6
-    monkeypatch.chdir(tmp_path)
-    for line in lines:
-        words = shlex.split(line, comments=True)
-        if words[0] == "python":
-            subprocess.run([sys.executable, *words[1:]], check=True, env={**os.environ, "PYTHONPATH": str(ROOT)})
-            rig = json.loads(Path("plant/cameras.json").read_text())
-            Path("plant/cameras.json").write_text(json.dumps(rig | {"views": rig["views"][::2]}))
-        else:
-            assert words[0] == "mvseg"
-            assert main(words[1:]) == 0, line
-    assert (tmp_path / "results" / "plant" / "traits_wide.csv").is_file()
-    assert json.loads((tmp_path / "ids" / "plant" / "metrics.json").read_text())["ari"] == 1
-
-
-def commands_of(page: Path) -> list[list[str]]:
-    """Commands `mvseg ...` in the code blocks of a page."""
-    blocks = re.findall(r"```\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
-    lines = [line for block in blocks for line in block.strip().splitlines()]
-    return [words[1:] for line in lines if (words := shlex.split(line, comments=True)) and words[0] == "mvseg"]
-
-
-@pytest.mark.parametrize("name", ["check", "own-masks", "own-cameras", "fine-tune"])
-def test_other_commands_are_understood(name: str) -> None:
-    from mvseg.cli.command import build_parser
-
-    commands = commands_of(DOCS / f"{name}.md")
-    assert commands
-    for words in commands:
-        build_parser().parse_args(words)
 
 
 @pytest.mark.slow

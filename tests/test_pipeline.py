@@ -139,6 +139,8 @@ def test_the_users_word_on_the_world(plant: Path) -> None:
     assert (second.scene.unit, second.scene.up) == ("cm", (0, -1, 0))
     assert first.traits is not None
     assert second.traits is not None
+    assert torch.equal(second.matching.instance_ids, first.matching.instance_ids)
+    assert torch.equal(second.matching.match_scores, first.matching.match_scores)
     for leaf, other in zip(first.traits.leaves, second.traits.leaves, strict=True):
         assert other.numbers["volume"].value == pytest.approx(leaf.numbers["volume"].value / 1000, rel=1e-6)
         assert other.numbers["x_min"].value == pytest.approx(leaf.numbers["x_min"].value / 10, abs=1e-9)
@@ -147,6 +149,44 @@ def test_the_users_word_on_the_world(plant: Path) -> None:
 def test_another_unit_without_a_scale_is_warned_of(plant: Path) -> None:
     with pytest.warns(InputWarning, match="the cameras are in mm: unit cm without a scale only renames it"):
         assert run_scene(plant, plant / "masks", replace(IDS_ONLY, unit="cm")).scene.unit == "cm"
+
+
+def test_a_scale_without_a_unit_is_refused_where_the_cameras_say_theirs(plant: Path, tmp_path: Path) -> None:
+    scaled = replace(IDS_ONLY, scale=0.001)
+    with pytest.raises(InputError, match=r"scale is 0\.001 without a unit, but the cameras are in mm: expected"):
+        run_scene(plant, plant / "masks", scaled)
+    assert run_scene(plant, plant / "masks", replace(scaled, unit="mm")).scene.unit == "mm"
+    assert run_scene(plant, plant / "masks", replace(scaled, scale=1.0)).scene.unit == "mm"
+    unknown = shutil.copytree(plant, tmp_path / "plant")
+    rig = json.loads((unknown / "cameras.json").read_text())
+    del rig["unit"]
+    (unknown / "cameras.json").write_text(json.dumps(rig))
+    assert run_scene(unknown, unknown / "masks", scaled).scene.unit == ""
+
+
+def test_an_up_that_the_cameras_contradict_is_warned_of(plant: Path) -> None:
+    run_scene(plant, plant / "masks", replace(IDS_ONLY, up=(0.0, -1.0, 0.0)))  # +y is down there
+    with pytest.warns(InputWarning, match="up may be upside down: the cameras look up at the plant"):
+        run_scene(plant, plant / "masks", replace(IDS_ONLY, up=(0.0, 1.0, 0.0)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scale", [1e-3, 412.0])
+def test_a_scale_moves_no_relative_result(scale: float) -> None:
+    """The shipped plant with its photos: the same ids, scores, doubts, and shares of the areas."""
+    plant = demo_scene()
+    first, second = (
+        run_scene(plant, plant / "masks", RunConfig(scale=each, unit="m", up=(0.0, 0.0, 1.0))) for each in (1.0, scale)
+    )
+    assert torch.equal(second.matching.instance_ids, first.matching.instance_ids)
+    assert second.matching.match_scores.numpy() == pytest.approx(first.matching.match_scores.numpy(), abs=1e-6)
+    assert second.traits is not None
+    assert first.traits is not None
+    for leaf, other in zip(first.traits.leaves, second.traits.leaves, strict=True):
+        assert other.reasons == leaf.reasons
+        for name, power in {"area": 2, "length": 1, "inclination": 0, "greenness_index": 0, "visible_share": 0}.items():
+            expected = leaf.numbers[name].value * scale**power
+            assert other.numbers[name].value == pytest.approx(expected, rel=1e-4, nan_ok=True)
 
 
 @pytest.mark.parametrize("wrong", [{"scale": 0.0}, {"scale": math.inf}, {"up": (0.0, 0.0, 0.0)}])

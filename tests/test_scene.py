@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from blade_scene import ring_cameras
 from mvseg.errors import InputError
 from mvseg.scene import Cameras, Scene, View
 from synthetic import arc_positions, cameras_at
@@ -83,3 +85,19 @@ def test_two_views_of_one_name_are_an_error() -> None:
     views = tuple(View(name, Path(name)) for name in ("a", "b", "a", "c"))
     with pytest.raises(InputError, match="views 0 and 2 have the same name 'a'"):
         Scene("plant", views, some_cameras())
+
+
+@pytest.mark.parametrize("elevation_deg", [-5.0, 0.0, 5.0, 15.0, 60.0, 89.0])
+def test_cameras_look_down_on_plants(elevation_deg: float) -> None:
+    cameras = ring_cameras(6, elevations_deg=(elevation_deg,))
+    views = tuple(View(str(view), Path(f"{view}.png")) for view in range(6))
+    for up, is_doubtful in ((None, False), ((0.0, 0.0, 2.0), False), ((0.0, 0.0, -1.0), True), ((1.0, 0, 0), False)):
+        assert Scene("plant", views, cameras, up=up).seems_upside_down == is_doubtful
+
+
+def test_cameras_that_hang_upside_down_but_look_down_are_no_contradiction() -> None:
+    cameras = ring_cameras(6, elevations_deg=(20,))
+    flip = torch.diag(torch.tensor([-1.0, -1.0, 1.0])).double()
+    cameras = replace(cameras, R=flip @ cameras.R, t=cameras.t @ flip)
+    views = tuple(View(str(view), Path(f"{view}.png")) for view in range(6))
+    assert not Scene("plant", views, cameras, up=(0.0, 0.0, 1.0)).seems_upside_down

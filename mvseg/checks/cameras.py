@@ -24,6 +24,8 @@ FIELD_OF_VIEW = (2.0, 140.0)  # degrees, of the photo's diagonal, that lenses wi
 OFF_CENTER = 0.2  # of width and height; a principal point beyond is that of another photo
 SQUARE = 1.2  # quotient of the focal lengths
 FAR = 8.0  # distance of a camera from the middle of the others, in their median distance
+UNITS = {1000: "millimetres and metres", 100: "centimetres and metres", 10: "millimetres and centimetres"}
+GAP, ALIKE = 3.0, 2.0  # quotients of lengths of t between which two units may lie; of distances of cameras in one unit
 NARROW, WIDE = 2.0, 75.0  # degrees between the rays of neighbouring views: no depth below, no common leaves above
 FLIP = np.diag([1.0, -1.0, -1.0])  # from cameras that look along -z with +y up (OpenGL, Blender)
 
@@ -81,6 +83,8 @@ def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]
     if bool(is_coincident(cameras).all()):
         what = "all cameras are at one place, where depth cannot be seen: do R and t map world points to the camera?"
         return [Finding(where="cameras", what=what, level="error")]
+    if (mixed := _mixed_units(cameras, coverage, names)) is not None:
+        return [mixed]
     if reading := _other_reading(cameras, coverage):
         return [Finding(where="cameras", what=reading, level="error")]
     share = coverage.sees.mean()
@@ -168,6 +172,9 @@ def _world_findings(scene: Scene) -> list[Finding]:
     if scene.up is None:
         what = "the cameras do not say which way is up: heights and angles are not measured, unless --up says it"
         findings.append(Finding(where="cameras", what=what, level="note"))
+    elif scene.seems_upside_down:
+        what = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
+        findings.append(Finding(where="cameras", what=what, level="note"))
     return findings
 
 
@@ -175,6 +182,43 @@ def field_of_view(cameras: Cameras) -> Floats:
     """(V,) degrees, along the diagonal of each photo."""
     half = cameras.sizes.double() / 2 / torch.stack((cameras.K[:, 0, 0], cameras.K[:, 1, 1]), 1)
     return np.asarray(torch.rad2deg(2 * half.norm(dim=1).atan()).numpy())
+
+
+def _mixed_units(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> Finding | None:
+    """Is t in one unit in some views, and in another one in the rest?
+
+    Then there are two lengths of t, and with a factor between units all cameras look at one point from like distances.
+    Cameras that do so as they are have one unit, wherever the world's origin is.
+    """
+    lengths = torch.linalg.vector_norm(cameras.t, dim=1)
+    order = lengths.argsort()
+    ordered = lengths[order].clamp(min=1e-300)
+    share = coverage.sees.mean()
+    for place in ((ordered[1:] > GAP * ordered[:-1]).nonzero()[:, 0] + 1).tolist():
+        is_short = torch.zeros(len(cameras), dtype=torch.bool)
+        is_short[order[:place]] = True
+        if share >= ALL and _distance_ratio(cameras, coverage, is_short) < GAP:
+            continue
+        for factor, units in UNITS.items():
+            scaled = replace(cameras, t=torch.where(is_short[:, None], factor * cameras.t, cameras.t))
+            found = find_coverage(scaled)
+            if found.sees.mean() < ALL or _distance_ratio(scaled, found, is_short) > ALIKE:
+                continue
+            few, length = (is_short, "short") if 2 * place <= len(cameras) else (~is_short, "long")
+            views = tuple(few.nonzero()[:, 0].tolist())
+            facts = f"t is some {factor} times as {length} as in the other {len(cameras) - len(views)}"
+            step = f"is t in another unit ({units})? In one, {found.sees.sum()} of {len(cameras)} look at one point"
+            what = f"{name_views(views, names)}: {facts}; {step}"
+            is_sure = factor > min(UNITS) or share < ALL
+            return Finding(where="cameras", what=what, level="error" if is_sure else "warning", views=views)
+    return None
+
+
+def _distance_ratio(cameras: Cameras, coverage: Coverage, is_short: Tensor) -> float:
+    """How many times as far from the point as one group of the cameras the other one is, in the median; at least 1."""
+    distance = torch.linalg.vector_norm(cameras.centers - torch.from_numpy(coverage.point), dim=1)
+    short, long = (float(distance[group].median().clamp(min=1e-300)) for group in (is_short, ~is_short))
+    return max(short / long, long / short)
 
 
 def _other_reading(cameras: Cameras, coverage: Coverage) -> str | None:

@@ -12,11 +12,13 @@ from tqdm import tqdm
 
 from mvseg.checks.finding import Finding, name_views
 from mvseg.errors import InputError
-from mvseg.formats.image_file import is_turned, read_image_size, read_rgb
+from mvseg.formats.image_file import is_grey, is_turned, read_image_size, read_rgb
 from mvseg.formats.photos import describe_folder
 from mvseg.scene import Scene
 
-BLANK = 4.0  # grey levels: standard deviation of a photo of nothing
+# Standard deviation of a photo of nothing: grey levels, or a share of its level where it is dark (photos of something
+# have a fifth), but no less than rounding makes.
+BLANK, BLANK_SHARE, ROUNDING = 4.0, 0.03, 1.0
 DARK = 30  # grey level that 99 % of the pixels stay below
 BRIGHT, BURNT = 250, 0.7  # grey level of all channels; share of the pixels from which a photo is overexposed
 STEP = 4  # every fourth row and column is looked at
@@ -33,6 +35,7 @@ class PhotoFacts:
         contrast: standard deviation of its grey levels.
         level: grey level that 99 % of the pixels stay below.
         burnt: share of its pixels that are white.
+        grey: it has no colours.
         digest: hash of the file.
     """
 
@@ -42,6 +45,7 @@ class PhotoFacts:
     contrast: float = 0.0
     level: float = 0.0
     burnt: float = 0.0
+    grey: bool = False
     digest: str = ""
 
 
@@ -104,7 +108,7 @@ def _size_findings(facts: list[PhotoFacts], scene: Scene, names: tuple[str, ...]
 def _content_findings(facts: list[PhotoFacts], names: tuple[str, ...]) -> list[Finding]:
     findings = []
     whole = [view for view, each in enumerate(facts) if each.size is not None]
-    blank = tuple(view for view in whole if facts[view].contrast < BLANK)
+    blank = tuple(view for view in whole if _is_blank(facts[view]))
     dark = tuple(view for view in whole if view not in blank and facts[view].level < DARK)
     burnt = tuple(view for view in whole if view not in blank and facts[view].burnt > BURNT)
     if blank:
@@ -114,6 +118,10 @@ def _content_findings(facts: list[PhotoFacts], names: tuple[str, ...]) -> list[F
         if views:
             what = f"the photos of {name_views(views, names)} are {fault}: detectors will find few leaves there"
             findings.append(Finding(where="photos", what=what, level="warning", views=views))
+    grey = tuple(view for view in whole if view not in blank and facts[view].grey)
+    if grey:
+        what = f"the photos of {name_views(grey, names)} are grey: leaf colours and greenness are not measured in them"
+        findings.append(Finding(where="photos", what=what, level="note", views=grey))
     same: dict[str, list[int]] = defaultdict(list)
     for view in whole:
         same[facts[view].digest].append(view)
@@ -122,6 +130,11 @@ def _content_findings(facts: list[PhotoFacts], names: tuple[str, ...]) -> list[F
             what = f"{name_views(tuple(twins), names)} are the same photo: check which one belongs to which camera"
             findings.append(Finding(where="photos", what=what, level="error", views=tuple(twins)))
     return findings
+
+
+def _is_blank(photo: PhotoFacts) -> bool:
+    """One colour all over. A dark photo of a plant has little contrast, too: it counts against its level."""
+    return photo.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * photo.level))
 
 
 def _beside(scene: Scene, view: int) -> str:
@@ -144,6 +157,7 @@ def _read_facts(path: Path) -> PhotoFacts:
         turned=is_turned(path),
         contrast=float(grey.std()),
         level=float(np.quantile(grey, 0.99)),
+        grey=is_grey(pixels),
         burnt=float((pixels.min(2) >= BRIGHT).mean()),
         digest=hashlib.sha256(path.read_bytes()).hexdigest(),
     )

@@ -104,7 +104,7 @@ def add_run_options(parser: ArgumentParser) -> None:
     parser.add_class_arguments(DetectConfig, "detect")
     parser.add_class_arguments(ReconstructConfig, "reconstruct")
     parser.add_class_arguments(TraitsConfig, "traits")
-    help_scale = "multiplies the world's lengths, for cameras without a scale"
+    help_scale = "multiplies the world's lengths; cameras that say their unit need --unit with it"
     parser.add_argument("--scale", type=float | None, help=help_scale)
     help_unit = "name of the world's unit, after --scale (default: the scene's)"
     parser.add_argument("--unit", type=str | None, help=help_unit)

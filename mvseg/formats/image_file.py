@@ -31,6 +31,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 PHONE_SUFFIXES = (".heic", ".heif")  # known by name, to say what to do with them
 MAX_SIDE = 1 << 20  # pixels
 MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
+GREY = 2  # levels between the channels of a photo without colours
 ORIENTATION = 0x0112  # EXIF tag
 BITS_PER_SAMPLE = 0x0102  # TIFF tag
 LARGE = 1 << 26  # pixels; Pillow's own limit lies above
@@ -200,6 +201,11 @@ def _read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
     if pixels is None or pixels.dtype != np.uint16 or pixels.shape[:2] != (image.height, image.width):
         return None
     return pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., 2::-1])
+
+
+def is_grey(pixels: np.ndarray) -> bool:
+    """Whether a photo (H, W, 3) uint8 has no colours; a level or two, which a JPEG may make of them, are none."""
+    return bool((np.ptp(pixels, axis=2) <= GREY).all())
 
 
 def is_turned(path: Path) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 import logging
 import math
 from dataclasses import dataclass, field
@@ -32,7 +33,7 @@ class TrainingState:
     Attributes:
         model: the detector itself, in train mode.
         optimizer: over its trainable parameters.
-        averaged: exponential moving average of the model in eval mode, or None.
+        averaged: exponential moving average of the model, buffers included, in eval mode; or None.
         step: steps done since the start of the run.
         history: one record per epoch that was trained and evaluated.
         loss_sums: sums of the losses over the steps of the unfinished epoch.
@@ -181,7 +182,21 @@ def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> b
     state.optimizer.step()
     if state.averaged is not None:  # torch's AveragedModel would copy the first weights, and rename them
         decay = min(config.ema_decay, (1 + state.step) / (10 + state.step))
-        for average, current in zip(state.averaged.parameters(), state.model.parameters(), strict=True):
-            average.lerp_(current, 1 - decay)
+        follow(state.averaged, state.model, decay=decay)
     state.step += 1
     return True
+
+
+def follow(averaged: nn.Module, model: nn.Module, *, decay: float) -> None:
+    """Move an average a share of 1 - `decay` towards the model: its parameters, and its buffers with them.
+
+    The running statistics of a live BatchNorm belong to the weights that they were measured with. Those of the model
+    describe its present weights, so they are averaged as these are, over the same steps, and not copied. Whole numbers
+    (batches that were tracked) are copied.
+    """
+    here, there = (itertools.chain(each.parameters(), each.buffers()) for each in (averaged, model))
+    for average, current in zip(here, there, strict=True):
+        if average.is_floating_point():
+            average.lerp_(current, 1 - decay)
+        else:
+            average.copy_(current)

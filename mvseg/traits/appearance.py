@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.formats.image_file import is_grey
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
@@ -22,6 +23,7 @@ COLORS = ("mean_red", "mean_green", "mean_blue", "greenness_index")
 OUTSIDE = missing("not measured: no photo can show it")
 NO_PIXELS = missing("not measured: no pixel is surely of this leaf")
 NO_PHOTOS = missing("not measured: there are no photos")
+GREY = missing("not measured: the photos are grey")
 
 
 def measure_appearance(
@@ -37,7 +39,7 @@ def measure_appearance(
 
     Returns:
         {instance id: {trait: number}}. The standard deviation of a colour is the standard error over the views, so
-        there is none with one view.
+        there is none with one view. Grey photos have no part in colours.
 
     Raises:
         InputError: a photo is broken, or missing while others exist.
@@ -45,8 +47,12 @@ def measure_appearance(
     has_photos = bool(surfaces) and photos.exist
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
     colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # sure pixels, their mean
+    has_colors = False
     for view in range(len(cameras)):
         photo = photos(view) if has_photos else None
+        if photo is not None and is_grey(photo):
+            photo = None
+        has_colors |= photo is not None
         labels = masks.regions.label_map(view, masks.instance_ids, cameras.sizes[view].tolist()).cpu().numpy()
         for instance, surface in surfaces.items():
             covered, (x, y) = project_crop(surface, cameras, view)
@@ -63,7 +69,8 @@ def measure_appearance(
     for instance in surfaces:
         projected, visible = pixels[instance].tolist()
         share = Measurement(visible / projected, float("nan"), "masks") if projected else OUTSIDE
-        of_photos = mean_colors(colors[instance]) if has_photos else dict.fromkeys(COLORS, NO_PHOTOS)
+        why = GREY if has_photos else NO_PHOTOS
+        of_photos = mean_colors(colors[instance]) if has_colors else dict.fromkeys(COLORS, why)
         found[instance] = {"visible_share": share, **of_photos}
     return found
 

@@ -111,7 +111,8 @@ def test_the_point_is_where_the_plant_is(demo_scene: Scene) -> None:
         (lambda cameras: inverted(flipped(cameras)), "error", (), "as Blender's do: invert them"),
         (lambda cameras: turned(cameras, 4, 70), "warning", (4,), "view 4 (004) look past the point"),
         (lambda cameras: replace(cameras, R=cameras.R[[0] * 9], t=cameras.t[[0] * 9]), "error", (), "all cameras"),
-        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(1000)), "warning", (2,), "is t in another unit"),
+        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(1000)), "error", (2,), "is t in another unit (mill"),
+        (lambda cameras: edited(cameras, 2, lambda K, t: t.mul_(20)), "warning", (2,), "is t in another unit?"),
         (lambda cameras: edited(cameras, 5, lambda K, t: K[:2].mul_(2)), "warning", (5,), "is K that of photos of"),
         (lambda cameras: edited(cameras, 5, lambda K, t: K[0, 0].mul_(1.5)), "warning", (5,), "a factor of 1.50"),
     ],
@@ -131,6 +132,35 @@ def test_cameras_that_look_elsewhere_are_no_fault(demo_scene: Scene) -> None:
     found = findings_of(demo_scene, cameras)
     assert [(each.level, each.views) for each in found if "look past" in each.what] == [("warning", (1, 4, 7))]
     assert "error" not in {each.level for each in found}
+
+
+@pytest.mark.parametrize(
+    ("views", "few"), [((1, 3, 5, 7), (1, 3, 5, 7)), ((0, 2, 4, 6, 8), (1, 3, 5, 7)), ((6,), (6,))]
+)
+@pytest.mark.parametrize(
+    ("factor", "times", "units"),
+    [(0.001, 1000, "(millimetres and m"), (100, 100, "(centimetres and m"), (0.1, 10, "(millimetres and centim")],
+)
+def test_cameras_in_two_units(
+    views: tuple[int, ...], few: tuple[int, ...], factor: float, times: int, units: str, demo_scene: Scene
+) -> None:
+    """Wherever the world's origin is; nothing else is said of where these cameras are."""
+    far = moved(demo_scene.cameras, 1.0, rotation([1, 2, 3], 40), torch.tensor([900.0, -300.0, 100.0]).double())
+    for cameras in (demo_scene.cameras, far):
+        t = cameras.t.clone()
+        t[list(views)] *= factor
+        (found,) = findings_of(demo_scene, replace(cameras, t=t))
+        length = "short" if (factor < 1) == (views == few) else "long"
+        assert found.views == few
+        assert f"t is some {times} times as {length} as in the other {9 - len(few)}; is t in another unit" in found.what
+        assert units in found.what
+        assert found.level == "error" or times == 10
+
+
+def test_an_origin_at_a_camera_is_no_other_unit(demo_scene: Scene) -> None:
+    for view in (0, 4):
+        cameras = moved(demo_scene.cameras, 1.0, torch.eye(3).double(), -demo_scene.cameras.centers[view])
+        assert findings_of(demo_scene, cameras) == []
 
 
 def test_a_field_of_view_that_no_lens_has(demo_scene: Scene) -> None:
@@ -174,6 +204,11 @@ def test_what_is_not_known_is_a_note(demo_scene: Scene) -> None:
         ("note", "the cameras do not say their unit"),
         ("note", "the cameras do not say which way is up"),
     ]
+
+
+def test_an_up_that_the_cameras_contradict_is_a_note(demo_scene: Scene) -> None:
+    (found,) = findings_of(replace(demo_scene, up=(0.0, 0.0, -1.0)), demo_scene.cameras)
+    assert (found.level, found.what.split(":")[0]) == ("note", "up may be upside down")
 
 
 def test_the_plan_shows_every_camera(demo_scene: Scene) -> None:

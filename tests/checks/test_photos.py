@@ -41,6 +41,19 @@ def dim(folder: Path, view: int) -> None:
     write_image(photo(folder, view), image // 10 + np.arange(WIDTH, dtype=np.uint8)[None, :, None] // 8)
 
 
+def drain(folder: Path, view: int) -> None:
+    """A photo without colours, as a grey JPEG."""
+    jpeg = folder / "images" / "grey.jpg"
+    Image.open(photo(folder, view)).convert("L").save(jpeg, quality=80)
+    edit_rig(folder, view, file="images/grey.jpg")
+
+
+def darken(folder: Path, view: int) -> None:
+    """12 % of the brightness of a photo with the contrast that real ones have: a fifth of its level."""
+    ramp = np.linspace(100, 200, WIDTH)[None, :, None] * np.ones((HEIGHT, 1, 3))
+    write_image(photo(folder, view), (0.12 * ramp).astype(np.uint8))
+
+
 def overexpose(folder: Path, view: int) -> None:
     image = cv2.imread(str(photo(folder, view)))
     image[:, : WIDTH * 4 // 5] = 255
@@ -69,6 +82,9 @@ def test_sound_photos_have_no_finding(tmp_path: Path) -> None:
         (lambda f: cut_file(photo(f, 0), 0.5), "error", (0,), "cannot be read"),
         (lambda f: fill(f, 1, 128), "error", (1,), "show nothing"),
         (lambda f: [fill(f, view, 0) for view in (0, 1)], "error", (0, 1), "show nothing"),
+        (lambda f: fill(f, 1, 25), "error", (1,), "show nothing"),
+        (lambda f: darken(f, 2), "warning", (2,), "nearly black"),
+        (lambda f: drain(f, 2), "note", (2,), "are grey: leaf colours and greenness are not measured"),
         (lambda f: dim(f, 2), "warning", (2,), "nearly black"),
         (lambda f: overexpose(f, 2), "warning", (2,), "overexposed"),
         (lambda f: turn_by_exif(f, 1), "warning", (1,), "EXIF turns view 1"),

@@ -136,6 +136,14 @@ def test_photos_three_times_as_large_give_the_same(textured: LeafSurface) -> Non
     assert middle(fit(masks, photos, cameras)) == pytest.approx(middle(textured), abs=0.1)
 
 
+@pytest.mark.parametrize("scale", [2.0**-10, 2.0**10])
+def test_the_world_may_be_scaled(textured: LeafSurface, scale: float) -> None:
+    """What hides what on the blade is told in its own length, not in the world's unit."""
+    other = fit(DOME.masks, DOME.photos, CAMERAS.scale(scale))
+    assert other.area / scale**2 == pytest.approx(textured.area, rel=1e-6)
+    assert other.deviations[0] / scale**2 == pytest.approx(textured.deviations[0], rel=1e-3)
+
+
 def test_photo_of_another_size_is_refused() -> None:
     photos = [*DOME.photos[:2], DOME.photos[2][:-1], *DOME.photos[3:]]
     with pytest.raises(InputError, match=r"the photo of view 2 is of shape \(199, 200, 3\), expected \(200, 200, 3\)"):

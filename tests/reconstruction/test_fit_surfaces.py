@@ -8,8 +8,9 @@ from scipy import ndimage
 from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_cameras
 from known_leaves import flat_leaf
 from mvseg.errors import InputError
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, spread_views
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, spread_views, start_in
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Cameras
 from mvseg.verification.visible_leaves import visible_leaves
 
@@ -204,6 +205,18 @@ def test_two_views_say_so() -> None:
     surface = fit([masks[0], masks[2]], CAMERAS[[0, 2]])
     assert not surface.quality.is_good
     assert any("two views" in reason for reason in surface.quality.reasons)
+
+
+@pytest.mark.parametrize("size", [1e-3, 0.37, 1 / 3, 1e3])
+def test_starts_do_not_depend_on_the_size_of_a_voxel(size: float) -> None:
+    """Voxels have many neighbours that are equally near; rounding must not choose between them."""
+    x, y, z = np.mgrid[:30, :20, :9]
+    blob = (x - 15) ** 2 / 200 + (y - 9 - x / 5) ** 2 / 30 + (z - 4 - y / 9) ** 2 / 6 <= 1
+    votes = torch.from_numpy(blob).float()
+    origin = torch.tensor([-7.0, 3.0, 5.0], dtype=torch.float64)
+    grids = [VoxelGrid(origin * each, each, votes, num_views=2, threshold=0.5) for each in (1.0, size)]
+    for start, scaled in zip(*(start_in(grid, is_clear=False) for grid in grids), strict=True):
+        assert scaled / size == pytest.approx(start, rel=1e-9, abs=1e-9)
 
 
 def test_one_view_gives_no_numbers() -> None:

@@ -76,6 +76,26 @@ def test_gradients_are_clipped_and_followed_by_the_average() -> None:
     assert unclipped.model.weight.item() == pytest.approx(0.5)
 
 
+def test_running_statistics_are_followed_too() -> None:
+    """Of a live BatchNorm: an average that kept 0 and 1 would be exported with them."""
+    config = make_config(Path(), Path(), optimizer="sgd", ema_decay=0.99)
+    model: Any = torch.nn.Sequential(torch.nn.Conv2d(1, 2, 1), torch.nn.BatchNorm2d(2))
+    state = TrainingState(model.train(), build_optimizer(config, model), copy.deepcopy(model).eval())
+    photo = torch.linspace(3, 9, 32).reshape(2, 1, 4, 4)
+    expected = {"running_mean": torch.zeros(2), "running_var": torch.ones(2)}
+    for step in range(4):
+        model(photo).square().sum().backward()
+        assert apply_gradients(config, state, 0.01)
+        share = 1 - min(0.99, (1 + step) / (10 + step))
+        for name, value in expected.items():
+            value.lerp_(getattr(model[1], name), share)
+    averaged: Any = state.result
+    for name, value in expected.items():
+        assert getattr(averaged[1], name).tolist() == pytest.approx(value.tolist(), rel=1e-5)
+    assert averaged[1].num_batches_tracked == 4
+    assert not torch.allclose(averaged[1].running_var, model[1].running_var, rtol=1e-3)  # not copied
+
+
 def test_a_gradient_that_is_not_finite_changes_nothing() -> None:
     state, applied = step_once(make_config(Path(), Path()), math.nan)
     assert not applied

@@ -50,6 +50,20 @@ def test_colours_are_those_of_sure_pixels(tmp_path: Path) -> None:
     assert found["greenness_index"].sd == pytest.approx(0, abs=1e-9)
 
 
+@pytest.mark.parametrize("num_grey", [1, 3])
+def test_grey_photos_have_no_colour(num_grey: int, tmp_path: Path) -> None:
+    """They do not count where others have colours, and where none has any the leaf has no greenness, rather than 0."""
+    masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
+    photos = [painted(mask, GREEN) for mask in masks]
+    for photo in photos[:num_grey]:
+        photo[:] = photo.mean(2, keepdims=True) + [0, 1, 2]
+    found = measure_appearance({1: LEAF}, *labels_of(masks), scene=scene_of(tmp_path, photos))[1]
+    if num_grey < 3:
+        assert found["greenness_index"].value == pytest.approx((360 - 60 - 30) / (360 + 60 + 30))
+    else:
+        assert {found[name].method for name in COLORS} == {"not measured: the photos are grey"}
+
+
 def test_masks_that_reach_beyond_the_leaf_add_no_colour(tmp_path: Path) -> None:
     masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
     wide = [cv2.dilate(mask.astype(np.uint8), np.ones((21, 21), np.uint8)) for mask in masks]

@@ -14,8 +14,10 @@ from mvseg.formats.masks.label_image import labels_of_numbers
 def read_npy(path: Path, width: int, height: int) -> np.ndarray | list[FoundMask]:
     """The (height, width) uint16 labels of a photo, or its masks, numbered from 1, where the file holds a stack.
 
+    The masks of a stack are what is not 0, in whole numbers of any type, floats included.
+
     Raises:
-        InputError: the file is no array of numbers, or has another size.
+        InputError: the file is no array of numbers, or has another size; a stack holds fractions or negative numbers.
     """
     if not path.is_file():
         raise InputError(f"{path}: the mask file is missing")
@@ -34,6 +36,15 @@ def read_npy(path: Path, width: int, height: int) -> np.ndarray | list[FoundMask
         raise InputError(f"{path}: its shape is {shape or 'empty'}, {expected}")
     if array.ndim == 2:
         return labels_of_numbers(path, np.asarray(array, np.uint8) if array.dtype == bool else np.asarray(array))
-    if array.dtype not in (bool, np.uint8, np.int64, np.int32, np.uint16):
+    if array.dtype.kind not in "buif":
         raise InputError(f"{path}: holds a stack of {array.dtype}, expected masks of bool or whole numbers")
-    return [FoundMask(number, np.asarray(mask) != 0) for number, mask in enumerate(array, start=1)]
+    return [FoundMask(number, _mask_of(path, np.asarray(mask))) for number, mask in enumerate(array, start=1)]
+
+
+def _mask_of(path: Path, numbers: np.ndarray) -> np.ndarray:
+    """(H, W) bool of one mask of a stack."""
+    if numbers.dtype.kind == "f" and not (np.isfinite(numbers) & (numbers == np.floor(numbers))).all():
+        raise InputError(f"{path}: holds a stack of fractions, expected masks of 0 and 1: save masks > 0.5")
+    if numbers.dtype.kind in "if" and (numbers < 0).any():
+        raise InputError(f"{path}: holds a stack with negative numbers, expected masks of 0 and 1")
+    return np.asarray(numbers != 0)

@@ -25,14 +25,14 @@ from mvseg.reconstruction.surface.fit_patch import (
     jackknife_covariance,
 )
 from mvseg.reconstruction.surface.fit_photos import fit_photos
-from mvseg.reconstruction.surface.leaf_patch import Floats, measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
 from mvseg.reconstruction.surface.patch_image import hiding_pixels, project_points, view_ious
 from mvseg.reconstruction.surface.patch_start import start_patches
-from mvseg.reconstruction.voxels import back_project
+from mvseg.reconstruction.voxels import VoxelGrid, back_project
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.worker_pool import spread
@@ -225,7 +225,7 @@ def _fit_from_hull(
                 masks = masks.select(is_right)
                 members = members.select(torch.isin(members.view_index, torch.from_numpy(masks.views)))
                 hull = back_project(members, cameras, config=HULL, free=free) or hull
-        starts, ranks = _likely_starts(masks, hull.points.numpy())
+        starts, ranks = _likely_starts(masks, hull)
         for start, rank in zip(starts, ranks, strict=True):
             if is_good and rank < ranks[0] - UNCLEAR:
                 break
@@ -239,18 +239,29 @@ def _fit_from_hull(
     return masks, best
 
 
-def _likely_starts(masks: MaskStack, points: Floats) -> tuple[list[Floats], list[float]]:
-    """At most MOST_FITS starts from the voxels (P, 3) of the hull, the likeliest first, and how likely each is.
+def _likely_starts(masks: MaskStack, hull: VoxelGrid) -> tuple[list[Floats], list[float]]:
+    """At most MOST_FITS starts from the voxels of the hull, the likeliest first, and how likely each is.
 
     They are told by how well they explain the masks as they are, before any fit.
     """
-    starts = start_patches(points)
+    starts = start_in(hull)
     ranks = [_rank(masks, start) for start in starts]
     if ranks and max(ranks) < CLEAR_IOU:
-        starts = start_patches(points, is_clear=False)
+        starts = start_in(hull, is_clear=False)
         ranks = [_rank(masks, start) for start in starts]
     order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_FITS]
     return [starts[index] for index in order], [ranks[index] for index in order]
+
+
+def start_in(hull: VoxelGrid, *, is_clear: bool = True) -> list[Floats]:
+    """`start_patches` in whole numbers of voxels: many of these are equally far from each other, and in world units
+    rounding, and with it the world's scale, would choose between them."""
+    corner = (hull.origin + 0.5 * hull.voxel_size).numpy()
+    starts = start_patches(hull.occupied.nonzero().double().numpy(), is_clear=is_clear)
+    starts = [hull.voxel_size * start for start in starts]
+    for start in starts:
+        start[MIDRIB] += corner
+    return starts
 
 
 def _rank(masks: MaskStack, start: Floats) -> float:

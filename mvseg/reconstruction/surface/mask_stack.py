@@ -110,9 +110,9 @@ class MaskStack:
         return replace(self, others=others)
 
     def move_world(self, centre: Floats, scale: float) -> MaskStack:
-        """The same masks for world coordinates (x - centre) / scale."""
+        """The same masks for world coordinates (x - centre) / scale; depths are divided by `scale`, too."""
         shift = self.px_from_world[:, :, :3] @ centre + self.px_from_world[:, :, 3]
-        matrices = np.concatenate([self.px_from_world[:, :, :3] * scale, shift[:, :, None]], 2)
+        matrices = np.concatenate([self.px_from_world[:, :, :3], shift[:, :, None] / scale], 2)
         return replace(self, px_from_world=matrices)
 
 

@@ -46,9 +46,10 @@ def test_labels_of_any_type(dtype: str, tmp_path: Path) -> None:
     np.testing.assert_array_equal(found, LABELS)
 
 
-def test_stacks_may_overlap(tmp_path: Path) -> None:
+@pytest.mark.parametrize("dtype", ["?", "u1", "u2", "u4", "u8", "i1", "<i2", ">i4", "i8", "f2", "f4", ">f8"])
+def test_stacks_of_any_type_may_overlap(dtype: str, tmp_path: Path) -> None:
     masks = np.random.default_rng(0).random((3, 40, 60)) > 0.4
-    np.save(tmp_path / "a.npy", masks.astype(np.uint8) * 255)
+    np.save(tmp_path / "a.npy", masks.astype(dtype) * np.array(255 if dtype == "u1" else 1, dtype))
     found = read_npy(tmp_path / "a.npy", 60, 40)
     assert isinstance(found, list)
     np.testing.assert_array_equal([each.mask for each in found], masks)
@@ -67,6 +68,16 @@ def test_npy_files_that_are_refused(tmp_path: Path) -> None:
     np.save(path, LABELS[None].astype(complex))
     with pytest.raises(InputError, match=r"a.npy: holds a stack of complex128, expected masks of bool"):
         read_npy(path, 60, 40)
+    soft = np.full((2, 40, 60), 0.7, np.float32)
+    for stack, problem in (
+        (soft, "fractions, expected masks of 0 and 1: save masks > 0.5"),
+        (soft * np.nan, "fractions"),
+        (-np.ones((2, 40, 60), np.int8), "negative numbers"),
+        (-np.ones((2, 40, 60)), "negative numbers"),
+    ):
+        np.save(path, stack)
+        with pytest.raises(InputError, match=rf"a.npy: holds a stack .*{problem}"):
+            read_npy(path, 60, 40)
     np.save(path, LABELS + 0.5)
     with pytest.raises(InputError, match=r"a.npy: holds numbers that are no labels"):
         read_npy(path, 60, 40)
