@@ -16,6 +16,7 @@ import torch
 from tqdm import tqdm
 
 from mvseg._version import code_hash
+from mvseg.checks.contradictions import warn_of_contradictions
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
 from mvseg.detection.config import DetectConfig
@@ -150,6 +151,7 @@ def list_stages(config: RunConfig, *, has_masks: bool) -> dict[str, Stage]:
         "match": match_refined if config.refine_poses else match,
         "split": split if config.split_merged and not is_checked else None,
         "verify": verify if is_verified else None,
+        "check": check_cameras,
         "check_ids": check_ids if is_checked else None,
         "split_checked": split if config.split_merged and is_checked else None,
         "reconstruct": None if shapes is None else reconstruct,
@@ -262,6 +264,14 @@ def verify(state: State) -> State:
         progress=state.progress,
     )
     return replace(state, matching=state.matched.with_masks(masks), starts=starts)
+
+
+def check_cameras(state: State) -> State:
+    """Warns where masks or photos contradict the cameras, see `warn_of_contradictions`; photos are not asked where ids
+    alone are wanted."""
+    has_photos = state.config.reconstruct is not None and state.photos.exist
+    warn_of_contradictions(state.scene, state.matched.masks.regions, photos=has_photos, progress=state.progress)
+    return state
 
 
 def check_ids(state: State) -> State:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import shutil
 import warnings
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,9 +15,12 @@ import pytest
 
 from mvseg.checks.check_scene import check_scene
 from mvseg.cli import main
+from mvseg.config import RunConfig
 from mvseg.demo import demo_scene as demo_folder
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.pipeline import run_scene
+from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 from scene_folders import write_image, write_scene
@@ -52,6 +57,55 @@ def test_a_fault_is_an_exit_code_of_1(plant: Path, tmp_path: Path, capsys: pytes
     content = json.loads((tmp_path / "out" / "check.json").read_text())
     assert [finding["views"] for finding in content["findings"]] == [[2], [5]]
     assert (cv2.imread(str(tmp_path / "out" / "cameras.png")) == (39, 48, 215)).all(2).any()  # red, as OpenCV has it
+
+
+def edit_cameras(plant: Path, edit: Callable[[int, dict[str, Any]], object]) -> None:
+    """Change each entry of the rig file, by its index."""
+    rig = json.loads((plant / "cameras.json").read_text())
+    for index, entry in enumerate(rig["views"]):
+        edit(index, entry)
+    (plant / "cameras.json").write_text(json.dumps(rig))
+
+
+def move_every_second(index: int, entry: dict[str, Any]) -> None:
+    entry["t"] = (np.array(entry["t"]) * (1.2 if index % 2 == 0 else 1)).tolist()
+
+
+def lengthen(_: int, entry: dict[str, Any]) -> None:
+    entry["K"] = (np.array(entry["K"]) * [[1.1], [1.1], [1]] + [[0, 0, -32], [0, 0, -24], [0, 0, 0]]).tolist()
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_two_worlds_are_an_error(masks: bool, plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit_cameras(plant, move_every_second)
+    assert main(["check", str(plant), *(["--masks", "masks"] if masks else []), "--quiet"]) == 1
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("error")]
+    assert "5 views (000, 002, 004, 006, 008)" in line
+    assert "4 views (001, 003, 005, 007)" in line
+
+
+@pytest.mark.parametrize("masks", [True, False])
+def test_a_wrong_focal_length_is_an_error(masks: bool, plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit_cameras(plant, lengthen)
+    assert main(["check", str(plant), *(["--masks", "masks"] if masks else []), "--quiet"]) == 1
+    (line,) = [line for line in capsys.readouterr().out.splitlines() if line.startswith("error")]
+    assert "the focal lengths seem wrong, expected about 0.9" in line
+
+
+@pytest.mark.parametrize(
+    ("edit", "expected"), [(move_every_second, "agree within 5 views"), (lengthen, "the focal lengths seem wrong")]
+)
+def test_a_run_warns_of_it(edit: Callable[[int, dict[str, Any]], object], expected: str, plant: Path) -> None:
+    edit_cameras(plant, edit)
+    config = RunConfig(reconstruct=ReconstructConfig(shape="voxels", voxel_size=4.0))
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        run_scene(plant, plant / "masks", config)
+    assert sum(expected in str(each.message) for each in caught) == 1
+
+
+def test_a_run_does_not_accuse_right_cameras(plant: Path) -> None:
+    run_scene(plant, plant / "masks", RunConfig(reconstruct=ReconstructConfig(shape="voxels", voxel_size=4.0)))
 
 
 def test_a_warning_is_none(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:

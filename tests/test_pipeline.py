@@ -71,7 +71,7 @@ def test_it_is_the_stages_one_after_another(plant: Path) -> None:
     assert result.voxels is not None
     assert result.voxels.keys() == shapes.keys() == {1, 2, 3}
     assert all(torch.equal(result.voxels[instance].votes, shapes[instance].votes) for instance in shapes)
-    assert [*result.seconds] == ["load", "match", "reconstruct", "measure"]
+    assert [*result.seconds] == ["load", "match", "check", "reconstruct", "measure"]
 
 
 def test_ids_are_those_of_the_balls(plant: Path) -> None:
@@ -85,7 +85,7 @@ def test_ids_are_those_of_the_balls(plant: Path) -> None:
 def test_ids_only(plant: Path) -> None:
     result = run_scene(plant, plant / "masks", IDS_ONLY)
     assert (result.surfaces, result.voxels, result.traits) == (None, None, None)
-    assert [*result.seconds] == ["load", "match"]
+    assert [*result.seconds] == ["load", "match", "check"]
 
 
 def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 from mvseg.checks.cameras import Coverage, camera_findings, find_coverage
+from mvseg.checks.epipolar_distances import distance_findings
 from mvseg.checks.finding import Finding
+from mvseg.checks.groups import group_findings
 from mvseg.checks.masks import mask_findings
+from mvseg.checks.photo_matches import match_photos
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
+from mvseg.formats.photos import read_photo
 from mvseg.matching.match import check_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.regions import Regions
@@ -40,14 +45,17 @@ class Check:
         return any(finding.level == "error" for finding in self.findings)
 
 
-def check_scene(scene: Scene, regions: Regions | None = None, *, progress: bool = False) -> Check:
-    """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks.
+def check_scene(
+    scene: Scene, regions: Regions | None = None, *, features: bool = True, progress: bool = False
+) -> Check:
+    """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks and the photos.
 
-    Nothing is matched. Photos are decoded, one at a time. Everything runs on the CPU, wherever the inputs are.
+    No ids are given. Photos are decoded, one at a time. Everything runs on the CPU, wherever the inputs are.
 
     Args:
         scene: of V views; photos may be absent.
         regions: its masks.
+        features: compare features of neighbouring photos with the cameras.
         progress: show progress bars.
 
     Raises:
@@ -65,7 +73,11 @@ def check_scene(scene: Scene, regions: Regions | None = None, *, progress: bool 
         findings += mask_findings(regions, scene.cameras, names)
         if not bool(is_coincident(scene.cameras).all()):
             agreement = pairwise_agreement(regions, scene.cameras, progress=progress)
-            findings += pose_findings(agreement, names)
+            findings += pose_findings(agreement, names) + group_findings(agreement, names)
+    if features:
+        is_said = any(each.where == "poses" and each.level == "error" for each in findings)
+        matches = match_photos(partial(read_photo, scene), scene.cameras, progress=progress)
+        findings += distance_findings(matches, scene.cameras, names, only_focal=is_said)
     return Check(
         scene=scene,
         regions=regions,

@@ -26,12 +26,12 @@ class Finding:
     views: tuple[int, ...] = ()
 
 
-def name_views(views: tuple[int, ...], names: tuple[str, ...]) -> str:
+SHOWN = 3  # names in a sentence
+
+
+def name_views(views: tuple[int, ...], names: tuple[str, ...], *, shown: int = SHOWN) -> str:
     """The views in a sentence: "view 3 (003)", or "5 views (000, 001, 002 and 2 more)"."""
     if len(views) == 1:
         return f"view {views[0]} ({names[views[0]]})"
-    more = f" and {len(views) - SHOWN} more" if len(views) > SHOWN else ""
-    return f"{len(views)} views ({', '.join(names[view] for view in views[:SHOWN])}{more})"
-
-
-SHOWN = 3  # names in a sentence
+    more = f" and {len(views) - shown} more" if len(views) > shown else ""
+    return f"{len(views)} views ({', '.join(names[view] for view in views[:shown])}{more})"

@@ -163,8 +163,7 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     compared = pairs.num_masks[pairs.num_masks > 0]
     if not len(compared):
         return []
-    is_sure = np.median(compared) >= FEW_MASKS and len(names) >= FEW_VIEWS
-    level: Level = "error" if is_sure else "warning"
+    level: Level = "error" if is_sure(pairs) else "warning"
     if not view.agree:
         share, px = np.nanmedian(view.fitting), np.nanmedian(view.offset_px)
         facts = f"only {share:.0%} of the masks end where others do, epipolar lines miss by {px:.0f} px or more"
@@ -185,6 +184,12 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
         what = f"epipolar lines of {name_views(missing, names)} miss by up to {most:.0f} px: {step}"
         findings.append(Finding(where="poses", what=what, level="warning", views=missing))
     return findings
+
+
+def is_sure(pairs: PoseAgreement) -> bool:
+    """Whether views and masks are enough for an error; there must be masks to compare."""
+    enough = np.median(pairs.num_masks[pairs.num_masks > 0]) >= FEW_MASKS
+    return bool(enough and len(pairs.fitting) >= FEW_VIEWS)
 
 
 def _against(pairs: PoseAgreement, kept: list[int]) -> tuple[Floats, Floats]:

@@ -105,7 +105,8 @@ def save_scene(
     run = describe_run(result, masks, config, messages=messages)
     run["config"] = {"scene": str(scene.resolve()), "out": str(out)} | run["config"]
     if config.report:
-        run["checks"] = [asdict(finding) for finding in check_scene(result.scene, result.regions).findings]
+        check = check_scene(result.scene, result.regions, features=False)  # of which the run has warned
+        run["checks"] = [asdict(finding) for finding in check.findings]
     save_result(result, out, run, progress=progress, draw_rims=config.draw_rims, report=config.report)
 
 

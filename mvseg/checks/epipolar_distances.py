@@ -1,0 +1,159 @@
+"""Do the cameras agree with what the photos share? By epipolar distances of features, pair by pair.
+
+A pair of photos whose features fit one fundamental matrix, but not that of their cameras, contradicts the cameras. One
+factor of all focal lengths at which the features of the pairs fit far better is the error of the focal length.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from mvseg.checks.finding import Finding, name_views
+from mvseg.checks.groups import NAMED, NEXT_STEP
+from mvseg.checks.photo_matches import PhotoMatches
+from mvseg.scene import Cameras
+
+Floats = NDArray[np.float64]
+
+OFFSET = 1.5  # units; features that miss by less fit the cameras
+CONTRADICTS, AGREES = 0.3, 0.6  # share of the features of one fundamental matrix that fit the cameras', below and above
+FEWEST_PAIRS = 3  # that a focal length is told by
+FACTORS = np.exp(np.linspace(-1, 1, 101))  # of the focal length, in steps of 2 %; the middle one is 1
+LEAST_ERROR = 0.05  # of the focal length's logarithm
+BETTER = 0.5  # of the epipolar distance, with another focal length
+MOST = 0.7  # share of the pairs for which it is better, and fits
+
+ONE_STEP = "it has the pose of another photo, or was moved; mend it or leave it out"
+QUESTION = "do R and t map world points to the camera, and does each camera belong to its photo?"
+
+
+def distance_findings(
+    matches: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...], *, only_focal: bool = False
+) -> list[Finding]:
+    """What the features of the photos say against the cameras.
+
+    Nothing where too few are told apart (plain leaves before black cloth), or where most of them stand still from photo
+    to photo: the plant turns, and what does not turn tells nothing about the cameras round it.
+
+    Args:
+        matches: see `match_photos`.
+        cameras: V cameras on the CPU.
+        names: of the V views.
+        only_focal: say nothing of poses, which the masks have spoken of.
+    """
+    num_still = sum(pair.num_still for pair in matches)
+    if num_still > sum(pair.xy.shape[1] for pair in matches):
+        return []
+    telling = [pair for pair in matches if pair.is_telling]
+    factor = focal_factor(telling, cameras)
+    findings = []
+    if factor != 1:
+        before, after = (_median_px(telling, cameras, each) for each in (1.0, factor))
+        facts = f"features of the photos miss their epipolar lines by {before:.1f} px, and by {after:.1f} px with that"
+        what = f"the focal lengths seem wrong, expected about {factor:.2f} times as much ({facts}): is K that of these "
+        what += "photos, of this zoom and in pixels of this size?"
+        findings.append(Finding(where="poses", what=what, level="error"))
+        cameras = scale_focal(cameras, factor)
+    return findings if only_focal else findings + _pose_findings(telling, cameras, names)
+
+
+def focal_factor(matches: Sequence[PhotoMatches], cameras: Cameras) -> float:
+    """By what all focal lengths must be multiplied for the features to fit; 1 where that is not certain.
+
+    Another focal length is certain if it halves the median epipolar distance, brings it below what fits in 70 % of
+    the pairs, differs by 5 % or more, and is not at the end of what is tried (0.37 to 2.7).
+    """
+    if len(matches) < FEWEST_PAIRS:
+        return 1.0
+    cost = np.array([[_miss(pair, cameras, factor) for pair in matches] for factor in FACTORS])
+    best, given = int(np.median(cost, axis=1).argmin()), len(FACTORS) // 2
+    is_inside = 0 < best < len(FACTORS) - 1
+    is_far = abs(np.log(FACTORS[best])) > LEAST_ERROR
+    is_better = np.median(cost[best]) < BETTER * np.median(cost[given]) and np.mean(cost[best] < cost[given]) >= MOST
+    fits = np.mean(cost[best] < OFFSET) >= MOST
+    return float(FACTORS[best]) if is_inside and is_far and is_better and fits else 1.0
+
+
+def scale_focal(cameras: Cameras, factor: float) -> Cameras:
+    """Cameras with other focal lengths."""
+    K = cameras.K.clone()
+    K[:, [0, 1], [0, 1]] *= factor
+    return replace(cameras, K=K)
+
+
+def fundamental(views: tuple[int, int], cameras: Cameras) -> Floats:
+    """(3, 3) F with x_j^T F x_i = 0 for the views i and j."""
+    first, second = views
+    K, R, centers = cameras.K.numpy(), cameras.R.numpy(), cameras.centers.numpy()
+    x, y, z = R[second] @ (centers[first] - centers[second])
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    return np.asarray(np.linalg.inv(K[second]).T @ cross @ R[second] @ R[first].T @ np.linalg.inv(K[first]))
+
+
+def epipolar_distances(xy: Floats, F: Floats) -> Floats:
+    """(N,) pixels, Sampson's distance of points (2, N, 2) of two views: of both photos together."""
+    one, other = np.concatenate((xy, np.ones_like(xy[..., :1])), 2)
+    lines, back = one @ F.T, other @ F
+    slope = np.hypot(np.hypot(lines[:, 0], lines[:, 1]), np.hypot(back[:, 0], back[:, 1]))
+    return np.asarray(np.abs((other * lines).sum(1)) / slope.clip(min=1e-300))
+
+
+def _miss(pair: PhotoMatches, cameras: Cameras, factor: float = 1) -> float:
+    """Units, median epipolar distance of the features that fit one fundamental matrix, with focal lengths `factor`
+    times as long: as if the photos were as much smaller about their principal points."""
+    centers = cameras.K[list(pair.views), None, :2, 2].numpy()
+    xy = (pair.xy[:, pair.is_rigid] - centers) / factor + centers
+    return float(np.median(epipolar_distances(xy, fundamental(pair.views, cameras)))) * factor / pair.unit_px
+
+
+def _median_px(matches: Sequence[PhotoMatches], cameras: Cameras, factor: float = 1) -> float:
+    return float(np.median([_miss(pair, cameras, factor) * pair.unit_px for pair in matches]))
+
+
+def _pose_findings(telling: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
+    """The pairs of views that contradict their cameras, as one finding; one pair among others may be a mistake."""
+    shares = [_fitting_share(pair, cameras) for pair in telling]
+    wrong = [pair for pair, share in zip(telling, shares, strict=True) if share < CONTRADICTS]
+    if not wrong or (len(wrong) == 1 and len(telling) > 1):
+        return []
+    agreeing = [pair.views for pair, share in zip(telling, shares, strict=True) if share > AGREES]
+    facts = f"in {len(wrong)} of {len(telling)} pairs of photos they miss by {_median_px(wrong, cameras):.0f} px"
+    few, many = _sides(agreeing, [pair.views for pair in wrong], len(names))
+    if not few:
+        what = f"features of the photos contradict the cameras ({facts}): {QUESTION}"
+    else:
+        between = " and those of ".join(name_views(side, names, shown=NAMED) for side in (few, many))
+        step = ONE_STEP if len(few) == 1 else NEXT_STEP
+        what = f"features of the photos do not fit both the cameras of {between} ({facts}): {step}"
+    return [Finding(where="poses", what=what, level="error", views=few)]
+
+
+def _sides(
+    agreeing: Sequence[tuple[int, int]], wrong: Sequence[tuple[int, int]], num: int
+) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Fewer and more views that contradict each other: of the groups of views that agree, the smallest one that is in
+    all wrong pairs, and all others that are in some; empty where there is none."""
+    if not agreeing:
+        return (), ()
+    first, second = np.array(agreeing).T
+    group = connected_components(coo_array((np.ones(len(first)), (first, second)), (num, num)), directed=False)[1]
+    pairs = [{int(group[i]), int(group[j])} for i, j in wrong]
+    shared = sorted(set.intersection(*pairs), key=lambda each: int((group == each).sum()))
+    others = set().union(*pairs) - set(shared[:1])
+    if not shared or not others:
+        return (), ()
+    sides = [tuple(np.flatnonzero(np.isin(group, side)).tolist()) for side in (shared[:1], sorted(others))]
+    few, many = sorted(sides, key=lambda side: (len(side), side))
+    return few, many
+
+
+def _fitting_share(pair: PhotoMatches, cameras: Cameras) -> float:
+    """How many features fit the cameras, of as many as fit one fundamental matrix."""
+    fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < OFFSET * pair.unit_px
+    return float(fits.sum() / pair.is_rigid.sum())

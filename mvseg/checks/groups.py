@@ -1,0 +1,113 @@
+"""Do all views tell of one world? Groups of views that agree within themselves only, by the masks.
+
+Views that were calibrated in two goes may have two scales or two sets of axes. Each view then agrees with its group, so
+that none of them stands out alone; between the groups, only chance makes masks end where others do.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.checks.finding import Finding, Level, name_views
+from mvseg.checks.poses import OFFSET, PoseAgreement, is_sure, view_agreement
+
+Floats = NDArray[np.float64]
+
+CHANCE = 0.06  # share of the masks that fit where poses and masks have nothing to do with each other
+APART = 0.5  # of the share that fits within the groups: in one world, more fit between them, see docs/check.md
+SMALLEST = 2  # views of a group; one alone is for `view_agreement`
+NAMED = 12  # views of a group that a sentence names
+NEXT_STEP = "were these cameras calibrated apart, in two scales or axes? Calibrate them together, or take one group"
+
+
+def world_groups(pairs: PoseAgreement) -> tuple[tuple[int, ...], ...]:
+    """Groups of two or more views that agree within themselves and not with each other, the largest first.
+
+    Views that agree with none, or have no masks to compare, are in no group. There is a single group where all agree,
+    and none where most views agree with none.
+    """
+    views = view_agreement(pairs)
+    if not views.agree:
+        return ()
+    kept = np.array([view for view in np.flatnonzero(~np.isnan(views.fitting)) if view not in views.off], int)
+    groups, waiting = [], [kept]
+    while waiting:
+        members = waiting.pop()
+        parts = _split(pairs, members)
+        if parts is None:
+            groups.append(tuple(members.tolist()))
+        else:
+            waiting += parts
+    return tuple(sorted(groups, key=lambda group: (-len(group), group)))
+
+
+def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]:
+    """One finding where the V views, named, fall into groups, about all but the largest; none for one world."""
+    groups = world_groups(pairs)
+    if len(groups) < 2:
+        return []
+    members = [np.array(group) for group in groups]
+    within = np.concatenate([_upper(pairs.fitting, group) for group in members])
+    between = np.concatenate([_block(pairs, one, other)[0] for one, other in combinations(members, 2)])
+    facts = f"{np.nanmean(between):.0%} of the masks fit instead of {np.nanmean(within):.0%}"
+    each = " and ".join(f"within {name_views(group, names, shown=NAMED)}" for group in groups)
+    level: Level = "error" if is_sure(pairs) else "warning"
+    return [
+        Finding(
+            where="poses",
+            what=f"masks and poses agree {each}, but not between these groups ({facts}): {NEXT_STEP}",
+            level=level,
+            views=tuple(sorted(view for group in groups[1:] for view in group)),
+        )
+    ]
+
+
+def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.int64]] | None:
+    """Two groups of the members that contradict each other; None where they are of one world."""
+    if len(members) < 2 * SMALLEST:
+        return None
+    order = members[_order(pairs, members)]
+    cuts = [(order[:cut], order[cut:]) for cut in range(SMALLEST, len(order) - SMALLEST + 1)]
+    found = [(_contrast(pairs, *cut), cut) for cut in cuts]
+    contrast, (one, other) = min(found, key=lambda each: each[0])
+    return [np.sort(one), np.sort(other)] if contrast < APART and _is_off(pairs, one, other) else None
+
+
+def _order(pairs: PoseAgreement, members: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The members so that those that agree stand together: by the second eigenvector of the graph's Laplacian (the
+    Fiedler vector of the normalized cut, Shi and Malik 2000)."""
+    weight = np.nan_to_num(pairs.fitting[np.ix_(members, members)]).clip(CHANCE / 10)
+    np.fill_diagonal(weight, 0)
+    root = np.sqrt(weight.sum(1))
+    second = np.linalg.eigh(np.eye(len(members)) - weight / np.outer(root, root))[1][:, 1]
+    return np.argsort(second / root, kind="stable")
+
+
+def _contrast(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
+    """Share of the masks that fit between two groups, of that within them, chance aside; 1 where nothing tells."""
+    between, _ = _block(pairs, one, other)
+    within = np.concatenate((_upper(pairs.fitting, one), _upper(pairs.fitting, other)))
+    if np.isnan(between).all() or np.isnan(within).all():
+        return 1.0
+    return max(float(np.nanmean(between)) - CHANCE, 0.0) / max(float(np.nanmean(within)) - CHANCE, CHANCE)
+
+
+def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
+    """Whether epipolar lines miss in half of the pairs between two groups, but not within both: one of them may be of
+    two worlds itself."""
+    within = [np.nanmedian(values) for values in (_upper(pairs.offset, one), _upper(pairs.offset, other))
+              if not np.isnan(values).all()]  # fmt: skip
+    return bool(np.nanmedian(_block(pairs, one, other)[1]) >= OFFSET > min(within))
+
+
+def _block(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[Floats, Floats]:
+    """Fitting and offset of all pairs between two groups."""
+    return pairs.fitting[np.ix_(one, other)].ravel(), pairs.offset[np.ix_(one, other)].ravel()
+
+
+def _upper(values: Floats, members: NDArray[np.int64]) -> Floats:
+    """Of all pairs within a group."""
+    return np.asarray(values[np.ix_(members, members)][np.triu_indices(len(members), 1)])

@@ -1,0 +1,161 @@
+"""Cameras against features of the photos: focal lengths, poses and groups; and photos that tell nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from mvseg.checks.epipolar_distances import (
+    distance_findings,
+    epipolar_distances,
+    focal_factor,
+    fundamental,
+    scale_focal,
+)
+from mvseg.checks.photo_matches import PhotoMatches, _match, find_features, match_photos, neighbours
+from mvseg.errors import InputError
+from mvseg.formats.photos import read_photo
+from mvseg.formats.scene_folder import load_scene
+from mvseg.scene import Cameras, Scene
+from two_worlds import every_second_farther, half_turned
+
+NAMES = tuple(f"{view:03d}" for view in range(9))
+
+
+@pytest.fixture(scope="module")
+def shared(demo_scene: Scene) -> list[PhotoMatches]:
+    """What the photos of the shipped plant share."""
+    return match_photos(partial(read_photo, demo_scene), demo_scene.cameras)
+
+
+def say(shared: list[PhotoMatches], cameras: Cameras) -> list[tuple[str, tuple[int, ...]]]:
+    return [(each.what, each.views) for each in distance_findings(shared, cameras, NAMES)]
+
+
+def one_turned(cameras: Cameras) -> Cameras:
+    R = cameras.R.clone()
+    R[2] = half_turned(cameras, 10).R[2]
+    return replace(cameras, R=R)
+
+
+def test_right_cameras_have_no_finding(shared: list[PhotoMatches], demo_scene: Scene) -> None:
+    assert sum(pair.is_telling for pair in shared) >= 8
+    assert focal_factor(shared, demo_scene.cameras) == 1
+    assert say(shared, demo_scene.cameras) == []
+
+
+@pytest.mark.parametrize("factor", [0.5, 0.9, 1.1, 2.0])
+def test_a_wrong_focal_length_is_measured(factor: float, shared: list[PhotoMatches], demo_scene: Scene) -> None:
+    telling = [pair for pair in shared if pair.is_telling]
+    cameras = scale_focal(demo_scene.cameras, factor)
+    assert focal_factor(telling, cameras) == pytest.approx(1 / factor, rel=0.04)
+    ((what, views),) = say(shared, cameras)
+    assert "the focal lengths seem wrong" in what
+    assert views == ()
+
+
+@pytest.mark.parametrize(
+    ("fault", "views", "named"),
+    [
+        (partial(every_second_farther, factor=1.2), (1, 3, 5, 7), "5 views (000, 002, 004, 006, 008)"),
+        (partial(every_second_farther, factor=1.1), (1, 3, 5, 7), "5 views (000, 002, 004, 006, 008)"),
+        (partial(half_turned, degrees=10), (0, 1, 2, 3), "5 views (004, 005, 006, 007, 008)"),
+        (partial(half_turned, degrees=-10), (0, 1, 2, 3), "5 views (004, 005, 006, 007, 008)"),
+        (one_turned, (2,), "view 2 (002)"),
+        (lambda cameras: cameras[[8, *range(8)]], (), "features of the photos contradict the cameras"),
+    ],
+    ids=["t x 1.2", "t x 1.1", "half turned", "turned the other way", "one turned", "cameras of the previous photo"],
+)
+def test_wrong_poses_are_named(
+    fault: Callable[[Cameras], Cameras],
+    views: tuple[int, ...],
+    named: str,
+    demo_scene: Scene,
+) -> None:
+    cameras = fault(demo_scene.cameras)
+    shared = match_photos(partial(read_photo, demo_scene), cameras)  # wrong about what is near, too
+    ((what, found),) = say(shared, cameras)
+    assert named in what
+    assert found == views
+    assert distance_findings(shared, cameras, NAMES, only_focal=True) == []
+
+
+def test_a_common_scale_is_invisible(shared: list[PhotoMatches], demo_scene: Scene) -> None:
+    assert say(shared, demo_scene.cameras.scale(3.0)) == []
+
+
+def test_what_stands_still_tells_nothing(shared: list[PhotoMatches], demo_scene: Scene) -> None:
+    """A wall behind a turntable is seen at the same pixels of all photos."""
+    still = [replace(pair, num_still=2 * pair.xy.shape[1]) for pair in shared]
+    assert say(still, scale_focal(demo_scene.cameras, 0.5)) == []
+    photo = read_photo(demo_scene, 3)
+    same = match_photos(lambda _: photo, demo_scene.cameras)
+    assert all(pair.xy.shape[1] == 0 for pair in same)
+    assert all(pair.num_still > 50 for pair in same)
+
+
+def test_plain_photos_tell_nothing(demo_scene: Scene) -> None:
+    black = np.zeros((480, 640, 3), np.uint8)
+    assert find_features(black)[0].shape == (0, 2)
+    shared = match_photos(lambda _: black, demo_scene.cameras)
+    assert not any(pair.is_telling for pair in shared)
+    assert say(shared, scale_focal(demo_scene.cameras, 0.5)) == []
+
+
+def test_photos_that_cannot_be_read_are_left_out(demo_scene: Scene) -> None:
+    def read(view: int) -> np.ndarray:
+        if view == 3:
+            raise InputError("broken")
+        return read_photo(demo_scene, view)
+
+    shared = match_photos(read, demo_scene.cameras)
+    assert {view for pair in shared for view in pair.views} == {0, 1, 2, 4, 5, 6, 7, 8}
+
+
+def test_features_that_fit_nothing_are_no_evidence() -> None:
+    random = np.random.default_rng(0)
+    for num in (20, 40, 200):
+        xy = random.uniform(0, 480, (2, num, 2))
+        described = np.eye(num, 128 if num <= 128 else num, dtype=np.float32)
+        assert not _match((0, 1), (xy[0], described), (xy[1], described), unit_px=1.0).is_telling
+
+
+def test_neighbours_are_near_and_few(demo_scene: Scene) -> None:
+    cameras = demo_scene.cameras
+    pairs = neighbours(cameras)
+    assert {view for pair in pairs for view in pair} == set(range(9))
+    assert len(pairs) <= 36
+    many = neighbours(cameras[torch.arange(9).repeat(7)])  # of views that share a place, none
+    assert 1 <= len(many) <= 32
+    assert all(i % 9 != j % 9 for i, j in many)
+
+
+def test_epipolar_distances_are_pixels(demo_scene: Scene) -> None:
+    """A point that is moved by 6 px across its epipolar line in one photo misses by 6 / sqrt(2) where the photos are
+    alike (Sampson)."""
+    cameras = demo_scene.cameras
+    points = torch.tensor([[0.0, 0, 80], [20, 10, 60], [-30, 5, 90]]).double()
+    xy = cameras.project(points)[0][[3, 5]].numpy()
+    F = fundamental((3, 5), cameras)
+    assert epipolar_distances(xy, F).max() < 1e-6
+    lines = np.concatenate((xy[0], np.ones((3, 1))), 1) @ F.T
+    across = lines[:, :2] / np.linalg.norm(lines[:, :2], axis=1, keepdims=True)
+    moved = np.stack((xy[0], xy[1] + 6 * across))
+    np.testing.assert_allclose(epipolar_distances(moved, F), 6 / np.sqrt(2), rtol=0.2)
+
+
+@pytest.mark.shared_data
+@pytest.mark.parametrize("plant", ["basil-0729", "fern-llff", "maize-plant1"])
+def test_real_photos_do_not_accuse_right_cameras(plant: str, shared_data: Path) -> None:
+    scene = load_scene(shared_data / plant)
+    names = tuple(view.name for view in scene.views)
+    shared = match_photos(partial(read_photo, scene), scene.cameras)
+    assert distance_findings(shared, scene.cameras, names) == []
+    found = distance_findings(shared, scale_focal(scene.cameras, 1.1), names)
+    assert [each.what[:32] for each in found] == ["the focal lengths seem wrong, ex"] * (plant != "maize-plant1")
