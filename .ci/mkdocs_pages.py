@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -12,17 +14,31 @@ from mkdocs.structure.files import File, Files
 from nbconvert import MarkdownExporter
 
 ROOT = Path(__file__).parent.parent
-SOURCE = "https://github.com/mvseg/mvseg/blob/main/"
-RAW = "https://raw.githubusercontent.com/mvseg/mvseg/main/"
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+REPOSITORY = PROJECT["tool"]["hatch"]["metadata"]["hooks"]["custom"]["repository"]
+VERSION = os.environ.get("DOCS_VERSION", "")  # of a release, whose site keeps its address; "" for a site of one's own
+SOURCE = f"{REPOSITORY}/blob/{'v' + VERSION if VERSION else 'main'}/"
 # Pages in the order of the site; those that are not there are left out, and those that are not listed come last.
 ORDER = {
     "Start": ("index.md", "guide.md", "check.md", "results.md"),
-    "Bring your own": ("own-masks.md", "own-cameras.md", "pose.md", "fine-tune.md", "batch.md", "formats.md"),
+    "Bring your own": (
+        "own-masks.md", "own-cameras.md", "pose.md", "recipes.md", "fine-tune.md", "batch.md", "data-out.md",
+        "formats.md",
+    ),
     "Notebooks": ("notebooks/demo_plant.md", "notebooks/own_arrays.md"),
     "Method": ("matching.md", "surfaces.md", "traits.md", "detector.md"),
-    "How well it works": ("benchmarks.md", "performance.md", "reliability.md"),
+    "How well it works": ("gallery.md", "benchmarks.md", "performance.md", "reliability.md"),
     "Python": ("api.md",),
 }
+
+
+def on_config(config: MkDocsConfig) -> MkDocsConfig:
+    """The site of a release says which, and knows its own address."""
+    if VERSION:
+        owner, name = REPOSITORY.split("/")[-2:]
+        config.site_name = f"mvseg {VERSION}"
+        config.site_url = f"https://{owner}.github.io/{name}/{VERSION}/"
+    return config
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
@@ -42,8 +58,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
 
 def first_page() -> str:
     """The README with the links of the site: to its own pages and pictures, and to the source for all other files."""
-    text = (ROOT / "README.md").read_text(encoding="utf-8").replace(f"]({RAW}docs/", "](")
-    text = text.replace("](docs/", "](")
+    text = (ROOT / "README.md").read_text(encoding="utf-8").replace("](docs/", "](")
     return re.sub(r"\]\((?!https?:|#)([^)]+)\)", lambda link: f"]({_site_link(link[1])})", text)
 
 

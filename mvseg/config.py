@@ -10,7 +10,7 @@ from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.traits.config import TraitsConfig, Up
+from mvseg.traits.config import ColorCard, TraitsConfig, Up
 
 
 @dataclass(frozen=True)
@@ -29,6 +29,8 @@ class RunConfig:
             level, "board" from ArUco markers that lie flat; None for that of the scene.
         refine_poses: refine poses that are a few pixels off, with the masks as the only evidence; kept only if leaves
             that they were not fitted to agree clearly better.
+        color_card: how the colours of the photos are corrected before they are measured, see
+            `mvseg.traits.color_correction.read_color_card`; "find" looks for a card in them; None leaves them.
         split_merged: cut a mask that seems to cover two instances in two.
         draw_rims: draw the rims of the surfaces into the overlays.
         report: write report.html, the result as one page.
@@ -46,6 +48,7 @@ class RunConfig:
     unit: str | None = None
     up: Up | None = None
     refine_poses: bool = False
+    color_card: ColorCard | None = None
     split_merged: bool = False
     draw_rims: bool = True
     report: bool = True

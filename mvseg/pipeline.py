@@ -314,6 +314,7 @@ def reconstruct(state: State, *, with_voxels: bool = True) -> State:
 
 def measure(state: State) -> State:
     """Traits of the leaves and of the plant, see `measure_plant`."""
+    from mvseg.traits.color_correction import correct_views
     from mvseg.traits.measure import measure_plant
 
     traits = measure_plant(
@@ -323,6 +324,7 @@ def measure(state: State) -> State:
         voxels=state.voxels or {},
         photos=state.photos,
         config=state.config.traits,
+        corrections=correct_views(state.scene, state.config.color_card),
     )
     return replace(state, traits=traits)
 

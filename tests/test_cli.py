@@ -23,12 +23,14 @@ import pytest
 import trimesh
 
 import mvseg
+from color_cards import LAMP, photograph_card
 from mvseg.cli import main
 from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning
 from mvseg.formats.coco import encode_mask
+from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
@@ -208,6 +210,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "scale": None,
         "unit": None,
         "up": None,
+        "color_card": None,
         "draw_rims": True,
         "report": True,
     }
@@ -238,6 +241,23 @@ def test_which_way_is_up(words: list[str], up: list[float] | None, plant: Path, 
     assert said["unit"] == ("cm" if "cm" in words else "mm")
 
 
+def test_a_colour_card_corrects_all_photos(
+    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    photo, corners = photograph_card(LAMP)
+    write_png(tmp_path / "card.png", photo)
+    content = {"format": "mvseg-color-card/1", "cards": [{"photo": "card.png", "corners": corners.tolist()}]}
+    (tmp_path / "card.json").write_text(json.dumps(content))
+    arguments = ["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *COARSE]
+    assert main([*arguments, "--color_card", str(tmp_path / "card.json")]) == 0
+    (said,) = json.loads((tmp_path / "out" / "run.json").read_text())["traits"]["colors"]
+    assert (said["views"], said["photo"]) == ("*", "card.png")
+    assert said["delta_e"] < 1
+    capsys.readouterr()
+    assert main([*arguments, "--color_card", str(tmp_path / "absent.png")]) == 2
+    assert complaint(capsys).startswith(f"{tmp_path / 'absent.png'}: the photo of a colour card cannot be read")
+
+
 def test_rims_may_be_left_out(plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     drawn = []
     monkeypatch.setattr("mvseg.results.folder.save_result", lambda *_, draw_rims, **__: drawn.append(draw_rims))
@@ -262,7 +282,7 @@ def test_up_that_is_no_direction(
     words: list[str], plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["infer", str(plant), "--masks", "masks", "--up", *words, "--out", str(tmp_path / "out")]) == 2
-    assert complaint(capsys).startswith("up is ")
+    assert complaint(capsys).startswith("--up is ")
     assert not (tmp_path / "out").exists()
 
 
@@ -315,9 +335,11 @@ def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
     [
         (["--help"], ["{" + ",".join(VERBS) + "}"]),
         (["--version"], [f"mvseg {mvseg.__version__}"]),
-        (["infer", "--help"], ["--masks", "--detect.weights", "--match.method", "--reconstruct.seen_share"]),
+        (["infer", "--help"], ["--masks", "--detect.weights", "--help_all"]),
+        (["infer", "--help_all"], ["--masks", "--detect.weights", "--match.method", "--reconstruct.seen_share"]),
         (["batch", "--help"], ["--resume", "--num_workers", "--scheduler", "--detect.weights", "--scale", "--up"]),
-        (["match", "--help"], ["scenes [scenes ...]", "--masks", "--match.method"]),
+        (["batch", "--help_all"], ["--traits.min_quality", "--draw_rims"]),
+        (["match", "--help"], ["[options] scenes", "--masks", "--match.method"]),
         (["train", "--help"], ["--photos", "--labels", "--resume"]),
     ],
 )
@@ -329,7 +351,34 @@ def test_help_and_version(arguments: list[str], words: list[str], capsys: pytest
     assert [word for word in words if word not in shown] == []
 
 
-@pytest.mark.parametrize(("script", "option"), [("infer.py", "--match.method"), ("train.py", "--photos")])
+@pytest.mark.parametrize("verb", ["", *VERBS])
+def test_help_fits_a_screen(verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main([*verb.split(), "--help"])
+    assert len(capsys.readouterr().out.splitlines()) <= 45
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--match.num_points", "many"], "--match.num_points is many, expected a whole number or null"),
+        (["--split_merged=maybe"], "--split_merged is maybe, expected true or false"),
+        (["--reconstruct.shape", "ball"], "--reconstruct.shape is ball, expected surface, voxels, both"),
+        (["--detect.min_score", "3"], "--detect.min_score is 3, expected a number from 0 to 1"),
+        (["--config", "run.yaml"], "scale is -1, expected a positive number"),  # it stands so in the file
+    ],
+)
+def test_options_are_named_as_they_were_typed(
+    words: list[str], message: str, plant: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(plant)
+    Path("run.yaml").write_text("scale: -1\n")
+    assert main(["infer", ".", *words]) == 2
+    assert complaint(capsys) == message
+
+
+@pytest.mark.parametrize(("script", "option"), [("infer.py", "--masks"), ("train.py", "--photos")])
 def test_scripts_of_the_checkout_are_verbs(
     script: str, option: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

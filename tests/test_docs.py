@@ -9,7 +9,7 @@ import subprocess
 import sys
 from importlib import import_module
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import pytest
@@ -34,6 +34,27 @@ def pages(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     pytest.importorskip("nbconvert")
     monkeypatch.syspath_prepend(str(ROOT / ".ci"))
     return import_module("mkdocs_pages")
+
+
+@pytest.mark.skipif(shutil.which("Rscript") is None, reason="R is not installed")
+def test_the_code_for_r_runs(tmp_path: Path) -> None:
+    """On the tables of eight plants on four days."""
+    numbers = [["scene", "plant", "time", "treatment", "leaf", "trait", "value", "sd", "unit", "method", "ontology"]]
+    leaves = [["scene", "plant", "time", "treatment", "leaf", "area", "area_sd", "unit", "method", "quality"]]
+    for plant in range(8):
+        for day in range(4):
+            area = (1000 + 30 * plant) * (1 + day / (8 if plant % 2 else 5)) + 7 * (plant * day % 3)
+            row = [f"{day}_{plant}", plant, f"2026-05-0{day + 1}", "dry" if plant % 2 else "wet"]
+            numbers.append([*row, "", "total_leaf_area", area, 9, "mm^2", "surface", ""])
+            leaves.append([*row, 1, area / 2, 5, "mm", "surface", "good"])
+    for name, rows in (("traits", numbers), ("traits_wide", leaves)):
+        path = tmp_path / "night" / "tables" / f"{name}.csv"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("".join(",".join(map(str, row)) + "\n" for row in rows))
+    (code,) = re.findall(r"```r\n(.*?)```", (DOCS / "data-out.md").read_text(encoding="utf-8"), re.DOTALL)
+    ran = subprocess.run(["Rscript", "-"], input=code, cwd=tmp_path, capture_output=True, text=True, check=True)
+    assert "day:treatmentwet" in ran.stdout
+    assert (tmp_path / "growth.png").stat().st_size > 1000
 
 
 @pytest.mark.slow
@@ -92,6 +113,14 @@ def test_pages_that_nobody_listed_are_shown(pages: ModuleType) -> None:
     assert missing == set()
 
 
+def test_the_site_of_a_release_has_its_own_address(pages: ModuleType, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = SimpleNamespace(site_name="mvseg", site_url=None)
+    assert pages.on_config(config).site_url is None
+    monkeypatch.setattr(pages, "VERSION", "0.2.0")
+    said = pages.on_config(config)
+    assert (said.site_name, said.site_url) == ("mvseg 0.2.0", "https://mvseg.github.io/mvseg/0.2.0/")
+
+
 def test_the_first_page_links_into_the_site(pages: ModuleType) -> None:
     links = re.findall(r"\]\(([^)#]+)", pages.first_page())
     assert "demo.jpg" in links
@@ -130,7 +159,7 @@ def test_the_image_is_made_of_files_that_are_there() -> None:
     assert {path for path in copied if not (ROOT / path).exists()} == set()
     allowed = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
     assert {path.removeprefix("./") for path in copied} == {line[1:] for line in allowed if line.startswith("!")}
-    assert {"pyproject.toml", "README.md", "LICENSE", "mvseg", "models", "configs"} == copied
+    assert {"pyproject.toml", "hatch_build.py", "README.md", "LICENSE", "mvseg", "models", "configs"} == copied
 
 
 def test_shipped_configs_have_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -9,6 +9,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from dataclasses import fields
 from importlib.util import resolve_name
@@ -267,6 +268,11 @@ def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     )
     (wheel,) = tmp_path.glob("*.whl")
     names = zipfile.ZipFile(wheel).namelist()
+    (about,) = [name for name in names if name.endswith(".dist-info/METADATA")]
+    readme = zipfile.ZipFile(wheel).read(about).decode().split("\n\n", 1)[1]
+    links = re.findall(r"\]\(([^)#]+)", readme)
+    assert any(link.endswith("/raw/main/docs/demo.jpg") for link in links)
+    assert [link for link in links if not link.startswith("https://")] == []
     top = {name.split("/")[0] for name in names if ".dist-info/" not in name}
     assert top == {"mvseg"}
     assert {"mvseg/demo_plant/cameras.json", "mvseg/py.typed", "mvseg/zoo/leaf-lite/weights.safetensors"} <= set(names)
@@ -279,6 +285,26 @@ def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     assert said.stdout.split() == [str(home / "fine.yaml"), str(home / "train" / "rosettes.yaml")]
     assets = (PACKAGE / "results" / "report" / "assets").rglob("*")
     assert {file.relative_to(ROOT).as_posix() for file in assets if file.is_file()} <= set(names)
+
+
+def test_the_projects_address_is_set_in_one_place() -> None:
+    """Links among the project's own files are relative."""
+    hooks = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["tool"]["hatch"]["metadata"]["hooks"]
+    address = hooks["custom"]["repository"]
+    folders = [ROOT / name for name in (".ci", ".github", "mvseg", "docs")]
+    files = [path for path in (*ROOT.glob("*"), *(each for folder in folders for each in folder.rglob("*")))]
+    texts = [path for path in files if path.suffix in (".py", ".md", ".toml", ".yml", ".yaml", ".cff", ".ipynb")]
+    named = {path.name for path in texts if address in path.read_text(encoding="utf-8")}
+    assert named == {"pyproject.toml"}
+
+
+def test_the_conda_recipe_wants_what_the_package_wants() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    recipe = yaml.safe_load((ROOT / ".ci" / "conda" / "recipe.yaml").read_text(encoding="utf-8"))
+    conda_names = {"torch": "pytorch", "opencv-python-headless": "py-opencv"}
+    pairs = [wanted.split(">=") for wanted in project["dependencies"]]
+    expected = {f"{conda_names.get(name, name).partition('[')[0]} >={version}" for name, version in pairs}
+    assert expected <= set(recipe["requirements"]["run"])
 
 
 def test_shipped_scene_is_small() -> None:

@@ -1,11 +1,11 @@
-"""Where a batch keeps what: OUT/NAME holds the result of a scene, and two folders beside them are the batch's own."""
+"""Where a batch keeps what: OUT/NAME holds the result of a scene, and three folders beside them are the batch's own."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-STATE, TABLES = "_batch", "tables"
-RESERVED = {STATE, TABLES}
+STATE, TABLES, EXPORT = "_batch", "tables", "export"
+RESERVED = {STATE, TABLES, EXPORT}
 
 
 def scene_state(out: Path, name: str) -> Path:

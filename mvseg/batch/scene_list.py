@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import csv
 import io
+import re
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +16,7 @@ from mvseg.system.atomic import resolve_place
 
 OWN_COLUMNS = ("scene", "name", "masks")
 MAX_BYTES = 1 << 26
+FORBIDDEN = "/\\\0" + ('<>:"|?*' if sys.platform == "win32" else "")  # in the name of a folder
 
 
 @dataclass(frozen=True)
@@ -96,7 +99,7 @@ def _read_table(source: Path, masks: Path | None) -> tuple[BatchScene, ...]:
         if not row["scene"]:
             raise InputError(f"{source}: line {line} names no scene, expected the path of its folder")
         name = row.get("name") or _name_of(row["scene"])
-        if name in ("", ".", "..") or name.startswith(".") or "/" in name or "\\" in name or "\0" in name:
+        if name in ("", ".", "..") or name.startswith(".") or any(character in name for character in FORBIDDEN):
             raise InputError(f"{source}: line {line}: '{name}' cannot name a folder of results")
         carried = {"plant": row.get("plant") or name, "time": row.get("time", "")}
         scenes.append(
@@ -164,5 +167,6 @@ def _columns_of_results() -> set[str]:
 
 
 def _name_of(path: str) -> str:
-    """The parts of a path in one name: "day-1/basil" is "day-1_basil"."""
-    return "_".join(part for part in path.replace("\\", "/").split("/") if part not in ("", ".", ".."))
+    """The parts of a path in one name, without a drive: "day-1/basil" is "day-1_basil"."""
+    parts = re.sub(r"^[A-Za-z]:[\\/]", "", path).replace("\\", "/").split("/")
+    return "_".join(part for part in parts if part not in ("", ".", ".."))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 from collections import defaultdict
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from tqdm import tqdm
@@ -13,7 +12,7 @@ from tqdm import tqdm
 from mvseg.checks.finding import Finding, name_views
 from mvseg.errors import InputError
 from mvseg.formats.image_file import is_grey, is_turned, read_image_size, read_rgb
-from mvseg.formats.photos import describe_folder
+from mvseg.formats.photos import describe_folder, photo_bits
 from mvseg.scene import Scene
 
 # Standard deviation of a photo of nothing: grey levels, or a share of its level where it is dark (photos of something
@@ -51,8 +50,8 @@ class PhotoFacts:
 
 def read_photo_facts(scene: Scene, *, progress: bool = False) -> list[PhotoFacts]:
     """One entry per view; each photo is decoded once."""
-    paths = [view.path for view in scene.views]
-    return [_read_facts(path) for path in tqdm(paths, desc="photos", unit="photo", disable=not progress)]
+    views = tqdm(range(len(scene.views)), desc="photos", unit="photo", disable=not progress)
+    return [_read_facts(scene, view) for view in views]
 
 
 def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) -> list[Finding]:
@@ -143,12 +142,13 @@ def _beside(scene: Scene, view: int) -> str:
     return f"; {beside}" if beside else ""
 
 
-def _read_facts(path: Path) -> PhotoFacts:
+def _read_facts(scene: Scene, view: int) -> PhotoFacts:
+    path = scene.views[view].path
     if not path.is_file():
         return PhotoFacts()
     try:
         size = read_image_size(path)
-        pixels = read_rgb(path)[::STEP, ::STEP]
+        pixels = read_rgb(path, bits=photo_bits(scene, view))[::STEP, ::STEP]
     except InputError as error:
         return PhotoFacts(problem=str(error))
     grey = pixels.mean(2)

@@ -12,10 +12,11 @@ from typing import TextIO
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg._version import __version__
-from mvseg.cli import batch, check, infer, match, models, pose, simulate, train
+from mvseg.cli import batch, check, export, infer, match, models, pose, simulate, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
+from mvseg.cli.short_help import shorten_help
 from mvseg.errors import InputError, InputWarning
 from mvseg.system.atomic import clear_begun
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
@@ -27,6 +28,7 @@ VERBS = {
     "check": check,
     "infer": infer,
     "batch": batch,
+    "export": export,
     "match": match,
     "eval": evaluate,
     "train": train,
@@ -60,7 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             with stopped_by_sigterm():
                 return VERBS[args.verb].run(args[args.verb])
     except (InputError, argparse.ArgumentError) as error:
-        return complain(error)
+        return complain(error, sys.argv[1:] if argv is None else argv)
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -91,7 +93,9 @@ def _show_warning(
 
 def _parse(arguments: Sequence[str]) -> Namespace:
     try:
-        args = build_parser().parse_args(list(arguments))
+        short = "--help_all" not in arguments
+        words = ["--help" if word == "--help_all" else word for word in arguments]
+        args = build_parser(short=short).parse_args(words)
         for name in ("quiet", "report", "split_merged", "coco_crowd", "overwrite"):
             if args.verb and name in args[args.verb] and args[args.verb][name] is None:
                 raise InputError(f"{name} is null, expected a value")
@@ -104,10 +108,13 @@ def _parse(arguments: Sequence[str]) -> Namespace:
         raise InputError("an option is a number of thousands of digits") from None
 
 
-def build_parser() -> ArgumentParser:
-    """The parser of all verbs; its errors are raised, not printed."""
+def build_parser(*, short: bool = False) -> ArgumentParser:
+    """The parser of all verbs; its errors are raised, not printed. With `short`, `--help` shows some options only."""
     parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__)
     verbs = parser.add_subcommands(dest="verb")
     for verb in VERBS.values():
         verb.add(verbs)
+    if short:
+        for name, of_verb in verbs.choices.items():
+            shorten_help(name, of_verb)
     return parser

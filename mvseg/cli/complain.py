@@ -2,16 +2,40 @@
 
 from __future__ import annotations
 
+import re
 import sys
+from collections.abc import Sequence
 
 from mvseg.errors import InputError
 
 BAD_INPUT = 2
 
 
-def complain(error: Exception) -> int:
-    """Print what is wrong with the input, on one line; returns the exit code."""
+# What jsonargparse says of a value of a wrong type: the option, the types that would be right, and the value.
+WRONG_TYPE = re.compile(r'Parser key "([^"]+)":? (.*?)(?:Got value|Given value): (.*)')
+EXPECTED = re.compile(r"Expected an? (?:<class '([\w.]+)'>|typing\.Literal\[([^\]]*)\])")
+TYPES = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "NoneType": "null"}
+
+
+def complain(error: Exception, arguments: Sequence[str] = ()) -> int:
+    """Print what is wrong with the input, on one line; returns the exit code.
+
+    Args:
+        error: says it.
+        arguments: of the command line; an option among them is named as it stands there.
+    """
     if isinstance(error, OSError) and error.filename:
         error = InputError(f"{error.filename}: {error.strerror}")
-    print(f"mvseg: error: {' '.join(str(error).split())}", file=sys.stderr)
+    print(f"mvseg: error: {_as_typed(' '.join(str(error).split()), arguments)}", file=sys.stderr)
     return BAD_INPUT
+
+
+def _as_typed(message: str, arguments: Sequence[str]) -> str:
+    """A sentence about an option: "--match.seed is x, expected a whole number"; without dashes for one in a file."""
+    wrong = WRONG_TYPE.match(message)
+    if wrong is not None and (expected := EXPECTED.findall(wrong[2])):
+        words = [TYPES.get(kind, kind) or ", ".join(text.strip("' ") for text in choices.split(","))
+                 for kind, choices in expected]  # fmt: skip
+        message = f"{wrong[1]} is {wrong[3]}, expected {' or '.join(words)}"
+    typed = {word.partition("=")[0] for word in arguments if word.startswith("--")}
+    return f"--{message}" if f"--{message.partition(' ')[0]}" in typed else message

@@ -110,12 +110,19 @@ def add_run_options(parser: ArgumentParser) -> None:
     parser.add_argument("--unit", type=str | None, help=help_unit)
     help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers); default: the scene's own"
     parser.add_argument("--up", type=str | list[float] | None, help=help_up)
+    help_card = "24-patch colour card that corrects the colours: a photo of it, a card file, or 'find' it in the photos"
+    parser.add_argument("--color_card", type=str | None, help=help_card)
     help_rims = "draw the rims of the surfaces, as the cameras see them, into overlay/"
     parser.add_argument("--draw_rims", type=bool, default=True, help=help_rims)
 
 
 def build_run(args: Namespace) -> RunConfig:
     """The options that `add_run_options` added."""
+    card = args.color_card
+    if card is not None:
+        from mvseg.traits.color_correction import read_color_card  # keeps --help quick
+
+        card = read_color_card(card)
     return RunConfig(
         detect=build_options(DetectConfig, args.detect, "detect."),
         match=build_options(MatchConfig, args.match, "match."),
@@ -125,6 +132,7 @@ def build_run(args: Namespace) -> RunConfig:
         unit=args.unit,
         up=read_up(args.up),
         refine_poses=args.refine_poses,
+        color_card=card,
         split_merged=args.split_merged,
         draw_rims=args.draw_rims,
         report=args.report,

@@ -21,6 +21,7 @@ import safetensors.torch
 from torch import Tensor
 
 from mvseg.errors import InputError
+from mvseg.formats.photos import photo_bits
 from mvseg.scene import Scene
 from mvseg.system.atomic import delete_abandoned, is_partial, lock_folder, write_whole
 
@@ -48,7 +49,7 @@ class KeptDetections:
         camera = [None if lens is None else [lens.model_name, list(lens.params)], K, size]
         with scene.views[view].path.open("rb") as file:
             photo = hashlib.file_digest(file, "sha256").hexdigest()
-        text = json.dumps([photo, camera, self.made_by, box])
+        text = json.dumps([photo, photo_bits(scene, view), camera, self.made_by, box])
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.safetensors"
 
 

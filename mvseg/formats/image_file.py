@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
@@ -126,11 +127,17 @@ def no_image_message(start: bytes) -> str:
     return "it is not a JPEG, PNG, TIFF, BMP or WebP file"
 
 
-def read_rgb(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
+def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) -> np.ndarray:
     """(H, W, 3) uint8: an image in colour, without transparency, the upper 8 of 16 bits.
 
     Files of 16 bits that hold smaller numbers only, as cameras of 10, 12 or 14 bits write them, give the upper 8 of
     those; see `sensor_bits`.
+
+    Args:
+        path: the file.
+        size: see `read_image`.
+        bits: that the numbers of a file of 16 bits have at least: what those of its neighbours have, so that a dark
+            photo stays darker than they.
 
     Raises:
         InputError: see `read_image`; or the pixels are signed, or have 32 bits.
@@ -138,7 +145,7 @@ def read_rgb(path: Path, size: tuple[int, int] | None = None) -> np.ndarray:
     image = read_image(path, size)
     deep = _read_deep(path, image)
     if deep is not None:
-        bits = _bits_of(deep)
+        bits = max(bits, _bits_of(deep))
         if bits < 16 or deep.ndim == 2:
             pixels = (deep >> (bits - 8)).astype(np.uint8)
             return pixels if pixels.ndim == 3 else np.repeat(pixels[..., None], 3, axis=2)
@@ -169,6 +176,20 @@ def sensor_bits(path: Path, size: tuple[int, int] | None = None) -> int:
         return 8
     deep = _read_deep(path, read_image(path, size))
     return 8 if deep is None else _bits_of(deep)
+
+
+def known_bits(path: Path, size: tuple[int, int] | None = None) -> int:
+    """As `sensor_bits`, remembered while the file stays as it is; 8 for one that cannot be read or has another size."""
+    try:
+        facts = path.stat()
+        return _bits_of_file(path, size, facts.st_mtime_ns, facts.st_size)
+    except (InputError, OSError):
+        return 8
+
+
+@lru_cache(maxsize=4096)
+def _bits_of_file(path: Path, size: tuple[int, int] | None, modified_ns: int, num_bytes: int) -> int:
+    return sensor_bits(path, size)
 
 
 def _tiff_bits(file: BinaryIO) -> int:
@@ -220,7 +241,8 @@ def is_turned(path: Path) -> bool:
 def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | None:
     """What is wrong with an image's path relative to its folder, as the end of a sentence; None for a sound one."""
     path = os.path.normpath(file)
-    if os.path.isabs(path) or path.split(os.sep)[0] == "..":
+    starts_elsewhere = os.path.isabs(path) or path.startswith(os.sep) or os.path.splitdrive(path)[0]  # on Windows, too
+    if starts_elsewhere or path.split(os.sep)[0] == "..":
         return f"the file name leads out of {folder}"
     if path == "." or "\0" in path:
         return "this is not the name of a file"

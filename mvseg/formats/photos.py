@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import posixpath
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,9 +22,9 @@ from mvseg.formats.image_file import (
     WrongSize,
     file_name_problem,
     is_turned,
+    known_bits,
     read_image_size,
     read_rgb,
-    sensor_bits,
 )
 from mvseg.formats.lens import undistort
 from mvseg.scene import Cameras, Scene, View, camera_problem
@@ -155,8 +156,8 @@ def _is_named(path: Path, name: str) -> bool:
 
 def view_names(files: Sequence[str]) -> list[str]:
     """Names of views: the paths of their photos below the folder that all share, without suffix."""
-    paths = [PurePosixPath(os.path.normpath(file)) for file in files]
-    shared = os.path.commonpath([path.parent for path in paths])
+    paths = [PurePosixPath(posixpath.normpath(file)) for file in files]
+    shared = posixpath.commonpath([path.parent for path in paths])
     return [path.relative_to(shared).with_suffix("").as_posix() for path in paths]
 
 
@@ -177,7 +178,8 @@ def check_photos(scene: Scene) -> None:
     """Are the photos of a scene there? None at all is fine: masks are enough for matching and for shapes.
 
     Warns (InputWarning) of photos that EXIF asks viewers to turn: cameras and masks must refer to the stored pixels, as
-    those of COLMAP do; of photos of 16 bits that use fewer; and of files in the place of the photos, if none is there.
+    those of COLMAP do; of photos of 16 bits that all use fewer; and of files in the place of the photos, if none is
+    there.
 
     Raises:
         InputError: some photos are there and others are missing.
@@ -198,13 +200,11 @@ def check_photos(scene: Scene) -> None:
     if turned:
         message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
         warnings.warn(f"{turned[0]}: {message}", InputWarning, stacklevel=2)
-    sizes = scene.cameras.sizes.tolist()
-    known = [_known_bits(path, (width, height)) for path, (width, height) in zip(paths, sizes, strict=True)]
-    few = [(path, bits) for path, bits in zip(paths, known, strict=True) if bits not in (8, 16)]
-    if few:
-        path, bits = few[0]
-        message = f"{len(few)} photos of 16 bits hold smaller numbers, this one of {bits} bits: they are brightened"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=2)
+    known = _bits_of_views(scene)
+    if 8 < max(known) < 16:
+        deep = [path for path, bits in zip(paths, known, strict=True) if bits > 8]
+        message = f"{len(deep)} photos of 16 bits hold numbers of {max(known)} bits at most: they are brightened alike"
+        warnings.warn(f"{deep[0]}: {message}", InputWarning, stacklevel=2)
 
 
 def describe_turn(path: Path) -> str:
@@ -226,12 +226,16 @@ def describe_folder(folder: Path) -> str:
     return f"found {', '.join(pictures[:3])}{more}" if pictures else ""
 
 
-def _known_bits(path: Path, size: tuple[int, int]) -> int:
-    """As `sensor_bits`; 8 for a photo that cannot be read or has another size, which `read_photo` will name."""
-    try:
-        return sensor_bits(path, size)
-    except (InputError, OSError):
-        return 8
+def photo_bits(scene: Scene, view: int) -> int:
+    """How many bits the numbers in the photo of a view are taken to have: 8 or, for a file of 16 bits, as many as those
+    of any photo of the scene, so that one range brightens them all."""
+    own = known_bits(scene.views[view].path, tuple(scene.cameras.sizes[view].tolist()))
+    return own if own in (8, 16) else max(_bits_of_views(scene))
+
+
+def _bits_of_views(scene: Scene) -> list[int]:
+    sizes = [(width, height) for width, height in scene.cameras.sizes.tolist()]
+    return [known_bits(view.path, size) for view, size in zip(scene.views, sizes, strict=True)]
 
 
 def load_photos(scene: Scene) -> list[torch.Tensor]:
@@ -277,7 +281,8 @@ class Photos:
 def read_photo(scene: Scene, view: int) -> np.ndarray:
     """(H, W, 3) uint8 RGB, the photo of a view with its lens distortion removed.
 
-    Rows and columns are those that the file stores, whatever EXIF says; see `check_photos`.
+    Rows and columns are those that the file stores, whatever EXIF says; see `check_photos`. Photos of 10, 12 or 14 bits
+    in files of 16 are brightened, all of a scene alike; see `photo_bits`.
 
     Raises:
         InputError: the photo is missing, cannot be read, or is of another size than its camera says.
@@ -286,7 +291,7 @@ def read_photo(scene: Scene, view: int) -> np.ndarray:
     if not path.is_file():
         raise InputError(f"{path}: the image of view {view} is missing")
     try:
-        pixels = read_rgb(path, (width, height))
+        pixels = read_rgb(path, (width, height), bits=photo_bits(scene, view))
         if pixels.shape[:2] != (height, width):
             raise WrongSize(pixels.shape[1], pixels.shape[0])
     except WrongSize as error:

@@ -114,7 +114,7 @@ def match_features(
     with tqdm(total=len(pairs), desc="matching", unit="pair", disable=not progress) as bar:
         for start in range(0, len(pairs), PAIRS_AT_ONCE):
             some = pairs[start : start + PAIRS_AT_ONCE]
-            listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some))
+            listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some), newline="\n")
             run_cancellable(
                 lambda token: pycolmap.match_image_pairs(
                     database,

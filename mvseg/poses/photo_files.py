@@ -17,9 +17,9 @@ from mvseg.formats.image_file import (
     PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
     is_turned,
+    known_bits,
     read_image,
     read_rgb,
-    sensor_bits,
     write_png,
 )
 
@@ -104,7 +104,7 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: b
     """Copy photos into a scene's `images/`, as they are where that is possible.
 
     Photos that EXIF turns are written anew, upright; so are WebP files and those of 10, 12 or 14 bits in 16, which
-    COLMAP cannot read, as PNG of 8 bits.
+    COLMAP cannot read, as PNG of 8 bits; one range brightens them all.
 
     Args:
         folder: of the photos.
@@ -117,18 +117,19 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: b
         OSError: a photo cannot be copied.
     """
     photos = []
+    bits = max((known_bits(folder / name) for name in names), default=8)
     for name in tqdm(names, desc="photos", unit="photo", disable=not progress):
         path = images / name
         path.parent.mkdir(parents=True, exist_ok=True)
         try:
-            photos.append(_copy(folder / name, path, images))
+            photos.append(_copy(folder / name, path, images, bits=bits))
         except InputError as error:
             message = f"the photo cannot be read, expected a whole image file: {error}"
             raise InputError(f"{folder / name}: {message}") from None
     return photos
 
 
-def _copy(source: Path, path: Path, images: Path) -> PhotoFile:
+def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
     turned = is_turned(source)
     image = read_image(source)  # decoded: a file that is cut short is found now
     optics = _describe_optics(image)
@@ -137,9 +138,9 @@ def _copy(source: Path, path: Path, images: Path) -> PhotoFile:
         image = ImageOps.exif_transpose(image)
         exif[0x0112] = 1
         image.convert("RGB").save(path, format="JPEG", quality=QUALITY, subsampling=0, exif=exif)
-    elif path.suffix.lower() == ".webp" or sensor_bits(source) not in (8, 16):
+    elif path.suffix.lower() == ".webp" or known_bits(source) not in (8, 16):
         path = path.with_suffix(".png")
-        write_png(path, read_rgb(source))
+        write_png(path, read_rgb(source, bits=bits))
     else:
         shutil.copyfile(source, path)
     name = path.relative_to(images).as_posix()

@@ -10,6 +10,7 @@ import json
 import math
 import os
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -189,5 +190,7 @@ def _describe_poses(poses: RefinedPoses) -> dict[str, Any]:
 
 
 def _describe_traits(traits: Traits) -> dict[str, Any]:
-    """What run.json says of the traits: the world they are measured in, and how many instances are no leaves."""
-    return {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
+    """What run.json says of the traits: the world they are measured in, how their colours were corrected, and how many
+    instances are no leaves."""
+    colors = {"colors": [asdict(correction) for correction in traits.corrections]} if traits.corrections else {}
+    return {"unit": traits.unit or None, "up": traits.up, **colors, "rejected": traits.rejected}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
@@ -14,6 +14,8 @@ from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
+from mvseg.traits.color_correction import correct_colors
+from mvseg.traits.config import ColorCorrection
 from mvseg.traits.leaf import Measurement, missing
 
 Floats = NDArray[np.float64]
@@ -27,7 +29,12 @@ GREY = missing("not measured: the photos are grey")
 
 
 def measure_appearance(
-    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos
+    surfaces: Mapping[int, LeafSurface],
+    masks: Masks,
+    cameras: Cameras,
+    *,
+    photos: Photos,
+    corrections: Sequence[ColorCorrection | None] = (),
 ) -> dict[int, dict[str, Measurement]]:
     """Visible share, mean colour and greenness of leaves.
 
@@ -36,6 +43,7 @@ def measure_appearance(
         masks: D masks of the scene, with ids.
         cameras: V cameras.
         photos: looked at, if they exist.
+        corrections: of the colours, one per view; where there is any, views without one have no part in the colours.
 
     Returns:
         {instance id: {trait: number}}. The standard deviation of a colour is the standard error over the views, so
@@ -47,12 +55,13 @@ def measure_appearance(
     has_photos = bool(surfaces) and photos.exist
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
     colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # sure pixels, their mean
-    has_colors = False
+    has_colors, is_corrected = False, any(corrections)
     for view in range(len(cameras)):
         photo = photos(view) if has_photos else None
         if photo is not None and is_grey(photo):
             photo = None
         has_colors |= photo is not None
+        correction = corrections[view] if is_corrected else None
         labels = masks.regions.label_map(view, masks.instance_ids, cameras.sizes[view].tolist()).cpu().numpy()
         for instance, surface in surfaces.items():
             covered, (x, y) = project_crop(surface, cameras, view)
@@ -61,16 +70,18 @@ def measure_appearance(
             window = np.s_[y : y + covered.shape[0], x : x + covered.shape[1]]
             own = labels[window] == instance
             pixels[instance] += (covered.sum(), (covered & own).sum())
-            if photo is not None:
+            if photo is not None and (correction is not None or not is_corrected):
                 sure = covered & shrink(own)
                 if sure.any():
-                    colors[instance].append((int(sure.sum()), photo[window][sure].mean(0) / 255))
+                    seen = photo[window][sure]
+                    shown = seen / 255 if correction is None else correct_colors(correction, seen)
+                    colors[instance].append((int(sure.sum()), shown.mean(0)))
     found = {}
     for instance in surfaces:
         projected, visible = pixels[instance].tolist()
         share = Measurement(visible / projected, float("nan"), "masks") if projected else OUTSIDE
-        why = GREY if has_photos else NO_PHOTOS
-        of_photos = mean_colors(colors[instance]) if has_colors else dict.fromkeys(COLORS, why)
+        why, method = GREY if has_photos else NO_PHOTOS, describe_colors(corrections)
+        of_photos = mean_colors(colors[instance], method) if has_colors else dict.fromkeys(COLORS, why)
         found[instance] = {"visible_share": share, **of_photos}
     return found
 
@@ -99,7 +110,13 @@ def shrink(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(eroded, bool)
 
 
-def mean_colors(views: list[tuple[int, Floats]]) -> dict[str, Measurement]:
+def describe_colors(corrections: Sequence[ColorCorrection | None]) -> str:
+    """How the colours of photos were measured, with the residual of the worst card."""
+    residuals = [correction.delta_e for correction in corrections if correction is not None]
+    return f"photographs, corrected (Delta E {max(residuals):.1f})" if residuals else "photographs, uncorrected"
+
+
+def mean_colors(views: list[tuple[int, Floats]], method: str) -> dict[str, Measurement]:
     """The traits in COLORS from the number of pixels and the mean colour (3,), 0 to 1, of each view."""
     if not views:
         return dict.fromkeys(COLORS, NO_PIXELS)
@@ -111,6 +128,6 @@ def mean_colors(views: list[tuple[int, Floats]]) -> dict[str, Measurement]:
     means = weights @ table / weights.sum()
     errors = table.std(0, ddof=1) / np.sqrt(len(views)) if len(views) > 1 else np.full(4, np.nan)
     return {
-        name: Measurement(float(mean), float(error), "photographs")
+        name: Measurement(float(mean), float(error), method)
         for name, mean, error in zip(COLORS, means, errors, strict=True)
     }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -16,7 +16,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
-from mvseg.traits.config import TraitsConfig
+from mvseg.traits.config import ColorCorrection, TraitsConfig
 from mvseg.traits.filters import Rejection, Support, find_rejected, median_iou
 from mvseg.traits.from_above import Cells, look_from_above
 from mvseg.traits.leaf import UP_UNKNOWN, Floats, Measurement, measure_leaf, measure_voxels, missing
@@ -57,6 +57,7 @@ class Traits:
         leaves: one entry per instance, by id.
         whole: {trait: number} of all `PLANT_TRAITS`.
         up: unit vector, None when unknown.
+        corrections: of the colours of the photos; empty where they were not corrected.
     """
 
     plant: str
@@ -64,6 +65,7 @@ class Traits:
     leaves: tuple[LeafTraits, ...]
     whole: Mapping[str, Measurement]
     up: tuple[float, float, float] | None
+    corrections: tuple[ColorCorrection, ...] = ()
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -79,6 +81,7 @@ def measure_plant(
     voxels: Voxels,
     photos: Photos | None = None,
     config: TraitsConfig = TraitsConfig(),
+    corrections: Sequence[ColorCorrection | None] = (),
 ) -> Traits:
     """Measure all instances, and the plant that those make which count as leaves.
 
@@ -89,6 +92,7 @@ def measure_plant(
         voxels: {instance id: voxels}.
         photos: of the scene; None: they are read.
         config: what counts as a leaf.
+        corrections: of the photos' colours, see `correct_views`.
 
     Returns:
         The traits; an instance that cannot be measured, or is rejected, has empty numbers that say why.
@@ -103,7 +107,9 @@ def measure_plant(
     sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     shapes = {instance: shape for instance, shape in best.items() if shape is not None}
     every = {instance: shape for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
-    appearance = measure_appearance(every, matching.masks, scene.cameras, photos=photos or Photos(scene))
+    appearance = measure_appearance(
+        every, matching.masks, scene.cameras, photos=photos or Photos(scene), corrections=corrections
+    )
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
     rejected = find_rejected(shapes, Support(sure_views, visible), up, config=config)
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
@@ -121,7 +127,10 @@ def measure_plant(
         rejection = rejected.get(instance)
         leaves.append(describe_leaf(instance, numbers[instance], best[instance], fitted=fitted, rejection=rejection))
     whole = measure_whole(blades, cells, frame, num_leaves=len(instances) - len(rejected))
-    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up)
+    known = tuple(dict.fromkeys(each for each in corrections if each is not None))
+    return Traits(
+        plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, corrections=known
+    )
 
 
 def measure_blades(

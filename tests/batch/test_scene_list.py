@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from mvseg.batch import scene_list
 from mvseg.batch.scene_list import list_scenes
 from mvseg.errors import InputError
 
@@ -35,6 +36,14 @@ def test_a_table_says_where_scenes_are_and_what_they_are(tmp_path: Path) -> None
     assert (second.masks, second.beside) == (Path("mint.json"), tmp_path)
     assert second.carried == {"plant": "far_away_mint", "time": "2", "treatment": "wet, cold"}
     assert list(first.carried) == list(second.carried)
+
+
+def test_paths_of_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (scene,) = list_scenes(write(tmp_path, "scene\nC:\\day 1\\basil\n"), OUT, None)
+    assert scene.name == "day 1_basil"
+    monkeypatch.setattr(scene_list, "FORBIDDEN", '/\\\0<>:"|?*')
+    with pytest.raises(InputError, match="line 2: '10:30' cannot name a folder of results"):
+        list_scenes(write(tmp_path, "scene,name\nbasil,10:30\n"), OUT, None)
 
 
 def test_tables_with_semicolons_and_names(tmp_path: Path) -> None:

@@ -100,6 +100,14 @@ def test_each_fault_has_its_sentence(
     assert [(each.level, each.views) for each in found] == [(level, views)]
 
 
+def test_a_dark_photo_of_12_bits_is_dark_beside_its_neighbours(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    ramp = np.linspace(0, 4095, HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3)
+    for view in range(4):
+        write_image(photo(folder, view), (ramp / (12 if view == 2 else 1 + view)).astype(np.uint16))
+    assert [(each.views, "nearly black" in each.what) for each in findings_of(folder)] == [((2,), True)]
+
+
 def test_without_photos_masks_will_do(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant", images=False)
     assert [each.level for each in findings_of(folder, has_masks=True)] == ["note"]

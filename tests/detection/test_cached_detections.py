@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -16,7 +17,7 @@ from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.pipeline import detect_regions
 from mvseg.system.atomic import MACHINE, write_whole
-from scene_folders import edit_rig, write_image, write_scene
+from scene_folders import HEIGHT, WIDTH, edit_rig, write_image, write_scene
 
 FOUND = {
     "boxes": torch.rand(3, 4),
@@ -61,6 +62,12 @@ def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> No
     assert len(set(names)) == 4
     note()
     assert names[-1] == names[-2]
+    deep = np.full((HEIGHT, WIDTH, 3), 1000, np.uint16)
+    write_image(folder / "images" / "001.png", deep)
+    note()
+    write_image(folder / "images" / "002.png", 4 * deep)  # 12 bits: they brighten the first one less
+    note()
+    assert len(set(names)) == 6
 
 
 def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ntpath
+import os
 import struct
 import zlib
 from io import BytesIO
@@ -190,6 +192,15 @@ def test_sound_file_names(file: str) -> None:
 @pytest.mark.parametrize("file", ["../a.jpg", "a/../../b.jpg", "/a.jpg", "", ".", "a\0.jpg"])
 def test_file_names_that_lead_out_or_nowhere(file: str) -> None:
     assert file_name_problem(file)
+
+
+@pytest.mark.parametrize("file", ["../a.jpg", "/a.jpg", "C:/a.jpg", "C:a.jpg", "\\\\server\\share\\a.jpg"])
+def test_file_names_that_lead_out_on_windows(file: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "path", ntpath)
+        patch.setattr(os, "sep", "\\")
+        assert file_name_problem(file) == "the file name leads out of the scene folder"
+        assert file_name_problem("images/a.jpg") is None
 
 
 @pytest.fixture

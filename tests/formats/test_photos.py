@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import ntpath
+import os
 from pathlib import Path
 
 import numpy as np
@@ -38,6 +40,12 @@ def scene_of(*photos: Photo) -> Scene:
 )
 def test_view_names_are_paths_below_the_shared_folder(files: list[str], names: list[str]) -> None:
     assert view_names(files) == names
+
+
+def test_views_have_the_same_names_on_windows(monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "path", ntpath)
+        assert view_names(["images/left/1.jpg", "images/right/1.jpg"]) == ["left/1", "right/1"]
 
 
 def test_scene_keeps_order_names_paths_and_cameras() -> None:
@@ -207,7 +215,7 @@ def test_photos_of_12_bits_are_brightened_and_said(suffix: str, channels: int, t
     edit_rig(folder, 1, file=f"images/001.{suffix}")
     write_image(folder / "images" / f"001.{suffix}", values)
     scene = load_scene(folder)
-    with pytest.warns(InputWarning, match=rf"001.{suffix}: 1 photos of 16 bits hold .*, this one of 12 bits"):
+    with pytest.warns(InputWarning, match=rf"001.{suffix}: 1 photos of 16 bits hold numbers of 12 bits at most"):
         check_photos(scene)
     expected = (values >> 4).astype(np.uint8)
     np.testing.assert_array_equal(read_photo(scene, 1), expected if channels == 3 else np.dstack([expected] * 3))
@@ -216,3 +224,29 @@ def test_photos_of_12_bits_are_brightened_and_said(suffix: str, channels: int, t
     check_photos(scene)  # all 16 bits: no warning
     difference = read_photo(scene, 1)[..., 0].astype(int) - (values.reshape(HEIGHT, WIDTH, -1)[..., 0] >> 8)
     assert np.abs(difference).max() <= 1
+
+
+def write_deep_photos(folder: Path, *highest: int) -> Path:
+    """Photos of 16 bits, each a ramp from 0 to its own highest number."""
+    for view, top in enumerate(highest):
+        ramp = np.linspace(0, top, HEIGHT * WIDTH * 3).astype(np.uint16).reshape(HEIGHT, WIDTH, 3)
+        write_image(folder / "images" / f"{view:03d}.png", ramp)
+    return folder
+
+
+def test_one_range_brightens_all_photos_of_a_scene(tmp_path: Path) -> None:
+    """A dark photo of 12 bits whose numbers would fit into 10 stays darker than its neighbours."""
+    scene = load_scene(write_deep_photos(write_scene(tmp_path / "plant", 3), 4095, 1000, 2000))
+    with pytest.warns(InputWarning, match=r"000.png: 3 photos of 16 bits hold numbers of 12 bits at most"):
+        check_photos(scene)
+    assert [read_photo(scene, view).max() for view in range(3)] == [255, 1000 >> 4, 2000 >> 4]
+    write_deep_photos(tmp_path / "plant", 4095, 65535, 2000)  # one uses all 16: so may all
+    assert [int(read_photo(scene, view).max()) for view in (0, 2)] == [4095 >> 8, 2000 >> 8]
+
+
+def test_photos_of_8_bits_beside_deep_ones_stay(tmp_path: Path) -> None:
+    scene = load_scene(write_deep_photos(write_scene(tmp_path / "plant", 2), 4095, 1000))
+    whole = np.full((HEIGHT, WIDTH, 3), 77, np.uint8)
+    write_image(scene.views[0].path, whole)
+    np.testing.assert_array_equal(read_photo(scene, 0), whole)
+    assert read_photo(scene, 1).max() == 1000 >> 2

@@ -93,6 +93,13 @@ def test_what_colmap_cannot_read_becomes_png(tmp_path: Path) -> None:
         np.testing.assert_allclose(read_rgb(tmp_path / "images" / photo.name)[..., 0], RAMP, atol=3)
 
 
+def test_one_range_for_all_photos_of_12_bits(tmp_path: Path) -> None:
+    for name, most in (("a.png", 4095), ("b.png", 1000)):  # 1000 would fit into 10 bits
+        cv2.imwrite(str(tmp_path / name), np.full(RAMP.shape, most, np.uint16))
+    copy_photos(tmp_path, ["a.png", "b.png"], tmp_path / "images")
+    assert [int(read_rgb(tmp_path / "images" / name).max()) for name in ("a.png", "b.png")] == [255, 1000 >> 4]
+
+
 def test_a_broken_photo_is_named(tmp_path: Path) -> None:
     save(tmp_path, "a.png")
     (tmp_path / "a.png").write_bytes((tmp_path / "a.png").read_bytes()[:-20])

@@ -15,6 +15,8 @@ from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from mvseg.traits.appearance import COLORS, mean_colors, measure_appearance, project_crop, shrink
+from mvseg.traits.color_correction import from_linear, to_linear
+from mvseg.traits.config import ColorCorrection
 
 CAMERAS = ring_cameras(3)
 LEAF = flat_leaf(length=2, half_width=0.45, at=(-1, 0, 0))
@@ -57,11 +59,26 @@ def test_grey_photos_have_no_colour(num_grey: int, tmp_path: Path) -> None:
     photos = [painted(mask, GREEN) for mask in masks]
     for photo in photos[:num_grey]:
         photo[:] = photo.mean(2, keepdims=True) + [0, 1, 2]
-    found = measure_appearance({1: LEAF}, *labels_of(masks), scene=scene_of(tmp_path, photos))[1]
+    found = measure_appearance({1: LEAF}, labels_of(masks), CAMERAS, photos=Photos(scene_of(tmp_path, photos)))[1]
     if num_grey < 3:
         assert found["greenness_index"].value == pytest.approx((360 - 60 - 30) / (360 + 60 + 30))
     else:
         assert {found[name].method for name in COLORS} == {"not measured: the photos are grey"}
+
+
+def test_colours_say_whether_they_were_corrected(tmp_path: Path) -> None:
+    """Of three views one has no card: it has no part in the colours."""
+    masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
+    scene = scene_of(tmp_path, [painted(mask, color) for mask, color in zip(masks, (GREEN, GREEN, RED), strict=True)])
+    halves = ColorCorrection("*", (0.5, 0, 0, 0, 0.5, 0, 0, 0, 0.5), 1.74, "card.png")  # of the light
+    found = measure_appearance({1: LEAF}, labels_of(masks), CAMERAS, photos=Photos(scene))[1]
+    assert {found[name].method for name in COLORS} == {"photographs, uncorrected"}
+    cards = [halves, halves, None]
+    found = measure_appearance({1: LEAF}, labels_of(masks), CAMERAS, photos=Photos(scene), corrections=cards)[1]
+    assert {found[name].method for name in COLORS} == {"photographs, corrected (Delta E 1.7)"}
+    expected = from_linear(to_linear(np.array(GREEN) / 255) / 2)
+    assert [found[name].value for name in COLORS[:3]] == pytest.approx(expected)
+    assert found["mean_green"].sd == pytest.approx(0, abs=1e-9)
 
 
 def test_masks_that_reach_beyond_the_leaf_add_no_colour(tmp_path: Path) -> None:
@@ -114,10 +131,10 @@ def test_shrunken_masks_keep_to_the_edge_of_the_picture() -> None:
 
 def test_views_weigh_as_much_as_their_pixels() -> None:
     views = [(300, np.array([0.2, 0.4, 0.2])), (100, np.array([0.6, 0.8, 0.4]))]
-    found = mean_colors(views)
+    found = mean_colors(views, "photographs")
     assert found["mean_red"].value == pytest.approx(0.3)
     assert found["mean_red"].sd == pytest.approx(0.2)  # (0.6 - 0.2) / sqrt(2) between views, / sqrt(2) of their mean
     (first, second) = ((0.8 - 0.4) / (0.8 + 0.4), (1.6 - 1.0) / (1.6 + 1.0))
     assert found["greenness_index"].value == pytest.approx(0.75 * first + 0.25 * second)
-    assert not np.isfinite(mean_colors(views[:1])["mean_red"].sd)
-    assert not mean_colors([])["mean_red"].exists
+    assert not np.isfinite(mean_colors(views[:1], "photographs")["mean_red"].sd)
+    assert not mean_colors([], "photographs")["mean_red"].exists

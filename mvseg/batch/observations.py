@@ -1,0 +1,79 @@
+"""The numbers of a batch with what its table says of each plant, as standards for data want them."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+
+from mvseg.batch.places import tables_folder
+from mvseg.errors import InputError
+
+OWN_COLUMNS = ("leaf", "trait", "value", "sd", "unit", "method", "ontology")
+
+
+@dataclass(frozen=True)
+class Observation:
+    """One number.
+
+    Attributes:
+        facts: {column: cell} of the batch's table: `scene`, `plant`, `time` and all others.
+        leaf: number of the leaf, "" for the whole plant.
+        trait, value, sd, unit, method, ontology: as in traits.csv.
+    """
+
+    facts: Mapping[str, str]
+    leaf: str
+    trait: str
+    value: str
+    sd: str
+    unit: str
+    method: str
+    ontology: str
+
+    @property
+    def variable(self) -> str:
+        """What is observed, by whom, in which scale: leaf_area_mvseg_mm2, number_of_leaves_mvseg_1."""
+        scale = re.sub(r"\W", "", self.unit)
+        return f"{'leaf_' if self.leaf else ''}{self.trait}_mvseg_{scale}"
+
+    @property
+    def time_stamp(self) -> str:
+        """When it was made, in ISO 8601 with a time zone (UTC where `time` names none); "" where `time` is no date."""
+        try:
+            time = datetime.fromisoformat(self.facts["time"])
+        except ValueError:
+            return ""
+        return time.isoformat() + ("" if time.tzinfo else "Z")
+
+
+def read_observations(batch: Path) -> list[Observation]:
+    """All numbers of a batch that exist, in the order of its tables.
+
+    Raises:
+        InputError: `batch` is not the --out of a finished batch, its table is broken, or there are no numbers.
+    """
+    path = tables_folder(batch) / "traits.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file, restkey="", restval=""))
+    except OSError as error:
+        what = f"{path}: cannot be read ({error.strerror}), expected the table of a batch"
+        raise InputError(f"{what}: mvseg export takes the --out of mvseg batch") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: is no CSV table ({error})") from None
+    missing = [name for name in ("scene", "plant", "time", *OWN_COLUMNS) if rows and name not in rows[0]]
+    if missing:
+        raise InputError(f"{path}: has no column '{missing[0]}', expected the table of a batch")
+    found = [_observation(row) for row in rows if row["value"]]
+    if not found:
+        raise InputError(f"{path}: holds no numbers, expected the traits of one plant or more")
+    return found
+
+
+def _observation(row: Mapping[str, str]) -> Observation:
+    facts = {name: cell for name, cell in row.items() if name not in OWN_COLUMNS}
+    return Observation(facts=facts, **{name: row[name] for name in OWN_COLUMNS})
