@@ -36,6 +36,7 @@ LEAST_COLORED = 0.8  # of it, that have the colour of leaves, for it to become a
 LEAST_FOUND = 0.3  # of the views that show an instance openly, where its surface agrees with what the detector found
 ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
 SURE_VIEWS = 4  # of an instance whose masks tell that colour
+LEAST_PARALLAX = 30.0  # degrees between the views of an instance, from which its surface tells what they show
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,9 +70,15 @@ def verify_masks(
 
     Returns:
         D' masks on the CPU, see `revise_masks`, their ids without gaps. And {instance id: surface}, what they were
-        judged by.
+        judged by. Where the cameras see the leaves from one side only, by less than `LEAST_PARALLAX`, surfaces are too
+        uncertain to judge by: all masks stay, without surfaces, and a warning (InputWarning) says so.
     """
     masks, cameras = masks.to("cpu"), cameras.to("cpu")
+    parallax = median_parallax(masks, cameras)
+    if parallax < LEAST_PARALLAX:
+        message = f"the cameras see the leaves from one side only ({parallax:.0f} degrees apart, as a rule)"
+        warnings.warn(f"{message}: the other views cannot verify their masks", InputWarning, stacklevel=2)
+        return masks, {}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
         surfaces = fit_surfaces(
@@ -79,6 +86,21 @@ def verify_masks(
         )
     revised = revise_masks(masks, surfaces, cameras=cameras, photos=photos, progress=progress)
     return revised.close_gaps(), revised.renumber(surfaces)
+
+
+def median_parallax(masks: Masks, cameras: Cameras) -> float:
+    """Degrees; median over the instances of the largest angle between two lines of sight to their masks; infinite
+    without an instance that two views show."""
+    boxes = masks.regions.boxes.double()
+    centres = torch.cat((boxes[:, :2] + boxes[:, 2:], torch.full_like(boxes[:, :1], 2)), 1) / 2
+    sights = (cameras.world_from_px[masks.view_index] @ centres[:, :, None])[..., 0]
+    sights = sights / sights.norm(dim=1, keepdim=True)
+    angles = []
+    for instance in masks.instance_ids[masks.instance_ids > 0].unique().tolist():
+        own = sights[masks.instance_ids == instance]
+        if len(own) > 1:
+            angles.append(torch.rad2deg(torch.acos((own @ own.T).clamp(-1, 1)).max()))
+    return float(torch.stack(angles).median()) if angles else float("inf")
 
 
 def revise_masks(

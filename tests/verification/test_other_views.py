@@ -9,9 +9,10 @@ import pytest
 import torch
 
 from blade_scene import SIZE, as_regions
+from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions
-from mvseg.verification.other_views import revise_masks
+from mvseg.verification.other_views import median_parallax, revise_masks, verify_masks
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 GREEN, BROWN = (70, 150, 50), (120, 90, 60)
@@ -151,3 +152,19 @@ def test_nothing_found() -> None:
     revised = revise_masks(detected(regions, ids), {}, cameras=CAMERAS, photos=photo)
     assert len(revised) == revised.num_instances == 0
     assert revised.regions.num_views == 6
+
+
+def test_cameras_on_one_side_verify_nothing() -> None:
+    regions, ids = as_regions(TRUE)
+    masks = detected(regions, ids)
+    apart = median_parallax(masks, CAMERAS)
+    assert apart > 60
+    K = CAMERAS.K.clone()
+    K[:, :2, :2] *= 10
+    alike = replace(CAMERAS, R=CAMERAS.R[:1].repeat(len(CAMERAS), 1, 1), K=K)
+    with pytest.warns(InputWarning, match="from one side only"):
+        kept, surfaces = verify_masks(masks, cameras=alike, photos=photo)
+    assert torch.equal(kept.regions.crops, regions.crops)
+    assert torch.equal(kept.instance_ids, ids)
+    assert surfaces == {}
+    assert median_parallax(detected(regions, torch.full_like(ids, -1)), CAMERAS) == float("inf")
