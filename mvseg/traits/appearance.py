@@ -21,7 +21,8 @@ from mvseg.traits.leaf import Measurement, missing
 Floats = NDArray[np.float64]
 
 BORDER_PX = 2  # pixels this near to the edge of a mask may show something else
-COLORS = ("mean_red", "mean_green", "mean_blue", "greenness_index")
+COLORS = ("mean_red", "mean_green", "mean_blue", "greenness_index", "senescent_share", "hue")
+YELLOW_DEG = 60.0  # hues from red to here are those of yellow, brown and red leaves
 OUTSIDE = missing("not measured: no photo can show it")
 NO_PIXELS = missing("not measured: no pixel is surely of this leaf")
 NO_PHOTOS = missing("not measured: there are no photos")
@@ -54,7 +55,7 @@ def measure_appearance(
     """
     has_photos = bool(surfaces) and photos.exist
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
-    colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # sure pixels, their mean
+    colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # see `mean_colors`
     has_colors, is_corrected = False, any(corrections)
     for view in range(len(cameras)):
         photo = photos(view) if has_photos else None
@@ -75,7 +76,8 @@ def measure_appearance(
                 if sure.any():
                     seen = photo[window][sure]
                     shown = seen / 255 if correction is None else correct_colors(correction, seen)
-                    colors[instance].append((int(sure.sum()), shown.mean(0)))
+                    is_senescent = hues(shown) < YELLOW_DEG
+                    colors[instance].append((int(sure.sum()), np.append(shown.mean(0), is_senescent.mean())))
     found = {}
     for instance in surfaces:
         projected, visible = pixels[instance].tolist()
@@ -117,17 +119,31 @@ def describe_colors(corrections: Sequence[ColorCorrection | None]) -> str:
 
 
 def mean_colors(views: list[tuple[int, Floats]], method: str) -> dict[str, Measurement]:
-    """The traits in COLORS from the number of pixels and the mean colour (3,), 0 to 1, of each view."""
+    """The traits in COLORS from the number of pixels of each view and (4,): their mean colour, 0 to 1, and the share of
+    them that is yellow, brown or red."""
     if not views:
         return dict.fromkeys(COLORS, NO_PIXELS)
     weights = np.array([count for count, _ in views], dtype=np.float64)
-    colors = np.stack([color for _, color in views])
-    red, green, blue = colors.T
+    seen = np.stack([each for _, each in views])
+    red, green, blue, senescent = seen.T
     greenness = (2 * green - red - blue) / np.maximum(2 * green + red + blue, 1e-9)
-    table = np.column_stack([colors, greenness])
+    hue = hues((weights @ seen[:, :3] / weights.sum())[None])[0]
+    apart = (hues(seen[:, :3]) - hue + 180) % 360 - 180  # of the views; hues are on a circle
+    table = np.column_stack([red, green, blue, greenness, senescent, apart])
     means = weights @ table / weights.sum()
-    errors = table.std(0, ddof=1) / np.sqrt(len(views)) if len(views) > 1 else np.full(4, np.nan)
+    means[-1] = hue
+    errors = table.std(0, ddof=1) / np.sqrt(len(views)) if len(views) > 1 else np.full(len(COLORS), np.nan)
     return {
         name: Measurement(float(mean), float(error), method)
         for name, mean, error in zip(COLORS, means, errors, strict=True)
     }
+
+
+def hues(colors: Floats) -> Floats:
+    """(n,) hues of colours (n, 3), 0 to 1: degrees in [0, 360), 0 red, 60 yellow, 120 green; 0 for greys."""
+    low, high = colors.min(1), colors.max(1)
+    spread = np.where(high > low, high - low, 1)
+    (red, green, blue), top = colors.T, colors.argmax(1)
+    sixths = np.choose(top, [(green - blue) / spread, 2 + (blue - red) / spread, 4 + (red - green) / spread])
+    degrees: Floats = 60 * sixths % 360
+    return np.where(degrees >= 360, 0.0, degrees)

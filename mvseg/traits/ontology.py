@@ -55,6 +55,8 @@ SEEN_TRAITS = (
     Definition("mean_green", "1", "mean green of the surely seen pixels, 0 to 1"),
     Definition("mean_blue", "1", "mean blue of the surely seen pixels, 0 to 1"),
     Definition("greenness_index", "1", "green leaf index (2G - R - B) / (2G + R + B), -1 to 1"),
+    Definition("senescent_share", "1", "share of its sure pixels whose hue is below 60 degrees: yellow, brown or red"),
+    Definition("hue", "degree", "hue of its mean colour, 0 red, 60 yellow, 120 green"),
 )
 VOXEL_TRAITS = (
     Definition("volume", "volume", "of the occupied voxels", has_sd=False),

@@ -5,6 +5,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from skimage.color import rgb2hsv
 
 from blade_scene import SIZE, ring_cameras
 from known_leaves import flat_leaf
@@ -14,7 +15,7 @@ from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
-from mvseg.traits.appearance import COLORS, mean_colors, measure_appearance, project_crop, shrink
+from mvseg.traits.appearance import COLORS, hues, mean_colors, measure_appearance, project_crop, shrink
 from mvseg.traits.color_correction import from_linear, to_linear
 from mvseg.traits.config import ColorCorrection
 
@@ -130,11 +131,34 @@ def test_shrunken_masks_keep_to_the_edge_of_the_picture() -> None:
 
 
 def test_views_weigh_as_much_as_their_pixels() -> None:
-    views = [(300, np.array([0.2, 0.4, 0.2])), (100, np.array([0.6, 0.8, 0.4]))]
+    views = [(300, np.array([0.2, 0.4, 0.2, 0.0])), (100, np.array([0.6, 0.8, 0.4, 0.4]))]
     found = mean_colors(views, "photographs")
     assert found["mean_red"].value == pytest.approx(0.3)
     assert found["mean_red"].sd == pytest.approx(0.2)  # (0.6 - 0.2) / sqrt(2) between views, / sqrt(2) of their mean
     (first, second) = ((0.8 - 0.4) / (0.8 + 0.4), (1.6 - 1.0) / (1.6 + 1.0))
     assert found["greenness_index"].value == pytest.approx(0.75 * first + 0.25 * second)
+    assert found["senescent_share"].value == pytest.approx(0.1)
     assert not np.isfinite(mean_colors(views[:1], "photographs")["mean_red"].sd)
     assert not mean_colors([], "photographs")["mean_red"].exists
+
+
+def test_hues_are_those_of_a_library() -> None:
+    colors = np.random.default_rng(0).random((200, 3))
+    colors[0] = 0.5  # grey
+    np.testing.assert_allclose(hues(colors), 360 * rgb2hsv(colors)[:, 0], atol=1e-6)
+    known = np.array([[1.0, 0, 0], [0, 1, 0], [0, 0, 1], [0.5, 0.4, 0.1]])
+    assert hues(known).tolist() == pytest.approx([0, 120, 240, 45])
+
+
+def test_a_leaf_that_yellows_says_how_much(tmp_path: Path) -> None:
+    """A third of each view's leaf is brown."""
+    masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
+    photos = []
+    for mask in masks:
+        photo = painted(mask, GREEN)
+        rows = np.nonzero(mask)[0]
+        photo[: int(np.quantile(rows, 1 / 3))] = (120, 80, 20)
+        photos.append(photo)
+    found = measure_appearance({1: LEAF}, labels_of(masks), CAMERAS, photos=Photos(scene_of(tmp_path, photos)))[1]
+    assert found["senescent_share"].value == pytest.approx(1 / 3, abs=0.05)
+    assert 60 < found["hue"].value < 120

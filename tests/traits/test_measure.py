@@ -67,7 +67,7 @@ def test_every_leaf_has_every_trait(traits: Traits) -> None:
     for leaf in traits.leaves:
         assert (leaf.method, leaf.reasons, leaf.rejection) == ("surface", (), None)
         missing = {name for name, number in leaf.numbers.items() if not number.exists}
-        assert missing == {"mean_red", "mean_green", "mean_blue", "greenness_index", "volume",
+        assert missing == {"mean_red", "mean_green", "mean_blue", "greenness_index", "senescent_share", "hue", "volume",
                            "x_min", "y_min", "z_min", "x_max", "y_max", "z_max", "num_pieces"}  # fmt: skip
         assert {leaf.numbers[name].method for name in missing} == {
             "not measured: there are no photos", "not measured: only voxels have it"
