@@ -56,6 +56,9 @@ if TYPE_CHECKING:
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
     from mvseg.system.worker_pool import start_workers as start_workers
+    from mvseg.tracking.track import LeafLink as LeafLink
+    from mvseg.tracking.track import Tracks as Tracks
+    from mvseg.tracking.track import track_leaves as track_leaves
     from mvseg.traits.config import TraitsConfig as TraitsConfig
     from mvseg.traits.measure import Traits as Traits
     from mvseg.traits.measure import measure_plant as measure_plant
@@ -96,6 +99,7 @@ _HOME = {
     "checks.check_scene": ("Check", "check_scene"),
     "config": ("RunConfig",),
     "pipeline": ("run_scene",),
+    "tracking.track": ("LeafLink", "Tracks", "track_leaves"),
     "system.worker_pool": ("start_workers",),
 }
 __all__ = [name for names in _HOME.values() for name in names]

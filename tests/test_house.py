@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from collections.abc import Callable
 from dataclasses import fields
 from importlib.util import resolve_name
 from pathlib import Path
@@ -23,7 +24,7 @@ import mvseg
 import mvseg.matching
 from mvseg._version import code_hash, made_by
 from mvseg.cli.command import build_parser
-from mvseg.simulation.demo_plant import write_demo_plant
+from mvseg.simulation.demo_plant import write_demo_plant, write_demo_plant_later
 from mvseg.training.config import TrainConfig
 
 ROOT = Path(__file__).parent.parent
@@ -42,7 +43,7 @@ FLOORS = (
     ("detection",),
     ("config",),
     ("training", "results"),
-    ("pipeline",),
+    ("pipeline", "tracking"),
     ("runs",),
     ("batch",),
     ("__init__",),
@@ -308,16 +309,19 @@ def test_the_conda_recipe_wants_what_the_package_wants() -> None:
 
 
 def test_shipped_scene_is_small() -> None:
-    size = sum(file.stat().st_size for file in (PACKAGE / "demo_plant").rglob("*") if file.is_file())
-    assert size <= 3_000_000
+    for name, most in (("demo_plant", 3_000_000), ("demo_plant_later", 500_000)):
+        assert sum(file.stat().st_size for file in (PACKAGE / name).rglob("*") if file.is_file()) <= most
 
 
-def test_shipped_masks_are_what_the_script_makes(tmp_path: Path) -> None:
-    write_demo_plant(tmp_path / "plant")
-    shipped = sorted((PACKAGE / "demo_plant").rglob("*.png"))
+@pytest.mark.parametrize(
+    ("name", "write"), [("demo_plant", write_demo_plant), ("demo_plant_later", write_demo_plant_later)]
+)
+def test_shipped_masks_are_what_the_script_makes(name: str, write: Callable[[Path], None], tmp_path: Path) -> None:
+    write(tmp_path / "plant")
+    shipped = sorted((PACKAGE / name).rglob("*.png"))
     assert len(shipped) == 18
     for file in shipped:
-        assert (tmp_path / "plant" / file.relative_to(PACKAGE / "demo_plant")).read_bytes() == file.read_bytes()
+        assert (tmp_path / "plant" / file.relative_to(PACKAGE / name)).read_bytes() == file.read_bytes()
 
 
 @pytest.mark.parametrize("config", sorted((ROOT / "configs").rglob("*.yaml")), ids=lambda path: path.name)

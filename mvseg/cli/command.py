@@ -12,7 +12,7 @@ from typing import TextIO
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg._version import __version__
-from mvseg.cli import batch, check, export, infer, match, models, pose, simulate, train
+from mvseg.cli import batch, check, export, infer, match, models, pose, simulate, track, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -29,6 +29,7 @@ VERBS = {
     "infer": infer,
     "batch": batch,
     "export": export,
+    "track": track,
     "match": match,
     "eval": evaluate,
     "train": train,

@@ -13,7 +13,7 @@ MOST_USED = {
               "detect.image_size", "split_merged", "num_workers"),
     "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "scheduler", "scale", "unit", "up",
               "color_card", "detect.weights"),
-    "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method", "match.refine_poses"),
+    "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method", "refine_poses"),
     "train": ("photos", "labels", "output", "val_photos", "val_labels", "config", "arch", "weights", "image_size",
               "epochs", "resume"),
 }  # fmt: skip

@@ -1,0 +1,218 @@
+"""Plants over days, one after another or side by side, from the output of a batch or from single results."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Generator, Mapping, Sequence
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from tqdm import tqdm
+
+from mvseg._version import __version__
+from mvseg.batch.dask_workers import connect, run_on_dask
+from mvseg.batch.local_workers import run_locally
+from mvseg.batch.lost import Lost
+from mvseg.batch.places import scene_result, tables_folder
+from mvseg.errors import InputError
+from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
+from mvseg.results.provenance import hash_files
+from mvseg.system.atomic import folder_whole
+from mvseg.tracking.corrections import LinkEdit, find_links, read_link_edits
+from mvseg.tracking.dates import read_date
+from mvseg.tracking.page import INDEX_FILE, write_index, write_page
+from mvseg.tracking.tables import COLUMNS, Row, table_rows, write_tables
+from mvseg.tracking.track import track_leaves
+
+
+@dataclass(frozen=True)
+class PlantResults:
+    """One plant to track: its name, its result folders and their times as the user gave them."""
+
+    plant: str
+    folders: tuple[Path, ...]
+    times: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class TrackedPlant:
+    """What is left of a plant when its pages are written: rows of the tables, counts, warnings; a sentence where it
+    failed."""
+
+    rows: Mapping[str, Sequence[Row]]
+    dates: int = 0
+    tracks: int = 0
+    warnings: tuple[str, ...] = ()
+    sentence: str = ""
+
+
+def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
+    """The plants of a batch with two finished dates or more, in the order of its table, and how many have fewer.
+
+    Raises:
+        InputError: `batch` is not the output of a batch, or no plant has two dates.
+    """
+    path = tables_folder(batch) / "summary.csv"
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [(row["scene"], row["plant"], row["time"]) for row in csv.DictReader(file) if row["state"] == "done"]
+    except OSError:
+        raise InputError(f"{batch}: is no output of mvseg batch (tables/summary.csv is missing)") from None
+    except (KeyError, ValueError, csv.Error) as error:
+        raise InputError(f"{path}: is no table that mvseg batch wrote ({error})") from None
+    scenes: dict[str, list[tuple[str, str]]] = {}
+    for scene, plant, time in rows:
+        scenes.setdefault(plant, []).append((scene, time))
+    several = {plant: seen for plant, seen in scenes.items() if len(seen) > 1}
+    if not several:
+        message = "no plant has two finished dates, expected a table with columns plant and time (docs/batch.md)"
+        raise InputError(f"{batch}: {message}")
+    plants = [
+        PlantResults(
+            plant=plant,
+            folders=tuple(scene_result(batch, scene) for scene, _ in seen),
+            times=tuple(time for _, time in seen),
+        )
+        for plant, seen in several.items()
+    ]
+    return plants, len(scenes) - len(several)
+
+
+def track_plants(
+    plants: Sequence[PlantResults],
+    out: Path,
+    *,
+    corrections: Path | None = None,
+    num_workers: int = 1,
+    scheduler: str | None = None,
+    report: bool = True,
+    quiet: bool = False,
+) -> list[TrackedPlant]:
+    """Track plants and write the folder `out`, whole or not at all; an earlier one is replaced.
+
+    One plant is in memory at a time in each process. A plant that fails is told in its `sentence`; the others go on.
+
+    Args:
+        plants: see `list_plants`.
+        out: tracks.csv, growth.csv, plants.csv, curves.csv, tracks.html, growth.png and run.json; of several plants,
+            pages and pictures lie in `plants/`, and tracks.html is their list.
+        corrections: a file with `same_track` and `different_track`.
+        num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
+        scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.
+        report: write pages and pictures, too.
+        quiet: no progress bar.
+
+    Raises:
+        InputError: `out` cannot be written, the corrections are broken, or every plant failed.
+    """
+    if num_workers < 1:
+        raise InputError(f"{num_workers} workers asked for, expected at least 1")
+    check_out(out)
+    edits = [] if corrections is None else read_link_edits(corrections)
+    try:
+        with folder_whole(out) as folder:
+            work = partial(_track_plant, folder if report else None, edits, is_alone=len(plants) == 1)
+            tracked = _work_on_all(plants, work, num_workers=num_workers, scheduler=scheduler, quiet=quiet)
+            if all(plant.sentence for plant in tracked):
+                raise InputError(tracked[0].sentence)
+            write_tables(folder, {name: [row for plant in tracked for row in plant.rows[name]] for name in COLUMNS})
+            if report and len(plants) > 1:
+                about = [
+                    (plants[n].plant, each.dates, each.tracks) for n, each in enumerate(tracked) if not each.sentence
+                ]
+                write_index(folder / INDEX_FILE, about)
+            _write_run(folder, plants, tracked, corrections)
+            keep_user_files(out, folder)
+    except OSError as error:
+        raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
+    return tracked
+
+
+def _work_on_all(
+    plants: Sequence[PlantResults],
+    work: Callable[[tuple[int, PlantResults]], TrackedPlant],
+    *,
+    num_workers: int,
+    scheduler: str | None,
+    quiet: bool,
+) -> list[TrackedPlant]:
+    items = dict(enumerate(enumerate(plants)))
+    done: dict[int, TrackedPlant] = {}
+
+    def gather(answers: Generator[tuple[int, Any], None, None]) -> None:
+        with closing(answers), tqdm(total=len(plants), desc="track", unit="plant", disable=quiet) as bar:
+            for index, answer in answers:
+                if isinstance(answer, Lost):
+                    answer = _failed(f"{plants[index].plant}: the process that worked on it {answer.reason}")
+                done[index] = answer
+                bar.update()
+
+    def ignore(_: int) -> None:
+        return None
+
+    if scheduler is not None:
+        with connect(scheduler) as client:
+            gather(run_on_dask(work, items, client=client, at_once=None, started=ignore))
+    elif num_workers == 1 or len(plants) == 1:
+        gather((index, work(item)) for index, item in items.items())
+    else:
+        gather(run_locally(work, items, num_workers=num_workers, started=ignore))
+    return [done[index] for index in range(len(plants))]
+
+
+def _track_plant(
+    folder: Path | None, edits: Sequence[LinkEdit], item: tuple[int, PlantResults], *, is_alone: bool
+) -> TrackedPlant:
+    """Track one plant and write its page into `folder`, if there is one."""
+    index, plant = item
+    try:
+        missing = [where.name for where, time in zip(plant.folders, plant.times, strict=True) if not time]
+        if missing:
+            raise InputError(f"{missing[0]} has no time, expected a number (days) or an ISO date (column time)")
+        dates = [read_date(where, time) for where, time in zip(plant.folders, plant.times, strict=True)]
+        links, lost = find_links(edits, dates)
+        tracks = track_leaves(dates, links=links, plant=plant.plant)
+        if folder is not None:
+            place = folder if is_alone else folder / "plants" / f"{index + 1:05d}"
+            place.mkdir(parents=True, exist_ok=True)
+            write_page(place, tracks)
+    except InputError as error:
+        return _failed(f"plant {plant.plant}: {error}")
+    warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.warnings, *lost))
+    return TrackedPlant(table_rows(tracks), len(tracks.dates), tracks.num_tracks, warnings)
+
+
+def _failed(sentence: str) -> TrackedPlant:
+    return TrackedPlant(rows={name: [] for name in COLUMNS}, sentence=sentence)
+
+
+def _write_run(
+    folder: Path, plants: Sequence[PlantResults], tracked: Sequence[TrackedPlant], corrections: Path | None
+) -> None:
+    inputs = {str(place): _hash_of(place) for plant in plants for place in plant.folders}
+    if corrections is not None:
+        inputs[str(corrections)] = hash_files(corrections)
+    said = {
+        "mvseg": __version__,
+        "inputs": inputs,
+        "config": {"corrections": corrections and str(corrections)},
+        "warnings": [sentence for plant in tracked for sentence in plant.warnings],
+        "failures": [plant.sentence for plant in tracked if plant.sentence],
+        "counts": {
+            "plants": len(plants),
+            "dates": sum(plant.dates for plant in tracked),
+            "tracks": sum(plant.tracks for plant in tracked),
+        },
+        "files": list_files(folder),
+    }
+    (folder / RUN_FILE).write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
+
+
+def _hash_of(place: Path) -> str | None:
+    """SHA-256 of a result's run.json, which lists those of all its files; None where it has none."""
+    path = place / RUN_FILE
+    return hash_files(path) if path.is_file() else None

@@ -1,0 +1,71 @@
+"""`mvseg track`: the same leaf over days."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any
+
+from jsonargparse import ArgumentParser, Namespace
+
+from mvseg.errors import InputError
+
+SOME_FAILED = 3
+
+
+def add(verbs: Any) -> None:
+    """Add the verb to the parser's sub-commands."""
+    about = "The same leaf over days: tracks, growth curves, births and deaths; see docs/tracking.md."
+    parser = ArgumentParser(exit_on_error=False, description=about)
+    help_results = "output of mvseg batch (every plant with two dates or more), or the results of one plant"
+    parser.add_argument("results", type=Path, nargs="+", help=help_results)
+    help_times = "of each result: numbers (days) or ISO dates"
+    parser.add_argument("--times", type=str, nargs="+", help=help_times)
+    parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: that of --out)")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the tables and pages")
+    help_corrections = "what a person says: same_track and different_track, see docs/tracking.md"
+    parser.add_argument("--corrections", type=Path | None, help=help_corrections)
+    parser.add_argument("--report", type=bool, default=True, help="write tracks.html and growth.png")
+    parser.add_argument("--num_workers", type=int | None, help="plants tracked at once, each in a process of its own")
+    help_scheduler = "work on a Dask cluster instead: the scheduler's address, or its file"
+    parser.add_argument("--scheduler", type=str | None, help=help_scheduler)
+    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    verbs.add_subcommand("track", parser, help="the same leaf over days")
+
+
+def run(args: Namespace) -> int:
+    """Run the verb; returns the exit code."""
+    from mvseg.batch.track_plants import PlantResults, list_plants, track_plants  # keeps --help quick
+
+    if args.scheduler is not None and args.num_workers is not None:
+        raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
+    results, times = args.results, args.times
+    if times is None:
+        if len(results) > 1:
+            raise InputError(f"{len(results)} results are given without --times, expected one time for each")
+        plants, num_single = list_plants(results[0])
+        if num_single:
+            print(f"mvseg: {num_single} plants have one date and are left out", file=sys.stderr)
+    else:
+        if len(times) != len(results):
+            raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")
+        plants = [PlantResults(args.plant or args.out.resolve().name, tuple(results), tuple(times))]
+    tracked = track_plants(
+        plants,
+        args.out,
+        corrections=args.corrections,
+        num_workers=1 if args.num_workers is None else args.num_workers,
+        scheduler=args.scheduler,
+        report=args.report,
+        quiet=args.quiet,
+    )
+    for plant in tracked:
+        for sentence in plant.warnings:
+            print(f"mvseg: warning: {sentence}", file=sys.stderr)
+    failed = [plant.sentence for plant in tracked if plant.sentence]
+    for sentence in failed:
+        print(f"mvseg: {sentence}", file=sys.stderr)
+    num_dates, num_tracks = sum(plant.dates for plant in tracked), sum(plant.tracks for plant in tracked)
+    done = len(tracked) - len(failed)
+    print(f"{args.out}: {num_tracks} leaves of {done} {'plant' if done == 1 else 'plants'} on {num_dates} dates")
+    return SOME_FAILED if failed else 0

@@ -1,0 +1,160 @@
+"use strict";
+const data = JSON.parse(document.getElementById("data").textContent);
+const find = (id) => document.getElementById(id);
+const WIDE = 190, HIGH = 210;
+const tracks = Object.keys(data.colors).map(Number);
+let picked = 0;
+
+function make(name, text, parent, kind) {
+  const element = document.createElement(name);
+  if (text !== undefined) element.textContent = text;
+  if (kind) element.className = kind;
+  if (parent) parent.append(element);
+  return element;
+}
+
+function project(shape, turn) {
+  const cos = Math.cos(turn), sin = Math.sin(turn), out = [];
+  for (let at = 0; at < shape.length; at += 3) {
+    const [x, y, z] = shape.slice(at, at + 3);
+    out.push([WIDE / 2 + (x * cos - y * sin) * WIDE / 2400, HIGH / 2 - z * HIGH / 2400, x * sin + y * cos]);
+  }
+  return out;
+}
+
+function drawDate(canvas, date) {
+  const pen = canvas.getContext("2d"), turn = find("turn").value * Math.PI / 180;
+  pen.setTransform(2, 0, 0, 2, 0, 0);
+  pen.clearRect(0, 0, WIDE, HIGH);
+  const leaves = data.leaves.filter((leaf) => leaf.date === date && leaf.shape.length)
+    .map((leaf) => ({ leaf, line: project(leaf.shape, turn) }));
+  for (const item of leaves) item.depth = item.line.reduce((sum, point) => sum + point[2], 0) / item.line.length;
+  leaves.sort((one, other) => other.depth - one.depth);
+  canvas.leaves = leaves.map(({ leaf, line }) => {
+    const path = new Path2D();
+    line.forEach(([x, y], n) => (n ? path.lineTo(x, y) : path.moveTo(x, y)));
+    pen.globalAlpha = picked && leaf.track !== picked ? 0.15 : 0.9;
+    pen.fillStyle = pen.strokeStyle = data.colors[leaf.track];
+    if (leaf.flat) { path.closePath(); pen.fill(path); pen.strokeStyle = "#0008"; pen.lineWidth = 0.5; pen.stroke(path); }
+    else { pen.lineWidth = 4; pen.stroke(path); }
+    return { track: leaf.track, path };
+  });
+  pen.globalAlpha = 1;
+}
+
+function pickAt(canvas, event) {
+  const pen = canvas.getContext("2d"), box = canvas.getBoundingClientRect();
+  const x = (event.clientX - box.left) * 2, y = (event.clientY - box.top) * 2;
+  pen.lineWidth = 6;
+  const hit = [...canvas.leaves].reverse().find(({ path }) => pen.isPointInPath(path, x, y) || pen.isPointInStroke(path, x, y));
+  pick(hit ? hit.track : 0);
+}
+
+function drawDates() {
+  for (const [date, canvas] of [...document.querySelectorAll("#dates canvas")].entries()) drawDate(canvas, date);
+}
+
+function buildDates() {
+  data.dates.forEach((date) => {
+    const figure = make("figure", undefined, find("dates")), canvas = make("canvas", undefined, figure);
+    canvas.width = 2 * WIDE; canvas.height = 2 * HIGH; canvas.style.width = `${WIDE}px`;
+    canvas.addEventListener("click", (event) => pickAt(canvas, event));
+    make("figcaption", `${date.written} · ${date.scene}`, figure);
+  });
+}
+
+function buildTable() {
+  const table = make("table", undefined, find("tracks")), head = make("tr", undefined, make("thead", undefined, table));
+  make("th", "leaf", head);
+  data.dates.forEach((date) => make("th", date.written, head));
+  const body = make("tbody", undefined, table), rows = {};
+  for (const track of tracks) {
+    rows[track] = make("tr", undefined, body);
+    rows[track].dataset.track = track;
+    rows[track].addEventListener("click", () => pick(track));
+    make("td", track, rows[track]);
+    data.dates.forEach(() => make("td", "", rows[track]));
+  }
+  for (const leaf of data.leaves) {
+    const cell = make("span", undefined, rows[leaf.track].children[leaf.date + 1], `cell ${leaf.state}`);
+    cell.style.background = data.colors[leaf.track];
+    cell.style.opacity = leaf.p === null ? 1 : 0.25 + 0.75 * leaf.p;
+    cell.title = `leaf ${leaf.leaf}, ${leaf.state}` + (leaf.p === null ? "" : `, probability ${leaf.p}`);
+  }
+  for (const [date, track, state] of data.gaps) make("span", undefined, rows[track].children[date + 1], `cell ${state}`).title = state;
+}
+
+function svg(name, settings, text) {
+  const element = document.createElementNS("http://www.w3.org/2000/svg", name);
+  for (const [key, value] of Object.entries(settings)) element.setAttribute(key, value);
+  if (text !== undefined) element.textContent = text;
+  find("chart").append(element);
+  return element;
+}
+
+function drawChart() {
+  const trait = find("trait").value, of = data.numbers[trait];
+  find("chart").replaceChildren();
+  find("model").textContent = "";
+  if (!of) return;
+  const shown = Object.entries(of.tracks).filter(([track]) => !picked || Number(track) === picked);
+  const values = shown.flatMap(([, points]) => points.flatMap(([, value, sd]) => [value - sd, value + sd]));
+  if (!values.length) { find("model").textContent = "not measured on any date"; return; }
+  const low = Math.min(0, ...values), high = Math.max(...values, low + 1e-9), first = data.dates[0].time;
+  const span = Math.max(data.dates.at(-1).time - first, 1e-9);
+  const x = (time) => 70 + (time - first) / span * 630, y = (value) => 300 - (value - low) / (high - low) * 280;
+  for (let tick = 0; tick <= 4; tick += 1) {
+    const value = low + (high - low) * tick / 4;
+    svg("line", { x1: 70, x2: 700, y1: y(value), y2: y(value), stroke: "#8884" });
+    svg("text", { x: 4, y: y(value) + 4 }, Number(value.toPrecision(3)));
+  }
+  data.dates.forEach((date) => svg("text", { x: x(date.time) - 12, y: 318 }, date.written));
+  svg("text", { x: 70, y: 12 }, `${trait.replaceAll("_", " ")} (${of.unit})`);
+  for (const [track, points] of shown) {
+    const at = points.map(([date, value, sd]) => [x(data.dates[date].time), y(value - sd), y(value + sd), y(value)]);
+    const color = data.colors[track], curve = (data.curves[trait] || {})[track];
+    const band = [...at.map((p) => `${p[0]},${p[1]}`), ...[...at].reverse().map((p) => `${p[0]},${p[2]}`)];
+    svg("polygon", { points: band.join(" "), fill: color, opacity: picked ? 0.25 : 0.08 });
+    const within = (point) => point[0] >= data.dates[points[0][0]].time && point[0] <= data.dates[points.at(-1)[0]].time;
+    const line = curve ? curve.line.filter(within).map((p) => `${x(p[0])},${y(p[1])}`) : at.map((p) => `${p[0]},${p[3]}`);
+    svg("polyline", { points: line.join(" "), fill: "none", stroke: color, "stroke-width": 2 });
+    for (const p of at) svg("circle", { cx: p[0], cy: p[3], r: 3, fill: color });
+    if (curve && picked) find("model").textContent = `curve: ${curve.model}`;
+  }
+}
+
+function pick(track) {
+  picked = track;
+  find("leaf").textContent = track ? `Leaf ${track}` : "All leaves";
+  for (const row of document.querySelectorAll("tbody tr")) row.classList.toggle("picked", Number(row.dataset.track) === track);
+  find("crops").replaceChildren();
+  for (const leaf of data.leaves.filter((each) => each.track === track && each.crop)) {
+    const figure = make("figure", undefined, find("crops")), image = make("img", undefined, figure);
+    image.src = `data:image/jpeg;base64,${leaf.crop}`;
+    image.alt = `leaf ${track} on ${data.dates[leaf.date].written}`;
+    make("figcaption", data.dates[leaf.date].written, figure);
+  }
+  drawDates();
+  drawChart();
+}
+
+function press(event) {
+  if (event.target.tagName === "SELECT") return;
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key], turn = { ArrowUp: 10, ArrowDown: -10 }[event.key];
+  if (step) pick((picked + step + tracks.length + 1) % (tracks.length + 1));
+  else if (turn) { find("turn").value = (Number(find("turn").value) + turn + 360) % 360; drawDates(); }
+  else if (event.key === "Escape") pick(0);
+  else return;
+  event.preventDefault();
+}
+
+find("plant").textContent = data.plant;
+find("summary").textContent = `${tracks.length} leaves on ${data.dates.length} dates`;
+for (const sentence of data.warnings) make("li", sentence, find("warnings"));
+for (const trait of Object.keys(data.numbers)) make("option", trait, find("trait")).value = trait;
+find("trait").addEventListener("change", drawChart);
+find("turn").addEventListener("input", drawDates);
+document.addEventListener("keydown", press);
+buildDates();
+buildTable();
+pick(0);

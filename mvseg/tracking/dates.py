@@ -1,0 +1,333 @@
+"""What tracking needs of one plant on one date, from a result folder or from a `Result` in memory."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from mvseg.errors import InputError
+from mvseg.formats.json_file import Vector3, read_json
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE
+from mvseg.results.read import find_result
+from mvseg.traits.up import level_frame
+
+if TYPE_CHECKING:
+    from mvseg.results.result import Result
+
+Floats = NDArray[np.float64]
+STATIONS = 9  # points of a midrib, base and tip included
+ROWS = 12  # of points from base to tip, three in each: edge, midrib, edge
+CLOUD = 3 * ROWS  # points that stand for a leaf
+UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}  # in millimetres
+REJECTED = "rejected:"
+
+
+@dataclass(frozen=True)
+class Number:
+    """A trait: its value, its standard deviation (NaN where there is none) and its unit."""
+
+    value: float
+    sd: float
+    unit: str
+
+
+@dataclass(frozen=True, eq=False)
+class SeenLeaf:
+    """One leaf on one date.
+
+    Attributes:
+        leaf: its id in that date's result.
+        midrib: (STATIONS, 3) float64 from base to tip, evenly spread, in the date's frame: its unit, +z up where up is
+            known; None for a leaf without a shape (seen in one view).
+        normal: (3,) unit mean normal of the blade; None with the midrib.
+        points: (CLOUD, 3) points of the leaf: of a surface, rows from base to tip of edge, midrib, edge; None with the
+            midrib.
+        is_oriented: the first point of the midrib is known to be the base.
+        numbers: {trait: number} of what was measured.
+    """
+
+    leaf: int
+    midrib: Floats | None
+    normal: Floats | None
+    points: Floats | None
+    is_oriented: bool
+    numbers: Mapping[str, Number]
+
+    @property
+    def length(self) -> float:
+        """Along the midrib; NaN without a shape."""
+        return math.nan if self.midrib is None else polyline_length(self.midrib)
+
+
+@dataclass(frozen=True, eq=False)
+class PlantOnDate:
+    """One plant on one date.
+
+    Attributes:
+        scene: name of the result.
+        time: days; of ISO dates, days after the first of all dates.
+        written: the time as the user gave it.
+        unit: of its lengths, "" when unknown.
+        knows_up: +z of its frame is up.
+        leaves: those that count as leaves, by id.
+        whole: {trait: number} of the plant.
+        folder: of the result; None in memory.
+    """
+
+    scene: str
+    time: float
+    written: str
+    unit: str
+    knows_up: bool
+    leaves: tuple[SeenLeaf, ...]
+    whole: Mapping[str, Number]
+    folder: Path | None = None
+
+    @property
+    def shaped(self) -> list[int]:
+        """Indices of the leaves that have a shape."""
+        return [index for index, leaf in enumerate(self.leaves) if leaf.midrib is not None]
+
+
+class _World(BaseModel):
+    unit: str | None = None
+    up: Vector3 | None = None
+
+
+class _Run(BaseModel):
+    scene: str = ""
+    traits: _World | None = None
+
+
+def read_date(folder: Path, time: str | float) -> PlantOnDate:
+    """One date from a result folder.
+
+    Args:
+        folder: of `mvseg infer`, or of a scene of `mvseg batch`.
+        time: a number (days) or an ISO date.
+
+    Raises:
+        InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
+    """
+    folder = find_result(folder)
+    if not (folder / "run.json").is_file():
+        raise InputError(f"{folder}: is no result, expected a folder that mvseg infer or mvseg batch wrote")
+    run = read_json(folder / "run.json", _Run)
+    if run.traits is None or not (folder / "traits.csv").is_file():
+        raise InputError(f"{folder}: has ids but no surfaces, run mvseg infer or mvseg batch with these masks first")
+    frame = None if run.traits.up is None else level_frame(run.traits.up)
+    by_leaf, methods = _read_traits(folder / "traits.csv")
+    leaves = []
+    for number, numbers in sorted((key, value) for key, value in by_leaf.items() if key):
+        if any(method.startswith(REJECTED) for method in methods[number].values()):
+            continue
+        path = folder / "leaves" / f"leaf_{number:03d}.ply"
+        vertices = _read_vertices(path) if path.is_file() else np.zeros((0, 3))
+        is_oriented = "base and tip cannot be told apart" not in methods[number].get("azimuth", "")
+        leaves.append(_leaf_of(number, vertices, numbers, frame, is_oriented=is_oriented))
+    return PlantOnDate(
+        scene=folder.name,
+        time=read_time(time),
+        written=str(time),
+        unit=run.traits.unit or "",
+        knows_up=frame is not None,
+        leaves=tuple(leaves),
+        whole=by_leaf.get(0, {}),
+        folder=folder,
+    )
+
+
+def date_of(result: Result, time: str | float) -> PlantOnDate:
+    """One date from a result in memory.
+
+    Raises:
+        InputError: it has no surfaces.
+    """
+    from mvseg.reconstruction.shapes import best_shape
+    from mvseg.traits.ontology import DEFINITIONS, unit_of
+
+    traits = result.traits
+    if traits is None:
+        raise InputError(f"{result.scene.name}: has ids but no surfaces, expected a run with reconstruct and traits")
+    frame = None if traits.up is None else level_frame(traits.up)
+
+    def numbers_of(found: Mapping[str, Any]) -> dict[str, Number]:
+        units = {name: unit_of(DEFINITIONS[name].kind, traits.unit) for name in found}
+        return {name: Number(m.value, m.sd, units[name]) for name, m in found.items() if m.exists}
+
+    leaves = []
+    for leaf in traits.leaves:
+        if leaf.rejection is not None:
+            continue
+        shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
+        vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
+        is_oriented = bool(getattr(shape, "is_oriented", False))
+        leaves.append(_leaf_of(leaf.leaf, vertices, numbers_of(leaf.numbers), frame, is_oriented=is_oriented))
+    return PlantOnDate(
+        scene=result.scene.name,
+        time=read_time(time),
+        written=str(time),
+        unit=traits.unit,
+        knows_up=frame is not None,
+        leaves=tuple(leaves),
+        whole=numbers_of(traits.whole),
+    )
+
+
+def read_time(time: str | float) -> float:
+    """Days: the number itself, or days since year 1 of an ISO date (with a time of day, if you like).
+
+    Raises:
+        InputError: it is neither.
+    """
+    text = str(time).strip()
+    try:
+        number = float(text)
+    except ValueError:
+        try:
+            moment = datetime.datetime.fromisoformat(text)
+        except ValueError:
+            raise InputError(f"time '{time}': expected a number (days) or an ISO date, as in 2026-05-31") from None
+        seconds = moment.hour * 3600 + moment.minute * 60 + moment.second
+        return moment.toordinal() + seconds / 86400
+    if not math.isfinite(number):
+        raise InputError(f"time '{time}': expected a number (days) or an ISO date")
+    return number
+
+
+def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
+    """The dates in order of time, all lengths in the unit of the first.
+
+    Raises:
+        InputError: two dates have the same time, numbers and ISO dates are mixed, or units cannot be converted.
+    """
+    kinds = {_is_number(date.written) for date in dates}
+    if len(kinds) > 1:
+        raise InputError("the times are numbers and ISO dates, expected one of the two for all dates of a plant")
+    ordered = sorted(dates, key=lambda date: date.time)
+    for earlier, later in pairwise(ordered):
+        if earlier.time == later.time:
+            message = f"{earlier.scene} and {later.scene} have the same time {later.written}"
+            raise InputError(f"{message}, expected each date of a plant once")
+    start = 0.0 if kinds == {True} else math.floor(ordered[0].time)
+    unit = ordered[0].unit
+    return tuple(replace(_in_unit(date, unit, ordered[0].scene), time=date.time - start) for date in ordered)
+
+
+def polyline_length(points: Floats) -> float:
+    """Length of a line through points (P, 3)."""
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+def _in_unit(date: PlantOnDate, unit: str, first: str) -> PlantOnDate:
+    if date.unit == unit:
+        return date
+    if date.unit not in UNITS or unit not in UNITS:
+        said = [name or "no unit" for name in (unit, date.unit)]
+        message = f"{first} is in {said[0]} and {date.scene} in {said[1]}"
+        raise InputError(f"{message}, expected one unit for all dates, or m, cm and mm (--unit, --scale)")
+    factor = UNITS[date.unit] / UNITS[unit]
+
+    def convert(numbers: Mapping[str, Number]) -> dict[str, Number]:
+        powers = {date.unit: 1, f"{date.unit}^2": 2, f"{date.unit}^3": 3}
+        return {
+            name: Number(n.value * factor**power, n.sd * factor**power, n.unit.replace(date.unit, unit))
+            if (power := powers.get(n.unit, 0))
+            else n
+            for name, n in numbers.items()
+        }
+
+    leaves = tuple(
+        replace(
+            leaf,
+            midrib=None if leaf.midrib is None else leaf.midrib * factor,
+            points=None if leaf.points is None else leaf.points * factor,
+            numbers=convert(leaf.numbers),
+        )
+        for leaf in date.leaves
+    )
+    return replace(date, unit=unit, leaves=leaves, whole=convert(date.whole))
+
+
+def _read_traits(path: Path) -> tuple[dict[int, dict[str, Number]], dict[int, dict[str, str]]]:
+    """{leaf: {trait: number}} and {leaf: {trait: method, or why there is no number}}; leaf 0 is the plant."""
+    numbers: dict[int, dict[str, Number]] = {}
+    methods: dict[int, dict[str, str]] = {}
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            for row in csv.DictReader(file):
+                leaf = int(row["leaf"] or 0)
+                methods.setdefault(leaf, {})[row["trait"]] = row["method"]
+                found = numbers.setdefault(leaf, {})
+                if row["value"]:
+                    sd = float(row["sd"]) if row["sd"] else math.nan
+                    found[row["trait"]] = Number(float(row["value"]), sd, row["unit"])
+    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: is no table of traits that mvseg wrote ({error})") from None
+    return numbers, methods
+
+
+def _read_vertices(path: Path) -> Floats:
+    import trimesh  # slow to load
+
+    try:
+        mesh: Any = trimesh.load(path, process=False, force="mesh")
+        return np.asarray(mesh.vertices, dtype=np.float64)
+    except Exception as error:  # trimesh raises anything at broken files
+        raise InputError(f"{path}: is no mesh that mvseg wrote ({error})") from None
+
+
+def _leaf_of(
+    number: int, vertices: Floats, numbers: Mapping[str, Number], frame: Floats | None, *, is_oriented: bool
+) -> SeenLeaf:
+    if len(vertices) < CLOUD or not np.isfinite(vertices).all():
+        return SeenLeaf(number, None, None, None, False, numbers)
+    points = vertices if frame is None else vertices @ frame.T
+    rows, columns = MESH_SHAPE
+    if len(points) == 2 + (rows - 2) * columns:
+        grid = points[1:-1].reshape(rows - 2, columns, 3)
+        midrib = resample(np.concatenate([points[:1], grid[:, columns // 2], points[-1:]]))
+        normal = np.cross(grid[1:, :-1] - grid[:-1, 1:], grid[1:, 1:] - grid[:-1, :-1]).sum((0, 1))
+        cloud = grid[np.linspace(0, rows - 3, ROWS).round().astype(int)][:, [0, columns // 2, -1]].reshape(-1, 3)
+    else:
+        midrib, normal = _midrib_of_voxels(points)
+        cloud, is_oriented = points[np.linspace(0, len(points) - 1, CLOUD).round().astype(int)], False
+    size = float(np.linalg.norm(normal))
+    normal = normal / size if size > 0 else np.array([0.0, 0.0, 1.0])
+    return SeenLeaf(number, midrib, normal, cloud, is_oriented, numbers)
+
+
+def resample(line: Floats) -> Floats:
+    """(STATIONS, 3) points evenly spread along a line (P, 3)."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
+    at = np.linspace(0, along[-1], STATIONS)
+    return np.stack([np.interp(at, along, line[:, axis]) for axis in range(3)], 1)
+
+
+def _midrib_of_voxels(points: Floats) -> tuple[Floats, Floats]:
+    """A line through the middle of a long cloud, and the direction in which it is thinnest."""
+    center = points.mean(0)
+    _, _, axes = np.linalg.svd(points - center, full_matrices=False)
+    along = (points - center) @ axes[0]
+    bins = np.clip(np.digitize(along, np.linspace(along.min(), along.max(), STATIONS + 1)) - 1, 0, STATIONS - 1)
+    line = np.stack([points[bins == index].mean(0) for index in range(STATIONS) if (bins == index).any()])
+    ends = points[[along.argmin(), along.argmax()]]
+    return resample(np.concatenate([ends[:1], line[1:-1], ends[1:]])), axes[2]

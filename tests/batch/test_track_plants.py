@@ -1,0 +1,106 @@
+"""`mvseg track`: from results to tables and pages, written whole."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from mvseg.batch.track_plants import list_plants
+from mvseg.cli import main
+from mvseg.errors import InputError
+from tests.plants_over_days import grow_blades, grown, write_result
+
+BLADES = grow_blades(7, 4)
+
+
+def write_batch(folder: Path, rows: list[tuple[str, str, str]]) -> Path:
+    """A batch with these (scene, plant, time) rows, all done; every scene shows its plant a little larger."""
+    (folder / "tables").mkdir(parents=True)
+    for index, (scene, _, _) in enumerate(rows):
+        write_result(folder / scene, grown(BLADES, 1 + 0.05 * index))
+    lines = ["scene,plant,time,state", *(f"{scene},{plant},{time},done" for scene, plant, time in rows)]
+    (folder / "tables" / "summary.csv").write_text("\n".join(lines) + "\n")
+    return folder
+
+
+def read(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def test_results_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, factor in (("a", 1.0), ("b", 1.1)):
+        write_result(tmp_path / name, grown(BLADES, factor))
+    out = tmp_path / "out"
+    results = [str(tmp_path / "b"), str(tmp_path / "a")]  # in any order
+    times = ["--times", "2026-03-05", "2026-03-01"]
+    arguments = ["track", *results, *times, "--plant", "=basil", "--out", str(out), "--quiet"]
+    assert main(arguments) == 0
+    assert "7 leaves of 1 plant on 2 dates" in capsys.readouterr().out
+    rows = read(out / "tracks.csv")
+    assert list(rows[0]) == ["plant", "time", "scene", "leaf", "track", "probability", "state"]
+    assert [(row["scene"], row["leaf"]) for row in rows if row["track"] == "3"] == [("a", "3"), ("b", "3")]
+    assert {row["plant"] for row in rows} == {"'=basil"}  # no formula
+    growth = [row for row in read(out / "growth.csv") if row["track"] == "1" and row["trait"] == "length"]
+    assert [row["time"] for row in growth] == ["2026-03-01", "2026-03-05"]
+    first, second = (float(row["value"]) for row in growth)
+    assert float(growth[0]["rate"]) == pytest.approx((second - first) / 4, rel=1e-4)
+    (before, after) = read(out / "plants.csv")
+    assert (before["leaves"], before["total_area"], before["unit"]) == ("7", "5000", "mm^2")
+    assert float(after["relative_growth_rate"]) == pytest.approx(0.0238, abs=1e-3)  # ln 1.1 / 4 days
+    run = json.loads((out / "run.json").read_text())
+    assert set(run["files"]) == {"tracks.csv", "growth.csv", "plants.csv", "curves.csv", "tracks.html", "growth.png"}
+    page = (out / "tracks.html").read_text(encoding="utf-8")
+    assert not re.findall(r"(?:src|href)=[\"']?https?:", page)
+    (out / "notes.txt").write_text("mine")
+    assert main(arguments) == 0  # once more: replaced, and the user's file stays
+    assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_all_plants_of_a_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rows = [("a0", "a", "0"), ("b0", "b", "0"), ("a1", "a", "1"), ("b1", "b", ""), ("c0", "c", "0")]
+    batch = write_batch(tmp_path / "batch", rows)
+    assert main(["track", str(batch), "--out", str(tmp_path / "out"), "--quiet", "--num_workers", "2"]) == 3
+    said = capsys.readouterr().err
+    assert "1 plants have one date and are left out" in said
+    assert "plant b: b1 has no time" in said
+    assert {row["plant"] for row in read(tmp_path / "out" / "tracks.csv")} == {"a"}
+    assert (tmp_path / "out" / "plants" / "00001" / "tracks.html").is_file()
+    assert 'href="plants/00001/tracks.html"' in (tmp_path / "out" / "tracks.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["a", "a"], "2 results are given without --times"),
+        (["a", "--times", "1", "2"], "1 results have 2 times"),
+        (["a", "b", "--times", "1", "1"], "have the same time 1"),
+        (["a", "b", "--times", "1", "soon"], "expected a number .days. or an ISO date"),
+        (["a"], "is no output of mvseg batch"),
+        (["a", "ids", "--times", "1", "2"], "has ids but no surfaces, run mvseg infer"),
+    ],
+)
+def test_bad_input_gets_one_sentence(
+    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    for name in ("a", "b"):
+        write_result(tmp_path / name, BLADES)
+    (tmp_path / "ids").mkdir()
+    for name, content in (("run.json", "{}"), ("instances.json", "{}")):
+        (tmp_path / "ids" / name).write_text(content)
+    assert main(["track", *arguments, "--out", "out", "--quiet"]) == 2
+    error = capsys.readouterr().err.strip()
+    assert re.search(said, error)
+    assert len(error.splitlines()) == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_batch_without_two_dates_is_refused(tmp_path: Path) -> None:
+    batch = write_batch(tmp_path / "batch", [("a0", "a", "0"), ("b0", "b", "0")])
+    with pytest.raises(InputError, match="no plant has two finished dates"):
+        list_plants(batch)

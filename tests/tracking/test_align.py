@@ -1,0 +1,57 @@
+"""Aligning dates: any pot, and never a guess."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mvseg.tracking.align import align
+from mvseg.tracking.costs import leaves_of
+from tests.plants_over_days import grow_blades, grown, see
+
+
+@pytest.mark.parametrize(("turn", "lean"), [(0, 0), (75, 0), (180, 8), (300, 15)])
+def test_a_pot_that_was_turned_moved_and_leans(turn: float, lean: float) -> None:
+    blades = grow_blades(9, 3)
+    first, one = see(blades, 0)
+    second, other = see(grown(blades, 1.1), 2, turn=turn, lean=lean, shift=(200, -80, 15))
+    alignment = align(leaves_of(first), leaves_of(second), days=2, knows_up=True)
+    assert alignment.is_sure
+    assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]
+    assert len(alignment.pairs) == 9
+    true = Rotation.from_euler("zx", [turn, lean], degrees=True).as_matrix()
+    assert np.degrees(Rotation.from_matrix(alignment.rotation.T @ true).magnitude()) < 4
+    np.testing.assert_allclose(alignment.shift, (200, -80, 15), atol=15)
+
+
+def test_up_need_not_be_known() -> None:
+    blades = grow_blades(9, 3)
+    first, one = see(blades, 0)
+    second, other = see(blades, 2, turn=40, lean=120, shift=(0, 0, 500))
+    alignment = align(leaves_of(first), leaves_of(second), days=2, knows_up=False)
+    assert alignment.is_sure
+    assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]
+
+
+@pytest.mark.parametrize(("count", "said"), [(0, "no leaves"), (1, "1 leaf cannot"), (2, "2 leaves cannot")])
+def test_few_leaves_cannot_tell(count: int, said: str) -> None:
+    blades = grow_blades(count, 3)
+    first = leaves_of(see(grow_blades(5, 3), 0)[0])
+    alignment = align(first, leaves_of(see(blades, 1)[0]), days=1, knows_up=True)
+    assert said in alignment.reason
+
+
+@pytest.mark.parametrize("seed", [11, 12, 13])
+def test_another_plant_in_the_pot_is_not_aligned(seed: int) -> None:
+    first, second = leaves_of(see(grow_blades(8, 3), 0)[0]), leaves_of(see(grow_blades(8, seed), 1)[0])
+    alignment = align(first, second, days=1, knows_up=True)
+    assert not alignment.is_sure
+    assert alignment.reason
+
+
+def test_a_plant_that_looks_the_same_from_two_sides_is_not_aligned() -> None:
+    half = grow_blades(4, 5)
+    other = {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # the same, turned by half a turn
+    first, second = leaves_of(see(half | other, 0)[0]), leaves_of(see(half | other, 1, turn=30)[0])
+    assert align(first, second, days=1, knows_up=True).reason == "the pot could be turned in more than one way"

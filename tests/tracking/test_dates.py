@@ -1,0 +1,111 @@
+"""Dates from results: times, units, and what is refused."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mvseg.errors import InputError
+from mvseg.tracking.dates import STATIONS, Number, date_of, order_dates, read_date, read_time
+from mvseg.traits.leaf import Measurement, missing
+from mvseg.traits.measure import LeafTraits, Traits
+from tests.plants_over_days import grow_blades, see, write_result
+
+
+def test_times_are_days() -> None:
+    assert read_time("3.5") == 3.5
+    assert read_time("2026-03-02") - read_time("2026-02-27") == 3
+    assert read_time("2026-03-02T12:00") - read_time("2026-03-02") == 0.5
+
+
+@pytest.mark.parametrize("text", ["", "noon", "nan", "2026-13-01"])
+def test_times_that_are_none_are_refused(text: str) -> None:
+    with pytest.raises(InputError, match="expected a number"):
+        read_time(text)
+
+
+def test_repeated_and_mixed_times_are_refused() -> None:
+    date = see(grow_blades(4, 0), 1)[0]
+    with pytest.raises(InputError, match="day-1 and other have the same time 1"):
+        order_dates([date, replace(date, scene="other")])
+    iso = replace(date, scene="other", time=read_time("2026-03-02"), written="2026-03-02")
+    with pytest.raises(InputError, match="numbers and ISO dates"):
+        order_dates([date, iso])
+
+
+def test_units_are_converted_or_refused() -> None:
+    first, other = see(grow_blades(4, 0), 0)[0], see(grow_blades(4, 0), 1, unit="cm")[0]
+    _, later = order_dates([first, other])
+    assert later.unit == "mm"
+    assert later.leaves[0].length == pytest.approx(10 * other.leaves[0].length)
+    area, before = later.leaves[0].numbers["area"], other.leaves[0].numbers["area"]
+    assert (area.unit, area.value, area.sd) == (
+        "mm^2",
+        pytest.approx(100 * before.value),
+        pytest.approx(100 * before.sd),
+    )
+    with pytest.raises(InputError, match="day-0 is in mm and day-1 in no unit"):
+        order_dates([first, replace(other, unit="")])
+
+
+def test_results_are_read(tmp_path: Path) -> None:
+    blades = grow_blades(3, 1)
+    write_result(tmp_path / "day", blades)
+    date = read_date(tmp_path / "day", "4")
+    assert [leaf.leaf for leaf in date.leaves] == [1, 2, 3]
+    assert date.knows_up
+    assert date.whole["total_leaf_area"].value == 5000
+    midrib = date.leaves[0].midrib
+    assert midrib is not None
+    assert midrib.shape == (STATIONS, 3)
+    np.testing.assert_allclose(midrib[[0, -1]], blades[1][[0, -1], 1], atol=1.5)
+
+
+def test_leaves_without_a_shape_and_rejected_ones(tmp_path: Path) -> None:
+    write_result(tmp_path / "day", grow_blades(3, 1))
+    (tmp_path / "day" / "leaves" / "leaf_002.ply").unlink()
+    table = (
+        (tmp_path / "day" / "traits.csv")
+        .read_text()
+        .replace("p,3,length", "p,3,width,,,mm,rejected: flat,\np,3,length")
+    )
+    (tmp_path / "day" / "traits.csv").write_text(table)
+    date = read_date(tmp_path / "day", 0)
+    assert [(leaf.leaf, leaf.midrib is None) for leaf in date.leaves] == [(1, False), (2, True)]
+    assert date.shaped == [0]
+
+
+def test_what_is_no_result_with_surfaces_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="is no result"):
+        read_date(tmp_path, 0)
+    write_result(tmp_path / "day", grow_blades(3, 1))
+    (tmp_path / "day" / "traits.csv").write_text("no,table\n1,2\n")
+    with pytest.raises(InputError, match="is no table of traits"):
+        read_date(tmp_path / "day", 0)
+    (tmp_path / "day" / "run.json").write_text(json.dumps({"scene": "p"}))
+    with pytest.raises(InputError, match="has ids but no surfaces, run mvseg infer"):
+        read_date(tmp_path / "day", 0)
+
+
+def test_results_in_memory() -> None:
+    blade = grow_blades(1, 1)[1]
+    vertices = np.concatenate([blade[0, 1:2], np.repeat(blade[1:-1], 6, 0).reshape(-1, 3), blade[-1, 1:2]])
+    surface = SimpleNamespace(is_credible=True, is_oriented=True, mesh=lambda: SimpleNamespace(vertices=vertices))
+    numbers = {"length": Measurement(80.0, 2.0, "surface"), "area": missing("no surface")}
+    seen = LeafTraits(leaf=1, numbers=numbers, method="surface", reasons=(), rejection=None)
+    none = replace(seen, leaf=2, numbers={})
+    traits = Traits("p", "mm", (seen, none), {"total_leaf_area": Measurement(5.0, 1.0, "surface")}, up=(0, 0, 1))
+    result: Any = SimpleNamespace(scene=SimpleNamespace(name="p"), traits=traits, surfaces={1: surface}, voxels={})
+    date = date_of(result, 3)
+    assert [leaf.leaf for leaf in date.leaves] == [1, 2]
+    assert date.shaped == [0]
+    assert date.leaves[0].numbers == {"length": Number(80.0, 2.0, "mm")}
+    assert date.whole["total_leaf_area"].unit == "mm^2"
+    with pytest.raises(InputError, match="p: has ids but no surfaces"):
+        date_of(SimpleNamespace(scene=result.scene, traits=None), 3)  # type: ignore[arg-type]

@@ -1,0 +1,122 @@
+"""Tracks of whole plants: births, deaths, gaps, and what cannot be known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from mvseg.errors import InputError
+from mvseg.tracking.dates import PlantOnDate
+from mvseg.tracking.track import LeafLink, track_leaves
+from tests.plants_over_days import grow_blades, grown, see, true_tracks
+
+BLADES = grow_blades(10, 4)
+
+
+def days(*present: set[int]) -> tuple[list[PlantOnDate], list[list[int]]]:
+    """Dates with these leaves, in a pot that is turned each day."""
+    seen = [
+        see({leaf: BLADES[leaf] for leaf in there}, day, turn=77 * day, lean=3, shift=(60 * day, 0, 0))
+        for day, there in enumerate(present)
+    ]
+    return [date for date, _ in seen], [truth for _, truth in seen]
+
+
+def test_births_deaths_and_gaps() -> None:
+    old = set(range(1, 10))
+    dates, truths = days(old, old - {5}, (old | {10}) - {1}, (old | {10}) - {1})
+    tracks = track_leaves(dates, plant="basil")
+    assert tracks.warnings == ()
+    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
+    assert tracks.num_tracks == 10
+    of_leaf = {next(iter(leaves)): track for track, leaves in true_tracks(tracks, truths).items()}
+    states = {
+        leaf: [(row.date, row.state) for row in tracks.rows if row.track == of_leaf[leaf]] for leaf in (1, 2, 5, 10)
+    }
+    assert states[1] == [(0, "seen"), (1, "seen"), (2, "gone")]
+    assert states[2] == [(0, "seen"), (1, "seen"), (2, "seen"), (3, "seen")]
+    assert states[5] == [(0, "seen"), (1, "hidden"), (2, "seen"), (3, "seen")]
+    assert states[10] == [(2, "born"), (3, "seen")]
+    assert of_leaf[10] == 10  # in the order of appearance
+    linked = [row.probability for row in tracks.rows if row.date > 0 and row.state == "seen"]
+    assert min(linked) > 0.9
+
+
+def test_poses_bring_all_dates_into_the_first_frame() -> None:
+    dates, truths = days(set(BLADES), set(BLADES), set(BLADES))
+    tracks = track_leaves(dates)
+    for date, truth, pose in zip(tracks.dates[1:], truths[1:], tracks.poses[1:], strict=True):
+        for leaf in date.leaves:
+            assert leaf.midrib is not None
+            base = pose[:3, :3] @ leaf.midrib[0] + pose[:3, 3]
+            np.testing.assert_allclose(base, BLADES[truth[leaf.leaf - 1]][0, 1], atol=12)
+
+
+def test_a_repotted_plant_gets_tracks_of_its_own_and_a_sentence() -> None:
+    dates, _ = days(set(BLADES), set(BLADES))
+    other = see(grow_blades(9, 77), 2, scene="other")[0]
+    tracks = track_leaves([*dates, other])
+    assert tracks.num_tracks == 19
+    assert any(sentence.startswith("day-1 and other cannot be aligned surely") for sentence in tracks.warnings)
+    assert {row.state for row in tracks.rows} == {"seen"}  # neither born nor gone: nothing is known
+    assert np.isnan(tracks.poses[2]).all()
+
+
+def test_a_plant_with_one_leaf_and_a_date_without_leaves() -> None:
+    dates, _ = days({3}, {3})
+    tracks = track_leaves(dates)
+    assert tracks.num_tracks == 2
+    assert "1 leaf cannot tell how the pot stands" in tracks.warnings[0]
+    old = set(range(1, 9))
+    dates, truths = days(old, set(), old)
+    tracks = track_leaves(dates)
+    assert "no leaves cannot tell how the pot stands" in tracks.warnings[0]
+    assert tracks.num_tracks == 8  # linked over the date without leaves
+    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
+
+
+def test_a_leaf_without_a_shape_is_a_track_of_one_date() -> None:
+    dates, _ = days(set(BLADES), set(BLADES))
+    hidden = replace(dates[1].leaves[0], midrib=None, normal=None, points=None)
+    tracks = track_leaves([dates[0], replace(dates[1], leaves=(hidden, *dates[1].leaves[1:]))])
+    assert "1 leaves have no shape" in tracks.warnings[0]
+    assert tracks.num_tracks == 11
+
+
+def test_other_units_are_the_same_plant() -> None:
+    first, _ = see(BLADES, 0)
+    second, _ = see(grown({leaf: blade / 10 for leaf, blade in BLADES.items()}, 1.0), 1, unit="cm")
+    assert track_leaves([first, see({k: b / 10 for k, b in BLADES.items()}, 1, unit="cm", turn=50)[0]]).num_tracks == 10
+    assert second.unit == "cm"
+
+
+def test_what_a_person_says_is_obeyed() -> None:
+    dates, truths = days(set(BLADES), set(BLADES), set(BLADES))
+    ids = [{leaf: number for number, leaf in enumerate(truth, start=1)} for truth in truths]
+    same = LeafLink(True, (("day-0", ids[0][1]), ("day-2", ids[2][2])))
+    tracks = track_leaves(dates, links=[same])
+    assert {1, 2} in true_tracks(tracks, truths).values()
+    apart = LeafLink(False, (("day-0", ids[0][3]), ("day-2", ids[2][3])))
+    tracks = track_leaves(dates, links=[apart])
+    rows = {(row.date, row.leaf): row.track for row in tracks.rows}
+    assert rows[0, ids[0][3]] != rows[2, ids[2][3]]
+    with pytest.raises(InputError, match="results of one name"):
+        track_leaves([dates[0], replace(dates[1], scene="day-0")], links=[same])
+    for links, said in (
+        ([LeafLink(True, (("day-9", 1), ("day-1", 1)))], "names the scene day-9"),
+        ([LeafLink(True, (("day-0", 99), ("day-1", 1)))], "names leaf 99 of day-0"),
+        ([LeafLink(True, (("day-0", 1), ("day-0", 2)))], "two leaves of day-0 are one"),
+        ([replace(same, is_same=False), same], "same and to be different"),
+    ):
+        with pytest.raises(InputError, match=said):
+            track_leaves(dates, links=links)
+
+
+def test_the_number_of_dates_and_times() -> None:
+    date = see(BLADES, 0)[0]
+    with pytest.raises(InputError, match="expected two or more"):
+        track_leaves([date])
+    with pytest.raises(InputError, match="2 results have 1 times"):
+        track_leaves([date, date], [0])
