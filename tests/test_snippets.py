@@ -1,7 +1,7 @@
 """Everything in a code block of README.md and docs/ runs: Python, commands, and the files that are shown.
 
 What a block is stands behind its backticks: `python`; nothing for commands, one a line; `json` for camera files; `bash`
-for scripts; `text` and `csv` are only looked at. An HTML comment on the line before a block says more of it:
+for scripts; `text`, `csv` and `r` are only looked at. An HTML comment on the line before a block says more of it:
 `<!-- slow -->` runs it with the slow tests, as a script of its own, and `<!-- not run: WHY -->` leaves it alone.
 """
 
@@ -30,8 +30,8 @@ from mvseg.formats.label_png import read_labels, write_label_png
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 BLOCK = re.compile(r"(?:^<!-- ([^\n]*) -->\n)?^```(\w*)\n(.*?)^```$", re.DOTALL | re.MULTILINE)
-KINDS = {"python", "", "json", "bash", "text", "csv"}
-LONG = {"pose", "train", "adapt"}  # verbs that need photos or minutes; their own tests run them
+KINDS = {"python", "", "json", "bash", "text", "csv", "r"}
+LONG = {"pose", "train"}  # verbs that need photos or minutes; their own tests run them
 SCENES = ("SCENE", "basil", "tomato", "maize", "PLANTS/one", "PLANTS/two")
 WEIGHTS = ("runs/mine/model.safetensors", "runs/adapted/weights.safetensors")
 NUM_VIEWS, NUM_LEAVES = 3, 4  # of the shipped plant's nine and twelve: quicker

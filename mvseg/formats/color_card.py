@@ -12,6 +12,7 @@ are the pixels of the centres of the corner patches, clockwise from the brown on
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Literal
@@ -35,6 +36,7 @@ CORNERS = (0, COLUMNS - 1, ROWS * COLUMNS - 1, (ROWS - 1) * COLUMNS)
 INSIDE = np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 9)] * 2), -1).reshape(-1, 2)  # of a patch: where it is looked at
 LONGEST = 1600  # pixels; OpenCV looks for cards in photos no larger than this
 SCALES = (1.0, 0.8, 0.64, 1.25, 1.6)  # it finds a card at one scale that it misses at another
+STARTS = 5  # it groups colours from a random start, and not alike with one thread and with several
 
 
 class CardEntry(BaseModel):
@@ -99,19 +101,29 @@ def find_patches(photo: NDArray[np.uint8]) -> Iterator[Floats]:
         what = f"OpenCV {cv2.__version__} cannot look for colour cards, expected version 5 or later, or the card's "
         raise InputError(f"{what}'corners' in a card file")
     smaller = min(1.0, LONGEST / max(photo.shape[:2]))
-    for scale in SCALES:
-        factor = smaller * scale
-        kind = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
-        shown = cv2.resize(photo, None, fx=factor, fy=factor, interpolation=kind)
-        cv2.setRNGSeed(0)  # it groups colours from a random start
-        detector = cv2.mcc.CCheckerDetector.create()
-        if not detector.process(np.ascontiguousarray(shown[..., ::-1]), 1):
-            continue
-        quads = np.asarray(detector.getBestColorChecker().getColorCharts(), float).reshape(-1, 4, 2)
-        if len(quads) == ROWS * COLUMNS:
-            corners = (quads.mean(1)[list(CORNERS)] + 0.5) / factor
-            if _is_inside(corners, photo):
-                yield look_at_patches(photo, corners)
+    smooth = cv2.medianBlur(photo, 5)  # noise hides the edges of patches
+    for seed in range(STARTS):
+        found = []
+        for scale, given in itertools.product(SCALES, (photo, smooth)):
+            factor = smaller * scale
+            kind = cv2.INTER_AREA if factor < 1 else cv2.INTER_CUBIC
+            shown = np.asarray(cv2.resize(given, None, fx=factor, fy=factor, interpolation=kind), np.uint8)
+            corners = _find_corners(shown, seed)
+            if corners is not None and _is_inside(corners / factor, photo):
+                found.append(look_at_patches(photo, corners / factor))
+        yield from found
+        if found:
+            return
+
+
+def _find_corners(photo: NDArray[np.uint8], seed: int) -> Floats | None:
+    """(4, 2) pixels, as in a card file; None where OpenCV sees no card."""
+    detector = cv2.mcc.CCheckerDetector.create()
+    cv2.setRNGSeed(seed)
+    if not detector.process(np.ascontiguousarray(photo[..., ::-1]), 1):
+        return None
+    quads = np.asarray(detector.getBestColorChecker().getColorCharts(), float).reshape(-1, 4, 2)
+    return quads.mean(1)[list(CORNERS)] + 0.5 if len(quads) == ROWS * COLUMNS else None
 
 
 def look_at_patches(photo: NDArray[np.uint8], corners: Floats) -> Floats:

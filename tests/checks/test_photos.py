@@ -102,7 +102,7 @@ def test_each_fault_has_its_sentence(
 
 def test_a_dark_photo_of_12_bits_is_dark_beside_its_neighbours(tmp_path: Path) -> None:
     folder = write_scene(tmp_path / "plant")
-    ramp = np.linspace(0, 4095, HEIGHT * WIDTH * 3).reshape(HEIGHT, WIDTH, 3)
+    ramp = np.linspace(0, 4095, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH, 1) * [1, 0.8, 0.6]
     for view in range(4):
         write_image(photo(folder, view), (ramp / (12 if view == 2 else 1 + view)).astype(np.uint16))
     assert [(each.views, "nearly black" in each.what) for each in findings_of(folder)] == [((2,), True)]

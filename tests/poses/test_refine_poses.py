@@ -156,7 +156,7 @@ def test_nothing_to_refine_with(scene: BallScene) -> None:
 
 def test_equations_that_are_singular_move_no_camera(scene: BallScene, noisy: Cameras) -> None:
     """Rays that are all but parallel meet so far away that a step of a pixel outweighs every prior."""
-    problem = adjust(scene.regions, true_matching(scene), noisy)
+    problem = adjust(true_matching(scene).masks, noisy)
     stayed = fit_poses(replace(problem, world_per_px=1e200 * problem.world_per_px))
     assert torch.equal(stayed.R, noisy.R)
     assert torch.equal(stayed.t, noisy.t)
@@ -168,5 +168,4 @@ def test_a_leaf_that_no_pair_of_views_tells_anything_of() -> None:
     labels = np.zeros((240, 320), np.int64)
     labels[100:140, 140:180] = 1
     regions = regions_from_label_maps([labels, labels])
-    matching = Matching(instance_ids=regions.labels, match_scores=torch.ones(2), num_instances=1, method="truth")
-    assert np.isnan(held_out_gaps(regions, matching, cameras)).all()
+    assert np.isnan(held_out_gaps(matched(regions).masks, cameras)).all()
