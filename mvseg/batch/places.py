@@ -6,6 +6,8 @@ from pathlib import Path
 
 STATE, TABLES, EXPORT = "_batch", "tables", "export"
 RESERVED = {STATE, TABLES, EXPORT}
+# of summary.csv, behind those of the scene
+SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds", "peak_mb", "warning_text", "sentence")
 
 
 def scene_state(out: Path, name: str) -> Path:

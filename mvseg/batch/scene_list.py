@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mvseg.batch.places import RESERVED
+from mvseg.batch.places import RESERVED, SUMMARY_COLUMNS
 from mvseg.errors import InputError
 from mvseg.system.atomic import resolve_place
 
@@ -160,7 +160,6 @@ def _check_columns(source: Path, columns: Sequence[str]) -> None:
 
 
 def _columns_of_results() -> set[str]:
-    from mvseg.batch.tables import SUMMARY_COLUMNS
     from mvseg.traits.table import COLUMNS, wide_columns
 
     return {*COLUMNS, *wide_columns(), *SUMMARY_COLUMNS, "sentence"} - {"plant"}

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mvseg.batch.places import scene_result
+from mvseg.batch.places import SUMMARY_COLUMNS, scene_result
 from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status
 from mvseg.errors import InputError
@@ -17,7 +17,6 @@ from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_fil
 from mvseg.system.atomic import folder_whole
 from mvseg.traits.table import escape_text, write_csv
 
-SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds", "peak_mb", "warning_text", "sentence")
 TEXT_COLUMNS = {"trait", "unit", "method", "ontology", "quality"}
 
 
