@@ -158,7 +158,13 @@ def test_a_signal_ends_it_with_one_sentence(
     """The signal comes when the bar of a step shows up, while COLMAP works."""
     command = [sys.executable, "-m", "mvseg.cli", "pose", str(photos), "--out", str(tmp_path / "out")]
     root = Path(__file__).parent.parent
-    run = subprocess.Popen(command, stderr=subprocess.PIPE, cwd=root, env=os.environ | {"PYTHONPATH": str(root)})
+    run = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        cwd=root,
+        env=os.environ | {"PYTHONPATH": str(root)},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # background jobs of a shell ignore it
+    )
     heard = b""
     assert run.stderr is not None
     while f"{step}:".encode() not in heard:
