@@ -2,6 +2,6 @@
 
 import sys
 
-from mvseg.cli.command import main
+from mvseg.cli import main
 
 sys.exit(main())
