@@ -217,7 +217,7 @@ def test_the_readmes_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 # Links of Markdown, and paths in it that start at the root.
 PATHS = re.compile(r"\]\(([^)#]+)|\b((?:mvseg|benchmarks|configs|docs|models|tests)/[\w/.-]+\.\w+)")
-PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("models/**/*.md")]
+PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/notes/*.md"), *ROOT.glob("models/**/*.md")]
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
