@@ -11,8 +11,6 @@ of true areas, lengths and widths inside their 95 % intervals, "base" the share 
 `--real FOLDER` is a scene with true label images in `truth/`: every view is left out in turn, the surfaces of the
 others are projected into it, and the mean IoU with the true masks is printed: with all that the surface covers, and
 without the pixels that show other instances or are ignored.
-
-With `--photos` the surfaces are fitted to the texture in the photos as well (simulated ones are rendered, then cached).
 """
 
 from __future__ import annotations
@@ -36,7 +34,6 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.label_maps import KINDS, LabelledScene, load_maps, load_photos
 from benchmarks.paper_tables.masks import find_masks
 from mvseg.formats.label_png import read_label_png
-from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -51,17 +48,16 @@ MEASURES = ("area", "length", "width", "inclination", "distance")
 NUM_LEAVES = 8
 
 
-def run_scene(spec: SceneSpec, *, cache: Path, kinds: list[str], has_photos: bool) -> list[dict[str, Any]]:
+def run_scene(spec: SceneSpec, *, cache: Path, kinds: list[str]) -> list[dict[str, Any]]:
     """One record per kind of masks and leaf of a plant that at least one view shows."""
     torch.set_num_threads(1)
     scene = load_maps(spec, cache)
     plant = grow_plant(spec.family, spec.num_leaves, spec.seed)
-    photos = load_photos(spec, cache).__getitem__ if has_photos else None
     records = []
     for kind in kinds:
         regions, ids = scene.masks(kind) if kind in KINDS else detect_masks(spec, scene, cache)
         start = time.perf_counter()
-        surfaces = fit_surfaces(regions, torch.where(ids > 0, ids, -1), scene.cameras, photos=photos)
+        surfaces = fit_surfaces(regions, torch.where(ids > 0, ids, -1), scene.cameras)
         seconds = (time.perf_counter() - start) / max(len(surfaces), 1)
         cell = {"family": spec.family, "views": spec.num_views, "masks": kind, "scene": spec.folder}
         for leaf in plant.leaves:
@@ -139,7 +135,7 @@ def print_table(records: list[dict[str, Any]]) -> None:
             )
 
 
-def leave_one_out(folder: Path, *, has_photos: bool) -> None:
+def leave_one_out(folder: Path) -> None:
     """IoU of surfaces with the masks of a view that they were not fitted to."""
     torch.set_num_threads(1)
     scene = load_scene(folder)
@@ -149,11 +145,10 @@ def leave_one_out(folder: Path, *, has_photos: bool) -> None:
         for view, size in zip(scene.views, sizes, strict=True)
     ]
     regions = regions_from_label_maps(maps)
-    photos = partial(read_photo, scene) if has_photos else None
     records = []
     for view, labels in enumerate(maps):
         others = regions.select(regions.view_index != view)
-        surfaces = fit_surfaces(others, others.labels, scene.cameras, photos=photos)
+        surfaces = fit_surfaces(others, others.labels, scene.cameras)
         for instance in regions.labels[regions.view_index == view].tolist():
             if instance not in surfaces or not surfaces[instance].exists:
                 continue
@@ -177,21 +172,20 @@ def main() -> None:
     parser.add_argument("--families", nargs="+", choices=EVALUATED_FAMILIES, default=EVALUATED_FAMILIES)
     parser.add_argument("--views", nargs="+", type=int, default=(5, 10, 20))
     parser.add_argument("--masks", nargs="+", choices=(*KINDS, "detected"), default=KINDS)
-    parser.add_argument("--photos", action="store_true", help="fit to the texture in the photos as well")
     parser.add_argument("--plants", type=int, default=1, help="per family")
     parser.add_argument("--workers", type=int, default=2)
     parser.add_argument("--json", type=Path, help="write the records here")
     parser.add_argument("--real", type=Path, help="leave-one-view-out IoU on this scene folder, and nothing else")
     args = parser.parse_args()
     if args.real:
-        leave_one_out(args.real, has_photos=args.photos)
+        leave_one_out(args.real)
         return
     if args.cache is None:
         parser.error("expected --cache DIR or --real FOLDER")
     plants = args.plants * len(EVALUATED_FAMILIES)
     preset = Preset(plants=((args.split, plants),), leaves=(NUM_LEAVES,), views=tuple(args.views))
     scenes = [spec for spec in list_scenes(preset, args.seed) if spec.family in args.families]
-    work = partial(run_scene, cache=args.cache, kinds=args.masks, has_photos=args.photos)
+    work = partial(run_scene, cache=args.cache, kinds=args.masks)
     records = [record for found in run_all(work, scenes, num_workers=args.workers) for record in found]
     if args.json:
         args.json.write_text(json.dumps(records, indent=1), encoding="utf-8")

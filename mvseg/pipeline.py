@@ -304,7 +304,6 @@ def reconstruct(state: State, *, with_voxels: bool = True) -> State:
         config=state.config.reconstruct,
         starts=state.starts,
         known=state.surfaces or {},
-        photos=state.photos if state.photos.exist else None,
         with_voxels=with_voxels,
         workers=state.workers,
         progress=state.progress,

@@ -202,8 +202,6 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "seen_share": 0.8,
             "voxel_size": 1.5,
             "voxel_budget": 250_000,
-            "photos": True,
-            "jackknife": False,
             "check_ids": True,
         },
         "traits": {"min_sure_views": 2, "min_quality": 0.5, "min_visible_share": 0.05, "leaves_only": True},

@@ -6,7 +6,6 @@ import hashlib
 import json
 import math
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -220,29 +219,6 @@ class TestDescribeRun:
         path = masks / "001.png"
         path.write_bytes(path.read_bytes() + b"\0")
         assert describe_run(result, masks, IDS_ONLY)["inputs"][str(masks)] != first
-
-
-@pytest.mark.parametrize("is_wanted", [True, False])
-def test_surfaces_are_fitted_to_the_photos_when_wanted_and_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_wanted: bool
-) -> None:
-    asked_with = []
-
-    def fit(*_: object, photos: Callable[[int], np.ndarray] | None, **__: object) -> dict[int, object]:
-        asked_with.append(photos)
-        return {}
-
-    monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
-    config = RunConfig(reconstruct=ReconstructConfig(shape="surface", photos=is_wanted))
-    for name in ("cameras.json", "masks"):
-        (shutil.copytree if name == "masks" else shutil.copy)(demo_scene() / name, tmp_path / name)
-    for folder in (tmp_path, demo_scene()):
-        run_scene(folder, folder / "masks", config)
-    without, with_photos = asked_with[0], asked_with[-1]
-    assert without is None
-    assert (with_photos is not None) == is_wanted
-    if with_photos is not None:
-        assert with_photos(1).shape == (480, 640, 3)
 
 
 @pytest.mark.parametrize("is_wanted", [True, False])

@@ -15,7 +15,7 @@ class ReconstructConfig:
     Attributes:
         shape: surface (a spline surface fitted to the outlines of the masks, with area, length, width and angles, see
             docs/surfaces.md; an instance without a credible one gets voxels), voxels (Eq. 6, a closed shape with a
-            volume) or both. The other options but `photos`, `jackknife` and `check_ids` are about voxels.
+            volume) or both. The other options but `check_ids` are about voxels.
         threshold: a voxel belongs to an instance when more than this share of the instance's masks contains it (the
             paper: 0.5); in [0, 1).
         seen_share: keeps thin instances thin: of the instance's views with a clear line of sight to a voxel (its pixel
@@ -24,9 +24,6 @@ class ReconstructConfig:
             In [0, 1); 0 is the paper's rule, which leaves thin instances thick.
         voxel_size: edge of a voxel in the scene's unit; null to derive it from the budget.
         voxel_budget: number of voxels in an instance's bounding box when no size is given.
-        photos: let the texture of the leaves in the photos improve surfaces between their outlines; photos that are
-            missing are done without.
-        jackknife: standard deviations of surfaces from fits without each view in turn; takes many times longer.
         check_ids: masks that show another instance's surface than their own get its id, surfaces that lost or won masks
             are fitted again, and masks that show two surfaces are listed, see docs/matching.md; not where masks
             are verified (`detect.verify`), nor without surfaces.
@@ -37,8 +34,6 @@ class ReconstructConfig:
     seen_share: float = 0.8
     voxel_size: float | None = None
     voxel_budget: int = 250_000
-    photos: bool = True
-    jackknife: bool = False
     check_ids: bool = True
 
     def __post_init__(self) -> None:

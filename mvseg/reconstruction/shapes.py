@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from types import MappingProxyType
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.reconstruction.config import ReconstructConfig
@@ -30,7 +28,6 @@ def reconstruct_shapes(
     config: ReconstructConfig,
     starts: Surfaces = MappingProxyType({}),
     known: Surfaces = MappingProxyType({}),
-    photos: Callable[[int], NDArray[np.uint8]] | None = None,
     with_voxels: bool = True,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
@@ -44,7 +41,6 @@ def reconstruct_shapes(
         config: what to make, and how.
         starts: instance id -> a surface that is nearly right, see `fit_surfaces`.
         known: instance id -> a surface that stays as it is, see `fit_surfaces`.
-        photos: view index -> (H, W, 3) uint8 RGB, undistorted; None: there are none.
         with_voxels: False leaves voxels out, whatever the config says.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars over the instances.
@@ -64,8 +60,6 @@ def reconstruct_shapes(
             cameras,
             starts=starts,
             known=known,
-            photos=photos if config.photos else None,
-            jackknife=config.jackknife,
             workers=workers,
             progress=progress,
         )

@@ -11,14 +11,6 @@ from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patc
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
-from mvseg.reconstruction.surface.photo_consistency import (
-    COARSE_PX,
-    FINE_PX,
-    Comparison,
-    LeafPhotos,
-    compare_views,
-    photo_equations,
-)
 
 FIT_GRID = (36, 9)
 NUM_STEPS, NUM_WARM_STEPS = 18, 7
@@ -32,7 +24,6 @@ CLEAN_PX = 1.0  # deviation of the distances up to which masks are clean; beyond
 NARROW = 0.15  # of the length: steps along narrow leaves may be as long as those of a leaf with this half-width
 NOISY_VIEW = 1.5  # times the usual spread: such views count less
 
-LEAST_JACKKNIFED = 4  # views
 # Of the covariance.
 FIT_FACTOR, QUIET_PX = 2.0, 0.3  # of the deviations; they grow with the distances from this rms on
 CENTRE_FACTOR, LEAST_CENTRE_SD = 1.5, 0.1  # of what all masks may be too large by, pixels
@@ -68,11 +59,9 @@ def fit_patch(
     *,
     num_steps: int,
     errors: MaskErrors | None = None,
-    photos: LeafPhotos | None = None,
 ) -> PatchFit:
     """Move a patch until its outlines are those of the masks: reweighted Gauss-Newton.
 
-    With photos, what the views see of its texture has to agree as well: coarse texture at first, then the fine one.
     Works in a world moved and scaled to the start, so nothing depends on the scene's origin and unit.
 
     Args:
@@ -89,7 +78,6 @@ def fit_patch(
     grid = patch_grid(*FIT_GRID)
     is_warm = num_steps <= NUM_WARM_STEPS
     offsets = np.zeros(len(masks))
-    comparison: Comparison | None = None
     for step in range(num_steps):
         progress = 1.0 if is_warm else min(1.0, step / REACH_STEPS)
         reach = masks.enlargement * (FAR_REACH + (NEAR_REACH - FAR_REACH) * progress)
@@ -102,12 +90,6 @@ def fit_patch(
         equations = _weigh(distances, offsets - drawn, scale_px=scale_px)
         is_late = is_warm or step >= NUM_STEPS // 2
         matrix, right = _normal_matrix(coefficients, equations)
-        if photos is not None:
-            if comparison is None or step == num_steps // 2:
-                step_px = COARSE_PX if step < num_steps // 2 else FINE_PX
-                comparison = compare_views(moved, photos, coefficients, step_px=step_px)
-            seen = photo_equations(comparison, coefficients)
-            matrix, right = matrix + seen.matrix, right + seen.right
         damping, cap = (0.005, 0.12) if is_late else (0.05, 0.25)
         coefficients = _step(coefficients, matrix, right, damping=damping, cap=cap)
     drawn = offsets if errors else np.zeros(len(masks))
@@ -124,21 +106,6 @@ def fit_patch(
         residual_px=_rms_per_view(distances, equations, len(masks)),
         offsets_px=measured - _centre(measured, errors),
     )
-
-
-def jackknife_covariance(masks: MaskStack, fit: PatchFit, *, errors: MaskErrors | None) -> Floats:
-    """(78, 78) covariance of a fit from the fits without each of its S views in turn.
-
-    With fewer than four views the fit's own: three views less one say little. So where it is NaN.
-    """
-    if len(masks) < LEAST_JACKKNIFED or not np.isfinite(fit.covariance).all():
-        return fit.covariance
-    parts = []
-    for index in range(len(masks)):
-        others = masks.select(np.arange(len(masks)) != index)
-        parts.append(fit_patch(others, fit.coefficients, num_steps=NUM_WARM_STEPS, errors=errors).coefficients.ravel())
-    away = np.stack(parts) - np.mean(parts, axis=0)
-    return np.asarray((len(masks) - 1) / len(masks) * away.T @ away, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,15 +16,7 @@ from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.surface.fit_patch import (
-    FIT_GRID,
-    NUM_STEPS,
-    NUM_WARM_STEPS,
-    PatchFit,
-    fit_patch,
-    jackknife_covariance,
-)
-from mvseg.reconstruction.surface.fit_photos import fit_photos
+from mvseg.reconstruction.surface.fit_patch import FIT_GRID, NUM_STEPS, NUM_WARM_STEPS, PatchFit, fit_patch
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
@@ -63,9 +55,7 @@ def fit_surfaces(
     *,
     starts: Mapping[int, LeafSurface] = MappingProxyType({}),
     known: Mapping[int, LeafSurface] = MappingProxyType({}),
-    photos: Callable[[int], NDArray[np.uint8]] | None = None,
     most_views: int = MOST_VIEWS,
-    jackknife: bool = False,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> dict[int, LeafSurface]:
@@ -80,11 +70,7 @@ def fit_surfaces(
         starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
         known: instance id -> a surface that is returned as it is. The others are fitted as if it had been fitted with
             them: it hides what lies behind it, and its masks tell how all masks err.
-        photos: view index -> (H, W, 3) uint8 RGB, `list.__getitem__` for photos in memory; each is asked for once. The
-            texture of the leaves then says more of their shape between the outlines, see docs/surfaces.md.
         most_views: at least 2.
-        jackknife: fit each leaf again without each of its views in turn; deviations come from how much that changes it.
-            Takes as many times longer as there are views.
         workers: processes that instances are spread over, see `start_workers`; None: this one does it all.
         progress: show a progress bar over the instances.
 
@@ -93,8 +79,7 @@ def fit_surfaces(
         point) its coefficients are NaN and its `quality` says why.
 
     Raises:
-        InputError: as many ids as regions are expected; a photo is of another size than its camera says; a worker was
-            killed.
+        InputError: as many ids as regions are expected; a worker was killed.
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
@@ -146,12 +131,6 @@ def fit_surfaces(
     refitted = spread(partial(_fit_again, points, errors), ((i, stacks[i], first[i]) for i in again), workers)
     for instance, (masks, better) in zip(again, refitted, strict=True):
         stacks[instance], fits[instance] = masks, better
-    if photos is not None:
-        fits = fit_photos(stacks, fits, photos, sizes=cameras.sizes.tolist(), errors=errors)
-    if jackknife:
-        jackknifed = spread(partial(_jackknife, errors), ((stacks[i], fit) for i, fit in fits.items()), workers)
-        bar = tqdm(jackknifed, "jackknife", len(fits), unit="instance", disable=not progress)
-        fits = dict(zip(list(fits), bar, strict=True))
     surfaces |= {instance: _surface(stacks[instance], fit) for instance, fit in fits.items()}
     oriented = orient_surfaces(dict(sorted({**surfaces, **known}.items())), cameras)
     return {**oriented, **known}
@@ -316,11 +295,6 @@ def _fit_again(
         masks = masks.with_others(hiding)
         fit = fit_patch(masks, fit.coefficients, num_steps=NUM_WARM_STEPS, errors=errors)
     return masks, fit
-
-
-def _jackknife(errors: MaskErrors | None, asked: tuple[MaskStack, PatchFit]) -> PatchFit:
-    masks, fit = asked
-    return replace(fit, covariance=jackknife_covariance(masks, fit, errors=errors))
 
 
 def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:

@@ -51,7 +51,7 @@ class LeafSurface:
 
     Attributes:
         coefficients: (26, 3) float64 of the patch (`leaf_patch`); NaN for an instance that has no surface.
-        covariance: (78, 78) float64 of `coefficients.ravel()`, calibrated on simulated leaves, or by the jackknife.
+        covariance: (78, 78) float64 of `coefficients.ravel()`, calibrated on simulated leaves.
         views: (S,) int64, the views whose masks it was fitted to.
         residual_px: (S,) float64, root mean square distance between its outline and the mask's edge in each view.
         iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it, of the surface
