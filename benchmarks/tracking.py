@@ -28,7 +28,8 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.matching.result import Matching
+from mvseg.masks import Masks
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.shapes import reconstruct_shapes
 from mvseg.results.folder import save_result
@@ -38,7 +39,7 @@ from mvseg.simulation.blades import BLADE_COLUMNS
 from mvseg.simulation.growth import Plant
 from mvseg.simulation.series import SeriesSpec, draw_specs, grow_series
 from mvseg.tracking.costs import Leaves, leaves_of
-from mvseg.tracking.dates import ROWS, STATIONS, Number, PlantOnDate, SeenLeaf, read_date, resample
+from mvseg.tracking.dates import STATIONS, Number, PlantOnDate, SeenLeaf, read_date, see_surface
 from mvseg.tracking.track import Tracks, track_leaves
 from mvseg.traits.measure import measure_plant
 
@@ -58,30 +59,25 @@ def see_plant(
     for leaf in plant.leaves:
         if rng.random() < missed:
             continue
-        grid = leaf.vertices[1:-1].reshape(-1, BLADE_COLUMNS, 3)
-        midrib = resample(np.concatenate([leaf.vertices[:1], grid[:, BLADE_COLUMNS // 2], leaf.vertices[-1:]]))
         off, sd = rng.normal(0, 0.03 * noise * leaf.length, (2, 3)), 0.03 * noise * leaf.length
         share = np.linspace(0, 1, STATIONS)[:, None]
-        midrib = midrib + (1 - share) * off[0] + share * off[1]
+        clear = see_surface(0, leaf.vertices, BLADE_COLUMNS, {}, is_oriented=True)
+        assert clear.midrib is not None
+        assert clear.points is not None
+        midrib = clear.midrib + (1 - share) * off[0] + share * off[1]
         midrib += np.sin(np.pi * share) * rng.normal(0, 0.02 * noise * leaf.length, 3)
         is_oriented = bool(rng.random() < 0.8)
         if rng.random() < (0.03 if is_oriented else 0.3):
             midrib = midrib[::-1]
-        normal = np.cross(grid[1:, :-1] - grid[:-1, 1:], grid[1:, 1:] - grid[:-1, :-1]).sum((0, 1))
-        points = grid[np.linspace(0, len(grid) - 1, ROWS).round().astype(int)][:, [0, BLADE_COLUMNS // 2, -1]]
         numbers = {
             "length": Number(leaf.length + float(rng.normal(0, sd)), sd, "mm"),
             "area": Number(leaf.area * (1 + float(rng.normal(0, 0.05 * noise))), 0.05 * leaf.area, "mm^2"),
             "insertion_height": Number(float(midrib[0, 2]), sd, "mm"),
             "azimuth": Number(0.0, 3.0, "degree"),
         }
-        seen.append(
-            (
-                SeenLeaf(0, midrib, normal / np.linalg.norm(normal), points.reshape(-1, 3) + off.mean(0), is_oriented,
-                         numbers),
-                leaf.leaf_id,
-            )
-        )  # fmt: skip
+        points = clear.points + off.mean(0)
+        noisy = replace(clear, midrib=midrib, points=points, is_oriented=is_oriented, numbers=numbers)
+        seen.append((noisy, leaf.leaf_id))
     order = rng.permutation(len(seen)).tolist()
     leaves = tuple(replace(seen[place][0], leaf=number) for number, place in enumerate(order, start=1))
     date = PlantOnDate(scene, time, f"{time:g}", "mm", knows_up=True, leaves=leaves, whole={})
@@ -202,9 +198,8 @@ def track_by(name: str, dates: Sequence[PlantOnDate], poses: np.ndarray) -> Labe
     found: Labels = [list(range(1, len(dates[0].leaves) + 1))]
     count = len(found[0])
     for index, (first, second) in enumerate(pairwise(leaves)):
-        if name == "nearest base" and np.isfinite(poses[index + 1]).all():
-            step = np.linalg.inv(poses[index + 1]) @ (poses[index] if np.isfinite(poses[index]).all() else np.eye(4))
-            first = first.moved(step[:3, :3], step[:3, 3])
+        if name == "nearest base":
+            first = first.moved(np.linalg.inv(poses[index + 1]) @ poses[index])
         rows, columns = (
             linear_sum_assignment(BASELINES[name](first, second)) if len(first) and len(second) else ([], [])
         )
@@ -232,12 +227,10 @@ def prepare(table: Path, results: Path) -> None:
         regions = load_masks(scene, scene_folder / "truth")
         number = {label: n for n, label in enumerate(sorted(set(regions.labels.tolist()) - {IGNORED}), start=1)}
         ids = torch.tensor([number.get(label, -1) for label in regions.labels.tolist()])
-        matching = Matching(ids, (ids > 0).float(), num_instances=len(number), method="truth")
+        matching = Matching(Masks.of(regions, ids, (ids > 0).float()), MatchReport(method="truth"))
         surfaces, voxels = reconstruct_shapes(regions, ids, scene.cameras, config=ReconstructConfig())
-        traits = measure_plant(scene, regions, matching, surfaces=surfaces, voxels=voxels)
-        result = Result(
-            scene=scene, regions=regions, matching=matching, surfaces=surfaces, voxels=voxels, traits=traits
-        )
+        traits = measure_plant(scene, matching, surfaces=surfaces, voxels=voxels)
+        result = Result(scene=scene, matching=matching, surfaces=surfaces, voxels=voxels, traits=traits)
         save_result(result, place, {"scene": scene.name}, report=False, draw_rims=False)
         print(place, flush=True)
 

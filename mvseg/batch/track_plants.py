@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Generator, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -13,7 +13,7 @@ from typing import Any
 
 from tqdm import tqdm
 
-from mvseg._version import __version__
+from mvseg._version import made_by
 from mvseg.batch.dask_workers import connect, run_on_dask
 from mvseg.batch.local_workers import run_locally
 from mvseg.batch.lost import Lost
@@ -24,6 +24,7 @@ from mvseg.results.provenance import hash_files
 from mvseg.system.atomic import folder_whole
 from mvseg.tracking.corrections import LinkEdit, find_links, read_link_edits
 from mvseg.tracking.dates import read_date
+from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import INDEX_FILE, write_index, write_page
 from mvseg.tracking.tables import COLUMNS, Row, table_rows, write_tables
 from mvseg.tracking.track import track_leaves
@@ -67,19 +68,19 @@ def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
     scenes: dict[str, list[tuple[str, str]]] = {}
     for scene, plant, time in rows:
         scenes.setdefault(plant, []).append((scene, time))
-    several = {plant: seen for plant, seen in scenes.items() if len(seen) > 1}
-    if not several:
-        message = "no plant has two finished dates, expected a table with columns plant and time (docs/batch.md)"
-        raise InputError(f"{batch}: {message}")
     plants = [
         PlantResults(
             plant=plant,
             folders=tuple(scene_result(batch, scene) for scene, _ in seen),
             times=tuple(time for _, time in seen),
         )
-        for plant, seen in several.items()
+        for plant, seen in scenes.items()
+        if len(seen) > 1
     ]
-    return plants, len(scenes) - len(several)
+    if not plants:
+        message = "no plant has two finished dates, expected a table with columns plant and time (docs/batch.md)"
+        raise InputError(f"{batch}: {message}")
+    return plants, len(scenes) - len(plants)
 
 
 def track_plants(
@@ -121,10 +122,8 @@ def track_plants(
                 raise InputError(tracked[0].sentence)
             write_tables(folder, {name: [row for plant in tracked for row in plant.rows[name]] for name in COLUMNS})
             if report and len(plants) > 1:
-                about = [
-                    (plants[n].plant, each.dates, each.tracks) for n, each in enumerate(tracked) if not each.sentence
-                ]
-                write_index(folder / INDEX_FILE, about)
+                write_index(folder / INDEX_FILE, [(plant.plant, each.dates, each.tracks)
+                                                  for plant, each in zip(plants, tracked, strict=True)])  # fmt: skip
             _write_run(folder, plants, tracked, corrections)
             keep_user_files(out, folder)
     except OSError as error:
@@ -140,28 +139,26 @@ def _work_on_all(
     scheduler: str | None,
     quiet: bool,
 ) -> list[TrackedPlant]:
-    items = dict(enumerate(enumerate(plants)))
-    done: dict[int, TrackedPlant] = {}
-
-    def gather(answers: Generator[tuple[int, Any], None, None]) -> None:
-        with closing(answers), tqdm(total=len(plants), desc="track", unit="plant", disable=quiet) as bar:
-            for index, answer in answers:
-                if isinstance(answer, Lost):
-                    answer = _failed(f"{plants[index].plant}: the process that worked on it {answer.reason}")
-                done[index] = answer
-                bar.update()
-
-    def ignore(_: int) -> None:
-        return None
-
-    if scheduler is not None:
-        with connect(scheduler) as client:
-            gather(run_on_dask(work, items, client=client, at_once=None, started=ignore))
-    elif num_workers == 1 or len(plants) == 1:
-        gather((index, work(item)) for index, item in items.items())
-    else:
-        gather(run_locally(work, items, num_workers=num_workers, started=ignore))
+    items, done = dict(enumerate(enumerate(plants))), {}
+    with ExitStack() as stack:
+        answers: Generator[tuple[int, Any], None, None]
+        if scheduler is not None:
+            client = stack.enter_context(connect(scheduler))
+            answers = run_on_dask(work, items, client=client, at_once=None, started=_ignore)
+        elif num_workers > 1 and len(plants) > 1:
+            answers = run_locally(work, items, num_workers=num_workers, started=_ignore)
+        else:
+            answers = ((index, work(item)) for index, item in items.items())
+        stack.enter_context(closing(answers))
+        for index, answer in tqdm(answers, total=len(plants), desc="track", unit="plant", disable=quiet):
+            if isinstance(answer, Lost):
+                answer = _failed(f"{plants[index].plant}: the process that worked on it {answer.reason}")
+            done[index] = answer
     return [done[index] for index in range(len(plants))]
+
+
+def _ignore(_: int) -> None:
+    """Nobody is told which plant is worked on."""
 
 
 def _track_plant(
@@ -176,14 +173,15 @@ def _track_plant(
         dates = [read_date(where, time) for where, time in zip(plant.folders, plant.times, strict=True)]
         links, lost = find_links(edits, dates)
         tracks = track_leaves(dates, links=links, plant=plant.plant)
+        growth = measure_growth(tracks)
         if folder is not None:
             place = folder if is_alone else folder / "plants" / f"{index + 1:05d}"
             place.mkdir(parents=True, exist_ok=True)
-            write_page(place, tracks)
+            write_page(place, tracks, growth)
     except InputError as error:
         return _failed(f"plant {plant.plant}: {error}")
     warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.warnings, *lost))
-    return TrackedPlant(table_rows(tracks), len(tracks.dates), tracks.num_tracks, warnings)
+    return TrackedPlant(table_rows(tracks, growth), len(tracks.dates), tracks.num_tracks, warnings)
 
 
 def _failed(sentence: str) -> TrackedPlant:
@@ -193,12 +191,12 @@ def _failed(sentence: str) -> TrackedPlant:
 def _write_run(
     folder: Path, plants: Sequence[PlantResults], tracked: Sequence[TrackedPlant], corrections: Path | None
 ) -> None:
-    inputs = {str(place): _hash_of(place) for plant in plants for place in plant.folders}
+    inputs = [place / RUN_FILE for plant in plants for place in plant.folders]  # which list the hashes of all files
     if corrections is not None:
-        inputs[str(corrections)] = hash_files(corrections)
+        inputs.append(corrections)
     said = {
-        "mvseg": __version__,
-        "inputs": inputs,
+        **made_by(),
+        "inputs": {str(path): hash_files(path) if path.is_file() else None for path in inputs},
         "config": {"corrections": corrections and str(corrections)},
         "warnings": [sentence for plant in tracked for sentence in plant.warnings],
         "failures": [plant.sentence for plant in tracked if plant.sentence],
@@ -210,9 +208,3 @@ def _write_run(
         "files": list_files(folder),
     }
     (folder / RUN_FILE).write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")
-
-
-def _hash_of(place: Path) -> str | None:
-    """SHA-256 of a result's run.json, which lists those of all its files; None where it has none."""
-    path = place / RUN_FILE
-    return hash_files(path) if path.is_file() else None

@@ -200,18 +200,11 @@ def _seat_fronds(
         falls = rank < num_old and rng.random() < spec.falls * 2 * (1 - rank / num_old)
         yellows = rng.uniform(-0.5 * YELLOWING, max(span - YELLOWING, 0.1)) if falls else math.inf
         azimuth = turns[shoot] + math.radians(family.divergence * level + 360 * place / family.per_node)
+        scale, ids = shoots[shoot][0].scale * rng.uniform(0.8, 1.1), tuple(range(first_id, first_id + count))
         seats.append(
-            _Seat(
-                shoot=shoot,
-                level=level,
-                ids=tuple(range(first_id, first_id + count)),
-                born=born,
-                yellows=yellows,
-                azimuth=azimuth,
-                scale=shoots[shoot][0].scale * rng.uniform(0.8, 1.1),
-                seed=(spec.seed, rank, 0),
-            )
-        )
+            _Seat(shoot=shoot, level=level, ids=ids, born=born, yellows=yellows, azimuth=azimuth, scale=scale,
+                  seed=(spec.seed, rank, 0))
+        )  # fmt: skip
         first_id += count
     return seats
 
@@ -333,14 +326,10 @@ def draw_specs(num_plants: int, *, seed: int = 0, num_dates: int = 8) -> list[Se
         rng = np.random.default_rng([seed, index, 3])
         first, new = int(rng.integers(9, 20)), int(rng.integers(3, 11))
         times = np.round(np.cumsum(rng.uniform(1, 3, num_dates)) - 1, 1)
+        family, own_seed = families[index % len(families)], int(rng.integers(1 << 30))
+        wilts = int(rng.integers(1, num_dates)) if rng.random() < 0.5 else None
         specs.append(
-            SeriesSpec(
-                name=f"{families[index % len(families)]}-{index:02d}",
-                family=families[index % len(families)],
-                leaves=(first, new),
-                times=tuple(times.tolist()),
-                seed=int(rng.integers(1 << 30)),
-                wilts=int(rng.integers(1, num_dates)) if rng.random() < 0.5 else None,
-            )
-        )
+            SeriesSpec(name=f"{family}-{index:02d}", family=family, leaves=(first, new), times=tuple(times.tolist()),
+                       seed=own_seed, wilts=wilts)
+        )  # fmt: skip
     return specs

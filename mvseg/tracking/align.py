@@ -6,46 +6,45 @@ leaves. Each is refined on the leaves that it pairs, and the best one must beat 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import warnings
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.transform import Rotation
 
 from mvseg.tracking.costs import Leaves, pair_costs, typical_length
 from mvseg.tracking.dates import Floats
 
-NUM_REFINED = 40  # hypotheses, of those that look best
+NUM_REFINED = 20  # hypotheses, of those that look best
 UPRIGHT = 2.0  # weight of "up stays up", in leaves
 MOST_LEAN = np.radians(20.0)
 COARSE = (0.18, 0.45, 0.5)  # scales of base (median lengths), direction (radians) and log length while searching
 ROUNDS = (2.5, 1.8, 1.3, 1.0, 1.0)  # scales of the costs while refining
-DIFFERENT = 0.34  # share of the pairs in which two hypotheses that are not the same differ, at least
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
-WORLD_PRIOR, CHAIN_PRIOR = 5.0, 10.0  # log of how much likelier than any other pose it is that the world frames agree,
-# and that two sure alignments by way of a date in between hold
-NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # of such a pose: angle, and median lengths
+WORLD_PRIOR = 5.0  # log of how much likelier than any other pose it is that the world frames agree
+NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
+SAME = 0.5  # distance of hypotheses of which one is refined, in these
 SURE_MARGIN = 7.0  # of the best hypothesis over others
 SURE_SUM, PER_LEAF = 23.5, 3.0  # of margin and PER_LEAF times the gain per leaf of the date with fewer leaves
 
 
 @dataclass(frozen=True, eq=False)
 class Alignment:
-    """second_from_first of two dates.
+    """How the plant of one date stands on another.
 
     Attributes:
-        rotation: (3, 3).
-        shift: (3,).
+        pose: (4, 4) second_from_first, a rotation and a shift.
         pairs: (P, 2) leaves of the two dates (rows of `Leaves`) that go together.
         gain: how much likelier these pairs are the same leaves than strangers, a natural logarithm.
-        margin: by how much `gain` is larger than that of the best hypothesis with other pairs.
+        margin: by how much it is likelier than the best hypothesis of another pose.
         reason: why it is not to be trusted; "" for a sure one.
     """
 
-    rotation: Floats
-    shift: Floats
+    pose: Floats
     pairs: np.ndarray
-    gain: float
-    margin: float
+    gain: float = 0.0
+    margin: float = 0.0
     reason: str = ""
 
     @property
@@ -53,74 +52,55 @@ class Alignment:
         return not self.reason
 
 
-def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool, guess: Alignment | None = None) -> Alignment:
+def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Alignment:
     """The best alignment of two dates, and whether it is sure.
 
     Args:
         first, second: N and M leaves, each in its date's frame.
         days: between the dates.
         knows_up: +z is up in both frames; else any rotation is looked at.
-        guess: another hypothesis, from dates in between.
     """
-    if min(len(first), len(second)) < LEAST_PAIRS:
-        few = min(len(first), len(second))
-        reason = f"{few or 'no'} {'leaf' if few == 1 else 'leaves'} cannot tell how the pot stands"
-        return Alignment(np.eye(3), np.zeros(3), np.zeros((0, 2), int), 0.0, 0.0, reason)
-    scale = typical_length(first, second)
-    rotations, shifts = _hypotheses(first, second, knows_up=knows_up)
-    if guess is not None:
-        rotations, shifts = np.concatenate([guess.rotation[None], rotations]), np.vstack([guess.shift, shifts])
-    scores = _coarse_scores(first, second, rotations, shifts, scale=scale)
-    scores[: 1 + (guess is not None)] += 1e6  # always looked at
-    found = []
-    for index in np.argsort(-scores, kind="stable")[:NUM_REFINED]:
-        pose = rotations[index], shifts[index]
-        found.append(_refine(first, second, pose, days=days, scale=scale, knows_up=knows_up))
-    expected = [(np.eye(3), np.zeros(3), WORLD_PRIOR)]
-    if guess is not None:
-        expected.append((guess.rotation, guess.shift, CHAIN_PRIOR))
-    middle = first.midribs.mean((0, 1))
-    priors = [max(_prior(pose, *each, middle=middle, scale=scale) for each in expected) for pose in found]
-    return _best(found, priors, min(len(first), len(second)))
-
-
-def _prior(pose: Alignment, rotation: Floats, shift: Floats, prior: float, *, middle: Floats, scale: float) -> float:
-    """`prior` if a pose is near an expected one, or else 0."""
-    turned = np.arccos(np.clip((np.trace(rotation.T @ pose.rotation) - 1) / 2, -1, 1))
-    moved = np.linalg.norm(pose.rotation @ middle + pose.shift - rotation @ middle - shift)
-    return prior if turned < NEAR and moved < NEAR_SHIFT * scale else 0.0
-
-
-def _best(found: list[Alignment], priors: list[float], smaller: int) -> Alignment:
-    """The likeliest hypothesis, its margin over those that differ, and what speaks against it.
-
-    `smaller` is the number of leaves of the date with fewer ones.
-    """
-    place = max(range(len(found)), key=lambda n: found[n].gain + priors[n])
-    best = found[place]
-    pairs = {tuple(pair) for pair in best.pairs.tolist()}
-    others = [
-        other.gain + prior
-        for other, prior in zip(found, priors, strict=True)
-        if len(pairs & {tuple(pair) for pair in other.pairs.tolist()}) < (1 - DIFFERENT) * max(len(pairs), 1)
-    ]
-    margin = best.gain + priors[place] - max(others, default=0.0)
-    reason = ""
-    if len(pairs) < max(LEAST_PAIRS, 0.4 * smaller):
-        reason = f"only {len(pairs)} of {smaller} leaves are alike, however the pot is turned"
+    fewer = min(len(first), len(second))
+    if fewer < LEAST_PAIRS:
+        reason = f"{fewer or 'no'} {'leaf' if fewer == 1 else 'leaves'} cannot tell how the pot stands"
+        return Alignment(np.eye(4), np.zeros((0, 2), int), reason=reason)
+    scale, middle = typical_length(first, second), first.midribs.mean((0, 1))
+    poses = np.concatenate([np.eye(4)[None], _hypotheses(first, second, knows_up=knows_up)])
+    scores = _coarse_scores(first, second, poses, scale=scale)
+    scores[0] += 1e6  # always looked at
+    found: list[Alignment] = []
+    left = np.argsort(-scores, kind="stable")
+    while len(left) and len(found) < NUM_REFINED:
+        found.append(refine(first, second, poses[left[0]], days=days, knows_up=knows_up))
+        left = left[_distances(poses[left[0]], poses[left], middle, scale=scale) > SAME]
+    every = np.stack([each.pose for each in found])
+    scores = np.array([each.gain for each in found])
+    scores += WORLD_PRIOR * np.exp(-0.5 * _distances(np.eye(4), every, middle, scale=scale) ** 2)
+    place = int(scores.argmax())
+    best, others = found[place], scores[_distances(every[place], every, middle, scale=scale) >= 1]
+    margin, reason = float(scores[place] - others.max(initial=0.0)), ""
+    if len(best.pairs) < max(LEAST_PAIRS, 0.4 * fewer):
+        reason = f"only {len(best.pairs)} of {fewer} leaves are alike, however the pot is turned"
     elif margin < SURE_MARGIN:
         reason = "the pot could be turned in more than one way"
-    elif margin + PER_LEAF * best.gain / smaller < SURE_SUM:
+    elif margin + PER_LEAF * best.gain / fewer < SURE_SUM:
         reason = "the leaves are not alike enough, however the pot is turned"
-    return Alignment(best.rotation, best.shift, best.pairs, best.gain, margin, reason)
+    return replace(best, margin=margin, reason=reason)
 
 
-def _hypotheses(first: Leaves, second: Leaves, *, knows_up: bool) -> tuple[Floats, Floats]:
-    """(H, 3, 3) rotations and (H, 3) shifts: the world's own first, then one or more for every pair of leaves."""
+def _distances(pose: Floats, others: Floats, middle: Floats, *, scale: float) -> Floats:
+    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of NEAR and NEAR_SHIFT; `middle` (3,) of the plant."""
+    turned = np.arccos(np.clip((np.einsum("ij,hij->h", pose[:3, :3], others[:, :3, :3]) - 1) / 2, -1, 1))
+    moved = np.linalg.norm((others - pose)[:, :3] @ np.append(middle, 1.0), axis=1)
+    return np.hypot(turned / NEAR, moved / (NEAR_SHIFT * scale))
+
+
+def _hypotheses(first: Leaves, second: Leaves, *, knows_up: bool) -> Floats:
+    """(H, 4, 4) poses, one or more for every pair of leaves."""
     one, other = np.repeat(np.arange(len(first)), len(second)), np.tile(np.arange(len(second)), len(first))
     ratio = np.abs(np.log(second.lengths[other] / first.lengths[one]))
     one, other = one[ratio < 1.2], other[ratio < 1.2]
-    rotations, shifts = [np.eye(3)[None]], [np.zeros((1, 3))]
+    poses = [np.zeros((0, 4, 4))]
     for ends in ((0, -1), (-1, 0)):  # the later midrib as it is, and from its other end where its base is not known
         keep = np.ones(len(one), bool) if ends[0] == 0 else ~(first.is_oriented[one] & second.is_oriented[other])
         i, j = one[keep], other[keep]
@@ -128,21 +108,13 @@ def _hypotheses(first: Leaves, second: Leaves, *, knows_up: bool) -> tuple[Float
         ahead, before = end - start, first.midribs[i, -1] - first.midribs[i, 0]
         if knows_up:
             turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - np.arctan2(before[:, 1], before[:, 0])
-            turned = [_yaw(turn)]
+            turned = [Rotation.from_rotvec(turn[:, None] * (0, 0, 1)).as_matrix()]
         else:
             turned = [_frames(ahead, s * second.normals[j]) @ _frames(before, first.normals[i]).swapaxes(1, 2)
                       for s in (1, -1)]  # fmt: skip
         for rotation in turned:
-            rotations.append(rotation)
-            shifts.append(start - np.einsum("hij,hj->hi", rotation, first.midribs[i, 0]))
-    return np.concatenate(rotations), np.concatenate(shifts)
-
-
-def _yaw(angles: Floats) -> Floats:
-    """(H, 3, 3) rotations about +z."""
-    cos, sin = np.cos(angles), np.sin(angles)
-    zero, one = np.zeros_like(cos), np.ones_like(cos)
-    return np.stack([cos, -sin, zero, sin, cos, zero, zero, zero, one], -1).reshape(-1, 3, 3)
+            poses.append(make_poses(rotation, start - np.einsum("hij,hj->hi", rotation, first.midribs[i, 0])))
+    return np.concatenate(poses)
 
 
 def _frames(ahead: Floats, normal: Floats) -> Floats:
@@ -153,16 +125,20 @@ def _frames(ahead: Floats, normal: Floats) -> Floats:
     return np.stack([x, np.cross(z, x), z], -1)
 
 
-def _coarse_scores(first: Leaves, second: Leaves, rotations: Floats, shifts: Floats, *, scale: float) -> Floats:
+def make_poses(rotations: Floats, shifts: Floats) -> Floats:
+    """(..., 4, 4) of rotations (..., 3, 3) and shifts (..., 3)."""
+    poses = np.zeros((*shifts.shape[:-1], 4, 4))
+    poses[..., :3, :3], poses[..., :3, 3], poses[..., 3, 3] = rotations, shifts, 1.0
+    return poses
+
+
+def _coarse_scores(first: Leaves, second: Leaves, poses: Floats, *, scale: float) -> Floats:
     """(H,) how many leaves find one like them under each hypothesis, softly."""
     size = np.square(np.log(second.lengths[None] / first.lengths[:, None]) / COARSE[2])
     scores = []
-    for rotation, shift in zip(
-        np.array_split(rotations, 1 + len(rotations) // 200), np.array_split(shifts, 1 + len(rotations) // 200),
-        strict=True,
-    ):  # fmt: skip
-        bases = np.einsum("hij,nj->hni", rotation, first.bases) + shift[:, None]
-        chords = np.einsum("hij,nj->hni", rotation, first.chords)
+    for part in np.array_split(poses, 1 + len(poses) // 200):  # bounds the memory
+        bases = np.einsum("hij,nj->hni", part[:, :3, :3], first.bases) + part[:, None, :3, 3]
+        chords = np.einsum("hij,nj->hni", part[:, :3, :3], first.chords)
         away = np.square(bases[:, :, None] - second.bases).sum(-1) / (COARSE[0] * scale) ** 2
         turn = 2 * (1 - np.einsum("hni,mi->hnm", chords, second.chords)) / COARSE[1] ** 2
         alike = np.exp(-0.25 * (away + turn + size))
@@ -170,22 +146,20 @@ def _coarse_scores(first: Leaves, second: Leaves, rotations: Floats, shifts: Flo
     return np.concatenate(scores)
 
 
-def _refine(
-    first: Leaves, second: Leaves, pose: tuple[Floats, Floats], *, days: float, scale: float, knows_up: bool
-) -> Alignment:
-    """Pair the leaves, fit the pose to the pairs, and again with stricter costs."""
-    rotation, shift = pose
+def refine(first: Leaves, second: Leaves, pose: Floats, *, days: float, knows_up: bool) -> Alignment:
+    """From a pose (4, 4) that is nearly right: pair the leaves, fit it to the pairs, and again with stricter costs."""
+    scale = typical_length(first, second)
     for spread in ROUNDS:
-        costs = pair_costs(first.moved(rotation, shift), second, days=days, scale=scale, spread=spread)
+        costs = pair_costs(first.moved(pose), second, days=days, scale=scale, spread=spread)
         pairs = best_pairs(costs)
         if not len(pairs):
-            return Alignment(rotation, shift, pairs, 0.0, 0.0)
+            return Alignment(pose, pairs)
         if spread > ROUNDS[-1] or len(pairs) > 1:
             weights = np.minimum(-costs[pairs[:, 0], pairs[:, 1]], 6.0)
-            rotation, shift = _fit(first, second, pairs, weights, knows_up=knows_up, start=rotation)
-    costs = pair_costs(first.moved(rotation, shift), second, days=days, scale=scale)
+            pose = _fit(first, second, pairs, weights, knows_up=knows_up, start=pose[:3, :3])
+    costs = pair_costs(first.moved(pose), second, days=days, scale=scale)
     pairs = best_pairs(costs)
-    return Alignment(rotation, shift, pairs, float(-costs[pairs[:, 0], pairs[:, 1]].sum()), 0.0)
+    return Alignment(pose, pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
 
 
 def best_pairs(costs: Floats) -> np.ndarray:
@@ -195,10 +169,8 @@ def best_pairs(costs: Floats) -> np.ndarray:
     return np.stack([rows[keep], columns[keep]], 1)
 
 
-def _fit(
-    first: Leaves, second: Leaves, pairs: np.ndarray, weights: Floats, *, knows_up: bool, start: Floats
-) -> tuple[Floats, Floats]:
-    """Rotation and shift (weighted least squares) from bases and blades of the pairs; up stays nearly up."""
+def _fit(first: Leaves, second: Leaves, pairs: np.ndarray, weights: Floats, *, knows_up: bool, start: Floats) -> Floats:
+    """(4, 4) pose (weighted least squares) from bases and blades of the pairs; up stays nearly up."""
     one, other = first.midribs[pairs[:, 0]], second.midribs[pairs[:, 1]].copy()
     reverse = np.linalg.norm(one @ start.T - other, axis=2).sum(1) > np.linalg.norm(
         one @ start.T - other[:, ::-1], axis=2).sum(1) + np.linalg.norm(other[:, 0] - other[:, -1], axis=1)  # fmt: skip
@@ -210,22 +182,21 @@ def _fit(
     mass = (weights[:, None] * (1.0, 0.4, 0.15)).ravel()
     mass /= mass.sum()
     middle, aim = mass @ source, mass @ target
-    moment = (target - aim).T @ ((source - middle) * mass[:, None])
+    source, target = source - middle, target - aim
     if knows_up:
-        extent = np.sqrt(np.trace(moment.T @ moment))
-        held = moment + UPRIGHT / max(len(pairs), 1) * extent * np.outer((0, 0, 1), (0, 0, 1))
-        rotation = _kabsch(held)
+        moment = (target * mass[:, None]).T @ source
+        upright = UPRIGHT / max(len(pairs), 1) * np.linalg.norm(moment)
+        mass, up = np.append(mass, upright), [(0.0, 0.0, 1.0)]
+        rotation = _best_rotation(np.vstack([source, up]), np.vstack([target, up]), mass)
         if np.arccos(np.clip(rotation[2, 2], -1, 1)) > MOST_LEAN:
             turn = np.arctan2(moment[1, 0] - moment[0, 1], moment[0, 0] + moment[1, 1])
-            rotation = _yaw(np.array([turn]))[0]
+            rotation = Rotation.from_rotvec((0, 0, turn)).as_matrix()
     else:
-        rotation = _kabsch(moment)
-    return rotation, aim - rotation @ middle
+        rotation = _best_rotation(source, target, mass)
+    return make_poses(rotation, aim - rotation @ middle)
 
 
-def _kabsch(moment: Floats) -> Floats:
-    """The rotation R with the largest trace of R^T moment."""
-    left, _, right = np.linalg.svd(moment)
-    sign = np.sign(np.linalg.det(left @ right)) or 1.0
-    rotation: Floats = left @ np.diag([1.0, 1.0, sign]) @ right
-    return rotation
+def _best_rotation(source: Floats, target: Floats, weights: Floats) -> Floats:
+    """(3, 3) least squares rotation of vectors (P, 3)."""
+    with warnings.catch_warnings(action="ignore", category=UserWarning):  # on one line, any of the best will do
+        return Rotation.align_vectors(target, source, weights)[0].as_matrix()

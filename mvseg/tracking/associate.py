@@ -1,93 +1,106 @@
-"""Tracks over all dates at once: the cheapest way to give every leaf one track, with births, deaths and gaps.
+"""Tracks over all dates at once: the sights of leaves are parted such that the costs within tracks are least.
 
-Every leaf has at most one next sight and at most one earlier one, and a link costs what `pair_costs` says. The cheapest
-set of paths through such a graph is an assignment of leaves to their next sights (a minimum-cost flow of unit
-capacities), which `scipy.optimize.linear_sum_assignment` solves exactly.
+Not only neighbouring dates count: each leaf is compared with those of the three dates before and after, and a track's
+cost is the sum over all of its pairs. A leaf that looks odd on one date, or is missed, is held by the dates around it.
+The least sum is hard to find (a multicut, see Keuper et al., ICCV 2015); here all tracks are cut at a date, or one date
+is taken out of them, and their parts are joined anew, exactly (`linear_sum_assignment`), until that gains nothing.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.align import Alignment, align
+from mvseg.tracking.align import Alignment, align, refine
 from mvseg.tracking.costs import ACROSS, Leaves, cloud_costs, pair_costs, typical_length
 from mvseg.tracking.dates import Floats
 
 Sight = tuple[int, int]  # index of the date, row of its `Leaves`
-MOST_GAP = 3  # dates from one sight to the next, at most: two dates may hide a leaf
-# Of a date that hides a leaf, and of each further one. If it were less, a leaf that looks odd on every other date would
-# become two tracks.
-GAP_COST, MORE_GAP = 9.0, 0.5
-UNLINKED = 4.0  # a link may cost that much before two tracks are cheaper than one
+MOST_GAP = 3  # dates from one sight to another that it is compared with, at most: two dates may hide a leaf
+UNLINKED = 2.0  # a pair may cost that much in a track before two tracks are cheaper than one; / dates in between
 CLOUD_COUNTS = 0.3  # of the points of two surfaces, whose midribs say most already, and the other way round
 MOST_HELP = 8.0
 IN_PART = 0.3  # change of log length from which one of two surfaces may show a part of the leaf only
-ENTITLED = -1e4  # cost of a link that a person asks for
-CALIBRATION = (0.8, 1.6)  # slope and offset of the log odds of a link, fitted on simulated series (docs/tracking.md)
+ASKED = 1e4  # gain of what a person says
+CALIBRATION = (0.25, 2.8)  # slope and offset of the log odds of a link, fitted on simulated series (docs/tracking.md)
 LIKE_RIGID = 0.3  # weight of "the plant moved as a whole", in leaves
+ROUNDS = 10  # of joining anew, at most; two or three are enough
 
 
 @dataclass(frozen=True, eq=False)
-class DatePair:
-    """Two dates: how they are aligned, and the (N, M) costs of their leaves being the same."""
+class Comparison:
+    """How the T dates of a plant are aligned, and how alike their leaves are.
 
-    alignment: Alignment
-    costs: Floats
+    Attributes:
+        costs: {(earlier, later): (N, M) costs of their leaves being the same}, of dates that are surely aligned.
+        poses: (T, 4, 4) first_from_date, where "first" is the earliest of the dates that are surely aligned with it, by
+            way of others.
+        roots: (T,) index of that date; its own where there is no other.
+        reasons: (T - 1,) why each date cannot be aligned surely with the next one alone, "" where it can.
+    """
+
+    costs: Mapping[tuple[int, int], Floats]
+    poses: Floats
+    roots: np.ndarray
+    reasons: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Link:
-    """Two sights of one leaf, the earlier one first, and the probability that they are."""
+    """Two sights of one leaf that follow each other, and the probability that they are of one."""
 
     before: Sight
     after: Sight
     probability: float
 
 
-def compare_dates(
-    dates: Sequence[Leaves], times: Sequence[float], *, knows_up: bool
-) -> dict[tuple[int, int], DatePair]:
-    """{(earlier, later): pair} of all dates at most MOST_GAP apart, each aligned; those in between help."""
-    compared: dict[tuple[int, int], DatePair] = {}
-    for gap in range(1, min(MOST_GAP, len(dates) - 1) + 1):
-        for earlier in range(len(dates) - gap):
-            later = earlier + gap
-            first, second, days = dates[earlier], dates[later], times[later] - times[earlier]
-            guess = _chain(compared, earlier, later)
-            alignment = align(first, second, days=days, knows_up=knows_up, guess=guess)
-            costs = np.full((len(first), len(second)), np.inf)
-            if alignment.is_sure:
-                costs = _bent_costs(first, second, alignment, days=days)
-            compared[earlier, later] = DatePair(alignment, costs)
-    return compared
+def compare_dates(dates: Sequence[Leaves], times: Sequence[float], *, knows_up: bool) -> Comparison:
+    """Dates at most MOST_GAP apart are compared.
+
+    The surest alignments say how all dates stand; the others only refine that. So two dates that look alike in more
+    than one way are settled by those in between.
+    """
+    pairs = {(earlier, later): (dates[earlier], dates[later], times[later] - times[earlier])
+             for later in range(len(dates)) for earlier in range(max(later - MOST_GAP, 0), later)}  # fmt: skip
+    alone = {pair: align(one, other, days=days, knows_up=knows_up) for pair, (one, other, days) in pairs.items()}
+    poses, roots = place_dates(len(dates), alone)
+    costs = {}
+    for (earlier, later), (first, second, days) in pairs.items():
+        if roots[earlier] == roots[later]:
+            pose = np.linalg.inv(poses[later]) @ poses[earlier]
+            alignment = refine(first, second, pose, days=days, knows_up=knows_up)
+            if len(alignment.pairs):
+                costs[earlier, later] = _bent_costs(first, second, alignment, days=days)
+    return Comparison(costs, poses, roots, tuple(alone[n, n + 1].reason for n in range(len(dates) - 1)))
 
 
-def gap_cost(dates: int) -> float:
-    """What a link over that many dates costs more than one to the next date."""
-    return GAP_COST + MORE_GAP * (dates - 2) if dates > 1 else 0.0
-
-
-def _chain(compared: Mapping[tuple[int, int], DatePair], earlier: int, later: int) -> Alignment | None:
-    """The alignment by way of the date in between; None where that is not sure."""
-    middle = later - 1
-    if middle == earlier or not (
-        compared[earlier, middle].alignment.is_sure and compared[middle, later].alignment.is_sure
-    ):
-        return None
-    one, other = compared[earlier, middle].alignment, compared[middle, later].alignment
-    return replace(one, rotation=other.rotation @ one.rotation, shift=other.rotation @ one.shift + other.shift)
+def place_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment]) -> tuple[Floats, np.ndarray]:
+    """Poses and roots, see `Comparison`, by way of the alignments with the largest margins."""
+    margins, poses, roots = np.zeros((num_dates, num_dates)), np.zeros((num_dates, 4, 4)), np.full(num_dates, -1)
+    for pair, alignment in alignments.items():
+        margins[pair] = -alignment.margin if alignment.is_sure else 0.0
+    tree = minimum_spanning_tree(margins)
+    for root in range(num_dates):
+        if roots[root] < 0:
+            order, before = breadth_first_order(tree, root, directed=False)
+            poses[root], roots[order] = np.eye(4), root
+            for date in order[1:].tolist():
+                earlier, later = sorted((date, int(before[date])))
+                step = alignments[earlier, later].pose
+                poses[date] = poses[before[date]] @ (step if date == earlier else np.linalg.inv(step))
+    return poses, roots
 
 
 def _bent_costs(first: Leaves, second: Leaves, alignment: Alignment, *, days: float) -> Floats:
     """Costs after the plant was let bend and stretch: each leaf moves as the other pairs say, not as its own does."""
     scale = typical_length(first, second)
-    moved = first.moved(alignment.rotation, alignment.shift)
+    moved = first.moved(alignment.pose)
     pairs = alignment.pairs
     one, other = moved.bases[pairs[:, 0]], second.bases[pairs[:, 1]]
     middle = one.mean(0)
@@ -115,90 +128,98 @@ def _bent_costs(first: Leaves, second: Leaves, alignment: Alignment, *, days: fl
 
 def link_leaves(
     counts: Sequence[int],
-    compared: Mapping[tuple[int, int], DatePair],
+    costs: Mapping[tuple[int, int], Floats],
     *,
     same: Collection[tuple[Sight, Sight]] = (),
     different: Collection[tuple[Sight, Sight]] = (),
 ) -> list[Link]:
-    """The links of the cheapest tracks.
+    """The links of the cheapest tracks, by their earlier sight.
 
     Args:
         counts: number of leaves with a shape on each date.
-        compared: see `compare_dates`.
+        costs: see `Comparison`.
         same, different: pairs of sights that a person says are one leaf, or are not.
-    """
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
-    total = int(starts[-1])
-    if total == 0:
-        return []
-    costs = np.full((total, total), np.inf)
-    for (earlier, later), pair in compared.items():
-        block = pair.costs + gap_cost(later - earlier)
-        costs[starts[earlier] : starts[earlier + 1], starts[later] : starts[later + 1]] = block
-
-    date_of = np.repeat(np.arange(len(counts)), counts)
-    after = _obey(costs, *([(int(starts[a] + i), int(starts[b] + j)) for (a, i), (b, j) in said]
-                           for said in (same, different)))  # fmt: skip
-    sights = [(int(date_of[n]), int(n - starts[date_of[n]])) for n in range(total)]
-    links = []
-    for one, other in sorted(after.items()):
-        (date, row), (later, column) = sights[one], sights[other]
-        asked = costs[one, other] <= ENTITLED
-        chance = 1.0 if asked else probability(compared[date, later].costs, row, column)
-        links.append(Link((date, row), (later, column), chance))
-    return links
-
-
-def _obey(costs: Floats, same: Sequence[tuple[int, int]], different: Sequence[tuple[int, int]]) -> dict[int, int]:
-    """{sight: its next} of the cheapest paths, with pairs (earlier, later) on one path, or on two; changes `costs`.
-
-    A pair that is not on one path of its own gets a direct link; of a path that it must not share, the dearest link
-    between the two is forbidden.
 
     Raises:
         InputError: the pairs contradict each other.
     """
-    for _ in range(1 + len(costs) * (len(same) + len(different))):
-        after = _cheapest_links(costs)
-        apart = [(one, other) for one, other in same if other not in _path(after, one)]
-        joined = [(one, other) for one, other in different if other in _path(after, one)]
-        if not apart and not joined:
-            return after
-        for one, other in apart:
-            costs[one], costs[:, other] = np.inf, np.inf
-            costs[one, other] = ENTITLED
-        for one, other in joined:
-            path = [one, *_path(after, one)]
-            steps = list(pairwise(path[: path.index(other) + 1]))
-            costs[max(steps, key=lambda step: float(costs[step]))] = np.inf
-    raise InputError("what a person says of leaves over days contradicts itself")
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
+    date_of, gains = np.repeat(np.arange(len(counts)), counts), np.zeros((starts[-1], starts[-1]))
+    for (a, b), of_pair in costs.items():
+        gains[starts[a] : starts[a + 1], starts[b] : starts[b + 1]] = (UNLINKED - of_pair) / (b - a)
+    asked = {(starts[a] + i, starts[b] + j): sign * ASKED for said, sign in ((same, 1), (different, -1))
+             for (a, i), (b, j) in said}  # fmt: skip
+    for place, gain in asked.items():
+        gains[place] = gain
+    gains += gains.T
+    tracks = join_sights(gains, date_of)
+    if any((tracks[one] == tracks[other]) != (gain > 0) for (one, other), gain in asked.items()):
+        raise InputError("what a person says of leaves over days contradicts itself")
+    links = []
+    for later in range(1, len(counts)):
+        chances = _probabilities(tracks, gains, later=date_of >= later)
+        for after in np.flatnonzero(date_of == later):
+            known = np.flatnonzero((tracks == tracks[after]) & (date_of < later))
+            if len(known):
+                before, chance = known[-1], chances[tracks[after]]
+                is_asked = gains[known, after].max() >= ASKED
+                both = [(int(date_of[n]), int(n - starts[date_of[n]])) for n in (before, after)]
+                links.append(Link(both[0], both[1], 1.0 if is_asked else chance))
+    return links
 
 
-def _path(after: Mapping[int, int], start: int) -> list[int]:
-    """The sights that follow one."""
-    path = []
-    while start in after:
-        start = after[start]
-        path.append(start)
-    return path
+def join_sights(gains: Floats, date_of: np.ndarray) -> np.ndarray:
+    """(S,) the track of each sight, such that the gains within tracks are large; none has two sights of a date.
+
+    Args:
+        gains: (S, S) symmetric, of each pair in one track; 0 for pairs that were not compared.
+        date_of: (S,) index of the date of each sight.
+    """
+    tracks, dates = np.arange(len(gains)), np.unique(date_of)
+    for date in dates[1:]:
+        tracks = _rejoin(tracks, gains, date_of == date, among=date_of <= date)
+    for _ in range(ROUNDS):
+        before = tracks[:, None] == tracks
+        for date in dates:
+            for apart in (date_of > date, date_of == date):
+                tracks = _rejoin(tracks, gains, apart)
+        if ((tracks[:, None] == tracks) == before).all():
+            break
+    return tracks
 
 
-def _cheapest_links(costs: Floats) -> dict[int, int]:
-    """{sight: its next} of the paths with the least sum of costs, a missing link costing UNLINKED."""
-    rows, columns = linear_sum_assignment(np.minimum(costs, UNLINKED))
-    taken = costs[rows, columns] < UNLINKED
-    return dict(zip(rows[taken].tolist(), columns[taken].tolist(), strict=True))
+def _rejoin(tracks: np.ndarray, gains: Floats, apart: np.ndarray, among: np.ndarray | None = None) -> np.ndarray:
+    """The tracks cut in two, what is `apart` (S,) and the rest, and their parts joined for the largest gain."""
+    rest = ~apart if among is None else among & ~apart
+    here, there, table = _part_gains(tracks, gains, rest, apart)
+    rows, columns = linear_sum_assignment(np.maximum(table, 0.0), maximize=True)
+    is_better = table[rows, columns] > 0
+    names = tracks.max(initial=0) + 1 + np.arange(len(there))
+    names[columns[is_better]] = here[rows[is_better]]
+    joined = tracks.copy()
+    joined[apart] = names[np.searchsorted(there, tracks[apart])]
+    return joined
 
 
-def probability(costs: Floats, row: int, column: int) -> float:
-    """Of a pair in the costs (N, M) of two dates: that it is one leaf, against all other partners that each could have.
+def _part_gains(
+    tracks: np.ndarray, gains: Floats, one: np.ndarray, other: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Floats]:
+    """The tracks among the sights `one` (S,) and `other` (S,), and the gains (A, B) of joining each two of them."""
+    (here, row), (there, column) = (np.unique(tracks[part], return_inverse=True) for part in (one, other))
+    return here, there, np.eye(len(here))[row].T @ gains[np.ix_(one, other)] @ np.eye(len(there))[column]
 
-    With costs as log odds, p = e^-c / (1 + e^-c + the sum of e^-c over the others); its log odds are then stretched as
+
+def _probabilities(tracks: np.ndarray, gains: Floats, later: np.ndarray) -> dict[int, float]:
+    """{track: that its later sights are of the same leaf as those before}, against all other parts each could go with.
+
+    With gains as log odds, p = e^g / (1 + e^g + the sum of e^g over the others); its log odds are then stretched as
     simulated series say (`CALIBRATION`).
     """
-    odds = np.exp(-np.clip(costs, -40, 40))
-    own = odds[row, column]
-    others = odds[row].sum() + odds[:, column].sum() - 2 * own
-    slope, offset = CALIBRATION
-    logit = slope * float(np.log(own) - np.log1p(others)) + offset
-    return float(1 / (1 + np.exp(-np.clip(logit, -40, 40))))
+    here, there, table = _part_gains(tracks, gains, ~later, later)
+    odds, found = np.exp(np.clip(table, -40, 40)), {}
+    for track in np.intersect1d(here, there).tolist():
+        row, column = np.searchsorted(here, track), np.searchsorted(there, track)
+        others = odds[row].sum() + odds[:, column].sum() - 2 * odds[row, column]
+        logit = CALIBRATION[0] * (np.log(odds[row, column]) - np.log1p(others)) + CALIBRATION[1]
+        found[track] = float(expit(logit))
+    return found

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, FiniteFloat
+from pydantic import BaseModel, Field, FiniteFloat, ValidationError
 
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, read_json
@@ -14,26 +14,19 @@ from mvseg.formats.label_png import read_labels
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import LeafLink
 
-FORMAT = "mvseg-corrections/1"
-OPERATIONS = ("same_track", "different_track")
 Place = tuple[str, str, FiniteFloat, FiniteFloat]
-
-
-class _Edit(BaseModel):
-    op: str
-    at: list[Place] | object = None
 
 
 class _Corrections(BaseModel):
     format: Literal["mvseg-corrections/1"]
-    edits: Items[_Edit]
+    edits: Items[dict[str, Any]]
 
 
 class LinkEdit(BaseModel):
     """One link: at least two places (scene, view, x, y), pixels of the photo as the user has it."""
 
     op: Literal["same_track", "different_track"]
-    at: list[Place]
+    at: Annotated[list[Place], Field(min_length=2)]
 
 
 def read_link_edits(path: Path) -> list[LinkEdit]:
@@ -44,16 +37,12 @@ def read_link_edits(path: Path) -> list[LinkEdit]:
     """
     edits = []
     for index, edit in enumerate(read_json(path, _Corrections).edits):
-        if edit.op not in OPERATIONS:
-            continue
-        try:
-            found = LinkEdit.model_validate(edit.model_dump())
-        except ValueError:
-            message = 'expected "at": [["SCENE", "view", x, y], ...]'
-            raise InputError(f"{path}: edits[{index}]: {message}") from None
-        if len(found.at) < 2:
-            raise InputError(f"{path}: edits[{index}]: {edit.op} has {len(found.at)} places, expected two or more")
-        edits.append(found)
+        if edit.get("op") in ("same_track", "different_track"):
+            try:
+                edits.append(LinkEdit.model_validate(edit))
+            except ValidationError:
+                message = 'expected "at": [["SCENE", "view", x, y], ...], two places or more'
+                raise InputError(f"{path}: edits[{index}]: {message}") from None
     return edits
 
 
@@ -65,18 +54,15 @@ def find_links(edits: Sequence[LinkEdit], dates: Sequence[PlantOnDate]) -> tuple
     folders = {date.scene: date.folder for date in dates if date.folder is not None}
     links, lost = [], []
     for edit in edits:
-        here = [place for place in edit.at if place[0] in folders]
-        if not here:
+        if not any(scene in folders for scene, *_ in edit.at):
             continue
         leaves = []
         for scene, view, x, y in edit.at:
-            folder = folders.get(scene)
-            leaf = 0 if folder is None else leaf_at(folder, view, x, y)
-            if leaf:
-                leaves.append((scene, leaf))
-            else:
+            leaf = leaf_at(folders[scene], view, x, y) if scene in folders else 0
+            leaves.append((scene, leaf))
+            if not leaf:
                 lost.append(f"{edit.op}: there is no leaf at ({x:g}, {y:g}) in view {view} of {scene}")
-        if len(leaves) == len(edit.at):
+        if all(leaf for _, leaf in leaves):
             links.append(LeafLink(edit.op == "same_track", tuple(leaves)))
     return links, lost
 

@@ -25,6 +25,7 @@ FLIPPED = 3.0  # cost of a midrib that runs the other way on the other date, whe
 PARTING = 9.0  # log of how much rarer a stranger's differences are in each place, see `pair_costs`
 CLOUDS = 0.04  # scale of the distance between the points of two sights, as ACROSS
 APART = 3.0  # as PARTING, of `cloud_costs`
+SPREAD = 0.6  # see `typical_length`
 MOST_SD = 0.5  # standard deviations of surfaces count up to this share of the median length
 
 
@@ -65,8 +66,9 @@ class Leaves:
         ahead = self.midribs[:, -1] - self.midribs[:, 0]
         return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
 
-    def moved(self, rotation: Floats, shift: Floats) -> Leaves:
-        """In the frame of `rotation @ x + shift`."""
+    def moved(self, pose: Floats) -> Leaves:
+        """In another frame, by its pose (4, 4)."""
+        rotation, shift = pose[:3, :3], pose[:3, 3]
         return replace(
             self,
             midribs=self.midribs @ rotation.T + shift,
@@ -105,8 +107,14 @@ def leaves_of(date: PlantOnDate) -> Leaves:
 
 
 def typical_length(*dates: Leaves) -> float:
-    """Median length of the leaves of the date with the longest ones; what places are measured in."""
-    return max((float(np.median(leaves.lengths)) for leaves in dates if len(leaves)), default=1.0)
+    """What places are measured in: the median length of the leaves of the date with the longest ones; for plants of
+    many small leaflets, a share of how far their bases are spread."""
+    found = [1e-9]
+    for leaves in dates:
+        if len(leaves):
+            spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
+            found += [float(np.median(leaves.lengths)), SPREAD * float(np.sqrt(np.mean(spread**2)))]
+    return max(found)
 
 
 def pair_costs(first: Leaves, second: Leaves, *, days: float, scale: float, spread: float = 1.0) -> Floats:

@@ -6,6 +6,7 @@ import csv
 import datetime
 import math
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +20,8 @@ from mvseg.errors import InputError
 from mvseg.formats.json_file import Vector3, read_json
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE
 from mvseg.results.read import find_result
+from mvseg.traits.leaf import BASE_UNKNOWN, Measurement, cell_normals
+from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
 
 if TYPE_CHECKING:
@@ -66,7 +69,7 @@ class SeenLeaf:
     @property
     def length(self) -> float:
         """Along the midrib; NaN without a shape."""
-        return math.nan if self.midrib is None else polyline_length(self.midrib)
+        return math.nan if self.midrib is None else float(np.linalg.norm(np.diff(self.midrib, axis=0), axis=1).sum())
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +108,6 @@ class _World(BaseModel):
 
 
 class _Run(BaseModel):
-    scene: str = ""
     traits: _World | None = None
 
 
@@ -122,29 +124,20 @@ def read_date(folder: Path, time: str | float) -> PlantOnDate:
     folder = find_result(folder)
     if not (folder / "run.json").is_file():
         raise InputError(f"{folder}: is no result, expected a folder that mvseg infer or mvseg batch wrote")
-    run = read_json(folder / "run.json", _Run)
-    if run.traits is None or not (folder / "traits.csv").is_file():
+    world = read_json(folder / "run.json", _Run).traits
+    if world is None or not (folder / "traits.csv").is_file():
         raise InputError(f"{folder}: has ids but no surfaces, run mvseg infer or mvseg batch with these masks first")
-    frame = None if run.traits.up is None else level_frame(run.traits.up)
     by_leaf, methods = _read_traits(folder / "traits.csv")
-    leaves = []
-    for number, numbers in sorted((key, value) for key, value in by_leaf.items() if key):
-        if any(method.startswith(REJECTED) for method in methods[number].values()):
-            continue
-        path = folder / "leaves" / f"leaf_{number:03d}.ply"
-        vertices = _read_vertices(path) if path.is_file() else np.zeros((0, 3))
-        is_oriented = "base and tip cannot be told apart" not in methods[number].get("azimuth", "")
-        leaves.append(_leaf_of(number, vertices, numbers, frame, is_oriented=is_oriented))
+    frame, leaves = None if world.up is None else level_frame(world.up), []
+    for number, numbers in sorted(by_leaf.items()):
+        if number and not any(method.startswith(REJECTED) for method in methods[number].values()):
+            vertices = _read_vertices(folder / "leaves" / f"leaf_{number:03d}.ply")
+            is_oriented = BASE_UNKNOWN.method not in methods[number].get("azimuth", "")
+            leaves.append(_leaf_of(number, vertices, numbers, frame, is_oriented=is_oriented))
     return PlantOnDate(
-        scene=folder.name,
-        time=read_time(time),
-        written=str(time),
-        unit=run.traits.unit or "",
-        knows_up=frame is not None,
-        leaves=tuple(leaves),
-        whole=by_leaf.get(0, {}),
-        folder=folder,
-    )
+        scene=folder.name, time=read_time(time), written=str(time).strip(), unit=world.unit or "",
+        knows_up=frame is not None, leaves=tuple(leaves), whole=by_leaf.get(0, {}), folder=folder,
+    )  # fmt: skip
 
 
 def date_of(result: Result, time: str | float) -> PlantOnDate:
@@ -154,34 +147,26 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
         InputError: it has no surfaces.
     """
     from mvseg.reconstruction.shapes import best_shape
-    from mvseg.traits.ontology import DEFINITIONS, unit_of
 
     traits = result.traits
     if traits is None:
         raise InputError(f"{result.scene.name}: has ids but no surfaces, expected a run with reconstruct and traits")
-    frame = None if traits.up is None else level_frame(traits.up)
+    frame, leaves = None if traits.up is None else level_frame(traits.up), []
 
-    def numbers_of(found: Mapping[str, Any]) -> dict[str, Number]:
+    def numbers_of(found: Mapping[str, Measurement]) -> dict[str, Number]:
         units = {name: unit_of(DEFINITIONS[name].kind, traits.unit) for name in found}
         return {name: Number(m.value, m.sd, units[name]) for name, m in found.items() if m.exists}
 
-    leaves = []
     for leaf in traits.leaves:
-        if leaf.rejection is not None:
-            continue
-        shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
-        vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
-        is_oriented = bool(getattr(shape, "is_oriented", False))
-        leaves.append(_leaf_of(leaf.leaf, vertices, numbers_of(leaf.numbers), frame, is_oriented=is_oriented))
+        if leaf.rejection is None:
+            shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
+            vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
+            is_oriented = bool(getattr(shape, "is_oriented", False))
+            leaves.append(_leaf_of(leaf.leaf, vertices, numbers_of(leaf.numbers), frame, is_oriented=is_oriented))
     return PlantOnDate(
-        scene=result.scene.name,
-        time=read_time(time),
-        written=str(time),
-        unit=traits.unit,
-        knows_up=frame is not None,
-        leaves=tuple(leaves),
-        whole=numbers_of(traits.whole),
-    )
+        scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,
+        knows_up=frame is not None, leaves=tuple(leaves), whole=numbers_of(traits.whole),
+    )  # fmt: skip
 
 
 def read_time(time: str | float) -> float:
@@ -192,17 +177,13 @@ def read_time(time: str | float) -> float:
     """
     text = str(time).strip()
     try:
-        number = float(text)
+        if math.isfinite(number := float(text)):
+            return number
     except ValueError:
-        try:
-            moment = datetime.datetime.fromisoformat(text)
-        except ValueError:
-            raise InputError(f"time '{time}': expected a number (days) or an ISO date, as in 2026-05-31") from None
-        seconds = moment.hour * 3600 + moment.minute * 60 + moment.second
-        return moment.toordinal() + seconds / 86400
-    if not math.isfinite(number):
-        raise InputError(f"time '{time}': expected a number (days) or an ISO date")
-    return number
+        with suppress(ValueError):
+            moment = datetime.datetime.fromisoformat(text).replace(tzinfo=None)
+            return 1 + (moment - datetime.datetime.min) / datetime.timedelta(days=1)
+    raise InputError(f"time '{time}': expected a number (days) or an ISO date, as in 2026-05-31")
 
 
 def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
@@ -211,49 +192,38 @@ def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
     Raises:
         InputError: two dates have the same time, numbers and ISO dates are mixed, or units cannot be converted.
     """
-    kinds = {_is_number(date.written) for date in dates}
-    if len(kinds) > 1:
+    are_iso = {_is_iso(date.written) for date in dates}
+    if len(are_iso) > 1:
         raise InputError("the times are numbers and ISO dates, expected one of the two for all dates of a plant")
     ordered = sorted(dates, key=lambda date: date.time)
     for earlier, later in pairwise(ordered):
         if earlier.time == later.time:
             message = f"{earlier.scene} and {later.scene} have the same time {later.written}"
             raise InputError(f"{message}, expected each date of a plant once")
-    start = 0.0 if kinds == {True} else math.floor(ordered[0].time)
-    unit = ordered[0].unit
-    return tuple(replace(_in_unit(date, unit, ordered[0].scene), time=date.time - start) for date in ordered)
+    start = math.floor(ordered[0].time) if are_iso == {True} else 0.0
+    return tuple(replace(_in_unit(date, ordered[0]), time=date.time - start) for date in ordered)
 
 
-def polyline_length(points: Floats) -> float:
-    """Length of a line through points (P, 3)."""
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-def _is_number(text: str) -> bool:
+def _is_iso(text: str) -> bool:
     try:
-        float(text)
+        return not math.isfinite(float(text))
     except ValueError:
-        return False
-    return True
+        return True
 
 
-def _in_unit(date: PlantOnDate, unit: str, first: str) -> PlantOnDate:
-    if date.unit == unit:
+def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
+    """The date with all lengths in the unit of the first."""
+    if date.unit == first.unit:
         return date
-    if date.unit not in UNITS or unit not in UNITS:
-        said = [name or "no unit" for name in (unit, date.unit)]
-        message = f"{first} is in {said[0]} and {date.scene} in {said[1]}"
+    if date.unit not in UNITS or first.unit not in UNITS:
+        message = f"{first.scene} is in {first.unit or 'no unit'} and {date.scene} in {date.unit or 'no unit'}"
         raise InputError(f"{message}, expected one unit for all dates, or m, cm and mm (--unit, --scale)")
-    factor = UNITS[date.unit] / UNITS[unit]
+    factor = UNITS[date.unit] / UNITS[first.unit]
+    units = {f"{date.unit}{power}": (f"{first.unit}{power}", factor**n) for n, power in enumerate(("", "^2", "^3"), 1)}
 
     def convert(numbers: Mapping[str, Number]) -> dict[str, Number]:
-        powers = {date.unit: 1, f"{date.unit}^2": 2, f"{date.unit}^3": 3}
-        return {
-            name: Number(n.value * factor**power, n.sd * factor**power, n.unit.replace(date.unit, unit))
-            if (power := powers.get(n.unit, 0))
-            else n
-            for name, n in numbers.items()
-        }
+        found = {name: (number, *units.get(number.unit, (number.unit, 1.0))) for name, number in numbers.items()}
+        return {name: Number(n.value * times, n.sd * times, unit) for name, (n, unit, times) in found.items()}
 
     leaves = tuple(
         replace(
@@ -264,7 +234,7 @@ def _in_unit(date: PlantOnDate, unit: str, first: str) -> PlantOnDate:
         )
         for leaf in date.leaves
     )
-    return replace(date, unit=unit, leaves=leaves, whole=convert(date.whole))
+    return replace(date, unit=first.unit, leaves=leaves, whole=convert(date.whole))
 
 
 def _read_traits(path: Path) -> tuple[dict[int, dict[str, Number]], dict[int, dict[str, str]]]:
@@ -278,16 +248,18 @@ def _read_traits(path: Path) -> tuple[dict[int, dict[str, Number]], dict[int, di
                 methods.setdefault(leaf, {})[row["trait"]] = row["method"]
                 found = numbers.setdefault(leaf, {})
                 if row["value"]:
-                    sd = float(row["sd"]) if row["sd"] else math.nan
-                    found[row["trait"]] = Number(float(row["value"]), sd, row["unit"])
+                    found[row["trait"]] = Number(float(row["value"]), float(row["sd"] or "nan"), row["unit"])
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise InputError(f"{path}: is no table of traits that mvseg wrote ({error})") from None
     return numbers, methods
 
 
 def _read_vertices(path: Path) -> Floats:
+    """(P, 3) vertices of a mesh; none where there is no file."""
     import trimesh  # slow to load
 
+    if not path.is_file():
+        return np.zeros((0, 3))
     try:
         mesh: Any = trimesh.load(path, process=False, force="mesh")
         return np.asarray(mesh.vertices, dtype=np.float64)
@@ -303,16 +275,21 @@ def _leaf_of(
     points = vertices if frame is None else vertices @ frame.T
     rows, columns = MESH_SHAPE
     if len(points) == 2 + (rows - 2) * columns:
-        grid = points[1:-1].reshape(rows - 2, columns, 3)
-        midrib = resample(np.concatenate([points[:1], grid[:, columns // 2], points[-1:]]))
-        normal = np.cross(grid[1:, :-1] - grid[:-1, 1:], grid[1:, 1:] - grid[:-1, :-1]).sum((0, 1))
-        cloud = grid[np.linspace(0, rows - 3, ROWS).round().astype(int)][:, [0, columns // 2, -1]].reshape(-1, 3)
-    else:
-        midrib, normal = _midrib_of_voxels(points)
-        cloud, is_oriented = points[np.linspace(0, len(points) - 1, CLOUD).round().astype(int)], False
-    size = float(np.linalg.norm(normal))
-    normal = normal / size if size > 0 else np.array([0.0, 0.0, 1.0])
-    return SeenLeaf(number, midrib, normal, cloud, is_oriented, numbers)
+        return see_surface(number, points, columns, numbers, is_oriented=is_oriented)
+    midrib, normal = _midrib_of_voxels(points)
+    cloud = points[np.linspace(0, len(points) - 1, CLOUD).round().astype(int)]
+    return SeenLeaf(number, midrib, normal, cloud, False, numbers)
+
+
+def see_surface(
+    number: int, vertices: Floats, columns: int, numbers: Mapping[str, Number], *, is_oriented: bool
+) -> SeenLeaf:
+    """A leaf from the vertices (P, 3) of its surface: the base, rows of a grid with so many columns, and the tip."""
+    grid = vertices[1:-1].reshape(-1, columns, 3)
+    midrib = resample(np.concatenate([vertices[:1], grid[:, columns // 2], vertices[-1:]]))
+    normal = cell_normals(grid).sum((0, 1))
+    cloud = grid[np.linspace(0, len(grid) - 1, ROWS).round().astype(int)][:, [0, columns // 2, -1]].reshape(-1, 3)
+    return SeenLeaf(number, midrib, normal / max(float(np.linalg.norm(normal)), 1e-12), cloud, is_oriented, numbers)
 
 
 def resample(line: Floats) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
 from pathlib import Path
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mvseg.errors import InputError
-from mvseg.tracking.associate import DatePair, Link, Sight, compare_dates, link_leaves
+from mvseg.tracking.associate import Comparison, Link, Sight, compare_dates, link_leaves
 from mvseg.tracking.costs import leaves_of
 from mvseg.tracking.dates import Floats, PlantOnDate, date_of, order_dates, read_date
 
@@ -36,19 +36,19 @@ class TrackRow:
 
     Attributes:
         date: index into `Tracks.dates`.
-        leaf: its id in that date's result; None where the track is hidden or gone.
         track: from 1 on, in the order of appearance.
-        probability: that the leaf is the one that the track showed before; of the first one of a track, that it is none
-            of the tracks before. NaN where there is no leaf, or nothing to compare with.
         state: "born" where it appears after the first date, "seen", "hidden" where it is missing between two sights,
             "gone" on the first date on which it is missing for good.
+        leaf: its id in that date's result; None where the track is hidden or gone.
+        probability: that the leaf is the one that the track showed before; NaN of the first one of a track, and where
+            there is no leaf.
     """
 
     date: int
-    leaf: int | None
     track: int
-    probability: float
     state: State
+    leaf: int | None = None
+    probability: float = math.nan
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,8 +59,8 @@ class Tracks:
         plant: its name.
         dates: in the order of time, all in the unit of the first.
         rows: by date, then by track.
-        poses: (T, 4, 4) first_from_date, where the frame of a date stands in that of the first date it is surely
-            aligned with, by way of others; NaN where it is aligned with none before it.
+        poses: (T, 4, 4) first_from_date, where the frame of a date stands in that of the earliest date that it is
+            surely aligned with, by way of others; the identity where there is none.
         warnings: dates that could not be aligned, and why.
     """
 
@@ -106,16 +106,17 @@ def track_leaves(
         raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")
     if len(results) < 2:
         raise InputError(f"{plant}: has {len(results)} date, expected two or more")
-    written = list(range(len(results))) if times is None else times
+    written = range(len(results)) if times is None else times
     dates = order_dates([_date(result, time) for result, time in zip(results, written, strict=True)])
     leaves = [leaves_of(date) for date in dates]
-    knows_up = all(date.knows_up for date in dates)
-    compared = compare_dates(leaves, [date.time for date in dates], knows_up=knows_up)
+    compared = compare_dates(leaves, [date.time for date in dates], knows_up=all(date.knows_up for date in dates))
     same, different = _sights_of(links, dates)
-    links_found = link_leaves([len(each) for each in leaves], compared, same=same, different=different)
-    index = [each.index for each in leaves]
-    rows = _rows(dates, _chains(dates, links_found, index), compared)
-    return Tracks(plant, dates, rows, _poses(len(dates), compared), _warnings(dates, compared))
+    found = link_leaves([len(each) for each in leaves], compared.costs, same=same, different=different)
+    return Tracks(
+        plant=plant, dates=dates, rows=_rows(dates, found, compared.roots),
+        poses=compared.poses,
+        warnings=tuple(_warnings(dates, compared)),
+    )  # fmt: skip
 
 
 def _date(result: Path | str | Result | PlantOnDate, time: float | str) -> PlantOnDate:
@@ -128,20 +129,20 @@ def _sights_of(
     links: Sequence[LeafLink], dates: Sequence[PlantOnDate]
 ) -> tuple[list[tuple[Sight, Sight]], list[tuple[Sight, Sight]]]:
     """Pairs of rows of `Leaves` that are one leaf, in the order of time, and pairs that are not."""
-    scenes = {date.scene: index for index, date in enumerate(dates)}
-    if links and len(scenes) < len(dates):
+    rows = {date.scene: (index, {date.leaves[n].leaf: k for k, n in enumerate(date.shaped)})
+            for index, date in enumerate(dates)}  # fmt: skip
+    if links and len(rows) < len(dates):
         raise InputError("two dates have results of one name, expected different names where links name them")
     same, different = [], []
     for link in links:
         sights = []
         for scene, leaf in link.leaves:
-            if scene not in scenes:
-                raise InputError(f"a link names the scene {scene}, expected one of {', '.join(scenes)}")
-            date = dates[scenes[scene]]
-            rows = [row for row, place in enumerate(date.shaped) if date.leaves[place].leaf == leaf]
-            if not rows:
+            if scene not in rows:
+                raise InputError(f"a link names the scene {scene}, expected one of {', '.join(rows)}")
+            index, row_of = rows[scene]
+            if leaf not in row_of:
                 raise InputError(f"a link names leaf {leaf} of {scene}, which is no leaf with a shape")
-            sights.append((scenes[scene], rows[0]))
+            sights.append((index, row_of[leaf]))
         sights.sort()
         if link.is_same and len({date for date, _ in sights}) < len(sights):
             raise InputError(f"a link says that two leaves of {dates[sights[0][0]].scene} are one, over days none are")
@@ -154,81 +155,36 @@ def _sights_of(
     return same, different
 
 
-def _chains(
-    dates: Sequence[PlantOnDate], links: Sequence[Link], index: Sequence[np.ndarray]
-) -> list[list[tuple[int, int, float]]]:
-    """Tracks as lists of (date, place in its leaves, probability), in the order of appearance; leaves without a shape
-    are tracks of one date."""
-    after = {(link.before[0], int(index[link.before[0]][link.before[1]])): link for link in links}
-    later = {(link.after[0], int(index[link.after[0]][link.after[1]])) for link in links}
-    chains = []
-    for date, seen in enumerate(dates):
-        for place in range(len(seen.leaves)):
-            if (date, place) in later:
-                continue
-            chain, at = [(date, place, math.nan)], (date, place)
-            while at in after:
-                link = after[at]
-                at = link.after[0], int(index[link.after[0]][link.after[1]])
-                chain.append((*at, link.probability))
-            chains.append(chain)
-    return chains
-
-
-def _rows(
-    dates: Sequence[PlantOnDate],
-    chains: Sequence[Sequence[tuple[int, int, float]]],
-    compared: dict[tuple[int, int], DatePair],
-) -> tuple[TrackRow, ...]:
+def _rows(dates: Sequence[PlantOnDate], links: Sequence[Link], roots: np.ndarray) -> tuple[TrackRow, ...]:
+    """All tracks, by date; leaves without a shape are tracks of one date."""
+    place_of = {(n, row): (n, place) for n, date in enumerate(dates) for row, place in enumerate(date.shaped)}
+    after = {place_of[link.before]: (place_of[link.after], link.probability) for link in links}
+    later = {at for at, _ in after.values()}
+    starts = [(n, k) for n, date in enumerate(dates) for k in range(len(date.leaves)) if (n, k) not in later]
     rows = []
-    for track, chain in enumerate(chains, start=1):
-        first, last = chain[0][0], chain[-1][0]
-        seen = {date: (place, probability) for date, place, probability in chain}
-        for date in range(first, last + 1):
-            if date not in seen:
-                rows.append(TrackRow(date, None, track, math.nan, "hidden"))
-                continue
-            place, probability = seen[date]
-            state: State = "seen"
-            if date == first and _is_sure(compared, date - 1, date):
-                state = "born"
-            rows.append(TrackRow(date, dates[date].leaves[place].leaf, track, probability, state))
-        if _is_sure(compared, last, last + 1):
-            rows.append(TrackRow(last + 1, None, track, math.nan, "gone"))
+    for track, start in enumerate(starts, start=1):
+        state: State = "born" if start[0] > 0 and roots[start[0] - 1] == roots[start[0]] else "seen"
+        (date, place), chance = start, math.nan
+        while True:
+            leaf = dates[date].leaves[place].leaf
+            rows.append(TrackRow(date=date, track=track, state=state, leaf=leaf, probability=chance))
+            if (date, place) not in after:
+                break
+            before, ((date, place), chance), state = date, after[date, place], "seen"
+            rows += [TrackRow(date=n, track=track, state="hidden") for n in range(before + 1, date)]
+        if date + 1 < len(dates) and roots[date] == roots[date + 1]:
+            rows.append(TrackRow(date=date + 1, track=track, state="gone"))
     return tuple(sorted(rows, key=lambda row: (row.date, row.track)))
 
 
-def _is_sure(compared: dict[tuple[int, int], DatePair], earlier: int, later: int) -> bool:
-    return (earlier, later) in compared and compared[earlier, later].alignment.is_sure
-
-
-def _poses(num_dates: int, compared: dict[tuple[int, int], DatePair]) -> Floats:
-    """(T, 4, 4) first_from_date by way of the nearest earlier date that is surely aligned."""
-    poses = np.full((num_dates, 4, 4), np.nan)
-    for later in range(num_dates):
-        poses[later] = np.nan
-        for earlier in range(later - 1, -1, -1):
-            if _is_sure(compared, earlier, later):
-                start = np.eye(4) if np.isnan(poses[earlier]).any() else poses[earlier]
-                alignment, step = compared[earlier, later].alignment, np.eye(4)
-                step[:3, :3] = alignment.rotation.T
-                step[:3, 3] = -alignment.rotation.T @ alignment.shift
-                poses[later] = start @ step
-                break
-    return poses
-
-
-def _warnings(dates: Sequence[PlantOnDate], compared: dict[tuple[int, int], DatePair]) -> tuple[str, ...]:
-    said = []
+def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[str]:
     for later in range(1, len(dates)):
-        if any(_is_sure(compared, earlier, later) for earlier in range(later)):
-            continue
-        reason = compared[later - 1, later].alignment.reason
-        pair = f"{dates[later - 1].scene} and {dates[later].scene}"
-        said.append(f"{pair} cannot be aligned surely ({reason}): their leaves are not linked")
+        if compared.roots[later] == later:
+            reason = compared.reasons[later - 1]
+            pair = f"{dates[later - 1].scene} and {dates[later].scene}"
+            yield f"{pair} cannot be aligned surely ({reason}): their leaves are not linked"
     if not all(date.knows_up for date in dates):
-        said.append("up is not known on all dates (--up): any turn of the plant was looked at, which is less sure")
+        yield "up is not known on all dates (--up): any turn of the plant was looked at, which is less sure"
     shapeless = sum(len(date.leaves) - len(date.shaped) for date in dates)
     if shapeless:
-        said.append(f"{shapeless} leaves have no shape (seen in one view): each is a track of one date")
-    return tuple(said)
+        yield f"{shapeless} leaves have no shape (seen in one view): each is a track of one date"

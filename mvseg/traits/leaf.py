@@ -135,9 +135,7 @@ def _base_height(coefficients: Floats, frame: Floats | None) -> float:
     return float("nan") if frame is None else float((_ENDS[0] @ coefficients) @ frame[2])
 
 
-def _directions(
-    coefficients: Floats, frame: Floats | None, *, normal: Floats
-) -> dict[str, tuple[Floats, Floats]]:
+def _directions(coefficients: Floats, frame: Floats | None, *, normal: Floats) -> dict[str, tuple[Floats, Floats]]:
     """{angle: the two directions, (3,) of any length, that it lies between}; `normal` (3,) is the mean one."""
     ends, (left, middle, right) = _ENDS @ coefficients, _HALVES @ coefficients
     base, ahead, tip = ends[1] - ends[0], ends[2] - ends[1], ends[3] - ends[2]

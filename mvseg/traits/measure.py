@@ -114,9 +114,7 @@ def measure_plant(
     rejected = find_rejected(shapes, Support(sure_views, visible), up, config=config)
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     cells = {} if frame is None else look_from_above(blades, frame)
-    numbers = {
-        instance: _count(instance, matching.masks, sure_views=sure_views) for instance in instances
-    }
+    numbers = {instance: _count(instance, matching.masks, sure_views=sure_views) for instance in instances}
     for instance, found in measure_blades(blades, frame, cells=cells).items():
         numbers[instance] |= found | appearance[instance]
     for instance in voxels.keys() - rejected.keys():
@@ -128,9 +126,7 @@ def measure_plant(
         leaves.append(describe_leaf(instance, numbers[instance], best[instance], fitted=fitted, rejection=rejection))
     whole = measure_whole(blades, cells, frame, num_leaves=len(instances) - len(rejected))
     known = tuple(dict.fromkeys(each for each in corrections if each is not None))
-    return Traits(
-        plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, corrections=known
-    )
+    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, corrections=known)
 
 
 def measure_blades(

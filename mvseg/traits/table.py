@@ -6,6 +6,7 @@ A cell of text that a spreadsheet would run as a formula gets an apostrophe in f
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, VOXEL_
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology")
 FORMULA_STARTS = ("=", "+", "-", "@")
+NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
 
 
@@ -49,26 +51,29 @@ def wide_columns() -> list[str]:
 
 
 def _row(traits: Traits, name: str, number: Measurement, *, leaf: int | str) -> list[str | int]:
-    definition = DEFINITIONS[name]
-    unit = unit_of(definition.kind, traits.unit)
-    method, ontology = number.method, definition.ontology
-    return [
-        escape_text(traits.plant), leaf, name, format_number(number.value), format_number(number.sd),
-        escape_text(unit), escape_text(method), ontology,
-    ]  # fmt: skip
+    unit, ontology = unit_of(DEFINITIONS[name].kind, traits.unit), DEFINITIONS[name].ontology
+    return as_cells(traits.plant, leaf, name, number.value, number.sd, unit, number.method, ontology)
 
 
 def _wide_row(traits: Traits, leaf: LeafTraits) -> list[str | int]:
-    cells: list[str | int] = [leaf.leaf]
+    numbers: list[float] = []
     for trait in LEAF_TRAITS:
         if trait.name != "quality":
             number = leaf.numbers[trait.name]
-            cells.append(format_number(number.value))
-            if trait.has_sd:
-                cells.append(format_number(number.sd))
-    unit = escape_text(traits.unit or UNKNOWN_UNIT)
-    method, quality = escape_text(leaf.method), escape_text("; ".join(leaf.reasons) or "good")
-    return [*cells, format_number(leaf.numbers["quality"].value), unit, method, quality]
+            numbers += [number.value, number.sd] if trait.has_sd else [number.value]
+    texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or "good"
+    return as_cells(leaf.leaf, *numbers, leaf.numbers["quality"].value, *texts)
+
+
+def as_cells(*values: str | float | None) -> list[str | int]:
+    """Whole numbers as they are, other numbers by `format_number`, text by `escape_text`, None as ""."""
+    return [
+        escape_text(value) if isinstance(value, str)
+        else value if isinstance(value, int)
+        else "" if value is None
+        else format_number(value)
+        for value in values
+    ]  # fmt: skip
 
 
 def format_number(value: float) -> str:
@@ -77,9 +82,9 @@ def format_number(value: float) -> str:
 
 
 def escape_text(text: str) -> str:
-    """Text in one line that no spreadsheet takes for a formula."""
+    """Text in one line that no spreadsheet takes for a formula; numbers stay numbers, also negative ones."""
     text = " ".join(text.split())
-    return f"'{text}" if text.startswith(FORMULA_STARTS) else text
+    return f"'{text}" if text.startswith(FORMULA_STARTS) and not NUMBER.fullmatch(text) else text
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str | int]]) -> None:

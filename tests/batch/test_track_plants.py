@@ -7,6 +7,7 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from mvseg.batch.track_plants import list_plants
@@ -104,3 +105,20 @@ def test_a_batch_without_two_dates_is_refused(tmp_path: Path) -> None:
     batch = write_batch(tmp_path / "batch", [("a0", "a", "0"), ("b0", "b", "0")])
     with pytest.raises(InputError, match="no plant has two finished dates"):
         list_plants(batch)
+
+
+def test_the_growth_model_of_the_docs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names = [str(tmp_path / f"day-{day}") for day in range(6)]
+    sizes = [1 / (1 + np.exp(-0.8 * (day - 2))) for day in range(6)]
+    for name, size in zip(names, sizes, strict=True):
+        write_result(Path(name), grown(BLADES, float(0.7 + 0.3 * size)))
+    times = [str(day) for day in range(6)]
+    assert main(["track", *names, "--times", *times, "--out", str(tmp_path / "tracks"), "--quiet"]) == 0
+    page = (Path(__file__).parents[2] / "docs" / "tracking.md").read_text(encoding="utf-8")
+    (model,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    capsys.readouterr()
+    exec(model, {})
+    assert len(re.findall(r"^tracks \d+ \[", capsys.readouterr().out, re.MULTILINE)) == 7

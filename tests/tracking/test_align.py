@@ -21,8 +21,8 @@ def test_a_pot_that_was_turned_moved_and_leans(turn: float, lean: float) -> None
     assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]
     assert len(alignment.pairs) == 9
     true = Rotation.from_euler("zx", [turn, lean], degrees=True).as_matrix()
-    assert np.degrees(Rotation.from_matrix(alignment.rotation.T @ true).magnitude()) < 4
-    np.testing.assert_allclose(alignment.shift, (200, -80, 15), atol=15)
+    assert np.degrees(Rotation.from_matrix(alignment.pose[:3, :3].T @ true).magnitude()) < 4
+    np.testing.assert_allclose(alignment.pose[:3, 3], (200, -80, 15), atol=15)
 
 
 def test_up_need_not_be_known() -> None:

@@ -1,81 +1,106 @@
-"""Linking leaves over all dates: the cheapest paths, and their probabilities."""
+"""Joining the sights of leaves over all dates, against all ways to do so; and how dates hold each other."""
 
 from __future__ import annotations
 
-import networkx
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
-from mvseg.tracking.align import Alignment
-from mvseg.tracking.associate import UNLINKED, DatePair, gap_cost, link_leaves, probability
+from mvseg.errors import InputError
+from mvseg.tracking.align import Alignment, make_poses
+from mvseg.tracking.associate import UNLINKED, Link, join_sights, link_leaves, place_dates
 
-SURE = Alignment(np.eye(3), np.zeros(3), np.zeros((0, 2), int), gain=50.0, margin=50.0)
-Compared = dict[tuple[int, int], DatePair]
+Costs = dict[tuple[int, int], np.ndarray]
 
 
-def draw_costs(counts: list[int], seed: int) -> Compared:
+def draw_gains(counts: list[int], seed: int, *, noise: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Gains of sights of leaves that are seen by chance, the date of each, and the leaf."""
     rng = np.random.default_rng(seed)
-    pairs = [(a, b) for a in range(len(counts)) for b in range(a + 1, min(a + 4, len(counts)))]
-    return {(a, b): DatePair(SURE, rng.normal(0, 5, (counts[a], counts[b])).round(2)) for a, b in pairs}
+    date_of = np.repeat(np.arange(len(counts)), counts)
+    leaf = np.concatenate([rng.permutation(max(counts))[:count] for count in counts])
+    same = leaf[:, None] == leaf
+    gains = np.where(same, 3.0, -3.0) + rng.normal(0, noise, same.shape)
+    gains[date_of[:, None] == date_of] = 0
+    return gains + gains.T, date_of, leaf
 
 
-def least_flow(counts: list[int], compared: Compared) -> int:
-    """The cost of the cheapest flow, in hundredths, with networkx: every link saves what it costs less than a cut."""
-    graph = networkx.DiGraph()
-    sights = [(date, row) for date, count in enumerate(counts) for row in range(count)]
-    for sight in sights:
-        graph.add_edge("source", ("out", sight), capacity=1, weight=0)
-        graph.add_edge(("in", sight), "sink", capacity=1, weight=0)
-    graph.add_edge("source", "sink", capacity=len(sights), weight=0)
-    for (a, b), pair in compared.items():
-        for i in range(counts[a]):
-            for j in range(counts[b]):
-                cost = pair.costs[i, j] + gap_cost(b - a) - UNLINKED
-                graph.add_edge(("out", (a, i)), ("in", (b, j)), capacity=1, weight=round(100 * cost))
-    graph.nodes["source"]["demand"], graph.nodes["sink"]["demand"] = -len(sights), len(sights)
-    return int(networkx.min_cost_flow_cost(graph))
+def every_partition(date_of: np.ndarray) -> Iterator[list[int]]:
+    """All ways to part sights into tracks, none with two of a date."""
+
+    def extend(tracks: list[int]) -> Iterator[list[int]]:
+        if len(tracks) == len(date_of):
+            yield tracks
+            return
+        taken = {track for track, date in zip(tracks, date_of, strict=False) if date == date_of[len(tracks)]}
+        for track in sorted({*tracks, max(tracks, default=-1) + 1} - taken):
+            yield from extend([*tracks, track])
+
+    return extend([])
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_links_are_a_flow_of_least_cost(seed: int) -> None:
-    counts = [3, 4, 2, 5]
-    compared = draw_costs(counts, seed)
-    links = link_leaves(counts, compared)
-    costs = [
-        compared[link.before[0], link.after[0]].costs[link.before[1], link.after[1]]
-        + gap_cost(link.after[0] - link.before[0]) - UNLINKED
-        for link in links
-    ]  # fmt: skip
-    assert round(100 * sum(costs)) == least_flow(counts, compared)
-    for side in ("before", "after"):
-        assert len({getattr(link, side) for link in links}) == len(links)
+def gain_of(tracks: np.ndarray | list[int], gains: np.ndarray) -> float:
+    together = np.asarray(tracks)[:, None] == np.asarray(tracks)
+    return float(gains[together].sum() / 2)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_parting_is_better(seed: int) -> None:
+    gains, date_of, _ = draw_gains([2, 3, 2, 2], seed, noise=3.0)
+    best = max(gain_of(tracks, gains) for tracks in every_partition(date_of))
+    found = join_sights(gains, date_of)
+    assert gain_of(found, gains) == pytest.approx(best, rel=0.02)
+    for date in range(4):
+        assert len(set(found[date_of == date])) == (date_of == date).sum()
+
+
+def test_leaves_that_are_alike_are_one_track() -> None:
+    gains, date_of, leaf = draw_gains([5, 7, 6, 7, 4], 3, noise=0.5)
+    tracks = join_sights(gains, date_of)
+    assert ((tracks[:, None] == tracks) == (leaf[:, None] == leaf)).all()
+
+
+def pairs_of(links: list[Link]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+    return [(link.before, link.after) for link in links]
 
 
 def test_a_hidden_leaf_is_linked_over_the_gap() -> None:
-    far = np.full((1, 1), -8.0)
-    compared = {
-        (0, 1): DatePair(SURE, np.zeros((1, 0))),
-        (1, 2): DatePair(SURE, np.zeros((0, 1))),
-        (0, 2): DatePair(SURE, far),
-    }
-    (link,) = link_leaves([1, 0, 1], compared)
-    assert (link.before, link.after) == ((0, 0), (2, 0))
+    assert pairs_of(link_leaves([1, 0, 1], {(0, 2): np.full((1, 1), -8.0)})) == [((0, 0), (2, 0))]
+
+
+def test_dates_around_outweigh_one_on_which_two_leaves_look_swapped() -> None:
+    alike, odd = np.array([[-8.0, 5.0], [5.0, -8.0]]), np.array([[1.0, -1.0], [-1.0, 1.0]])
+    costs: Costs = {(0, 1): odd, (1, 2): alike, (0, 2): 2 * alike}
+    assert ((0, 0), (1, 0)) in pairs_of(link_leaves([2, 2, 2], costs))
+    assert ((0, 0), (1, 1)) in pairs_of(link_leaves([2, 2], {(0, 1): odd}))
 
 
 def test_nothing_is_linked_across_dates_that_are_not_aligned() -> None:
-    compared = {(0, 1): DatePair(SURE, np.full((2, 2), np.inf))}
-    assert link_leaves([2, 2], compared) == []
+    assert link_leaves([2, 2], {}) == []
     assert link_leaves([0, 0], {}) == []
+    assert link_leaves([1, 1], {(0, 1): np.full((1, 1), UNLINKED + 0.1)}) == []
 
 
 def test_a_person_is_obeyed() -> None:
-    compared = {(0, 1): DatePair(SURE, np.array([[-8.0, 5.0], [5.0, -8.0]]))}
-    same = link_leaves([2, 2], compared, same=[((0, 0), (1, 1))])
+    costs: Costs = {(0, 1): np.array([[-8.0, 5.0], [5.0, -8.0]])}
+    same = link_leaves([2, 2], costs, same=[((0, 0), (1, 1))])
     assert {(link.before[1], link.after[1]): link.probability for link in same} == {(0, 1): 1.0}
-    different = link_leaves([2, 2], compared, different=[((0, 0), (1, 0))])
+    different = link_leaves([2, 2], costs, different=[((0, 0), (1, 0))])
     assert [(link.before[1], link.after[1]) for link in different] == [(1, 1)]
+    with pytest.raises(InputError, match="contradicts itself"):
+        link_leaves([1, 2], {}, same=[((0, 0), (1, 0)), ((0, 0), (1, 1))])
 
 
 def test_rivals_make_a_link_less_probable() -> None:
-    alone, rivalled = np.array([[-5.0, 9.0]]), np.array([[-5.0, -4.0]])
-    assert 0 < probability(rivalled, 0, 0) < 0.95 < probability(alone, 0, 0) < 1
+    (alone,), (rivalled, *_) = (link_leaves([1, 2], {(0, 1): np.array([row])}) for row in ([-9.0, 9.0], [-9.0, -8.5]))
+    assert 0 < rivalled.probability < 0.97 < alone.probability < 1
+
+
+def test_dates_stand_as_the_surest_alignments_say() -> None:
+    def moved(x: float, margin: float, reason: str = "") -> Alignment:
+        return Alignment(make_poses(np.eye(3), np.array([x, 0, 0])), np.zeros((0, 2), int), 50.0, margin, reason)
+
+    pairs = {(0, 1): moved(-1, 30), (1, 2): moved(-1, 30), (0, 2): moved(9, 20), (2, 3): moved(5, 3, "not sure")}
+    poses, roots = place_dates(5, pairs)
+    np.testing.assert_allclose(poses[:, 0, 3], [0, 1, 2, 0, 0])
+    assert roots.tolist() == [0, 0, 0, 3, 4]

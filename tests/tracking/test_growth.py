@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mvseg.tracking.dates import Number, PlantOnDate
-from mvseg.tracking.growth import fit_curves, growth_points, plant_rows, slope
+from mvseg.tracking.growth import measure_growth, slope
 from mvseg.tracking.track import TrackRow, Tracks
 from tests.plants_over_days import grow_blades, see
 
@@ -24,7 +24,7 @@ def one_leaf(areas: list[float], times: list[float], *, sd: float = 0.02) -> Tra
         return replace(date, time=time, written=f"{time:g}", leaves=(leaf,))
 
     dates = tuple(on(time, area) for time, area in zip(times, areas, strict=True))
-    rows = tuple(TrackRow(index, 1, 1, math.nan, "seen") for index in range(len(times)))
+    rows = tuple(TrackRow(date=index, track=1, state="seen", leaf=1) for index in range(len(times)))
     return Tracks("p", dates, rows, np.tile(np.eye(4), (len(times), 1, 1)), ())
 
 
@@ -38,7 +38,7 @@ def test_slopes_and_their_deviations() -> None:
 
 
 def test_points_carry_the_numbers_of_the_results() -> None:
-    points = growth_points(one_leaf([100, 140, 180], [0, 2, 4]))
+    points = measure_growth(one_leaf([100, 140, 180], [0, 2, 4])).points
     assert [point.number.value for point in points] == [100, 140, 180]
     assert [point.number.sd for point in points] == pytest.approx([2, 2.8, 3.6])
     assert [point.rate for point in points] == pytest.approx([20] * 3)
@@ -54,11 +54,11 @@ def test_points_carry_the_numbers_of_the_results() -> None:
 )
 def test_curves_of_known_parameters(model: str, curve: Callable[[np.ndarray], np.ndarray]) -> None:
     times = np.arange(0, 13, 1.5)
-    (found,) = fit_curves(one_leaf(curve(times).tolist(), times.tolist()))
+    (found,) = measure_growth(one_leaf(curve(times).tolist(), times.tolist())).curves
     assert found.model == model
     np.testing.assert_allclose(found.at(times), curve(times), rtol=0.03, atol=3)
     if model == "logistic":
-        assert (found.size, found.rate, found.middle) == pytest.approx((900, 0.7, 6), rel=0.02)
+        assert found.parameters == pytest.approx((900, 0.7, 6), rel=0.02)
         assert 0 < found.sds[0] < 30
 
 
@@ -66,16 +66,16 @@ def test_one_wrong_date_does_not_bend_a_curve() -> None:
     times = np.arange(0, 13, 1.5)
     areas = 900 / (1 + np.exp(-0.7 * (times - 6)))
     areas[6] *= 0.5
-    (found,) = fit_curves(one_leaf(areas.tolist(), times.tolist()))
-    assert found.size == pytest.approx(900, rel=0.06)
+    (found,) = measure_growth(one_leaf(areas.tolist(), times.tolist())).curves
+    assert found.parameters[0] == pytest.approx(900, rel=0.06)
 
 
 def test_few_dates_get_no_curve() -> None:
-    assert fit_curves(one_leaf([1, 2, 3, 4], [0, 1, 2, 3])) == []
+    assert measure_growth(one_leaf([1, 2, 3, 4], [0, 1, 2, 3])).curves == ()
 
 
 def test_the_plant_grows() -> None:
-    first, second = plant_rows(one_leaf([100, 100 * math.e], [0, 2]))
+    first, second = measure_growth(one_leaf([100, 100 * math.e], [0, 2])).plant
     assert math.isnan(first.relative_growth_rate.value)
     assert second.relative_growth_rate.value == pytest.approx(0.5)
     assert second.relative_growth_rate.sd == pytest.approx(math.hypot(0.02, 0.02) / 2)

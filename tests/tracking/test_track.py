@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
 from mvseg.tracking.dates import PlantOnDate
@@ -61,7 +62,32 @@ def test_a_repotted_plant_gets_tracks_of_its_own_and_a_sentence() -> None:
     assert tracks.num_tracks == 19
     assert any(sentence.startswith("day-1 and other cannot be aligned surely") for sentence in tracks.warnings)
     assert {row.state for row in tracks.rows} == {"seen"}  # neither born nor gone: nothing is known
-    assert np.isnan(tracks.poses[2]).all()
+    np.testing.assert_array_equal(tracks.poses[2], np.eye(4))
+
+
+def two_in_a_pot(turn: float) -> tuple[list[PlantOnDate], list[list[int]]]:
+    """Two plants side by side on two dates; the second one is set back, turned against the first."""
+    other = {leaf + 10: blade + (250.0, 0, 0) for leaf, blade in grow_blades(8, 31).items()}
+    pot = Rotation.from_euler("z", turn, degrees=True)
+    turned = {leaf: pot.apply((blade - (250.0, 0, 0)).reshape(-1, 3)).reshape(blade.shape) + (250.0, 0, 0)
+              for leaf, blade in other.items()}  # fmt: skip
+    seen = [see(BLADES | other, 0), see(BLADES | turned, 1, turn=50)]
+    return [date for date, _ in seen], [truth for _, truth in seen]
+
+
+def test_two_plants_in_one_pot_are_tracked_as_one() -> None:
+    dates, truths = two_in_a_pot(0)
+    tracks = track_leaves(dates)
+    assert tracks.num_tracks == 18
+    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
+
+
+def test_of_two_plants_that_moved_against_each_other_the_larger_one_is_tracked() -> None:
+    dates, truths = two_in_a_pot(60)
+    tracks = track_leaves(dates)
+    right = [leaves for leaves in true_tracks(tracks, truths).values() if leaves <= set(BLADES)]
+    assert sorted(map(len, right)) == [1] * 10  # of the other one, wrong leaves are linked: docs/tracking.md says so
+    assert sum(row.leaf is not None and truths[row.date][row.leaf - 1] <= 10 for row in tracks.rows) == 20
 
 
 def test_a_plant_with_one_leaf_and_a_date_without_leaves() -> None:
