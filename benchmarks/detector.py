@@ -34,12 +34,12 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.best_dice import count_and_dice
 from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
 from mvseg.evaluation.average_precision import annotate_truth, average_precision, describe_mask
-from mvseg.evaluation.best_dice import count_and_dice
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances

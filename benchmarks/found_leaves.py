@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.evaluation.truth import tied_instances
-from mvseg.regions import Regions
+from mvseg.evaluation.truth import region_crops
+from mvseg.regions import IGNORE_LABEL, Regions
 
 FOUND_IOU = 0.5
 
@@ -40,3 +40,26 @@ def is_found(truth: Regions, regions: Regions, credited: Tensor) -> Tensor:
     found = set(zip(regions.view_index.tolist(), credited.tolist(), strict=True))
     keys = zip(truth.view_index.tolist(), truth.labels.tolist(), strict=True)
     return torch.tensor([key in found for key in keys], dtype=torch.bool)
+
+
+def tied_instances(regions: Regions, truth: Sequence[np.ndarray], *, min_iou: float = 0.5) -> Tensor:
+    """The true instance that each region covers well enough to count as found.
+
+    Args:
+        regions: D regions, as a detector finds them.
+        truth: V label maps (H, W): 0 = no instance, 65535 = ignore.
+        min_iou: least IoU with the visible part of the instance.
+
+    Returns:
+        (D,) int64 on the CPU: the instance with the largest IoU; 0 where that is below `min_iou`. Two regions may be
+        tied to one instance.
+    """
+    sizes = [np.bincount(labels.ravel(), minlength=1) for labels in truth]
+    ids = []
+    for view, (labels, mask) in zip(regions.view_index.tolist(), region_crops(regions, truth), strict=True):
+        intersection = np.bincount(labels[mask], minlength=len(sizes[view]))
+        iou = intersection / np.maximum(sizes[view] + mask.sum() - intersection, 1)
+        iou[[0, *range(IGNORE_LABEL, len(iou))]] = 0
+        best = int(iou.argmax())
+        ids.append(best if iou[best] >= min_iou else 0)
+    return torch.tensor(ids, dtype=torch.int64)

@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.faults import Faults, degrade_labels
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import load_detector
@@ -23,7 +24,6 @@ from mvseg.formats.image_file import read_rgb
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index, scene_cameras
-from mvseg.simulation.faults import Faults, degrade_labels
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.ray_cast import build_bvh, build_stage, merge_meshes, render_stage
 from mvseg.simulation.scene_writer import drop_small, write_jpeg

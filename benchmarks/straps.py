@@ -20,6 +20,7 @@ from scipy import ndimage
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.confidence import has_right_id
+from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import MIN_PIXELS, visible_ids
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.truth import shown_instances
@@ -27,7 +28,6 @@ from mvseg.matching.match import match_regions
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.faults import Faults, degrade_labels
 from mvseg.simulation.growth import Plant, grow_plant
 
 VIEWS, SIDE, TOP = 12, 10.0, 80.0  # views around; degrees of elevation

@@ -22,9 +22,9 @@ import yaml
 
 import mvseg
 import mvseg.matching
+from benchmarks.demo_plant import write_demo_plant, write_demo_plant_later
 from mvseg._version import code_hash, made_by
 from mvseg.cli.command import build_parser
-from mvseg.simulation.demo_plant import write_demo_plant, write_demo_plant_later
 from mvseg.training.config import TrainConfig
 
 ROOT = Path(__file__).parent.parent

@@ -15,6 +15,7 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
+from benchmarks.faults import Faults, degrade_labels
 from mvseg import Matching, load_masks, load_scene, match_regions
 from mvseg.demo import demo_scene
 from mvseg.evaluation.truth import shown_instances
@@ -23,7 +24,6 @@ from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.overlay import draw_overlay
 from mvseg.scene import Scene
-from mvseg.simulation.faults import Faults, degrade_labels
 
 DOCS = Path(__file__).parents[2] / "docs"
 WHITE = (255, 255, 255)

@@ -9,13 +9,14 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from benchmarks.faults import Faults, degrade_labels
+from benchmarks.found_leaves import tied_instances
 from benchmarks.paper_tables.cells import Cell
 from mvseg.detection.config import DetectConfig
-from mvseg.evaluation.truth import shown_instances, tied_instances
+from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import load_photos
 from mvseg.formats.scene_folder import load_masks
 from mvseg.regions import IGNORE_LABEL, Regions, mask_box, regions_from_label_maps, stack_regions
-from mvseg.simulation.faults import Faults, degrade_labels
 
 MIN_PIXELS = 30  # of a detected mask; true and degraded masks have as many
 

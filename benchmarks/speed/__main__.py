@@ -29,13 +29,13 @@ from typing import Any
 import numpy as np
 import torch
 
+from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import visible_ids
 from benchmarks.speed.rivals import measure_rivals
 from benchmarks.speed.write_up import write_all
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
-from mvseg.simulation.faults import Faults, degrade_labels
 from mvseg.simulation.growth import grow_plant
 
 ROOT = Path(__file__).parents[2]

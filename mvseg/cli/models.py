@@ -1,34 +1,22 @@
-"""`mvseg models`: list the shipped detectors, or pack one."""
+"""`mvseg models`: list the shipped detectors."""
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.errors import InputError
-
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser's sub-commands."""
-    parser = ArgumentParser(exit_on_error=False, description="List the shipped detectors, or pack one of your own.")
-    parser.add_argument("--pack", type=Path | None, help="output folder of a finished training run")
-    parser.add_argument("--into", type=Path | None, help="folder for the packed detector, with --pack")
-    parser.add_argument("--image_size", type=int | None, help="longer side that photos are scaled to, with --pack")
+    parser = ArgumentParser(exit_on_error=False, description="List the shipped detectors.")
     verbs.add_subcommand("models", parser, help="the detectors that ship with mvseg")
 
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.detectors.zoo import list_detectors
-    from mvseg.training.pack import pack_detector
 
-    if (args.pack is None) != (args.into is None):
-        raise InputError("--pack and --into belong together, expected both or neither")
-    if args.pack is not None:
-        pack_detector(args.pack, args.into, args.image_size)
-        return 0
     for entry in list_detectors():
         scores = entry.metrics.get("test") or entry.metrics.get("validation") or {}
         measured = [scores[name] for name in ("mask_AP", "mask_AP50") if scores.get(name) is not None]

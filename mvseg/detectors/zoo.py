@@ -8,7 +8,7 @@ A detector is a folder of its name with
     metrics.json                 what it reached
     card.md                      data, intended use, limits
 
-`mvseg.training.pack` makes such a folder from a training run.
+`benchmarks/pack_detector.py` makes such a folder from a training run.
 """
 
 from __future__ import annotations

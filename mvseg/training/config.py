@@ -17,8 +17,8 @@ Orientation = Literal["any", "upright", "fixed"]
 
 # These may differ when a run is resumed: they do not change what is computed. (The names of the samples are compared
 # separately, so the data may have moved.)
-FREE_ON_RESUME = {"photos", "labels", "val_photos", "val_labels", "backgrounds", "skip_broken", "output",
-                  "resume", "device", "num_workers", "checkpoint_every", "log_every"}  # fmt: skip
+FREE_ON_RESUME = {"photos", "labels", "from_results", "val_photos", "val_labels", "backgrounds", "skip_broken",
+                  "output", "resume", "device", "num_workers", "checkpoint_every", "log_every"}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -26,9 +26,12 @@ class TrainConfig:
     """How a detector is trained.
 
     Attributes:
-        photos: folder of the training photos.
-        labels: folder of label PNGs with the stems of the photos (0 background, 65535 ignored), or a COCO JSON file.
         output: folder for everything the run writes; made when missing.
+        photos: folder of the training photos, together with labels.
+        labels: folder of label PNGs with the stems of the photos (0 background, 65535 ignored), or a COCO JSON file.
+        from_results: a result folder of `mvseg infer`, or a folder of results: learn from their sure and their
+            corrected masks, in place of photos or besides; what is doubtful is ignored. With `new_plants`, nothing else
+            is forgotten.
         val_photos: folder of the validation photos, together with val_labels.
         val_labels: labels of the validation photos.
         hold_out_every: without val_photos: hold every n-th photo (sorted by name, from the first) out of the training
@@ -80,9 +83,10 @@ class TrainConfig:
         resume: continue from the checkpoint in output, if there is one.
     """
 
-    photos: Path
-    labels: Path
     output: Path
+    photos: Path | None = None
+    labels: Path | None = None
+    from_results: Path | None = None
     val_photos: Path | None = None
     val_labels: Path | None = None
     hold_out_every: int = 0
@@ -149,6 +153,10 @@ class TrainConfig:
             raise InputError("recolor is set and backgrounds is not, expected a folder of photos without leaves")
         if self.hold_out_every == 1:
             raise InputError("hold_out_every is 1, which leaves nothing to train on; expected 0 or at least 2")
+        if (self.photos is None) != (self.labels is None):
+            raise InputError("photos and labels belong together, expected both or neither")
+        if self.photos is None and self.from_results is None:
+            raise InputError("neither photos nor from_results is set, expected something to learn from")
         if (self.val_photos is None) != (self.val_labels is None):
             raise InputError("val_photos and val_labels belong together, expected both or neither")
         if self.val_photos is not None and self.hold_out_every:

@@ -52,6 +52,7 @@ from mvseg.training.files import (
     write_metrics,
     write_weights,
 )
+from mvseg.training.from_results import list_results
 from mvseg.training.new_plants import list_backgrounds
 from mvseg.training.precision import choose_bf16
 from mvseg.training.processes import Processes, join_processes
@@ -133,7 +134,13 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
     names = {path.name for path in config.output.glob("*") if not is_partial(path)}
     if names and not names & {"config.yaml", "broken_samples.txt"}:
         raise InputError(f"{config.output}: holds files that no training run wrote, expected a new or empty folder")
-    samples, held_out = list_samples(config.photos, config.labels), None
+    parts = [] if config.photos is None or config.labels is None else [list_samples(config.photos, config.labels)]
+    parts += [] if config.from_results is None else [list_results(config.from_results)]
+    if len({part.categories for part in parts}) > 1:
+        raise InputError(
+            f"{config.labels} has categories {parts[0].categories}, expected {parts[1].categories} as results"
+        )
+    samples, held_out = SampleList(sum((part.samples for part in parts), ()), parts[0].categories), None
     if config.val_photos is not None and config.val_labels is not None:
         held_out = list_samples(config.val_photos, config.val_labels)
         if held_out.categories != samples.categories:
@@ -212,9 +219,7 @@ def train_epoch(
                 save_state(state, config, run.samples)
 
 
-def add_gradients(
-    run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk]
-) -> dict[str, float]:
+def add_gradients(run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk]) -> dict[str, float]:
     """Forward and backward of this process's chunks of a step.
 
     Returns:

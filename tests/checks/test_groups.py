@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.faults import Faults, degrade_labels
 from mvseg.checks.finding import Finding
 from mvseg.checks.groups import group_findings, world_groups
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement
@@ -17,7 +18,6 @@ from mvseg.errors import InputWarning
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
-from mvseg.simulation.faults import Faults, degrade_labels
 from synthetic import ball_scene
 from two_worlds import every_second_farther, half_turned
 

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.faults import Faults, degrade_labels
 from mvseg.checks.finding import Finding
 from mvseg.checks.poses import _chosen_pairs, pairwise_agreement, pose_findings, view_agreement
 from mvseg.errors import InputWarning
@@ -19,7 +20,6 @@ from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.outline_gaps import SPECK, without_specks
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
-from mvseg.simulation.faults import Faults, degrade_labels
 from synthetic import ball_scene, cameras_at, moved, render_balls
 
 

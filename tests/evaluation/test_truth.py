@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from mvseg.evaluation.truth import shown_instance, shown_instances, tied_instances
+from benchmarks.found_leaves import tied_instances
+from mvseg.evaluation.truth import shown_instance, shown_instances
 from mvseg.regions import regions_from_label_maps
 
 TRUTH = np.array([[0, 0, 3, 3], [0, 65535, 65535, 3]], np.uint16)

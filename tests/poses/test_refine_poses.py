@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.faults import disc
 from matched import matched
 from mvseg.errors import InputWarning
 from mvseg.matching.match import match_regions
@@ -19,7 +20,6 @@ from mvseg.matching.result import Matching
 from mvseg.poses.refine_poses import RefinedPoses, adjust, fit_poses, held_out_gaps, refine_poses
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
-from mvseg.simulation.faults import disc
 from synthetic import BallScene, ball_scene, cameras_at, moved, permute_views
 
 

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from benchmarks.faults import disc
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
 from mvseg.reconstruction.surface.fit_patch import NUM_WARM_STEPS, fit_patch, invert_normal
 from mvseg.reconstruction.surface.leaf_patch import (
@@ -30,7 +31,6 @@ from mvseg.reconstruction.surface.patch_image import (
     project_points,
     view_ious,
 )
-from mvseg.simulation.faults import disc
 
 CAMERAS = ring_cameras(4)
 GRID = patch_grid(36, 9)

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.demo_plant import grow_later
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_labels
-from mvseg.simulation.demo_plant import grow_later
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.series import PotPlace, SeriesSpec, draw_pots, grow_series, plan_plant, write_series
 

@@ -1,4 +1,4 @@
-"""Renders the scenes that ship with mvseg: `python -m mvseg.simulation.demo_plant OUT OUT_LATER`.
+"""Renders the scenes that ship with mvseg: `python -m benchmarks.demo_plant OUT OUT_LATER`.
 
 A basil-like plant of 12 curved leaves, seen by 9 cameras: `mvseg/demo_plant/`. The same plant six days later, seen by
 other cameras: `mvseg/demo_plant_later/`.

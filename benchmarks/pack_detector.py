@@ -1,4 +1,4 @@
-"""From a training run to a folder of the zoo."""
+"""From a training run to a folder of the zoo: `python benchmarks/pack_detector.py RUN FOLDER [IMAGE_SIZE]`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,10 @@ import dataclasses
 import hashlib
 import json
 import shutil
+import sys
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import HASH, WEIGHTS
@@ -50,3 +53,7 @@ def pack_detector(run: Path, folder: Path, image_size: int | None = None) -> Non
     write_whole(folder / "recipe" / "train.yaml", lambda partial: shutil.copyfile(run / "config.yaml", partial))
     # last: without it the folder is no entry
     write_text_whole(folder / HASH, f"{hashlib.sha256(content).hexdigest()}  {WEIGHTS}\n")
+
+
+if __name__ == "__main__":
+    pack_detector(Path(sys.argv[1]), Path(sys.argv[2]), *(int(size) for size in sys.argv[3:]))

@@ -10,9 +10,9 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
+from benchmarks.pack_detector import pack_detector
 from mvseg.detectors.weights_file import read_weights
 from mvseg.errors import InputError
-from mvseg.training.pack import pack_detector
 from tiny_training import write_finished_run
 
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.best_dice import count_and_dice
 from mvseg.evaluation.average_precision import describe_mask
-from mvseg.evaluation.best_dice import count_and_dice
 
 
 def annotate(labels: np.ndarray, image_id: int = 0, score: float | None = None) -> list[dict[str, Any]]:

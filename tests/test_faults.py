@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from benchmarks.faults import Faults, degrade_labels
 from mvseg.errors import InputError
-from mvseg.simulation.faults import Faults, degrade_labels
 
 NONE = Faults(missed=0, merged=0, split=0, blur_px=0)
 

@@ -1,0 +1,96 @@
+"""Simulated plants as unruly as real ones: `python benchmarks/unruly_plants.py OUT`.
+
+Blades are curled and wavy, plants wild (`make_wild`), leaves move from photo to photo as in a draught, and the poses
+that the scene states are wrong by about 1.5 px. Four plants with truth, to
+judge on them what is chosen for real plants.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.spatial.transform import Rotation
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from mvseg.formats.label_png import write_label_png
+from mvseg.formats.rig import write_rig
+from mvseg.scene import Cameras, Scene, View
+from mvseg.simulation.blades import BLADE_COLUMNS, Leaf, measure_leaf
+from mvseg.simulation.cameras import arc_cameras
+from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.ray_cast import build_stage, render_stage
+from mvseg.simulation.scene_writer import drop_small, shuffle_labels, write_jpeg
+from mvseg.simulation.wild import make_wild, roll_up
+
+PLANTS = (("ovate", 18, 10, 71), ("leggy", 12, 12, 72), ("lanceolate", 16, 10, 73), ("compound", 20, 8, 74))
+SIZE = 800
+CURL, WAVE = 0.7, 0.035  # radians from midrib to edge; of a leaf's length
+SWAY_DEG = 1.2  # from photo to photo: some 2 px at the tip of a leaf of 100 px
+POSE_PX = 1.5
+
+
+def make_unruly(plant: Plant, seed: int) -> Plant:
+    """A wild plant with curled and wavy blades."""
+    rng = np.random.default_rng([seed, 3])
+    return replace(make_wild(plant, seed), leaves=tuple(curl(leaf, rng) for leaf in make_wild(plant, seed).leaves))
+
+
+def curl(leaf: Leaf, rng: np.random.Generator) -> Leaf:
+    """The leaf rolled around its midrib, and with two waves or so along it."""
+    vertices = roll_up(leaf.vertices, rng.normal(0, CURL))
+    rows = (len(vertices) - 2) // BLADE_COLUMNS
+    along = np.concatenate([[0.0], np.repeat(np.linspace(0, 1, rows), BLADE_COLUMNS), [1.0]])
+    height = WAVE * leaf.length * rng.normal() * np.sin(2 * np.pi * (rng.uniform(0.7, 2) * along + rng.random()))
+    waved = vertices + (height - height[0])[:, None] * rng.normal(0, 0.3, 3) + (height - height[0])[:, None] * [0, 0, 1]
+    return replace(measure_leaf(leaf.leaf_id, waved), dryness=leaf.dryness)
+
+
+def sway(plant: Plant, rng: np.random.Generator) -> Plant:
+    """The plant a moment later: every leaf turned a little around its base."""
+    turns = [Rotation.from_rotvec(np.radians(rng.normal(0, SWAY_DEG, 3))) for _ in plant.leaves]
+    moved = [
+        replace(leaf, vertices=leaf.vertices[0] + turn.apply(leaf.vertices - leaf.vertices[0]))
+        for leaf, turn in zip(plant.leaves, turns, strict=True)
+    ]
+    return replace(plant, leaves=tuple(moved))
+
+
+def shake_poses(cameras: Cameras, rng: np.random.Generator) -> Cameras:
+    """The cameras, each turned so that the image moves by about `POSE_PX` pixels."""
+    angles = rng.normal(0, POSE_PX, (len(cameras), 3)) / cameras.K[:, :1, 0].numpy()
+    turned = Rotation.from_rotvec(angles).as_matrix()
+    return replace(
+        cameras, R=torch.from_numpy(turned) @ cameras.R, t=(torch.from_numpy(turned) @ cameras.t[..., None])[..., 0]
+    )
+
+
+def write_unruly(folder: Path, family: str, num_leaves: int, *, num_views: int, seed: int) -> None:
+    """A scene as `mvseg simulate` writes it, without leaf meshes: no one shape is the truth of all photos."""
+    plant, rng = make_unruly(grow_plant(family, num_leaves, seed), seed), np.random.default_rng([seed, 4])
+    cameras = arc_cameras(
+        num_views, plant, span_deg=360, start_deg=seed, elevations_deg=(15.0, 45.0, 30.0), width=SIZE, height=SIZE
+    )
+    for part in ("images", "masks", "truth"):
+        (folder / part).mkdir(parents=True)
+    names = [f"{view:03d}" for view in range(num_views)]
+    for view, name in enumerate(names):
+        shot = render_stage(build_stage(sway(plant, rng), seed=seed), cameras, view)
+        truth = drop_small(shot.ids, 30)
+        write_jpeg(folder / "images" / f"{name}.jpg", shot.rgb)
+        write_label_png(folder / "truth" / f"{name}.png", truth)
+        write_label_png(folder / "masks" / f"{name}.png", shuffle_labels(truth, np.random.default_rng([seed, view])))
+    files = [f"images/{name}.jpg" for name in names]
+    views = tuple(View(name, folder / file) for name, file in zip(names, files, strict=True))
+    stated = shake_poses(cameras, rng)
+    scene = Scene(name=folder.name, views=views, cameras=stated, unit=plant.unit, up=(0.0, 0.0, 1.0))
+    write_rig(folder / "cameras.json", scene, files)
+
+
+if __name__ == "__main__":
+    for family, num_leaves, num_views, seed in PLANTS:
+        write_unruly(Path(sys.argv[1]) / f"{family}-{seed}", family, num_leaves, num_views=num_views, seed=seed)
