@@ -1,5 +1,10 @@
 """Bad input: an exception that ends a run with one sentence, and a warning that does not."""
 
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 
 class InputError(ValueError):
     """Wrong input from the user (a file, a camera, a mask, an option).
@@ -11,3 +16,12 @@ class InputError(ValueError):
 
 class InputWarning(UserWarning):
     """The input is odd but usable; the message says what was done about it. Kept in a result's `run.json`."""
+
+
+@contextmanager
+def faults_of(where: object) -> Iterator[None]:
+    """Put the place, as a file or a view, in front of the reason of any InputError that is raised inside."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
 
 ROTATION_TOLERANCE = 1e-4  # |R R^T - I|; hand-typed rig files carry about six digits
 MIN_FOCAL, MAX_PX = 1e-3, 1e9  # of K, pixels; far beyond any lens, and products of them are still numbers
+UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit
 LEVEL, UPSIDE_DOWN = 0.17, -0.7  # means: sine of the pitch of level cameras, cosine between their up and the world's
 MAX_WORLD = 1e12  # of t, world units: millimetres on a map of the whole earth fit
 
@@ -89,9 +90,7 @@ class Cameras:
         return self.K.device
 
     def to(self, device: torch.device | str) -> Cameras:
-        return Cameras(
-            K=self.K.to(device), R=self.R.to(device), t=self.t.to(device), sizes=self.sizes.to(device)
-        )
+        return Cameras(K=self.K.to(device), R=self.R.to(device), t=self.t.to(device), sizes=self.sizes.to(device))
 
     @property
     def centers(self) -> Tensor:
@@ -102,6 +101,31 @@ class Cameras:
     def world_from_px(self) -> Tensor:
         """(V, 3, 3): `world_from_px @ (u, v, 1)` is the viewing ray of a pixel in world axes, with depth 1 along +z."""
         return self.R.mT @ torch.linalg.inv(self.K)
+
+    @property
+    def px_from_world(self) -> Tensor:
+        """(V, 3, 4): `px_from_world @ (x, y, z, 1)` is the pixel of a world point, times its depth."""
+        return self.K @ torch.cat((self.R, self.t[:, :, None]), 2)
+
+    @property
+    def unit_px(self) -> float:
+        """Pixels per unit, in which what depends on drawn masks is judged: a 700th of the photos' diagonal, at least
+        one pixel. Masks and features of large photos are less exact."""
+        return max(1.0, float(self.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL)
+
+    def nearest_point(self, views: Tensor, directions: Tensor) -> Tensor:
+        """(3,) the world point nearest to N rays in the least squares; of parallel rays, one of many.
+
+        Args:
+            views: (N,) int64, from whose camera each ray starts.
+            directions: (N, 3) in world axes, of any length.
+        """
+        rays = torch.nn.functional.normalize(directions, dim=1)
+        across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
+        # From the mean centre: far from the world's origin the products would cancel.
+        middle = self.centers.mean(0)
+        target = (across @ (self.centers - middle)[views][..., None]).sum(0)
+        return middle + (torch.linalg.pinv(across.sum(0), rtol=1e-9) @ target)[:, 0]
 
     def scale(self, factor: float) -> Cameras:
         """The same cameras in a world whose lengths are multiplied by `factor` > 0; every point keeps its pixel."""

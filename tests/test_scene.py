@@ -34,6 +34,41 @@ def test_project_agrees_with_opencv() -> None:
         torch.testing.assert_close(depth[view], cam[2])
 
 
+def test_the_matrix_projects_as_the_cameras_do() -> None:
+    cameras = some_cameras()
+    points = torch.randn(50, 3, generator=torch.Generator().manual_seed(0)).double()
+    image = torch.cat((points, torch.ones(50, 1)), 1) @ cameras.px_from_world.mT
+    px, depth = cameras.project(points)
+    torch.testing.assert_close(image[..., 2], depth)
+    torch.testing.assert_close(image[..., :2] / image[..., 2:], px)
+
+
+@pytest.mark.parametrize("offset", [0.0, 1e6])
+def test_rays_through_one_point_are_nearest_to_it(offset: float) -> None:
+    """Wherever the origin of the world is; of rays that miss each other, no point nearby is nearer."""
+    cameras = some_cameras()
+    shift = torch.tensor([offset, -offset, offset]).double()
+    cameras = replace(cameras, t=cameras.t - (cameras.R @ shift[:, None])[:, :, 0])
+    point, views = shift + torch.tensor([3.0, -2.0, 1.0]), torch.tensor([0, 1, 2, 3, 3])
+    rays = (point - cameras.centers[views]) * torch.tensor([1.0, 2, 3, 4, 5])[:, None]
+    torch.testing.assert_close(cameras.nearest_point(views, rays), point, rtol=0, atol=1e-6)
+    rays = rays + 0.1 * rays.norm(dim=1, keepdim=True) * torch.eye(5, 3)
+
+    def cost(at: torch.Tensor) -> float:
+        return float(torch.linalg.cross(at - cameras.centers[views], rays / rays.norm(dim=1)[:, None]).square().sum())
+
+    found = cameras.nearest_point(views, rays)
+    assert all(cost(found + sign * step) > cost(found) for step in torch.eye(3) for sign in (1, -1))
+    parallel = torch.tensor([[0.0, 0, 1]]).double().expand(4, 3)
+    assert bool(cameras.nearest_point(torch.arange(4), parallel).isfinite().all())
+
+
+@pytest.mark.parametrize(("size", "unit_px"), [((300, 400), 1.0), ((2100, 2800), 5.0)])
+def test_units_of_large_photos_are_larger(size: tuple[int, int], unit_px: float) -> None:
+    cameras = some_cameras()
+    assert replace(cameras, sizes=torch.tensor([size] * 4)).unit_px == unit_px
+
+
 def test_center_projects_to_depth_zero_and_rays_return_to_their_pixel() -> None:
     cameras = some_cameras()
     for view in range(4):

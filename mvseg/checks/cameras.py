@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.checks.finding import Finding, name_views
+from mvseg.checks.finding import Finding, Rule, list_findings, name_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras, Scene
 
@@ -88,15 +88,15 @@ def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]
     if reading := _other_reading(cameras, coverage):
         return [Finding(where="cameras", what=reading, level="error")]
     share = coverage.sees.mean()
-    findings = []
+    findings: list[Finding] = []
     unseeing = tuple(np.flatnonzero(~coverage.sees).tolist())
     if coverage.sees.sum() < 2:
         what = "no two cameras look at one point: do R and t map world points to the camera?"
         findings.append(Finding(where="cameras", what=what, level="error"))
     elif unseeing and share > 0.5:
         point = f"the point that the other {coverage.sees.sum()} look at"
-        what = f"{name_views(unseeing, names)} look past {point}: check the pose, or leave the photo out"
-        findings.append(Finding(where="cameras", what=what, level="warning", views=unseeing))
+        rule: Rule = ("warning", unseeing, f"{{}} look past {point}: check the pose, or leave the photo out")
+        findings += list_findings("cameras", [rule], names)
     elif unseeing:
         what = f"no point is seen by more than {coverage.sees.sum()} of {len(names)} cameras: check the poses, unless "
         findings.append(Finding(where="cameras", what=f"{what}the photos show different plants", level="warning"))
@@ -105,31 +105,24 @@ def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]
     distance = np.linalg.norm(centers - np.median(centers, 0), axis=1)
     usual = float(np.median(distance))
     far = tuple(np.flatnonzero(distance > FAR * usual).tolist()) if len(names) > 3 and usual > 0 else ()
-    if far:
-        times = distance[list(far)].max() / usual
-        what = f"{name_views(far, names)}: {times:.0f} times as far out as the other cameras; is t in another unit?"
-        findings.append(Finding(where="cameras", what=what, level="warning", views=far))
-    return findings
+    what = (
+        f"{{}}: {distance.max() / max(usual, 1e-300):.0f} times as far out as the other cameras; is t in another unit?"
+    )
+    return findings + list_findings("cameras", [("warning", far, what)], names)
 
 
 def _baseline_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> list[Finding]:
-    findings = []
-    pairs = torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist()
-    if pairs:
-        views = tuple(sorted({view for pair in pairs for view in pair}))
-        what = f"{name_views(views, names)} stand where others stand, and tell no depth with them: move the camera"
-        findings.append(Finding(where="cameras", what=what, level="warning", views=views))
+    twins = torch.triu(is_coincident(cameras), diagonal=1).nonzero().flatten().unique().tolist()
+    what = "{} stand where others stand, and tell no depth with them: move the camera"
+    findings = list_findings("cameras", [("warning", twins, what)], names)
     spread = _widest_angle(cameras, coverage)
     if coverage.sees.sum() > 1 and spread < NARROW:
         what = f"the views differ by {spread:.1f} degrees at most: depth is hardly seen; photograph from more sides"
         findings.append(Finding(where="cameras", what=what, level="warning"))
-    lonely = tuple(np.flatnonzero(np.nan_to_num(coverage.angle) > WIDE).tolist())
-    if lonely:
-        far_off = coverage.angle[list(lonely)].max()
-        facts = f"the next view is {far_off:.0f} degrees away and shows few of the same leaves"
-        what = f"{name_views(lonely, names)}: {facts}; add photos between"
-        findings.append(Finding(where="cameras", what=what, level="warning", views=lonely))
-    return findings
+    angle = np.nan_to_num(coverage.angle)
+    facts = f"the next view is {angle.max():.0f} degrees away and shows few of the same leaves"
+    lonely: Rule = ("warning", np.flatnonzero(angle > WIDE).tolist(), f"{{}}: {facts}; add photos between")
+    return findings + list_findings("cameras", [lonely], names)
 
 
 def _lens_findings(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
@@ -155,27 +148,22 @@ def _lens_findings(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
             focal.max(1) / focal.min(1),
         ),
     )
-    findings = []
-    for is_odd, what, value in found:
-        if is_odd.any():
-            views = tuple(np.flatnonzero(is_odd).tolist())
-            sentence = f"{name_views(views, names)} have {what.format(value[is_odd].max())}"
-            findings.append(Finding(where="cameras", what=sentence, level="warning", views=views))
-    return findings
+    rules: list[Rule] = [
+        ("warning", np.flatnonzero(is_odd).tolist(), "{} have " + what.format(value[is_odd].max(initial=0)))
+        for is_odd, what, value in found
+    ]
+    return list_findings("cameras", rules, names)
 
 
 def _world_findings(scene: Scene) -> list[Finding]:
-    findings = []
+    notes = []
     if not scene.unit:
-        what = "the cameras do not say their unit: lengths are in world units, unless --scale and --unit say it"
-        findings.append(Finding(where="cameras", what=what, level="note"))
+        notes.append("the cameras do not say their unit: lengths are in world units, unless --scale and --unit say it")
     if scene.up is None:
-        what = "the cameras do not say which way is up: heights and angles are not measured, unless --up says it"
-        findings.append(Finding(where="cameras", what=what, level="note"))
+        notes.append("the cameras do not say which way is up: heights and angles are not measured, unless --up says it")
     elif scene.seems_upside_down:
-        what = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
-        findings.append(Finding(where="cameras", what=what, level="note"))
-    return findings
+        notes.append("up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it")
+    return [Finding(where="cameras", what=what, level="note") for what in notes]
 
 
 def field_of_view(cameras: Cameras) -> Floats:

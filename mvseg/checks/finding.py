@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 Level = Literal["note", "warning", "error"]
+Rule = tuple[Level, Sequence[int], str]  # views, and a sentence in which "{}" stands for them
 
 
 @dataclass(frozen=True)
@@ -35,3 +37,12 @@ def name_views(views: tuple[int, ...], names: tuple[str, ...], *, shown: int = S
         return f"view {views[0]} ({names[views[0]]})"
     more = f" and {len(views) - shown} more" if len(views) > shown else ""
     return f"{len(views)} views ({', '.join(names[view] for view in views[:shown])}{more})"
+
+
+def list_findings(where: str, rules: Iterable[Rule], names: tuple[str, ...]) -> list[Finding]:
+    """A finding for each rule that has views."""
+    return [
+        Finding(where=where, what=what.replace("{}", name_views(tuple(views), names)), level=level, views=tuple(views))
+        for level, views, what in rules
+        if views
+    ]

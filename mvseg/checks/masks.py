@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.checks.finding import Finding, name_views
-from mvseg.matching.outline_gaps import without_specks
+from mvseg.checks.finding import Finding, Rule, list_findings
+from mvseg.matching.outline_gaps import touches_border, without_specks
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -15,12 +15,6 @@ MANY = 0.25  # share of the masks
 FEW = 0.34  # of the median number of masks per view
 COVERS = 0.8  # of the photo: the background
 BEYOND = 0.1  # of the photo's longer side: how far specks reach beyond the rest of their mask
-
-
-def masks_at_border(regions: Regions, cameras: Cameras) -> NDArray[np.bool_]:
-    """(D,) whether a mask reaches the border of its photo, where it may be cut."""
-    sizes = cameras.sizes[regions.view_index]
-    return np.asarray(((regions.boxes[:, :2] <= 0) | (regions.boxes[:, 2:] >= sizes)).any(1).numpy())
 
 
 def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
@@ -36,20 +30,18 @@ def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) ->
 
 
 def _count_findings(counts: NDArray[np.int64], names: tuple[str, ...]) -> list[Finding]:
-    findings = []
-    empty = tuple(np.flatnonzero(counts == 0).tolist())
+    empty = np.flatnonzero(counts == 0).tolist()
     if len(counts) - len(empty) < 2:
         what = "only one view has masks, so that there is nothing to match: segment the other photos"
-        return [Finding(where="masks", what=what, level="error", views=empty)]
-    if empty:
-        what = f"there are no masks in {name_views(empty, names)}: is the plant hidden there, or a file missing?"
-        findings.append(Finding(where="masks", what=what, level="warning", views=empty))
+        return [Finding(where="masks", what=what, level="error", views=tuple(empty))]
     usual = float(np.median(counts[counts > 0]))
-    few = tuple(np.flatnonzero((counts > 0) & (counts < FEW * usual)).tolist())
-    if few:
-        what = f"there are {counts[list(few)].min()} masks in {name_views(few, names)} where {usual:.0f} are usual: "
-        findings.append(Finding(where="masks", what=f"{what}are some missing?", level="warning", views=few))
-    return findings
+    few = np.flatnonzero((counts > 0) & (counts < FEW * usual)).tolist()
+    facts = f"there are {counts[counts > 0].min()} masks in {{}} where {usual:.0f} are usual"
+    rules: list[Rule] = [
+        ("warning", empty, "there are no masks in {}: is the plant hidden there, or a file missing?"),
+        ("warning", few, f"{facts}: are some missing?"),
+    ]
+    return list_findings("masks", rules, names)
 
 
 def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
@@ -61,11 +53,10 @@ def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -
         what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: drop the crumbs, or segment larger photos"
         findings.append(Finding(where="masks", what=what, level="warning"))
     photo = cameras.sizes[view].prod(1).numpy()
-    whole = tuple(sorted(set(view.numpy()[areas > COVERS * photo].tolist())))
-    if whole:
-        what = f"a mask covers more than {COVERS:.0%} of {name_views(whole, names)}: if it is the background, make it 0"
-        findings.append(Finding(where="masks", what=what, level="error", views=whole))
-    cut = masks_at_border(regions, cameras)
+    whole = sorted(set(view.numpy()[areas > COVERS * photo].tolist()))
+    what = f"a mask covers more than {COVERS:.0%} of {{}}: if it is the background, make it 0"
+    findings += list_findings("masks", [("error", whole, what)], names)
+    cut = touches_border(regions, cameras).numpy()
     if cut.mean() > MANY:
         what = f"{cut.sum()} of {len(regions)} masks touch the border of their photo, and cut leaves come out small: "
         findings.append(Finding(where="masks", what=f"{what}step back, or add photos", level="warning"))
@@ -75,15 +66,12 @@ def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -
 def _speck_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
     """Masks with stray pixels: the shape of such a leaf is looked for in a space that is much too large."""
     longest = cameras.sizes.amax(1).tolist()
-    views = set()
+    views: set[int] = set()
     for index in range(len(regions)):
         view, crop = int(regions.view_index[index]), regions.crop(index).numpy()
         kept = without_specks(crop).astype(bool)
         reach = max(crop.shape[axis] - np.ptp(np.flatnonzero(kept.any(1 - axis))) - 1 for axis in (0, 1))
         if reach > BEYOND * longest[view]:
             views.add(view)
-    if not views:
-        return []
-    where = tuple(sorted(views))
-    what = f"masks of {name_views(where, names)} have stray pixels far from the rest of them: remove the small pieces"
-    return [Finding(where="masks", what=what, level="warning", views=where)]
+    what = "masks of {} have stray pixels far from the rest of them: remove the small pieces"
+    return list_findings("masks", [("warning", sorted(views), what)], names)

@@ -26,7 +26,6 @@ RATIO = 0.8  # of the distances to the best and the second best partner
 BEST_ANGLE, WIDEST_ANGLE = 15.0, 60.0  # degrees between two views: fewer features are the same above, less depth below
 PARTNERS = 4  # of each view: wrong cameras are wrong about what is near, too
 MOST_VIEWS, SOURCES = 24, 8  # of more views, the partners of some are looked for
-UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit
 STILL = 3.0  # units: features that have moved by less belong to what stands still, as the wall behind a turntable
 TOLERANCE = 1.0  # units, of a fundamental matrix
 FEWEST, LEAST_SHARE = 20, 0.5  # features that fit one fundamental matrix; 40 that have nothing in common give 13
@@ -41,7 +40,7 @@ class PhotoMatches:
         xy: (2, N, 2) pixels of views i and j: those that have moved.
         is_rigid: (N,) bool, those that fit one fundamental matrix, whichever it is.
         num_still: features at the same pixels of both photos, left out of `xy`.
-        unit_px: pixels per unit, see `UNIT_DIAGONAL`.
+        unit_px: pixels per unit, see `Cameras.unit_px`.
     """
 
     views: tuple[int, int]
@@ -74,9 +73,8 @@ def match_photos(
             features[view] = find_features(read(view))
         except InputError:
             continue
-    unit_px = max(1.0, float(cameras.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL)
     return [
-        _match(pair, features[pair[0]], features[pair[1]], unit_px=unit_px)
+        _match(pair, features[pair[0]], features[pair[1]], unit_px=cameras.unit_px)
         for pair in pairs
         if pair[0] in features and pair[1] in features
     ]

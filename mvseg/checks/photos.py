@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from tqdm import tqdm
 
-from mvseg.checks.finding import Finding, name_views
+from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.errors import InputError
 from mvseg.formats.image_file import is_grey, is_turned, read_image_size, read_rgb
 from mvseg.formats.photos import describe_folder, photo_bits
@@ -70,65 +70,55 @@ def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) ->
             return [Finding(where="photos", what=what, level="note")]
         what = f"there are neither photos nor masks: add {scene.views[0].path} and the others, or give --masks"
         return [Finding(where="photos", what=f"{what}{_beside(scene, 0)}", level="error")]
-    findings = []
+    what = ""
     if missing:
-        what = f"{name_views(missing, names)}: no photo, the first is {scene.views[missing[0]].path}; add it, or take "
-        what = f"{what}its camera out{_beside(scene, missing[0])}"
-        findings.append(Finding(where="photos", what=what, level="error", views=missing))
-    for view, each in enumerate(facts):
-        if each.problem:
-            what = f"the photo of {name_views((view,), names)} cannot be read ({each.problem}): export it again"
-            findings.append(Finding(where="photos", what=what, level="error", views=(view,)))
-    return [*findings, *_size_findings(facts, scene, names), *_content_findings(facts, names)]
+        first = scene.views[missing[0]].path
+        what = f"{{}}: no photo, the first is {first}; add it, or take its camera out{_beside(scene, missing[0])}"
+    broken: list[Rule] = [
+        ("error", (view,), f"the photo of {{}} cannot be read ({each.problem}): export it again")
+        for view, each in enumerate(facts)
+        if each.problem
+    ]
+    rules: list[Rule] = [("error", missing, what), *broken, *_size_rules(facts, scene), *_content_rules(facts)]
+    return list_findings("photos", rules, names)
 
 
-def _size_findings(facts: list[PhotoFacts], scene: Scene, names: tuple[str, ...]) -> list[Finding]:
-    findings = []
-    expected = [tuple(size) for size in scene.cameras.sizes.tolist()]
-    wrong = [view for view, each in enumerate(facts) if each.size is not None and each.size != expected[view]]
-    by_size: dict[tuple[tuple[int, int], tuple[int, ...]], list[int]] = defaultdict(list)
-    for view in wrong:
-        size = facts[view].size
-        assert size is not None
-        by_size[size, expected[view]].append(view)
-    for (size, camera), views in by_size.items():
+def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
+    by_size: dict[tuple[int, ...], list[int]] = defaultdict(list)
+    for view, (each, camera) in enumerate(zip(facts, scene.cameras.sizes.tolist(), strict=True)):
+        if each.size not in (None, tuple(camera)):
+            by_size[*each.size, *camera].append(view)
+    rules: list[Rule] = []
+    for (width, height, *camera), views in by_size.items():
         step = "scale K with the photos, or use the photos that the cameras were calibrated on"
-        if size == camera[::-1]:
+        if [height, width] == camera:
             step = "the photos were turned after the calibration; turn them back"
-        what = f"{name_views(tuple(views), names)}: the photo is {size[0]} x {size[1]}, its camera says {camera[0]} x "
-        findings.append(Finding(where="photos", what=f"{what}{camera[1]}: {step}", level="error", views=tuple(views)))
-    turned = tuple(view for view, each in enumerate(facts) if each.turned)
-    if turned:
-        what = f"EXIF turns {name_views(turned, names)} for display: cameras and masks must be of the pixels as stored"
-        findings.append(Finding(where="photos", what=what, level="warning", views=turned))
-    return findings
+        what = f"{{}}: the photo is {width} x {height}, its camera says {camera[0]} x {camera[1]}: {step}"
+        rules.append(("error", views, what))
+    turned = [view for view, each in enumerate(facts) if each.turned]
+    what = "EXIF turns {} for display: cameras and masks must be of the pixels as stored"
+    return [*rules, ("warning", turned, what)]
 
 
-def _content_findings(facts: list[PhotoFacts], names: tuple[str, ...]) -> list[Finding]:
-    findings = []
+def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     whole = [view for view, each in enumerate(facts) if each.size is not None]
-    blank = tuple(view for view in whole if _is_blank(facts[view]))
-    dark = tuple(view for view in whole if view not in blank and facts[view].level < DARK)
-    burnt = tuple(view for view in whole if view not in blank and facts[view].burnt > BURNT)
-    if blank:
-        what = f"the photos of {name_views(blank, names)} show nothing (one colour all over): leave them out"
-        findings.append(Finding(where="photos", what=what, level="error", views=blank))
-    for views, fault in ((dark, "nearly black"), (burnt, "overexposed")):
-        if views:
-            what = f"the photos of {name_views(views, names)} are {fault}: detectors will find few leaves there"
-            findings.append(Finding(where="photos", what=what, level="warning", views=views))
-    grey = tuple(view for view in whole if view not in blank and facts[view].grey)
-    if grey:
-        what = f"the photos of {name_views(grey, names)} are grey: leaf colours and greenness are not measured in them"
-        findings.append(Finding(where="photos", what=what, level="note", views=grey))
+    blank = [view for view in whole if _is_blank(facts[view])]
+    shown = [view for view in whole if view not in blank]
+    dark = [view for view in shown if facts[view].level < DARK]
+    burnt = [view for view in shown if facts[view].burnt > BURNT]
+    grey = [view for view in shown if facts[view].grey]
+    few = "detectors will find few leaves there"
     same: dict[str, list[int]] = defaultdict(list)
     for view in whole:
         same[facts[view].digest].append(view)
-    for twins in same.values():
-        if len(twins) > 1:
-            what = f"{name_views(tuple(twins), names)} are the same photo: check which one belongs to which camera"
-            findings.append(Finding(where="photos", what=what, level="error", views=tuple(twins)))
-    return findings
+    twins = [views for views in same.values() if len(views) > 1]
+    return [
+        ("error", blank, "the photos of {} show nothing (one colour all over): leave them out"),
+        ("warning", dark, f"the photos of {{}} are nearly black: {few}"),
+        ("warning", burnt, f"the photos of {{}} are overexposed: {few}"),
+        ("note", grey, "the photos of {} are grey: leaf colours and greenness are not measured in them"),
+        *(("error", views, "{} are the same photo: check which one belongs to which camera") for views in twins),
+    ]
 
 
 def _is_blank(photo: PhotoFacts) -> bool:

@@ -9,18 +9,16 @@ lines: it is 0 for right poses. Missing, merged and half-hidden masks cost agree
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from mvseg.checks.finding import Finding, Level, name_views
-from mvseg.matching.outline_gaps import WIDEST, without_specks
+from mvseg.checks.finding import Finding, Level, Rule, list_findings
+from mvseg.matching.outline_gaps import WIDEST, hull_corners, touches_border
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -29,7 +27,6 @@ Floats = NDArray[np.float64]
 
 NUM_MOVES = 16  # of a view's masks, to see what chance does
 MOST_PARTNERS = 20  # views that each view is compared with
-UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit of offset: masks of large photos are drawn less exactly
 MOST_OFFSET = 40  # units, tried in both directions
 SHARPNESS = 2.0  # units, of the vote for an offset
 # Chosen on 96 development scenes (48 simulated plants with true and with degraded masks) with eight faults in each: no
@@ -76,15 +73,6 @@ class ViewAgreement:
 
 
 @dataclass(frozen=True, eq=False)
-class _Hulls:
-    """The convex hulls of N masks: a mask begins and ends at corners of its hull. (P, 2) pixels, and (P,) whose."""
-
-    corners: Tensor
-    owner: Tensor
-    num: int
-
-
-@dataclass(frozen=True, eq=False)
 class _Spans:
     """Where N masks begin and end in a pencil: (N, 2) radians, and (N, 2) radians per pixel there."""
 
@@ -105,15 +93,14 @@ def pairwise_agreement(regions: Regions, cameras: Cameras, *, progress: bool = F
     """
     num_views = len(cameras)
     regions, cameras = regions.to("cpu"), cameras.to("cpu")
-    sizes = cameras.sizes[regions.view_index]
-    is_cut = ((regions.boxes[:, :2] <= 0) | (regions.boxes[:, 2:] >= sizes)).any(1)
-    regions = regions.select(~is_cut)
-    hulls = [_hulls(regions, view) for view in range(num_views)]
+    regions = regions.select(~touches_border(regions, cameras))
+    corners = hull_corners(regions)
+    hulls = [corners[regions.view_index == view] for view in range(num_views)]
     fitting, offset = np.full((2, num_views, num_views), np.nan)
     num_masks = np.zeros((num_views, num_views), np.int64)
-    unit_px = max(1.0, float(cameras.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL)
+    unit_px = cameras.unit_px
     skip = is_coincident(cameras).tolist()
-    pairs = [(i, j) for i, j in _chosen_pairs(num_views) if hulls[i].num and hulls[j].num and not skip[i][j]]
+    pairs = [(i, j) for i, j in _chosen_pairs(num_views) if len(hulls[i]) and len(hulls[j]) and not skip[i][j]]
     for i, j in tqdm(pairs, desc="poses", unit="pair", disable=not progress):
         pencil = epipolar_pencil(cameras, i, j)
         first, second = _spans(pencil, 0, hulls[i]), _spans(pencil, 1, hulls[j])
@@ -170,20 +157,17 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
         question = "do R and t map world points to the camera, and does each mask belong to its photo?"
         what = f"masks and poses of most views disagree ({facts}): {question}"
         return [Finding(where="poses", what=what, level=level)]
-    findings = []
+    rules: list[Rule] = []
     for index in view.off:
         facts = f"{view.fitting[index]:.0%} of its masks fit, epipolar lines miss by {view.offset_px[index]:.0f} px"
-        what = f"{name_views((index,), names)} agrees with none of the others ({facts} or more): it has the pose or "
-        step = "the masks of another photo, or was moved; mend it or leave it out"
-        findings.append(Finding(where="poses", what=what + step, level=level, views=(index,)))
+        step = "it has the pose or the masks of another photo, or was moved; mend it or leave it out"
+        rules.append((level, (index,), f"{{}} agrees with none of the others ({facts} or more): {step}"))
     missed = np.flatnonzero(view.offset_px >= OFFSET * pairs.unit_px).tolist() if len(names) >= FEW_VIEWS else []
-    missing = tuple(index for index in missed if index not in view.off)
-    if missing:
-        most = np.nanmax(view.offset_px[list(missing)])
-        step = "refine the poses, with --refine_poses true or COLMAP's bundle adjustment"
-        what = f"epipolar lines of {name_views(missing, names)} miss by up to {most:.0f} px: {step}"
-        findings.append(Finding(where="poses", what=what, level="warning", views=missing))
-    return findings
+    missing = [index for index in missed if index not in view.off]
+    most = view.offset_px[missing].max(initial=0)
+    step = "refine the poses, with --refine_poses true or COLMAP's bundle adjustment"
+    rules.append(("warning", missing, f"epipolar lines of {{}} miss by up to {most:.0f} px: {step}"))
+    return list_findings("poses", rules, names)
 
 
 def is_sure(pairs: PoseAgreement) -> bool:
@@ -209,30 +193,15 @@ def _chosen_pairs(num_views: int) -> list[tuple[int, int]]:
     return [(i, i + step) for step in dict.fromkeys(steps.tolist()) for i in range(num_views - step)]
 
 
-def _hulls(regions: Regions, view: int) -> _Hulls:
-    corners, members = [np.zeros((0, 2))], (regions.view_index == view).nonzero()[:, 0].tolist()
-    for index in members:
-        hull = cv2.convexHull(cv2.findNonZero(without_specks(regions.crop(index).numpy())))
-        corners.append(hull[:, 0] + regions.boxes[index, :2].numpy() + 0.5)
-    owner = np.repeat(np.arange(len(members)), [len(hull) for hull in corners[1:]])
-    return _Hulls(torch.from_numpy(np.concatenate(corners)), torch.from_numpy(owner), len(members))
-
-
-def _spans(pencil: Pencil, side: int, hulls: _Hulls) -> _Spans:
-    """Begin and end of each mask that does not hold the epipole."""
-    xy, owner, num = hulls.corners, hulls.owner, hulls.num
+def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
+    """Begin and end of each mask that does not hold the epipole, at corners (N, P, 2) of their hulls."""
     plane = pencil.plane_from_px[side]
-    x, y = (xy @ plane[:, :2].T + plane[:, 2]).unbind(1)
+    x, y = (corners @ plane[:, :2].T + plane[:, 2]).unbind(2)
     angle = torch.atan2(y, x)
-    across = x[:, None] * plane[1, :2] - y[:, None] * plane[0, :2]
-    pitch = across.norm(dim=1) / (x.square() + y.square()).clamp(min=torch.finfo(x.dtype).tiny)
-    ends, at_ends = [], []
-    for sign in (1, -1):
-        start = torch.full((num,), math.inf).double().scatter_reduce(0, owner, sign * angle, "amin")
-        is_there = sign * angle == start[owner]
-        at_ends.append(torch.zeros(num).double().scatter(0, owner[is_there], pitch[is_there]))
-        ends.append(sign * start)
-    spans, pitches = torch.stack(ends, 1), torch.stack(at_ends, 1)
+    across = x[..., None] * plane[1, :2] - y[..., None] * plane[0, :2]
+    pitch = across.norm(dim=2) / (x.square() + y.square()).clamp(min=torch.finfo(x.dtype).tiny)
+    at_ends = torch.stack((angle.argmin(1), angle.argmax(1)), 1)
+    spans, pitches = angle.gather(1, at_ends), pitch.gather(1, at_ends)
     is_span = (spans[:, 1] - spans[:, 0] < WIDEST) & (pitches > 0).all(1)
     return _Spans(spans[is_span], pitches[is_span])
 

@@ -103,40 +103,37 @@ def _print_table(check: Check) -> None:
 
 def _rows(check: Check) -> list[dict[str, Any]]:
     """What the table and check.json say about each view; None where there is nothing to say."""
-    from mvseg.checks.masks import masks_at_border
     from mvseg.checks.poses import view_agreement
+    from mvseg.matching.outline_gaps import touches_border
 
-    num = len(check.scene.views)
+    num, regions = len(check.scene.views), check.regions
     counts: list[Any] = [None] * num
     border: list[Any] = [None] * num
     fit, miss = np.full((2, num), np.nan)
-    if check.regions is not None:
-        counts = check.regions.num_per_view.tolist()
-        at_border = masks_at_border(check.regions, check.scene.cameras)
-        border = np.bincount(check.regions.view_index.numpy()[at_border], minlength=num).tolist()
+    if regions is not None:
+        counts = regions.num_per_view.tolist()
+        at_border = touches_border(regions, check.scene.cameras)
+        border = regions.view_index[at_border].bincount(minlength=num).tolist()
     if check.agreement is not None:
         agreement = view_agreement(check.agreement)
         fit, miss = agreement.fitting, agreement.offset_px
-    rows = []
-    for view in range(num):
-        photo = check.photos[view]
-        state = "broken" if photo.problem else "missing" if photo.size is None else "yes"
-        next_deg, fitting, px = (
-            None if np.isnan(value) else float(value) for value in (check.coverage.angle[view], fit[view], miss[view])
-        )
-        rows.append(
-            {
-                "view": check.scene.views[view].name,
-                "looks_at_point": bool(check.coverage.sees[view]),
-                "next_deg": next_deg,
-                "photo": state,
-                "masks": counts[view],
-                "border": border[view],
-                "fit": fitting,
-                "miss_px": px,
-            }
-        )
-    return rows
+    return [
+        {
+            "view": view.name,
+            "looks_at_point": bool(check.coverage.sees[index]),
+            "next_deg": _known(check.coverage.angle[index]),
+            "photo": "broken" if photo.problem else "missing" if photo.size is None else "yes",
+            "masks": counts[index],
+            "border": border[index],
+            "fit": _known(fit[index]),
+            "miss_px": _known(miss[index]),
+        }
+        for index, (view, photo) in enumerate(zip(check.scene.views, check.photos, strict=True))
+    ]
+
+
+def _known(value: float) -> float | None:
+    return None if np.isnan(value) else float(value)
 
 
 def _write(out: Path, check: Check, findings: list[Finding]) -> None:

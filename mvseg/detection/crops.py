@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -53,7 +52,7 @@ def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
             continue
         boxes = regions.boxes[members].double()
         seen = cameras[views]
-        point = triangulate(projections(seen), ((boxes[:, :2] + boxes[:, 2:]) / 2).numpy())
+        point = triangulate(seen.px_from_world.numpy(), ((boxes[:, :2] + boxes[:, 2:]) / 2).numpy())
         _, depth = seen.project(torch.from_numpy(point)[None])
         of_plant[members] = True
         if not bool((depth > 0).all()):
@@ -76,11 +75,6 @@ def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
     low, high = (low - margin).floor().clamp(min=0), torch.minimum((high + margin).ceil(), cameras.sizes.double())
     is_seen = ((high - low) >= 1).all(1, keepdim=True)  # else the plant is outside the photo
     return torch.where(is_seen, torch.cat((low, high), 1).nan_to_num(0, 0, 0), frames).long()
-
-
-def projections(cameras: Cameras) -> np.ndarray:
-    """(V, 3, 4) px_from_world."""
-    return (cameras.K @ torch.cat((cameras.R, cameras.t[:, :, None]), 2)).numpy()
 
 
 def gain_of_crops(boxes: Tensor, sizes: Tensor, longest: int) -> Tensor:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from pydantic import BaseModel, Field, FiniteFloat, RootModel
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.json_file import Vector3, read_json
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
@@ -43,10 +43,8 @@ def read_bop(path: Path) -> Scene:
         if camera.cam_R_w2c is None or camera.cam_t_w2c is None:
             raise InputError(f"{path}: image {number} has no cam_R_w2c or cam_t_w2c, expected the pose of each camera")
         file = _find_file(path.parent, number)
-        try:
+        with faults_of(f"{path}: image {number} ({file})"):
             width, height = size_of_photo(path.parent, file)
-        except InputError as error:
-            raise InputError(f"{path}: image {number} ({file}): {error}") from None
         K = np.array(camera.cam_K).reshape(3, 3)
         K[:2, 2] += 0.5
         R, t = np.array(camera.cam_R_w2c).reshape(3, 3), np.array(camera.cam_t_w2c)

@@ -16,8 +16,8 @@ import numpy as np
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, FiniteFloat, NonNegativeInt, RootModel, TypeAdapter, ValidationError
 
-from mvseg.errors import InputError, InputWarning
-from mvseg.formats.find_views import base_name, find_views, list_some, warn_of_base_names
+from mvseg.errors import InputError, InputWarning, faults_of
+from mvseg.formats.find_views import base_name, find_views, list_some
 from mvseg.formats.json_file import Int64, Items, read_json
 from mvseg.formats.masks.found_mask import check_categories
 from mvseg.formats.photos import describe_turn
@@ -199,7 +199,7 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     if len(image_ids) < len(coco.images):
         raise InputError(f"{path}: {len(coco.images)} images have {len(image_ids)} ids, expected one each")
     names = [image.file_name for image in coco.images]
-    views = find_views(names, scene, source=path)
+    views = find_views(names, scene, source=path, warn_of_loose=True)
     missing = [view for view in range(len(scene.views)) if view not in set(views)]
     if len(missing) == len(scene.views):
         photos, found = list_some([view.path.name for view in scene.views]), list_some(names)
@@ -208,7 +208,6 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
         first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
         message = f"{len(missing)} views have no entry among the images and no masks, the first is {first_view}"
         warnings.warn(f"{path}: {message}; the file holds {list_some(names)}", InputWarning, stacklevel=5)
-    warn_of_base_names(names, views, scene, source=path)
     for image, view in zip(coco.images, views, strict=True):
         width, height = (image.width, image.height) if view is None else scene.cameras.sizes[view].tolist()
         if (image.width, image.height) != (width, height):
@@ -225,11 +224,8 @@ def _decode_all(
 ) -> Iterator[tuple[int, np.ndarray]]:
     """The masks of annotations, each with its place in the file; `size` is the width and height of their image."""
     for place, annotation in annotations:
-        try:
+        with faults_of(f"{path}: annotation {place if annotation.id is None else annotation.id}"):
             mask = decode_segmentation(annotation.segmentation, *size)
-        except InputError as error:
-            name = place if annotation.id is None else annotation.id
-            raise InputError(f"{path}: annotation {name}: {error}") from None
         yield annotation.id if has_ids and isinstance(annotation.id, int) else place, mask
 
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import mmap
 import struct
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from mvseg.errors import InputError, InputWarning
-from mvseg.formats.colmap_binary_check import check_binary_model
+from mvseg.errors import InputError, InputWarning, faults_of
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.photos import Photo, build_scene
 from mvseg.scene import Scene
@@ -72,7 +73,7 @@ def read_colmap(model: Path, folder: Path) -> Scene:
         InputError: the model cannot be read or is cut short, a camera has no pinhole (EQUIRECTANGULAR); see also
             `build_scene`.
     """
-    check_binary_model(model)
+    _check_binary_model(model)
     try:
         reconstruction = pycolmap.Reconstruction(model)
         images = sorted(reconstruction.images.values(), key=lambda image: image.name)  # which may be no UTF-8
@@ -111,3 +112,67 @@ def _warn_of_photos_without_pose(model: Path, images: Path, registered: set[Path
             f"{len(left_out)} photos in images/ have no pose in the model and are left out, the first is {left_out[0]}"
         )
         warnings.warn(f"{model}: {message}", InputWarning, stacklevel=4)
+
+
+def _check_binary_model(model: Path) -> None:
+    """Walk through every binary file of a model, record by record: of files that were cut short, pycolmap 4.2 takes
+    half as whole, and reads others without end or asks for gigabytes. A model in text has none.
+
+    Raises:
+        InputError: a file cannot be read, does not end where its own counts say, or names an unknown camera model.
+    """
+    for name, record_end in RECORD_ENDS.items():
+        path = model / name
+        if not path.is_file():
+            continue
+        try:
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data, faults_of(path):
+                end = 8
+                for _ in range(_number(data, 0, "<Q")):
+                    end = record_end(data, end)
+                is_whole = end == len(data)
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+        except InputError:
+            raise
+        except (struct.error, ValueError, IndexError, OverflowError):  # beyond the end, or no byte at all
+            is_whole = False
+        if not is_whole:
+            raise InputError(f"{path}: not a whole COLMAP file (its length is not what its counts say)")
+
+
+def _number(data: mmap.mmap, at: int, form: str) -> int:
+    return int(struct.unpack_from(form, data, at)[0])
+
+
+def _camera_end(data: mmap.mmap, at: int) -> int:
+    model = _number(data, at + 4, "<i")
+    try:
+        camera = pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model), 1, 1, 1)
+    except ValueError:
+        raise InputError(f"camera model number {model} is not known") from None
+    return at + 24 + 8 * len(camera.params)
+
+
+def _image_end(data: mmap.mmap, at: int) -> int:
+    name_end = data.find(b"\0", at + 64)
+    if name_end < 0:
+        raise IndexError("no end of the name")
+    return name_end + 9 + 24 * _number(data, name_end + 1, "<Q")
+
+
+def _rig_end(data: mmap.mmap, at: int) -> int:
+    num_sensors = _number(data, at + 4, "<I")
+    end = at + (16 if num_sensors else 8)
+    for _ in range(num_sensors - 1):
+        end += 65 if data[end + 8] else 9  # with a pose or without
+    return end
+
+
+RECORD_ENDS: dict[str, Callable[[mmap.mmap, int], int]] = {
+    "rigs.bin": _rig_end,
+    "cameras.bin": _camera_end,
+    "frames.bin": lambda data, at: at + 68 + 16 * _number(data, at + 64, "<I"),
+    "images.bin": _image_end,
+    "points3D.bin": lambda data, at: at + 51 + 8 * _number(data, at + 43, "<Q"),
+}

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.image_file import PHOTO_SUFFIXES, read_rgb
 from mvseg.formats.json_file import Items, read_json
 
@@ -73,10 +73,8 @@ def read_card_file(path: Path) -> list[tuple[CardEntry, list[Floats]]]:
     found = []
     for entry in entries:
         file = path.parent / entry.photo
-        try:
+        with faults_of(f"{file}: the photo of a colour card cannot be read"):
             photo = read_rgb(file)
-        except InputError as error:
-            raise InputError(f"{file}: the photo of a colour card cannot be read: {error}") from None
         if entry.corners is None:
             patches = list(find_patches(photo))
             if not patches:

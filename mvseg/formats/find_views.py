@@ -17,7 +17,7 @@ SHOWN = 3  # names in a message
 ROBOFLOW = re.compile(r"_(jpe?g|png|tiff?|bmp|webp|heic)\.rf\.\w+$", re.IGNORECASE)
 
 
-def find_views(names: Sequence[str], scene: Scene, *, source: Path) -> list[int | None]:
+def find_views(names: Sequence[str], scene: Scene, *, source: Path, warn_of_loose: bool = False) -> list[int | None]:
     """The view that each file name means, None for a photo that is not in the scene.
 
     A name means a view if it is the path of the view's photo, its last part, or the view's name with or without suffix.
@@ -28,6 +28,7 @@ def find_views(names: Sequence[str], scene: Scene, *, source: Path) -> list[int 
         names: paths with "/" or "\\" between folders, with or without suffix; of any machine.
         scene: gives the views.
         source: the file or folder that holds the names; messages name it.
+        warn_of_loose: say (InputWarning) which names were told by their base name alone.
 
     Raises:
         InputError: a name fits several views, or several names that fit nothing else have the base name of one view.
@@ -45,6 +46,10 @@ def find_views(names: Sequence[str], scene: Scene, *, source: Path) -> list[int 
             message = f"both {first_of[view]} and {name} could be view {view} ({scene.views[view].name})"
             raise InputError(f"{source}: {message}, expected the path of its photo")
         found[index] = view
+    if first_of and warn_of_loose:
+        view, name = next(iter(first_of.items()))
+        message = f"{len(first_of)} names fit a photo by the base name only, the first is {name} for "
+        warnings.warn(f"{source}: {message}{scene.views[view].name}", InputWarning, stacklevel=4)
     return found
 
 
@@ -55,21 +60,6 @@ def base_name(name: str) -> str:
     if dot and f".{suffix.lower()}" in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES):
         last = stem
     return ROBOFLOW.sub("", last).lower()
-
-
-def warn_of_base_names(names: Sequence[str], views: Sequence[int | None], scene: Scene, *, source: Path) -> None:
-    """Say (InputWarning) which names `find_views` told by their base name alone."""
-    exact = _exact_views(names, scene, source)
-    loose = [
-        (name, view)
-        for name, view, exact_view in zip(names, views, exact, strict=True)
-        if view is not None and exact_view is None
-    ]
-    if loose:
-        name, view = loose[0]
-        first = f"{name} for {scene.views[view].name}"
-        message = f"{len(loose)} names fit a photo by the base name only, the first is {first}"
-        warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
 
 
 def list_some(names: Sequence[str]) -> str:

@@ -24,7 +24,7 @@ def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
     Raises:
         InputError: as `read_labels`, or another size than `width` x `height`.
     """
-    return _read(path, (width, height))
+    return labels_of(open_labels(path, (width, height)), path)
 
 
 def read_labels(path: Path) -> np.ndarray:
@@ -34,13 +34,7 @@ def read_labels(path: Path) -> np.ndarray:
         InputError: the file is missing, cannot be decoded, is a JPEG, has colour channels, or does not hold
             unsigned numbers of at most 16 bits.
     """
-    return _read(path, None)
-
-
-def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
-    if not path.is_file():
-        raise InputError(f"{path}: the mask file is missing")
-    return labels_of(open_labels(path, size), path)
+    return labels_of(open_labels(path, None), path)
 
 
 def open_labels(path: Path, size: tuple[int, int] | None) -> Image.Image:
@@ -51,8 +45,10 @@ def open_labels(path: Path, size: tuple[int, int] | None) -> Image.Image:
         size: width and height that its camera says; an image of another size is not decoded.
 
     Raises:
-        InputError: it cannot be decoded, is a JPEG, or is of another size.
+        InputError: it is missing, cannot be decoded, is a JPEG, or is of another size.
     """
+    if not path.is_file():
+        raise InputError(f"{path}: the mask file is missing")
     try:
         image = read_image(path, size)
         if size is not None and image.size != size:

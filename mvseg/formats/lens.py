@@ -8,23 +8,37 @@ sees what no pinhole can: a position that does not come back to itself, there an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import lru_cache
 
 import cv2
 import numpy as np
 import pycolmap
 
+from mvseg.errors import InputError
+
 CHUNK = 1 << 20  # pixels at a time: all of a photo of 24 megapixels would take 3 GB
 
 Mapping = Callable[[pycolmap.Camera, np.ndarray, np.ndarray], np.ndarray]
 
 
-def opencv_lens(K: np.ndarray, distortion: list[float], *, width: int, height: int) -> pycolmap.Camera:
-    """OpenCV's k1, k2, p1, p2 (, k3 (, k4, k5, k6)) as COLMAP's FULL_OPENCV; K in this project's pixels."""
-    coefficients = [*distortion, *[0.0] * (8 - len(distortion))]
-    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *coefficients]
-    return pycolmap.Camera(model="FULL_OPENCV", width=width, height=height, params=params)
+def opencv_lens(
+    K: np.ndarray, distortion: Sequence[float], *, width: int, height: int, is_fisheye: bool = False
+) -> pycolmap.Camera | None:
+    """OpenCV's k1, k2, p1, p2 (, k3 (, k4, k5, k6)) as COLMAP's FULL_OPENCV, or k1 to k4 as its OPENCV_FISHEYE; K in
+    this project's pixels. None for a pinhole.
+
+    Raises:
+        InputError: K has skew together with distortion.
+    """
+    if not is_fisheye and not any(distortion):
+        return None
+    if K[0, 1] != 0:
+        raise InputError("K has skew together with distortion, expected none")
+    padding = [0.0] * ((4 if is_fisheye else 8) - len(distortion))
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *distortion, *padding]
+    model = "OPENCV_FISHEYE" if is_fisheye else "FULL_OPENCV"
+    return pycolmap.Camera(model=model, width=width, height=height, params=params)
 
 
 def opencv_distortion(lens: pycolmap.Camera) -> list[float] | None:

@@ -18,10 +18,11 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, faults_of
 from mvseg.formats.image_file import MAX_SIDE
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, find_photo
+from mvseg.formats.text_file import read_bytes
 from mvseg.scene import Scene
 
 MAX_BYTES = 1 << 26
@@ -54,10 +55,8 @@ def read_metashape(path: Path) -> Scene:
     """
     chunk = _read_chunk(path)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    try:
+    with faults_of(path):
         world_from_chunk = _find_transform(path, chunk)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     photos, num_left_out = [], 0
     for index, camera in enumerate(_list_cameras(chunk)):
         text = camera.findtext("transform")
@@ -65,11 +64,9 @@ def read_metashape(path: Path) -> Scene:
             num_left_out += 1
             continue
         label = camera.get("label") or str(index)
-        try:
+        with faults_of(f"{path}: camera {label}"):
             sensor = sensors.get(camera.get("sensor_id"))
             photos.append(_photo(path.parent, label, sensor, transform=text, world_from_chunk=world_from_chunk))
-        except InputError as error:
-            raise InputError(f"{path}: camera {label}: {error}") from None
     if num_left_out:
         message = f"{num_left_out} cameras are not aligned or not enabled and are left out"
         warnings.warn(f"{path}: {message}", InputWarning, stacklevel=3)
@@ -78,12 +75,7 @@ def read_metashape(path: Path) -> Scene:
 
 
 def _read_chunk(path: Path) -> ElementTree.Element:
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: is larger than {MAX_BYTES >> 20} MiB, expected the cameras alone")
-        data = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    data = read_bytes(path, "the cameras of Metashape alone", most=MAX_BYTES)
     if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # entities can ask for memory without end
         raise InputError(f"{path}: declares a document type, which Metashape does not")
     try:
@@ -142,9 +134,7 @@ def _photo(
         ]
     )
     distortion = [values[name] for name in ("k1", "k2", "p2", "p1", "k3")]
-    lens = opencv_lens(K, distortion, width=width, height=height) if any(distortion) else None
-    if lens is not None and values["b2"]:
-        raise InputError("its sensor has skew (b2) together with distortion, expected b2 = 0")
+    lens = opencv_lens(K, distortion, width=width, height=height)
     chunk_from_cam = _numbers(transform, 16).reshape(4, 4)
     if chunk_from_cam[3].tolist() != [0, 0, 0, 1]:
         raise InputError("the last row of its transform is not 0, 0, 0, 1")

@@ -18,9 +18,9 @@ from mvseg.errors import InputError
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Pixels
 from mvseg.formats.lens import opencv_lens
-from mvseg.formats.yaml_file import check_yaml_text
+from mvseg.formats.yaml_file import read_yaml
 
-MAX_BYTES = 1 << 20
+EXPECTED = "camera_matrix and distortion_coefficients, as OpenCV or ROS writes them"
 # Names that tools use, in small letters and without "_".
 NAMES = {
     "matrix": ("cameramatrix", "k", "m", "mtx", "intrinsicmatrix"),
@@ -98,8 +98,7 @@ def read_calibration(folder: Path, file: str) -> Calibration:
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(map(str, first["loc"]))
-        expected = "expected camera_matrix and distortion_coefficients"
-        raise InputError(f"{path}: {where}: {first['msg']}, {expected}") from None
+        raise InputError(f"{path}: {where}: {first['msg']}, expected {EXPECTED}") from None
     if len(content.matrix.data) != 9:
         raise InputError(f"{path}: the camera matrix has {len(content.matrix.data)} numbers, expected 9")
     K = np.array(content.matrix.data).reshape(3, 3)
@@ -116,34 +115,15 @@ def calibration_lens(calibration: Calibration, width: int, height: int) -> pycol
     Raises:
         InputError: K has skew together with distortion.
     """
-    K = calibration.K
-    if not calibration.is_fisheye and not any(calibration.distortion):
-        return None
-    if K[0, 1] != 0:
-        raise InputError("the camera matrix has skew together with distortion, expected none")
-    if calibration.is_fisheye:
-        params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *calibration.distortion]
-        return pycolmap.Camera(model="OPENCV_FISHEYE", width=width, height=height, params=params)
-    return opencv_lens(K, list(calibration.distortion), width=width, height=height)
+    K, numbers = calibration.K, calibration.distortion
+    return opencv_lens(K, numbers, width=width, height=height, is_fisheye=calibration.is_fisheye)
 
 
 def _read_entries(path: Path) -> dict[str, Any]:
     """The top level of the file, keys in small letters and without "_"."""
-    try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: is too large for a calibration")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        text = "\n".join(line for line in lines if not line.startswith("%YAML"))  # "%YAML:1.0" is no YAML
-        check_yaml_text(path, text)
-        entries = yaml.load(text, _Loader)
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{path}: the calibration cannot be read ({error.strerror})") from None
-    except Exception as error:  # yaml raises its own kinds, and those of what it builds
-        raise InputError(f"{path}: is not YAML of OpenCV or ROS ({type(error).__name__})") from None
+    entries = read_yaml(path, EXPECTED, loader=_Loader)
     if not isinstance(entries, dict):
-        raise InputError(f"{path}: is not YAML of OpenCV or ROS, expected camera_matrix and distortion_coefficients")
+        raise InputError(f"{path}: is no calibration, expected {EXPECTED}")
     return {str(key).lower().replace("_", ""): value for key, value in entries.items()}
 
 

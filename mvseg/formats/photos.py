@@ -13,7 +13,7 @@ import numpy as np
 import pycolmap
 import torch
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, faults_of
 from mvseg.formats.image_file import (
     MAX_PIXELS,
     MAX_SIDE,
@@ -89,10 +89,8 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         t=torch.from_numpy(np.stack([photo.t for photo in photos])),
         sizes=torch.tensor([[photo.width, photo.height] for photo in photos]),
     )
-    try:
+    with faults_of(source):
         return Scene(name=scene_name(folder), views=views, cameras=cameras, unit=unit, source=source)
-    except InputError as error:
-        raise InputError(f"{source}: {error}") from None
 
 
 def scene_name(folder: Path) -> str:
@@ -132,10 +130,8 @@ def size_of_photo(folder: Path, file: str) -> tuple[int, int]:
     photo = folder / find_photo(folder, file)
     if file_name_problem(os.path.relpath(photo, folder)) or not photo.is_file():
         raise InputError("width and height are missing, and so is the photo that could tell")
-    try:
+    with faults_of("width and height are missing, and the photo cannot be read"):
         return read_image_size(photo)
-    except InputError as error:
-        raise InputError(f"width and height are missing, and the photo cannot be read: {error}") from None
 
 
 def is_elsewhere(file: str, found: str) -> bool:

@@ -1,10 +1,11 @@
-"""Where the camera stood at each photo, as carriages and robots log it: CSV, or JSON with a list of views.
+"""Where the camera stood at each photo, as carriages and robots log it, or how far a turntable had turned: CSV.
 
-    photo,x,y,z                          {"views": [{"file": "images/000.jpg", "x_mm": 75, "y_mm": 375, "z_mm": 80},
-    000.jpg,75,375,80                               ...]}
+    photo,x,y,z          photo,angle
+    000.jpg,75,375,80    000.jpg,7.5
 
-The first column may be called photo, image, file, filename or name; the others x, y, z, and perhaps their unit, as in
-x_mm. Columns may be separated by commas, semicolons or tabs; other columns and keys are left alone.
+The first column may be called photo, image, file, filename or name; x, y and z perhaps have their unit, as in x_mm.
+Columns may be separated by commas, semicolons or tabs; others are left alone. Positions may also be JSON with a list of
+views: {"views": [{"file": "images/000.jpg", "x_mm": 75, "y_mm": 375, "z_mm": 80}, ...]}.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from __future__ import annotations
 import csv
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,10 +23,12 @@ from pydantic import BaseModel
 
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, read_json
+from mvseg.formats.text_file import read_text
 
 NAMES = ("photo", "image", "file", "filename", "file_name", "name")
 AXIS = re.compile(r"([xyz])(?:[_ ]?[\[(]?(mm|cm|dm|m|um|in|ft)[\])]?)?")
 MAX_BYTES = 1 << 26
+Rows = Sequence[dict[Any, Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,60 +57,66 @@ def read_positions(path: Path) -> Positions:
         InputError: the file cannot be read, has no columns for photo, x, y and z, holds something else than numbers
             there, names a photo twice or has columns in different units.
     """
-    rows = read_json(path, _Positions).views if path.suffix.lower() == ".json" else read_table(path, "positions")
+    rows = read_json(path, _Positions).views if path.suffix.lower() == ".json" else _read_table(path, "positions")
     if not rows:
         raise InputError(f"{path}: holds no positions, expected a line for each photo")
-    columns, unit = _find_columns(path, rows[0])
-    names, xyz = [], []
-    for index, row in enumerate(rows):
-        name, *numbers = (row.get(column) for column in columns)
-        if not isinstance(name, str) or not name:
-            raise InputError(f"{path}: position {index} has no photo in '{columns[0]}'")
-        if name in names:
-            raise InputError(f"{path}: photo {name} has two positions, expected one")
-        names.append(name)
-        found = zip(numbers, columns[1:], strict=True)
-        xyz.append([read_number(value, f"{path}: {column} of {name}") for value, column in found])
-    return Positions(names=tuple(names), xyz=np.array(xyz), unit=unit)
+    keys = _columns(rows)
+    axes = {match[1]: (key, match[2] or "") for name, key in keys.items() if (match := AXIS.fullmatch(name))}
+    if "photo" not in keys or set(axes) != set("xyz"):
+        raise InputError(f"{path}: found the columns {', '.join(map(str, rows[0]))}; expected photo, x, y, z")
+    if len({unit for _, unit in axes.values()}) > 1:
+        raise InputError(f"{path}: x, y and z are in different units, expected one")
+    found = _by_photo(path, rows, [keys["photo"], *(axes[axis][0] for axis in "xyz")], what="position")
+    return Positions(names=tuple(found), xyz=np.array(list(found.values())), unit=axes["x"][1])
 
 
-def read_table(path: Path, what: str) -> list[dict[str, Any]]:
-    """The rows of a CSV file, as {column: entry}.
+def read_photo_angles(path: Path) -> dict[str, float]:
+    """{name of the photo, as in the file: degrees}.
 
     Raises:
-        InputError: it cannot be read as a table; `what` says of what it should be one.
+        InputError: the file cannot be read, has no columns for photo and angle, holds something else than numbers
+            there, or names a photo twice.
     """
+    rows = _read_table(path, "angles")
+    keys = _columns(rows)
+    if not {"photo", "angle"} <= keys.keys():
+        found = ", ".join(map(str, rows[0])) if rows else "nothing"
+        raise InputError(f"{path}: found the columns {found}; expected photo, angle and a line for each photo")
+    by_photo = _by_photo(path, rows, [keys["photo"], keys["angle"]], what="angle")
+    return {name: angle for name, (angle,) in by_photo.items()}
+
+
+def _read_table(path: Path, what: str) -> list[dict[Any, Any]]:
+    """The rows of a CSV file, as {column: entry}."""
+    lines = read_text(path, f"a table of {what}", most=MAX_BYTES).splitlines()
+    delimiter = max(",;\t", key=lines[0].count) if lines else ","
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: is too large for a table of {what}")
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-        head = lines[0] if lines else ""
-        delimiter = max(",;\t", key=head.count)
         return list(csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True))
-    except OSError as error:
-        raise InputError(f"{path}: the {what} cannot be read ({error.strerror})") from None
-    except (ValueError, csv.Error) as error:
+    except csv.Error as error:
         raise InputError(f"{path}: is not a table of {what} ({error})") from None
 
 
-def _find_columns(path: Path, row: Mapping[str, Any]) -> tuple[list[str], str]:
-    """The columns of the photo, x, y, z; and the unit."""
-    keys = {str(key).strip().lower(): key for key in row if key is not None}
+def _columns(rows: Rows) -> dict[str, Any]:
+    """{name in small letters: column}; that of the photos is called "photo", whatever its name."""
+    keys = {str(key).strip().lower(): key for key in (rows[0] if rows else ()) if key is not None}
     photo = next((keys[name] for name in NAMES if name in keys), None)
-    axes, units = {}, set()
-    for name, key in keys.items():
-        match = AXIS.fullmatch(name)
-        if match and match[1] not in axes:
-            axes[match[1]] = key
-            units.add(match[2] or "")
-    if photo is None or set(axes) != set("xyz"):
-        raise InputError(f"{path}: found the columns {', '.join(map(str, row))}; expected photo, x, y, z")
-    if len(units) > 1:
-        raise InputError(f"{path}: x, y and z are in different units, expected one")
-    return [photo, *(axes[axis] for axis in "xyz")], units.pop()
+    return keys if photo is None else keys | {"photo": photo}
 
 
-def read_number(value: Any, where: str) -> float:
+def _by_photo(path: Path, rows: Rows, columns: Sequence[Any], *, what: str) -> dict[str, list[float]]:
+    """{photo: numbers}, of the columns of the photo and of its numbers."""
+    found: dict[str, list[float]] = {}
+    for index, row in enumerate(rows):
+        name = row.get(columns[0])
+        if not isinstance(name, str) or not name:
+            raise InputError(f"{path}: {what} {index} has no photo in '{columns[0]}'")
+        if name in found:
+            raise InputError(f"{path}: photo {name} has two {what}s, expected one")
+        found[name] = [_read_number(row.get(column), f"{path}: {column} of {name}") for column in columns[1:]]
+    return found
+
+
+def _read_number(value: Any, where: str) -> float:
     """A number of moderate size; InputError, which begins with `where`, if it is none."""
     try:
         number = float(value)

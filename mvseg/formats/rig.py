@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import warnings
+from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal
@@ -20,7 +21,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, faults_of
 from mvseg.formats.json_file import Items, Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.opencv_yaml import calibration_lens, read_calibration
@@ -74,20 +75,21 @@ def read_rig(path: Path) -> Scene:
         InputError: the file is missing, broken or of another format, or holds unsound cameras; see `build_scene`.
     """
     rig = read_json(path, _Rig)
-    for owner, entry in [("the rig", rig), *((f"view {i}", view) for i, view in enumerate(rig.views))]:
-        for key in list(entry.model_extra or {})[:MANY]:
-            warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
+    warn_of_unknown_keys(path, [("the rig", rig), *((f"view {i}", view) for i, view in enumerate(rig.views))])
     photos = []
     for index, view in enumerate(rig.views):
-        try:
+        with faults_of(f"{path}: view {index} ({view.file})"):
             photos.append(photo_of(path.parent, view.file, view))
-        except InputError as error:
-            raise InputError(f"{path}: view {index} ({view.file}): {error}") from None
     scene = build_scene(path.parent, photos, unit=rig.unit, source=path)
-    try:
+    with faults_of(path):
         return replace(scene, up=rig.up)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
+
+
+def warn_of_unknown_keys(path: Path, entries: Iterable[tuple[str, BaseModel]]) -> None:
+    """Say (InputWarning) which keys of the named entries of a file are not used."""
+    for owner, entry in entries:
+        for key in list(entry.model_extra or {})[:MANY]:
+            warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=3)
 
 
 def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
@@ -107,13 +109,10 @@ def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
     size = (camera.width, camera.height)
     if camera.calibration is None:
         width, height = _complete_size(size, folder, file)
-        K, lens = np.array(camera.K), None
-        if camera.distortion and len(camera.distortion) not in (4, 5, 8):
-            raise InputError(f"distortion has {len(camera.distortion)} numbers, expected k1, k2, p1, p2, k3")
-        if camera.distortion and any(camera.distortion):
-            if K[0, 1] != 0:
-                raise InputError("K has skew together with distortion, expected none")
-            lens = opencv_lens(K, camera.distortion, width=width, height=height)
+        K, distortion = np.array(camera.K), camera.distortion or []
+        if len(distortion) not in (0, 4, 5, 8):
+            raise InputError(f"distortion has {len(distortion)} numbers, expected k1, k2, p1, p2, k3")
+        lens = opencv_lens(K, distortion, width=width, height=height)
     else:
         if camera.distortion:
             raise InputError("distortion beside a calibration file, expected one of them")

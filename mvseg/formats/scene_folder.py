@@ -91,9 +91,7 @@ def _describe(folder: Path) -> str:
     return f"found {list_some(names)}"
 
 
-def load_masks(
-    scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", categories: Collection[str] = ()
-) -> Regions:
+def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", categories: Collection[str] = ()) -> Regions:
     """Load the masks of every view, with the lens distortion of the scene removed.
 
     Args:
@@ -115,9 +113,7 @@ def load_masks(
     return read_masks(scene, recognise_masks(scene, Path(masks)), crowd=crowd, categories=categories)
 
 
-def read_masks(
-    scene: Scene, found: MaskFiles, *, crowd: Crowd = "mask", categories: Collection[str] = ()
-) -> Regions:
+def read_masks(scene: Scene, found: MaskFiles, *, crowd: Crowd = "mask", categories: Collection[str] = ()) -> Regions:
     """The second half of `load_masks`: read the files that were recognised."""
     if categories and found.kind not in ("COCO", "labelme", "YOLO"):
         raise InputError(f"{found.source}: holds {found.kind}, which have no categories to select from")

@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, faults_of
 from mvseg.formats.json_file import Items, Pixels, read_json
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
@@ -78,10 +78,8 @@ def read_transforms(path: Path) -> Scene:
     photos = []
     for index, frame in enumerate(transforms.frames):
         of_frame = frame.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
-        try:
+        with faults_of(f"{path}: frame {index} ({frame.file_path})"):
             photos.append(_photo(path.parent, frame, shared | of_frame, undo=undo))
-        except InputError as error:
-            raise InputError(f"{path}: frame {index} ({frame.file_path}): {error}") from None
     num_masks = sum(frame.mask_path is not None for frame in transforms.frames)
     if num_masks:
         message = f"the mask_path of {num_masks} frames is not used: it does not tell leaves apart, as --masks does"
@@ -141,13 +139,9 @@ def _lens(intrinsics: dict, K: np.ndarray) -> pycolmap.Camera | None:
     model, width, height = intrinsics.get("camera_model", "OPENCV"), intrinsics["w"], intrinsics["h"]
     k1, k2, k3, k4, p1, p2 = (intrinsics.get(key, 0.0) for key in ("k1", "k2", "k3", "k4", "p1", "p2"))
     if model == "OPENCV_FISHEYE" or (intrinsics.get("is_fisheye") and "camera_model" not in intrinsics):
-        model = "OPENCV_FISHEYE"
-        params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], k1, k2, k3, k4]
-        return pycolmap.Camera(model=model, width=width, height=height, params=params)
+        return opencv_lens(K, [k1, k2, k3, k4], width=width, height=height, is_fisheye=True)
     if model not in ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL"):
         raise InputError(f"the camera model '{model}' is not known, expected OPENCV, OPENCV_FISHEYE or PINHOLE")
     if k4:
         raise InputError(f"k4 is {k4:g} in the model {model}, expected 0 (a term in r^8 is not supported)")
-    if not any((k1, k2, k3, p1, p2)):
-        return None
     return opencv_lens(K, [k1, k2, p1, p2, k3], width=width, height=height)

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -25,10 +24,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 from scipy.spatial.transform import Rotation
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.json_file import Items, Vector3, read_json
 from mvseg.formats.photos import build_scene
-from mvseg.formats.rig import MANY, RigCamera, photo_of
+from mvseg.formats.rig import RigCamera, photo_of, warn_of_unknown_keys
 from mvseg.scene import Scene
 
 TURNTABLE_FORMAT = "mvseg-turntable/1"
@@ -65,9 +64,7 @@ def read_turntable(path: Path) -> Scene:
     """
     table = read_json(path, _Turntable)
     owners = [("the turntable", table), *((f"camera {name}", each) for name, each in table.cameras.items())]
-    for owner, entry in [*owners, *((f"view {index}", view) for index, view in enumerate(table.views))]:
-        for key in list(entry.model_extra or {})[:MANY]:
-            warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=2)
+    warn_of_unknown_keys(path, [*owners, *((f"view {index}", view) for index, view in enumerate(table.views))])
     if not any(table.axis.direction):
         raise InputError(f"{path}: the direction of the axis is 0, 0, 0, expected a vector along the axis")
     photos = []
@@ -76,10 +73,8 @@ def read_turntable(path: Path) -> Scene:
         if view.camera not in table.cameras:
             names = ", ".join(table.cameras)
             raise InputError(f"{where}: there is no camera '{view.camera}', expected of these: {names}")
-        try:
+        with faults_of(where):
             photo = photo_of(path.parent, view.file, table.cameras[view.camera])
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
         turn, shift = turn_about(np.array(table.axis.point), np.array(table.axis.direction), view.angle)
         photos.append(dataclasses.replace(photo, R=photo.R @ turn, t=photo.R @ shift + photo.t))
     return build_scene(path.parent, photos, unit=table.unit, source=path)

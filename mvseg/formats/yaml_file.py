@@ -1,4 +1,4 @@
-"""YAML files of options: what a parser may safely be given.
+"""YAML files: what a parser may safely be given.
 
 PyYAML itself follows brackets as deep as Python's stack, and a file of 300 bytes whose aliases name each other unfolds
 into thousands of millions of values.
@@ -7,12 +7,14 @@ into thousands of millions of values.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import yaml  # type: ignore[import-untyped]
 
 from mvseg.errors import InputError
+from mvseg.formats.text_file import read_text
 
-MAX_BYTES, MAX_DEPTH, MAX_DIGITS = 1 << 20, 32, 400
+MAX_DEPTH, MAX_DIGITS = 32, 400
 
 
 def check_yaml(path: Path) -> None:
@@ -22,30 +24,27 @@ def check_yaml(path: Path) -> None:
         InputError: it cannot be read, is larger than 1 MB, no UTF-8 or no YAML, is nested more than 32 deep, uses
             aliases, or holds a number of more than 400 digits.
     """
-    try:
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror}), expected a YAML file of options") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{path}: is larger than {MAX_BYTES} bytes, expected a YAML file of options")
-    try:
-        text = data.decode()
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is no UTF-8, expected a YAML file of options") from None
-    try:
-        check_yaml_text(path, text)
-    except yaml.YAMLError as error:
-        raise InputError(f"{path}: is no YAML file ({' '.join(str(error).split())})") from None
+    read_yaml(path, "a YAML file of options", loader=yaml.BaseLoader)
 
 
-def check_yaml_text(path: Path, text: str) -> None:
-    """Check the text of a YAML file; messages name the path.
+def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:
+    """What a YAML file holds; a line of OpenCV, "%YAML:1.0", is left out.
 
     Raises:
-        InputError: it is nested more than 32 deep, uses aliases, or holds a number of more than 400 digits.
-        yaml.YAMLError: it is no YAML.
+        InputError: see `check_yaml`; names the path and what was expected.
     """
+    lines = read_text(path, expected).split("\n")
+    text = "\n".join("" if line.startswith("%YAML:") else line for line in lines)
+    try:
+        _check_events(path, text)
+        return yaml.load(text, loader)
+    except InputError:
+        raise
+    except Exception as error:  # yaml raises its own kinds, and those of what it builds
+        raise InputError(f"{path}: is no YAML file ({' '.join(str(error).split())}), expected {expected}") from None
+
+
+def _check_events(path: Path, text: str) -> None:
     depth = 0
     for event in yaml.parse(text, Loader=yaml.SafeLoader):  # event by event: nothing is built
         line = event.start_mark.line + 1

@@ -80,21 +80,35 @@ def find_outlines(masks: Masks, cameras: Cameras) -> Outlines:
     fit to find out."""
     regions = masks.regions
     ids, views = masks.instance_ids.cpu(), regions.view_index.cpu()
-    regions, sizes = regions.to("cpu"), cameras.sizes.cpu()[views]
-    is_cut = ((regions.boxes[:, :2] <= 0) | (regions.boxes[:, 2:] >= sizes)).any(1)
+    regions, cameras = regions.to("cpu"), cameras.to("cpu")
     place = views * (masks.num_instances + 1) + ids.clamp(min=0)
     is_only = torch.bincount(place, minlength=1)[place] == 1
-    chosen = ((ids > 0) & ~is_cut & is_only).nonzero()[:, 0]
+    chosen = ((ids > 0) & ~touches_border(regions, cameras) & is_only).nonzero()[:, 0]
     hulls = [_hull(regions, index) for index in chosen.tolist()]
-    most = max((len(hull) for hull in hulls), default=1)
-    padded = [torch.cat((hull, hull[:1].expand(most - len(hull), 2))) for hull in hulls]
     return Outlines(
-        corners=torch.stack(padded) if hulls else torch.zeros(0, most, 2).double(),
+        corners=_pad(hulls),
         middle=torch.stack([hull.mean(0) for hull in hulls]) if hulls else torch.zeros(0, 2).double(),
         view=views[chosen],
         instance=ids[chosen],
         weight=masks.match_scores.cpu()[chosen].double(),
     )
+
+
+def touches_border(regions: Regions, cameras: Cameras) -> Tensor:
+    """(D,) bool, whether a region reaches the border of its photo, where it may be cut."""
+    return ((regions.boxes[:, :2] <= 0) | (regions.boxes[:, 2:] >= cameras.sizes[regions.view_index])).any(1)
+
+
+def hull_corners(regions: Regions) -> Tensor:
+    """(D, P, 2) float64, the corners of the regions' hulls, pixel centres; the first is repeated where there are
+    fewer."""
+    return _pad([_hull(regions, index) for index in range(len(regions))])
+
+
+def _pad(hulls: list[Tensor]) -> Tensor:
+    most = max((len(hull) for hull in hulls), default=1)
+    padded = [torch.cat((hull, hull[:1].expand(most - len(hull), 2))) for hull in hulls]
+    return torch.stack(padded) if hulls else torch.zeros(0, most, 2).double()
 
 
 def _hull(regions: Regions, index: int) -> Tensor:
@@ -147,9 +161,7 @@ def _pencil_frames(cameras: Cameras, views: Tensor) -> Tensor:
     return frames[which]
 
 
-def _linear_gaps(
-    outlines: Outlines, pairs: Tensor, at: Tensor, *, cameras: Cameras, world_per_px: Tensor
-) -> Gaps:
+def _linear_gaps(outlines: Outlines, pairs: Tensor, at: Tensor, *, cameras: Cameras, world_per_px: Tensor) -> Gaps:
     """The gaps between the points (T, 2, 2) at which pairs of outlines (T, 2) end.
 
     To first order, a gap does not change when the outlines touch elsewhere: the derivatives are those of fixed points.

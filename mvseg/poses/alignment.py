@@ -1,6 +1,8 @@
 """Similarities: the scale, turn and shift that structure from motion leaves open, from points known in both worlds.
 
 Closed form: Umeyama, Least-squares estimation of transformation parameters between two point patterns (PAMI 1991).
+`similarity * points` are (P, 3) points of the scene in the known world. pycolmap's own `estimate_sim3d` refuses points
+in one plane, as those of a board are, and its robust one finds fewer of these.
 """
 
 from __future__ import annotations
@@ -8,7 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
 
@@ -19,30 +23,7 @@ MIRRORED = 0.5  # residual of the best reflection over that of the best similari
 TRIALS = 300  # random triples of points
 OUTLIER = 3.0  # residuals that over half of the points keep to, times this, are still theirs
 ROUNDING = 1e-9  # of the spread of the points: residuals below it are none
-
-
-@dataclass(frozen=True, eq=False)
-class Similarity:
-    """target = scale * R @ source + t.
-
-    Attributes:
-        scale: > 0, target units per source unit.
-        R: (3, 3) float64 rotation.
-        t: (3,) float64, target units.
-    """
-
-    scale: float
-    R: Floats
-    t: Floats
-
-    def apply(self, points: Floats) -> Floats:
-        """(P, 3) source points in the target frame."""
-        return self.scale * points @ self.R.T + self.t
-
-    @property
-    def matrix(self) -> Floats:
-        """(3, 4): `matrix @ (x, y, z, 1)`."""
-        return np.column_stack([self.scale * self.R, self.t])
+MIRROR = np.array([1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +31,12 @@ class Alignment:
     """A similarity that most of the points agree on.
 
     Attributes:
-        similarity: fitted to the inliers by least squares.
+        similarity: world_from_scene, fitted to the inliers by least squares.
         residuals: (P,) distances between targets and mapped sources, target units.
         is_inlier: (P,) bool, the points that were used.
     """
 
-    similarity: Similarity
+    similarity: pycolmap.Sim3d
     residuals: Floats
     is_inlier: NDArray[np.bool_]
 
@@ -65,9 +46,9 @@ class Alignment:
         return float(np.sqrt((self.residuals[self.is_inlier] ** 2).mean()))
 
 
-def scale_by(factor: float) -> Similarity:
+def scale_by(factor: float) -> pycolmap.Sim3d:
     """The similarity that only multiplies lengths."""
-    return Similarity(scale=factor, R=np.eye(3), t=np.zeros(3))
+    return pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3))
 
 
 def spreads(points: Floats) -> Floats:
@@ -83,7 +64,7 @@ def is_one_line(points: Floats) -> bool:
     return bool(across <= FLAT * along)
 
 
-def fit_similarity(source: Floats, target: Floats) -> Similarity:
+def fit_similarity(source: Floats, target: Floats) -> pycolmap.Sim3d:
     """The similarity with the least squared distances between P mapped sources and their targets (Umeyama).
 
     Args:
@@ -98,36 +79,27 @@ def fit_similarity(source: Floats, target: Floats) -> Similarity:
         raise InputError(f"{len(source)} known points, expected at least three that are not on one line")
     if is_one_line(source) or is_one_line(target):
         raise InputError("the known points lie on one line, expected some beside it: the turn about it stays open")
-    proper, mirrored = (_fit(source, target, mirror=mirror) for mirror in (False, True))
-    if not _is_flat(source) and not _is_flat(target):
-        fits, size = (proper, mirrored), np.sqrt(len(source))
-        misses = [float(np.linalg.norm(fit.apply(source) - target)) / size for fit in fits]
-        if misses[1] < MIRRORED * misses[0]:
-            _refuse_mirror(misses[0], target)
-    return proper
+    fits = [(_fit(each, target), each) for each in (source, source * MIRROR)]
+    misses = [float(np.linalg.norm(_residuals(fit, each, target))) / np.sqrt(len(source)) for fit, each in fits]
+    _refuse_mirror(source, target, misses)
+    return fits[0][0]
 
 
-def _is_flat(points: Floats) -> bool:
-    """Whether points lie in one plane; a mirror image is then as good as a turn."""
-    _, across, off = spreads(points)
-    return bool(off <= FLAT * across)
-
-
-def _refuse_mirror(miss: float, target: Floats) -> None:
-    if miss > FLAT * spreads(target)[0]:  # below, the two differ by noise
-        raise InputError("the known points fit as in a mirror only, expected right-handed axes: turn one round")
-
-
-def _fit(source: Floats, target: Floats, *, mirror: bool) -> Similarity:
-    """Umeyama's equations (40) to (42); `mirror` asks for a reflection, whose R has determinant -1."""
+def _fit(source: Floats, target: Floats) -> pycolmap.Sim3d:
+    """Umeyama's equations (40) to (42)."""
     from_source, from_target = source - source.mean(0), target - target.mean(0)
-    left, sizes, right = np.linalg.svd(from_target.T @ from_source)
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(left) * np.linalg.det(right))])
-    if mirror:
-        signs[2] = -signs[2]
-    R = (left * signs) @ right
-    scale = float((sizes * signs).sum() / (from_source**2).sum())
-    return Similarity(scale=scale, R=R, t=target.mean(0) - scale * R @ source.mean(0))
+    turn, _ = Rotation.align_vectors(from_target, from_source)
+    scale = float((from_target * turn.apply(from_source)).sum() / (from_source**2).sum())
+    shift = target.mean(0) - scale * turn.apply(source.mean(0))
+    return pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn.as_matrix()), shift)
+
+
+def _refuse_mirror(source: Floats, target: Floats, misses: list[float]) -> None:
+    """Raise InputError if the targets are fitted far better by the mirror image of the sources: `misses` are the
+    residuals of both. In one plane a mirror image is as good as a turn, and small misses differ by noise."""
+    is_flat = any(off <= FLAT * across for _, across, off in (spreads(source), spreads(target)))
+    if not is_flat and misses[1] < MIRRORED * misses[0] and misses[0] > FLAT * spreads(target)[0]:
+        raise InputError("the known points fit as in a mirror only, expected right-handed axes: turn one round")
 
 
 def align(source: Floats, target: Floats) -> Alignment:
@@ -142,19 +114,25 @@ def align(source: Floats, target: Floats) -> Alignment:
     Raises:
         InputError: see `fit_similarity`.
     """
+    is_inlier = np.ones(len(source), bool)
     if len(source) < 5 or is_one_line(source) or is_one_line(target):
-        best, is_inlier = fit_similarity(source, target), np.ones(len(source), bool)
+        best = fit_similarity(source, target)
     else:
-        best = _most_agreed(source, target)
+        found, mirrored = (_most_agreed(each, target) for each in (source, source * MIRROR))
+        _refuse_mirror(source, target, [found[1], mirrored[1]])
+        best = found[0]
         for _ in range(3):
-            residuals = np.linalg.norm(best.apply(source) - target, axis=1)
+            residuals = _residuals(best, source, target)
             limit = OUTLIER * (1 + 5 / (len(source) - 3)) * _agreement(residuals)
             is_inlier = residuals <= max(limit, ROUNDING * spreads(target)[0])
             if is_one_line(source[is_inlier]) or is_one_line(target[is_inlier]):
                 is_inlier[:] = True
             best = fit_similarity(source[is_inlier], target[is_inlier])
-    residuals = np.linalg.norm(best.apply(source) - target, axis=1)
-    return Alignment(similarity=best, residuals=residuals, is_inlier=is_inlier)
+    return Alignment(similarity=best, residuals=_residuals(best, source, target), is_inlier=is_inlier)
+
+
+def _residuals(similarity: pycolmap.Sim3d, source: Floats, target: Floats) -> Floats:
+    return np.linalg.norm(similarity * source - target, axis=1)
 
 
 def _agreement(residuals: Floats) -> float:
@@ -162,21 +140,12 @@ def _agreement(residuals: Floats) -> float:
     return float(np.sort(residuals)[(len(residuals) + 4) // 2 - 1])
 
 
-def _most_agreed(source: Floats, target: Floats) -> Similarity:
-    """The similarity of three points on which just over half of all points agree best."""
-    rng, best, agreed = np.random.default_rng(0), None, {False: np.inf, True: np.inf}
-    for _ in range(TRIALS):
-        triple = rng.choice(len(source), 3, replace=False)
-        if is_one_line(source[triple]) or is_one_line(target[triple]):
-            continue
-        for mirror in (False, True):
-            fit = _fit(source[triple], target[triple], mirror=mirror)
-            agreement = _agreement(np.linalg.norm(fit.apply(source) - target, axis=1))
-            if agreement < agreed[mirror]:
-                agreed[mirror] = agreement
-                best = best if mirror else fit
-    if best is None:
-        return fit_similarity(source, target)
-    if not _is_flat(source) and not _is_flat(target) and agreed[True] < MIRRORED * agreed[False]:
-        _refuse_mirror(agreed[False], target)
-    return best
+def _most_agreed(source: Floats, target: Floats) -> tuple[pycolmap.Sim3d, float]:
+    """The similarity of three points on which just over half of all points agree best, and their agreement."""
+    rng = np.random.default_rng(0)
+    triples = [rng.choice(len(source), 3, replace=False) for _ in range(TRIALS)]
+    triples = [three for three in triples if not (is_one_line(source[three]) or is_one_line(target[three]))]
+    fits = [_fit(source[three], target[three]) for three in triples] or [_fit(source, target)]
+    agreements = [_agreement(_residuals(fit, source, target)) for fit in fits]
+    best = int(np.argmin(agreements))
+    return fits[best], agreements[best]

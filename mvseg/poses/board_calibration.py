@@ -190,8 +190,10 @@ def _start_world(
         direction, turns = -direction, -turns
     point = point + ((board_middle - point) @ direction) * direction
     cam_from_world = axes_about(direction), point
-    return cam_from_world, dict(zip(poses, turns.tolist(), strict=True)), _join(
-        _invert(cam_from_world), (board_turn, board_shift)
+    return (
+        cam_from_world,
+        dict(zip(poses, turns.tolist(), strict=True)),
+        _join(_invert(cam_from_world), (board_turn, board_shift)),
     )
 
 

@@ -9,16 +9,17 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, faults_of
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.find_views import find_views, list_some
 from mvseg.formats.markers import Corner, find_board, find_scene_markers
 from mvseg.formats.photos import read_photo
 from mvseg.formats.positions import read_positions
-from mvseg.poses.alignment import Similarity, align, is_one_line, scale_by, spreads
+from mvseg.poses.alignment import align, is_one_line, scale_by, spreads
 from mvseg.poses.config import Known
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Scene
@@ -39,16 +40,14 @@ class Placement:
         unit: of the world.
         source: where the scale comes from, as text; "" if nowhere.
         residual: root mean square misfit, in units of the world; None if nothing tells.
-        num_used: lengths or positions that were used.
         left_out: names of photos whose positions contradict the others.
         up: direction that points up in the world, where the source says so (a board that lies flat).
     """
 
-    similarity: Similarity
+    similarity: pycolmap.Sim3d
     unit: str
     source: str = ""
     residual: float | None = None
-    num_used: int = 0
     left_out: tuple[str, ...] = ()
     up: tuple[float, float, float] | None = None
 
@@ -102,7 +101,6 @@ def _by_board(scene: Scene, board: BoardConfig, unit: str, *, progress: bool) ->
         unit=unit,
         source=f"{int(alignment.is_inlier.sum())} corners of the board",
         residual=alignment.rms,
-        num_used=int(alignment.is_inlier.sum()),
         up=(0.0, 0.0, 1.0),
     )
 
@@ -123,7 +121,6 @@ def _by_markers(scene: Scene, side: float, unit: str, *, progress: bool) -> Plac
         unit=unit,
         source=f"{len(sides)} markers of {side:g} {unit}".rstrip(),
         residual=residual if len(sides) > 1 else None,
-        num_used=len(sides),
     )
 
 
@@ -154,7 +151,6 @@ def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str, *, p
         similarity=scale_by(length / apart),
         unit=unit,
         source=f"the distance from {names[0]} to {names[1]}, {length:g} {unit}".rstrip(),
-        num_used=1,
     )
 
 
@@ -186,10 +182,8 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
     target = positions.xyz[used]
     if is_one_line(target):
         return _by_positions_on_a_line(centers, target, path=path, unit=unit)
-    try:
+    with faults_of(path):
         alignment = align(centers, target)
-    except InputError as error:
-        raise InputError(f"{path}: {error}") from None
     wrong = [positions.names[used[index]] for index in np.flatnonzero(~alignment.is_inlier)]
     if alignment.rms > MISFIT * spreads(target)[0]:
         share = alignment.rms / spreads(target)[0]
@@ -200,7 +194,6 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
         unit=unit,
         source=f"{int(alignment.is_inlier.sum())} positions of {path.name}",
         residual=alignment.rms,
-        num_used=int(alignment.is_inlier.sum()),
         left_out=tuple(wrong),
     )
 
@@ -218,5 +211,4 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
         similarity=scale_by(float(np.median(ratios))),
         unit=unit,
         source=f"{len(target)} positions on one line of {path.name}",
-        num_used=len(target),
     )

@@ -195,4 +195,3 @@ def _fixed_lens(calibration: Calibration, photos: Sequence[PhotoFile]) -> pycolm
     K = calibration.K
     params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
     return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
-

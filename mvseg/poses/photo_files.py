@@ -12,7 +12,7 @@ from pathlib import Path
 from PIL import Image, ImageOps
 from tqdm import tqdm
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.image_file import (
     PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
@@ -121,11 +121,8 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: b
     for name in tqdm(names, desc="photos", unit="photo", disable=not progress):
         path = images / name
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
+        with faults_of(f"{folder / name}: the photo cannot be read, expected a whole image file"):
             photos.append(_copy(folder / name, path, images, bits=bits))
-        except InputError as error:
-            message = f"the photo cannot be read, expected a whole image file: {error}"
-            raise InputError(f"{folder / name}: {message}") from None
     return photos
 
 

@@ -30,7 +30,6 @@ CONVERGED = 0.02  # units, largest step
 # In units of one pixel, or more where photos are large: masks of these are drawn less exactly.
 POSE, GROWTH = 10.0, 2.0  # standard deviations of poses, along each axis, and of how tightly a mask is drawn
 LEAST_SPREAD, DOUBTED = 0.5, 2.0  # of gaps; and the number of spreads from which a gap is doubted
-UNIT_DIAGONAL = 700.0  # pixels of the photo's diagonal per unit
 FOLDS = 5  # of the instances
 
 
@@ -133,7 +132,7 @@ def adjust(masks: Masks, cameras: Cameras) -> Adjustment:
         pairs=pair_outlines(outlines, cameras),
         cameras=cameras,
         world_per_px=distances(regions.to("cpu"), cameras) / cameras.K[:, 0, 0],
-        unit_px=max(1.0, float(cameras.sizes.double().norm(dim=1).median()) / UNIT_DIAGONAL),
+        unit_px=cameras.unit_px,
     )
 
 
@@ -142,12 +141,7 @@ def distances(regions: Regions, cameras: Cameras) -> Tensor:
     middle = (regions.boxes[:, :2] + regions.boxes[:, 2:]).double() / 2
     pixels = torch.cat((middle, torch.ones_like(middle[:, :1])), 1)
     rays = (cameras.world_from_px[regions.view_index] @ pixels[..., None])[..., 0]
-    rays = rays / rays.norm(dim=1, keepdim=True)
-    across = torch.eye(3).double() - rays[:, :, None] * rays[:, None, :]
-    # From the mean centre: far from the world's origin the products would cancel.
-    centers = cameras.centers - cameras.centers.mean(0)
-    target = (across @ centers[regions.view_index][..., None]).sum(0)
-    return (centers - (torch.linalg.pinv(across.sum(0)) @ target)[:, 0]).norm(dim=1)
+    return (cameras.centers - cameras.nearest_point(regions.view_index, rays)).norm(dim=1)
 
 
 def fit_poses(problem: Adjustment) -> Cameras:
@@ -177,9 +171,7 @@ def fit_poses(problem: Adjustment) -> Cameras:
     return cameras
 
 
-def _solve(
-    columns: Tensor, slopes: Tensor, left: Tensor, *, weights: Tensor, prior: Tensor, state: Tensor
-) -> Tensor:
+def _solve(columns: Tensor, slopes: Tensor, left: Tensor, *, weights: Tensor, prior: Tensor, state: Tensor) -> Tensor:
     """(P,) one step of Gauss-Newton for T residuals, each with derivatives (T, C) by the unknowns `columns` (T, C).
 
     No step where the equations are singular but for rounding: lines of sight along a baseline have derivatives beside

@@ -10,7 +10,6 @@ import pycolmap
 from mvseg.formats.colmap import read_colmap
 from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.rig import write_rig
-from mvseg.poses.alignment import Similarity
 from mvseg.poses.mapping import Structure
 from mvseg.scene import Scene
 
@@ -32,9 +31,9 @@ def write_structure(structure: Structure, folder: Path) -> Scene:
     return read_colmap(model, folder)
 
 
-def move_structure(structure: Structure, similarity: Similarity, folder: Path) -> Scene:
+def move_structure(structure: Structure, similarity: pycolmap.Sim3d, folder: Path) -> Scene:
     """Write and read the scene again with its world moved by a similarity."""
-    structure.model.transform(pycolmap.Sim3d(similarity.matrix))
+    structure.model.transform(similarity)
     return write_structure(structure, folder)
 
 

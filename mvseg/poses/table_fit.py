@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
@@ -149,17 +150,8 @@ def _residuals(numbers: Floats, sightings: Sightings, *, num_cameras: int, heigh
     residuals = np.zeros_like(sightings.px)
     for index, camera in enumerate(cameras.reshape(num_cameras, NUM_CAMERA)):
         here = sightings.camera == index
-        cam = Rotation.from_rotvec(camera[8:11]).apply(turned[here]) + camera[11:14]
-        residuals[here] = _project_opencv(cam, camera[:NUM_LENS]) - (sightings.px[here] - HALF)
+        fx, fy, cx, cy = camera[:4]
+        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+        px, _ = cv2.projectPoints(turned[here], camera[8:11], camera[11:14], K, camera[4:8])
+        residuals[here] = px[:, 0] - (sightings.px[here] - HALF)
     return residuals
-
-
-def _project_opencv(cam: Floats, lens: Floats) -> Floats:
-    """(P, 2) OpenCV pixels of points (P, 3) in the camera's frame; lens holds fx, fy, cx, cy, k1, k2, p1, p2."""
-    x, y = (cam[:, :2] / cam[:, 2:]).T
-    r2 = x**2 + y**2
-    k1, k2, p1, p2 = lens[4:]
-    radial = 1 + k1 * r2 + k2 * r2**2
-    u = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x**2)
-    v = y * radial + p1 * (r2 + 2 * y**2) + 2 * p2 * x * y
-    return np.stack([lens[0] * u + lens[2], lens[1] * v + lens[3]], 1)

@@ -28,9 +28,8 @@ def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, 
         {point: (3,) world coordinates}; points seen in a single view, or not within `MOST_ERROR` in each, are left out,
         and so are those whose rays are all nearly parallel.
     """
-    K, R, t = (getattr(cameras, name).cpu().numpy().astype(float) for name in ("K", "R", "t"))
     centers, sizes = cameras.centers.cpu().numpy(), cameras.sizes.cpu().numpy()
-    px_from_world = K @ np.concatenate([R, t[:, :, None]], 2)
+    px_from_world = cameras.px_from_world.cpu().numpy()
     points: dict[Key, Floats] = {}
     for key, places in seen.items():
         views = [view for view, _ in places]

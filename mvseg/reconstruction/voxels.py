@@ -177,7 +177,8 @@ def back_project(
     masks = [_ViewMask.union(members, view, cameras) for view in views]
     if len(masks) < 2:
         return None
-    box = _bounding_box(masks, config.threshold)
+    middle = cameras.nearest_point(torch.tensor(views), torch.stack([mask.ray for mask in masks]))
+    box = _bounding_box(masks, middle, config.threshold)
     if box is None:
         return None
     low, high = box
@@ -214,14 +215,13 @@ class _ViewMask:
         ray = cameras.world_from_px[view] @ torch.stack((columns + x1, rows + y1, torch.ones_like(rows)))
         ray = ray / torch.linalg.vector_norm(ray)
         K = cameras.K[view]
-        px_from_world = K @ torch.cat((cameras.R[view], cameras.t[view, :, None]), 1)
         corners = torch.tensor([[u, v, 1.0] for u in (x1, x2) for v in (y1, y2)]).to(K)
         slant = float(torch.linalg.vector_norm(corners @ torch.linalg.inv(K).T, dim=1).max())
         focal = float(K.diagonal()[:2].max())
         return _ViewMask(
             mask=mask,
             corner=(x1, y1),
-            px_from_world=px_from_world,
+            px_from_world=cameras.px_from_world[view],
             focal=focal,
             slant=slant,
             center=cameras.centers[view],
@@ -305,17 +305,16 @@ def _share_of_masks(
     return torch.cat(parts)
 
 
-def _bounding_box(masks: list[_ViewMask], threshold: float) -> tuple[Tensor, Tensor] | None:
+def _bounding_box(masks: list[_ViewMask], middle: Tensor, threshold: float) -> tuple[Tensor, Tensor] | None:
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
-    A cube about the point nearest to all centroid rays, twice as far as the farthest camera, is halved again and again;
-    cells in which no point can exceed the threshold are discarded, until the box of the rest is `SEARCH_CELLS` cells
-    long and hardly shrinks any more. Cells are judged by the balls around them, so nothing is lost, however thin. None
-    when no cell is left. Masks of nearly parallel views may have no bounded common part: it is cut off at the cube.
+    A cube about `middle` (3,), the point nearest to all centroid rays, twice as far as the farthest camera, is halved
+    again and again; cells in which no point can exceed the threshold are discarded, until the box of the rest is
+    `SEARCH_CELLS` cells long and hardly shrinks any more. Cells are judged by the balls around them, so nothing is
+    lost, however thin. None when no cell is left. Masks of nearly parallel views may have no bounded common part: it is
+    cut off at the cube.
     """
-    centers, rays = torch.stack([m.center for m in masks]), torch.stack([m.ray for m in masks])
-    across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
-    middle = torch.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0)).solution[:, 0]
+    centers = torch.stack([mask.center for mask in masks])
     half = 2 * float(torch.linalg.vector_norm(centers - middle, dim=1).max().clamp(min=1e-9))
     root_low, root_high = middle - half, middle + half
     cells, split = middle[None], torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3).to(middle)

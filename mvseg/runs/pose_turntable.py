@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,7 +15,7 @@ from tqdm import tqdm
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.image_file import read_rgb
-from mvseg.formats.photo_angles import read_photo_angles
+from mvseg.formats.positions import read_photo_angles
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.turntable import read_turntable_parts, write_turntable
 from mvseg.poses.board_calibration import calibrate_turntable
@@ -151,21 +152,17 @@ def _angles_of(
         if missing is not None:
             raise InputError(f"{angles}: there is no angle of photo {missing}")
         return [angle for angle in found if angle is not None]
-    place: dict[str, int] = {}
-    places = []
-    for camera in camera_of:
-        places.append(place.get(camera, 0))
-        place[camera] = places[-1] + 1
+    places = [camera_of[:index].count(camera) for index, camera in enumerate(camera_of)]
     if angles is not None:
-        return [angles * index for index in places]
-    of_camera = {camera: [angle for name, angle in known if name == camera] for camera in place}
-    for camera, count in place.items():
-        if count != len(of_camera[camera]):
-            of = f" of camera {camera}" if len(place) > 1 else ""
-            message = f"{len(of_camera[camera])} views{of} for {count} photos"
-            message = f"{message}, expected one per photo, in the order of their names, or --angles"
-            raise InputError(f"{turntable}: {message}")
-    return [of_camera[camera][index] for camera, index in zip(camera_of, places, strict=True)]
+        return [angles * place for place in places]
+    counts = Counter(camera_of)
+    of_camera = {camera: [angle for name, angle in known if name == camera] for camera in counts}
+    wrong = next((camera for camera, count in counts.items() if count != len(of_camera[camera])), None)
+    if wrong is not None:
+        of = f" of camera {wrong}" if len(counts) > 1 else ""
+        message = f"{len(of_camera[wrong])} views{of} for {counts[wrong]} photos"
+        raise InputError(f"{turntable}: {message}, expected one per photo, in the order of their names, or --angles")
+    return [of_camera[camera][place] for camera, place in zip(camera_of, places, strict=True)]
 
 
 def _read_grey(folder: Path, files: Sequence[PhotoFile], *, quiet: bool) -> list[np.ndarray]:

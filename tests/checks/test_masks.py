@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mvseg.checks.masks import mask_findings, masks_at_border
+from mvseg.checks.masks import mask_findings
+from mvseg.matching.outline_gaps import touches_border
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene
 from synthetic import BallScene, ball_scene
@@ -80,4 +81,4 @@ def test_the_border_is_the_last_pixel(scene: BallScene) -> None:
     labels[238, 318] = 4
     maps = [labels, *(np.zeros_like(labels) for _ in range(4))]
     regions = regions_from_label_maps(maps)
-    assert masks_at_border(regions, scene.cameras).tolist() == [True, True, True, False]
+    assert touches_border(regions, scene.cameras).tolist() == [True, True, True, False]

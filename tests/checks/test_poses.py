@@ -201,5 +201,3 @@ def test_real_poses_are_sound_and_a_turned_camera_is_named(plant: str, masks: st
     assert findings_of(regions, scene.cameras) == []
     (found,) = findings_of(regions, turned(scene.cameras, 1, 10))
     assert found.views == (1,)
-
-

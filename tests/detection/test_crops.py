@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from matched import matched
-from mvseg.detection.crops import crop_cameras, gain_of_crops, place_crops, plant_boxes, projections
+from mvseg.detection.crops import crop_cameras, gain_of_crops, place_crops, plant_boxes
 from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
@@ -115,5 +115,5 @@ def test_what_is_found_in_crops_is_placed_where_it_is() -> None:
     assert torch.equal(placed.regions.boxes, regions.boxes)
     assert torch.equal(placed.regions.crops, regions.crops)
     ones = torch.cat((CENTERS, torch.ones(4, 1)), 1).numpy()
-    seen = projections(cameras) @ ones.T
+    seen = cameras.px_from_world.numpy() @ ones.T
     assert np.allclose(seen[:, :2] / seen[:, 2:], px.mT.numpy())

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.find_views import base_name, find_views, list_some, warn_of_base_names
+from mvseg.formats.find_views import base_name, find_views, list_some
 from mvseg.scene import Cameras, Scene, View
 
 
@@ -62,10 +62,9 @@ def test_names_that_fit_several_views() -> None:
 
 def test_only_loose_names_are_said() -> None:
     scene, names = scene_of("images/1.jpg", "images/2.jpg"), ["1.jpg", "old/2.jpg"]
-    views = find_views(names, scene, source=Path("masks"))
     with pytest.warns(InputWarning, match=r"masks: 1 names .* by the base name only, the first is old/2.jpg for 2"):
-        warn_of_base_names(names, views, scene, source=Path("masks"))
-    warn_of_base_names(names[:1], views[:1], scene, source=Path("masks"))
+        find_views(names, scene, source=Path("masks"), warn_of_loose=True)
+    find_views(names[:1], scene, source=Path("masks"), warn_of_loose=True)
 
 
 def test_lists_are_short() -> None:

@@ -89,9 +89,9 @@ def test_plain_lists(tmp_path: Path) -> None:
 
 
 BAD = [
-    ("", "is not YAML of OpenCV or ROS, expected camera_matrix"),
-    ("[1", r"is not YAML of OpenCV or ROS \(ParserError\)"),
-    ("a: !!python/object/apply:os.getcwd []", r"is not YAML of OpenCV or ROS \(ConstructorError\)"),
+    ("", "is no calibration, expected camera_matrix"),
+    ("[1", r"is no YAML file"),
+    ("a: !!python/object/apply:os.getcwd []", r"is no YAML file"),
     (ROS.replace("camera_matrix", "camera_matirx"), "matrix: Field required, expected camera_matrix"),
     (ROS.replace("1234.5678901234567", ".nan"), "matrix.data.0: Input should be a finite number"),
     (ROS.replace("1234.5678901234567, ", ""), "the camera matrix has 8 numbers, expected 9"),
@@ -100,8 +100,8 @@ BAD = [
     (ROS.replace("plumb_bob", "omni"), "the distortion model 'omni' is not known, expected plumb_bob or equidistant"),
     (ROS.replace("plumb_bob", "equidistant"), "a fisheye with 5 coefficients, expected k1, k2, k3, k4"),
     (ROS.replace("1280", "-1"), "width: Input should be greater than or equal to 1"),
-    ("#" * (1 << 20) + "\n", "is too large for a calibration"),
-    ("\0", r"is not YAML of OpenCV or ROS \(ReaderError\)"),
+    ("#" * (1 << 20) + "\n", "is larger than 1048576 bytes"),
+    ("\0", r"is no YAML file"),
 ]
 
 
@@ -114,5 +114,5 @@ def test_bad_files_are_named(text: str, message: str, tmp_path: Path) -> None:
 
 def test_skew_beside_distortion(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(ROS.replace("0., 640.25", "3., 640.25"))
-    with pytest.raises(InputError, match="the camera matrix has skew together with distortion"):
+    with pytest.raises(InputError, match="K has skew together with distortion"):
         calibration_lens(read_calibration(tmp_path, "a.yaml"), 1280, 720)

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.formats.photo_angles import read_photo_angles
+from mvseg.formats.positions import read_photo_angles
 
 
 def write(folder: Path, text: str) -> Path:
@@ -24,8 +24,8 @@ def test_angles_by_photo(tmp_path: Path) -> None:
     [
         ("", "found the columns nothing; expected photo, angle"),
         ("photo,x\na.jpg,1\n", "found the columns photo, x; expected photo, angle"),
-        ("photo,angle\na.jpg,north\n", "the angle of a.jpg is 'north', expected a number"),
-        ("photo,angle\na.jpg\n", "the angle of a.jpg is None, expected a number"),
+        ("photo,angle\na.jpg,north\n", "angle of a.jpg is 'north', expected a number"),
+        ("photo,angle\na.jpg\n", "angle of a.jpg is None, expected a number"),
         ("photo,angle\na.jpg,1\na.jpg,2\n", "photo a.jpg has two angles, expected one"),
         ("photo,angle\n,1\n", "angle 0 has no photo in 'photo'"),
     ],
@@ -36,5 +36,5 @@ def test_broken_tables(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_no_such_file(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="the angles cannot be read"):
+    with pytest.raises(InputError, match=r"cannot be read .*, expected a table of angles"):
         read_photo_angles(tmp_path / "nowhere.csv")

@@ -200,7 +200,7 @@ def test_sizes_come_from_the_photos(tmp_path: Path) -> None:
         ({"K": None}, "expected either K or a calibration file"),
         ({"calibration": "a.yaml"}, "expected either K or a calibration file"),
         ({"K": None, "calibration": "../a.yaml"}, "../a.yaml: the file name leads out of the scene folder"),
-        ({"K": None, "calibration": "absent.yaml"}, "absent.yaml: the calibration cannot be read"),
+        ({"K": None, "calibration": "absent.yaml"}, "absent.yaml: cannot be read"),
         ({"K": None, "calibration": "a.yaml", "distortion": [0.1, 0, 0, 0]}, "distortion beside a calibration file"),
         ({"K": None, "calibration": "a.yaml"}, "the calibration is of 640 x 480 pixels, the camera says 128 x 96"),
     ],

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import numpy as np
+import pycolmap
 import pytest
 from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
-from mvseg.poses.alignment import Similarity, align, fit_similarity, is_one_line, scale_by, spreads
+from mvseg.poses.alignment import align, fit_similarity, is_one_line, scale_by, spreads
 
 SEEDS = range(5)
 
 
-def draw(seed: int, num_points: int = 12) -> tuple[np.ndarray, Similarity]:
+def draw(seed: int, num_points: int = 12) -> tuple[np.ndarray, pycolmap.Sim3d]:
     rng = np.random.default_rng(seed)
-    similarity = Similarity(
-        scale=float(10 ** rng.uniform(-3, 3)),
-        R=Rotation.random(random_state=seed).as_matrix(),
-        t=rng.normal(size=3) * 100,
+    similarity = pycolmap.Sim3d(
+        float(10 ** rng.uniform(-3, 3)),
+        pycolmap.Rotation3d(Rotation.random(random_state=seed).as_matrix()),
+        rng.normal(size=3) * 100,
     )
     return rng.normal(size=(num_points, 3)), similarity
 
@@ -29,23 +30,23 @@ def test_any_similarity_comes_back(seed: int, fit, is_flat: bool) -> None:
     points, similarity = draw(seed)
     if is_flat:
         points[:, 2] = 0
-    found = fit(points, similarity.apply(points))
+    found = fit(points, similarity * points)
     assert found.scale == pytest.approx(similarity.scale, rel=1e-9)
-    np.testing.assert_allclose(found.R, similarity.R, atol=1e-8)
-    np.testing.assert_allclose(found.apply(points), similarity.apply(points), atol=1e-7 * similarity.scale)
-    np.testing.assert_allclose(found.matrix[:, :3] @ points[0] + found.matrix[:, 3], found.apply(points[:1])[0])
+    np.testing.assert_allclose(found.rotation.matrix(), similarity.rotation.matrix(), atol=1e-8)
+    np.testing.assert_allclose(found * points, similarity * points, atol=1e-7 * similarity.scale)
+    np.testing.assert_allclose(found.matrix()[:, :3] @ points[0] + found.matrix()[:, 3], (found * points[:1])[0])
 
 
 def test_it_is_the_least_squares_fit() -> None:
     """No similarity nearby has a smaller sum of squares: the gradient by finite differences is 0."""
     points, similarity = draw(3)
-    target = similarity.apply(points) + np.random.default_rng(0).normal(size=points.shape) * 0.1 * similarity.scale
+    target = similarity * points + np.random.default_rng(0).normal(size=points.shape) * 0.1 * similarity.scale
     found = fit_similarity(points, target)
 
     def cost(step: np.ndarray) -> float:
-        turn = Rotation.from_rotvec(step[:3]).as_matrix()
-        moved = Similarity(found.scale * np.exp(step[3]), turn @ found.R, found.t + step[4:] * found.scale)
-        return float(((moved.apply(points) - target) ** 2).sum()) / found.scale**2
+        turn = pycolmap.Rotation3d(step[:3]) * found.rotation
+        moved = pycolmap.Sim3d(found.scale * np.exp(step[3]), turn, found.translation + step[4:] * found.scale)
+        return float(((moved * points - target) ** 2).sum()) / found.scale**2
 
     steps = np.eye(7) * 1e-4
     gradient = [(cost(step) - cost(-step)) / 2e-4 for step in steps]
@@ -57,7 +58,7 @@ def test_it_is_the_least_squares_fit() -> None:
 def test_wrong_targets_are_left_out(seed: int) -> None:
     points, similarity = draw(seed, 30)
     rng = np.random.default_rng(seed)
-    target = similarity.apply(points) + similarity.scale * 1e-3 * rng.normal(size=points.shape)
+    target = similarity * points + similarity.scale * 1e-3 * rng.normal(size=points.shape)
     target[:9] += similarity.scale * rng.normal(size=(9, 3))
     found = align(points, target)
     assert found.similarity.scale == pytest.approx(similarity.scale, rel=2e-3)
@@ -68,24 +69,24 @@ def test_wrong_targets_are_left_out(seed: int) -> None:
 
 def test_one_wrong_target_of_five_is_left_out() -> None:
     points, similarity = draw(1, 5)
-    target = similarity.apply(points)
+    target = similarity * points
     target[2] += 3 * similarity.scale
     assert align(points, target).is_inlier.tolist() == [True, True, False, True, True]
 
 
 def test_the_order_does_not_matter() -> None:
     points, similarity = draw(2, 20)
-    target = similarity.apply(points) + similarity.scale * 0.01 * np.random.default_rng(2).normal(size=points.shape)
+    target = similarity * points + similarity.scale * 0.01 * np.random.default_rng(2).normal(size=points.shape)
     order = np.random.default_rng(3).permutation(20)
     one, other = fit_similarity(points, target), fit_similarity(points[order], target[order])
-    np.testing.assert_allclose(one.matrix, other.matrix, rtol=1e-9)
+    np.testing.assert_allclose(one.matrix(), other.matrix(), rtol=1e-9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("num_points", [4, 12])
 def test_left_handed_axes_are_refused(seed: int, num_points: int) -> None:
     points, similarity = draw(seed, num_points)
-    target = similarity.apply(points) * np.array([1, -1, 1])
+    target = (similarity * points) * np.array([1, -1, 1])
     target += 1e-3 * similarity.scale * np.random.default_rng(seed).normal(size=points.shape)
     for fit in (fit_similarity, align):
         with pytest.raises(InputError, match="in a mirror only"):
@@ -95,7 +96,7 @@ def test_left_handed_axes_are_refused(seed: int, num_points: int) -> None:
 def test_noise_of_flat_points_is_no_mirror() -> None:
     points, similarity = draw(0)
     points[:, 2] *= 1e-3
-    target = similarity.apply(points) + similarity.scale * 1e-2 * np.random.default_rng(1).normal(size=points.shape)
+    target = similarity * points + similarity.scale * 1e-2 * np.random.default_rng(1).normal(size=points.shape)
     assert align(points, target).similarity.scale == pytest.approx(similarity.scale, rel=0.02)
 
 
@@ -119,4 +120,4 @@ def test_spreads_and_scales() -> None:
     np.testing.assert_allclose(spreads(corners), [3, 2, 1])
     assert is_one_line(np.zeros((5, 3)))
     assert not is_one_line(corners)
-    np.testing.assert_allclose(scale_by(2).apply(corners), 2 * corners)
+    np.testing.assert_allclose(scale_by(2) * corners, 2 * corners)

@@ -20,9 +20,7 @@ def test_answers_and_errors_pass() -> None:
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="SIGTERM of POSIX systems")
 @pytest.mark.parametrize("delay", [0.0, 0.15])
 @pytest.mark.parametrize(("number", "error"), [(signal.SIGTERM, Terminated), (signal.SIGINT, KeyboardInterrupt)])
-def test_a_signal_cancels_the_call_and_waits_for_its_end(
-    number: int, error: type[BaseException], delay: float
-) -> None:
+def test_a_signal_cancels_the_call_and_waits_for_its_end(number: int, error: type[BaseException], delay: float) -> None:
     ended = []
 
     def call(token: pycolmap.CancellationToken) -> None:

@@ -15,7 +15,7 @@ from mvseg.formats.image_file import write_png
 from mvseg.formats.opencv_yaml import Calibration
 from mvseg.formats.photos import read_photo
 from mvseg.formats.rig import read_rig
-from mvseg.poses.alignment import Similarity, fit_similarity
+from mvseg.poses.alignment import fit_similarity
 from mvseg.poses.config import PoseConfig
 from mvseg.poses.mapping import find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
@@ -30,9 +30,9 @@ def test_all_photos_register_where_they_were_taken(room) -> None:
     assert structure.residual_px < 0.5
     centers, true_centers = room.scene.cameras.centers.numpy(), truth.centers.numpy()
     similarity = fit_similarity(centers, true_centers)
-    assert np.abs(similarity.apply(centers) - true_centers).max() < 2  # mm, at 600 mm
+    assert np.abs(similarity * centers - true_centers).max() < 2  # mm, at 600 mm
     assert room.scene.cameras.K[0, 0, 0] == pytest.approx(FOCAL, rel=0.01)
-    turned = room.scene.cameras.R.numpy() @ similarity.R.T
+    turned = room.scene.cameras.R.numpy() @ similarity.rotation.matrix().T
     angles = np.degrees(np.linalg.norm(turned - truth.R.numpy(), axis=(1, 2)) / np.sqrt(2))
     assert angles.max() < 0.3
 
@@ -45,12 +45,14 @@ def test_photos_may_have_spaces_in_their_names_and_one_shares_a_camera(room) -> 
 def test_a_moved_world_shows_the_same_photos(room, tmp_path: Path) -> None:
     """Rig file and COLMAP model say the same; points keep their pixels."""
     folder = shutil.copytree(room.folder, tmp_path / "scene")
-    similarity = Similarity(scale=3.0, R=np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]]), t=np.array([5.0, 6, 7]))
+    similarity = pycolmap.Sim3d(
+        3.0, pycolmap.Rotation3d(np.array([[0, -1.0, 0], [0, 0, -1], [1, 0, 0]])), np.array([5.0, 6, 7])
+    )
     structure = replace(room.structure, model=pycolmap.Reconstruction(room.folder / "sparse" / "0"))
     points = np.array([point.xyz for point in structure.model.points3D.values()])
     before, _ = write_structure(structure, folder).cameras.project(room.scene.cameras.centers.new_tensor(points))
     scene = replace(move_structure(structure, similarity, folder), unit="mm", up=(0.0, 0.0, 1.0))
-    moved = scene.cameras.centers.new_tensor(similarity.apply(points))
+    moved = scene.cameras.centers.new_tensor(similarity * points)
     after, depths = scene.cameras.project(moved)
     np.testing.assert_allclose(after.numpy(), before.numpy(), atol=1e-6)
     assert (depths > 0).all()

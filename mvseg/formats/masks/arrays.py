@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.masks.view_regions import ViewMasks, stack_views
 from mvseg.regions import IGNORE_LABEL, Regions
@@ -49,11 +49,10 @@ def regions_from_masks(views: Sequence[Any], scene: Scene | None = None) -> Regi
 
     def contents() -> Iterator[ViewMasks]:
         for index, view in enumerate(views):
-            try:
-                size = None if scene is None else tuple(scene.cameras.sizes[index].tolist())
-                yield _read(view, size)
-            except InputError as error:
-                raise InputError(f"view {index}: {error}") from None
+            size = None if scene is None else tuple(scene.cameras.sizes[index].tolist())
+            with faults_of(f"view {index}"):
+                content = _read(view, size)
+            yield content
 
     return stack_views(contents(), scene, num_views=len(views), source="masks in memory")
 

@@ -28,8 +28,6 @@ def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
         InputError: the file cannot be decoded, is a JPEG, has several pages, another size, numbers that are no labels,
             or too many colours.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: the mask file is missing")
     image = open_labels(path, (width, height))
     try:
         num_pages = getattr(image, "n_frames", 1)

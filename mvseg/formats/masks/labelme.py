@@ -16,7 +16,7 @@ import numpy as np
 from PIL.PngImagePlugin import PngImageFile
 from pydantic import BaseModel, FiniteFloat
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.masks.found_mask import FoundMask
@@ -54,10 +54,8 @@ def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
         raise InputError(f"{path}: its photo is {size[0]} x {size[1]}, its camera says {width} x {height}")
     parts: dict[tuple[str, Any], np.ndarray | None] = {}
     for index, shape in enumerate(content.shapes):
-        try:
+        with faults_of(f"{path}: shapes[{index}] ({shape.label})"):
             mask = _draw(shape, width, height)
-        except InputError as error:
-            raise InputError(f"{path}: shapes[{index}] ({shape.label}): {error}") from None
         key = (shape.label, ("alone", index) if shape.group_id is None else shape.group_id)
         earlier = parts.get(key)
         parts[key] = mask if earlier is None else earlier if mask is None else earlier | mask

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.find_views import base_name, find_views, list_some, warn_of_base_names
+from mvseg.formats.find_views import base_name, find_views, list_some
 from mvseg.scene import Scene
 
 # Endings of files that are called as their photo; longer ones first, since `_seg.npy` ends on `.npy`.
@@ -83,7 +83,7 @@ def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
     if others:
         message = f"{kind} for {counts[kind]} photos are taken, and not {', '.join(others)}"
         warnings.warn(f"{masks}: {message}", InputWarning, stacklevel=3)
-    _warn_of_loose_names(groups[kind], scene, folder)
+    find_views([f"{name}.png" for name in groups[kind]], scene, source=folder, warn_of_loose=True)
     files = _complete(scene, folder, kind=kind, files=by_kind[kind])
     return MaskFiles(masks, _name_kind(kind, by_kind[kind]), files)
 
@@ -152,11 +152,6 @@ def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str)
     if problem:
         raise InputError(problem)
     return tuple(map(tuple, files))
-
-
-def _warn_of_loose_names(names: dict[str, list[Path]], scene: Scene, folder: Path) -> None:
-    stems = [f"{name}.png" for name in names]
-    warn_of_base_names(stems, find_views(stems, scene, source=folder), scene, source=folder)
 
 
 def _complete(

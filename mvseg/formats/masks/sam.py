@@ -8,7 +8,7 @@ from typing import Any
 
 from pydantic import RootModel
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.json_file import read_json
 from mvseg.formats.masks.found_mask import FoundMask
@@ -32,11 +32,8 @@ def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
     masks = []
     for number, entry in enumerate(entries, start=1):
         segmentation = entry.get("segmentation")
-        if segmentation in (None, []):
-            masks.append(FoundMask(number, None))
-            continue
-        try:
-            masks.append(FoundMask(number, decode_segmentation(segmentation, width, height)))
-        except InputError as error:
-            raise InputError(f"{path}: mask {number}: {error}") from None
+        with faults_of(f"{path}: mask {number}"):
+            is_empty = segmentation in (None, [])
+            mask = None if is_empty else decode_segmentation(segmentation, width, height)
+        masks.append(FoundMask(number, mask))
     return masks

@@ -9,15 +9,15 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import yaml  # type: ignore[import-untyped]
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.masks.found_mask import FoundMask
-from mvseg.formats.yaml_file import check_yaml_text
+from mvseg.formats.text_file import read_text
+from mvseg.formats.yaml_file import read_yaml
 
 NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
-MAX_BYTES = 1 << 20  # of a file of names
+MAX_BYTES = 1 << 28  # of a photo
 
 
 def read_yolo(path: Path, width: int, height: int, *, names: dict[int, str]) -> list[FoundMask]:
@@ -32,18 +32,12 @@ def read_yolo(path: Path, width: int, height: int, *, names: dict[int, str]) -> 
     Raises:
         InputError: the file cannot be read, a line is not as above, or a polygon leaves the photo by far.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as text ({type(error).__name__})") from None
     masks = []
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(read_text(path, "YOLO's masks", most=MAX_BYTES).splitlines(), start=1):
         if not line.strip():
             continue
-        try:
+        with faults_of(f"{path}: line {number}"):
             masks.append(_read_line(line, number, (width, height), names=names))
-        except InputError as error:
-            raise InputError(f"{path}: line {number}: {error}") from None
     return masks
 
 
@@ -79,16 +73,11 @@ def read_class_names(folder: Path) -> dict[int, str]:
 
 
 def _read_names(path: Path) -> dict[int, str]:
+    is_yaml, expected = path.suffix == ".yaml", "names of classes"
+    content = read_yaml(path, expected) if is_yaml else {"names": read_text(path, expected).split("\n")}
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"{path}: is too large for a file of class names")
-        text = path.read_text(encoding="utf-8-sig")
-        if path.suffix == ".yaml":
-            check_yaml_text(path, text)
-        names = (yaml.safe_load(text) or {}).get("names", []) if path.suffix == ".yaml" else text.split("\n")
+        names = (content or {}).get("names", [])
         pairs = names.items() if isinstance(names, dict) else enumerate(names)
         return {int(number): str(name).strip() for number, name in pairs if str(name).strip()}
-    except InputError:
-        raise
-    except Exception:  # yaml and the shapes it may give
-        raise InputError(f"{path}: cannot be read as names of classes") from None
+    except (AttributeError, TypeError, ValueError, OverflowError):  # whatever shape YAML may have
+        raise InputError(f"{path}: cannot be read as {expected}") from None

@@ -271,12 +271,11 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
     """The outlines of one instance; its masks of one view are united."""
     views = members.view_index.unique().tolist()
     united = [members.union((members.view_index == view).nonzero()[:, 0].tolist()) for view in views]
-    px_from_world = cameras.K[views] @ torch.cat((cameras.R[views], cameras.t[views][:, :, None]), 2)
     return stack_masks(
         [mask.numpy() for _, mask in united],
         [frames[view] for view in views],
         views,
-        px_from_world=px_from_world.numpy(),
+        px_from_world=cameras.px_from_world[views].numpy(),
         mask_corners=[box[:2] for box, _ in united],
         own=instance,
     )

@@ -138,10 +138,7 @@ def grid_step(radius: float) -> float:
 
 def _looked_at(cameras: Cameras) -> Floats:
     """(3,) the point nearest to all optical axes; they may be parallel."""
-    axes, centers = cameras.R[:, 2].numpy(), cameras.centers.numpy()
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    found, *_ = np.linalg.lstsq(across.sum(0), (across @ centers[:, :, None]).sum(0), rcond=1e-6)
-    return np.asarray(found[:, 0])
+    return np.asarray(cameras.nearest_point(torch.arange(len(cameras)), cameras.R[:, 2]).numpy())
 
 
 def _encode(points: Floats, mesh: trimesh.Trimesh) -> dict[str, str]:
