@@ -231,7 +231,7 @@ def prepare(table: Path, results: Path) -> None:
         surfaces, voxels = reconstruct_shapes(regions, ids, scene.cameras, config=ReconstructConfig())
         traits = measure_plant(scene, matching, surfaces=surfaces, voxels=voxels)
         result = Result(scene=scene, matching=matching, surfaces=surfaces, voxels=voxels, traits=traits)
-        save_result(result, place, {"scene": scene.name}, report=False, draw_rims=False)
+        save_result(result, place, {"scene": scene.name}, report=False)
         print(place, flush=True)
 
 

@@ -32,7 +32,6 @@ class RunConfig:
         color_card: how the colours of the photos are corrected before they are measured, see
             `mvseg.traits.color_correction.read_color_card`; "find" looks for a card in them; None leaves them.
         split_merged: cut a mask that seems to cover two instances in two.
-        draw_rims: draw the rims of the surfaces into the overlays.
         report: write report.html, the result as one page.
         coco_crowd: what annotations with `iscrowd` are in a COCO file of masks: "mask", one like all others, or
             "ignore", left out.
@@ -50,7 +49,6 @@ class RunConfig:
     refine_poses: bool = False
     color_card: ColorCard | None = None
     split_merged: bool = False
-    draw_rims: bool = True
     report: bool = True
     coco_crowd: Literal["mask", "ignore"] = "mask"
     categories: str | None = None

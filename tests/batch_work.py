@@ -29,11 +29,8 @@ def do_as_told(item: str, *_: object) -> tuple[str, int]:
     elif verb == "raise":
         raise ValueError("it is\nbroken")
     elif verb == "wait":
-        try:
-            Path(argument, "begun").write_text(str(os.getpid()))
-            time.sleep(60)
-        finally:
-            Path(argument, "cleared").touch()
+        Path(argument, "begun").write_text(str(os.getpid()))
+        time.sleep(60)
     elif verb == "threads":
         return os.environ["OMP_NUM_THREADS"], os.getpid()
     return verb.upper(), os.getpid()

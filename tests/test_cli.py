@@ -209,7 +209,6 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "unit": None,
         "up": None,
         "color_card": None,
-        "draw_rims": True,
         "report": True,
     }
     assert run["mvseg"] == mvseg.__version__
@@ -256,16 +255,6 @@ def test_a_colour_card_corrects_all_photos(
     assert complaint(capsys).startswith(f"{tmp_path / 'absent.png'}: the photo of a colour card cannot be read")
 
 
-def test_rims_may_be_left_out(plant: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    drawn = []
-    monkeypatch.setattr("mvseg.results.folder.save_result", lambda *_, draw_rims, **__: drawn.append(draw_rims))
-    (tmp_path / "run.yaml").write_text("draw_rims: false\n")
-    for words in (["--draw_rims", "false"], ["--config", str(tmp_path / "run.yaml")], []):
-        out = ["--out", str(tmp_path / "out"), "--quiet", *COARSE]
-        assert main(["infer", *words, *out, "--masks", "masks", str(plant)]) == 0
-    assert drawn == [False, False, True]
-
-
 @pytest.mark.parametrize("verb", ["infer", "match"])
 def test_the_page_may_be_left_out(verb: str, plant: Path, tmp_path: Path) -> None:
     coarse = COARSE if verb == "infer" else []
@@ -287,9 +276,10 @@ def test_up_that_is_no_direction(
 def test_the_papers_config_serves_both_verbs(plant: Path, tmp_path: Path) -> None:
     for verb in ("infer", "match"):
         out = ["--out", str(tmp_path / verb), "--quiet", "--config", str(ROOT / "configs" / "paper.yaml")]
-        assert main([verb, str(plant), "--masks", "masks", "--match.num_instances", "3", *out]) == 0
-    assert trimesh.load_mesh(tmp_path / "infer" / "leaves" / "leaf_001.ply").is_watertight
-    assert "reconstruct" not in json.loads((tmp_path / "match" / "plant" / "run.json").read_text())["config"]
+        coarse = COARSE if verb == "infer" else []
+        assert main([verb, str(plant), "--masks", "masks", "--match.num_instances", "3", *coarse, *out]) == 0
+    for folder in (tmp_path / "infer", tmp_path / "match" / "plant"):
+        assert json.loads((folder / "run.json").read_text())["config"]["match"]["method"] == "symnmf"
 
 
 def test_progress_bars_unless_quiet(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -336,7 +326,7 @@ def test_masks_anywhere(plant: Path, tmp_path: Path) -> None:
         (["infer", "--help"], ["--masks", "--detect.weights", "--help_all"]),
         (["infer", "--help_all"], ["--masks", "--detect.weights", "--match.method", "--reconstruct.seen_share"]),
         (["batch", "--help"], ["--resume", "--num_workers", "--scheduler", "--detect.weights", "--scale", "--up"]),
-        (["batch", "--help_all"], ["--traits.min_quality", "--draw_rims"]),
+        (["batch", "--help_all"], ["--traits.min_quality", "--report"]),
         (["match", "--help"], ["[options] scenes", "--masks", "--match.method"]),
         (["train", "--help"], ["--photos", "--labels", "--resume"]),
     ],

@@ -164,12 +164,12 @@ def test_the_image_is_made_of_files_that_are_there() -> None:
 
 def test_shipped_configs_have_names(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert find_config("fine.yaml") == ROOT / "configs" / "fine.yaml"
+    assert find_config("paper.yaml") == ROOT / "configs" / "paper.yaml"
     assert find_config("train/rosettes.yaml") == ROOT / "configs" / "train" / "rosettes.yaml"
-    shutil.copy(ROOT / "configs" / "paper.yaml", "fine.yaml")
-    assert find_config("fine.yaml") == Path("fine.yaml")  # one's own come first
+    shutil.copy(ROOT / "configs" / "train" / "rosettes.yaml", "paper.yaml")
+    assert find_config("paper.yaml") == Path("paper.yaml")  # one's own come first
     for name in ("absent.yaml", "../pyproject.toml", "/absent.yaml"):
-        with pytest.raises(InputError, match=r"no such file.*fine\.yaml, paper\.yaml, train/finetune-coco\.yaml"):
+        with pytest.raises(InputError, match=r"no such file.*: paper\.yaml, train/finetune-coco\.yaml"):
             find_config(name)
 
 
@@ -177,4 +177,4 @@ def test_a_shipped_config_is_taken_by_name(tmp_path: Path, monkeypatch: pytest.M
     from mvseg.cli.command import build_parser
 
     monkeypatch.chdir(tmp_path)
-    assert build_parser().parse_args(["infer", "--config", "fine.yaml"]).infer.reconstruct.seen_share == 0.9
+    assert build_parser().parse_args(["infer", "--config", "paper.yaml"]).infer.match.num_points == 200

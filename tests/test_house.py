@@ -278,12 +278,12 @@ def test_wheel_holds_one_package_with_the_shipped_scene(tmp_path: Path) -> None:
     assert top == {"mvseg"}
     assert {"mvseg/demo_plant/cameras.json", "mvseg/py.typed", "mvseg/zoo/leaf-lite/weights.safetensors"} <= set(names)
     zipfile.ZipFile(wheel).extractall(tmp_path / "installed")
-    code = "from mvseg.cli.options import find_config as find; print(find('fine.yaml'), find('train/rosettes.yaml'))"
+    code = "from mvseg.cli.options import find_config as find; print(find('paper.yaml'), find('train/rosettes.yaml'))"
     where = {**os.environ, "PYTHONPATH": str(tmp_path / "installed")}
     command = [sys.executable, "-c", code]
     said = subprocess.run(command, cwd=tmp_path, env=where, check=True, capture_output=True, text=True)
     home = tmp_path / "installed" / "mvseg" / "configs"
-    assert said.stdout.split() == [str(home / "fine.yaml"), str(home / "train" / "rosettes.yaml")]
+    assert said.stdout.split() == [str(home / "paper.yaml"), str(home / "train" / "rosettes.yaml")]
     assets = (PACKAGE / "results" / "report" / "assets").rglob("*")
     assert {file.relative_to(ROOT).as_posix() for file in assets if file.is_file()} <= set(names)
 

@@ -12,7 +12,6 @@ from mvseg.formats.json_file import read_json
 from mvseg.system.atomic import write_text_whole
 
 STATUS_FILE = "status.json"
-FileHash = tuple[int, int, str]  # bytes, time of the last change in nanoseconds, SHA-256
 
 
 class Status(BaseModel, frozen=True):
@@ -22,7 +21,6 @@ class Status(BaseModel, frozen=True):
         state: "running" from the moment a process takes the scene until its result is there.
         scene: the scene folder.
         key: hash of the inputs and the options, see `scene_key`; "" where the inputs could not be read.
-        inputs: what the key was made of, {path: `FileHash`}.
         result: SHA-256 of the result's run.json, which lists the hashes of all its files.
         instances, masks, views: how many the result has.
         seconds: from the start of the scene to its result, or to its failure.
@@ -35,7 +33,6 @@ class Status(BaseModel, frozen=True):
     state: Literal["running", "done", "failed"]
     scene: str
     key: str = ""
-    inputs: dict[str, FileHash] = {}
     result: str = ""
     instances: int = 0
     masks: int = 0

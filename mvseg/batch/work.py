@@ -17,7 +17,7 @@ import torch
 from mvseg.batch.places import scene_detections, scene_result, scene_state
 from mvseg.batch.scene_key import scene_key
 from mvseg.batch.scene_list import BatchScene
-from mvseg.batch.status import FileHash, Status, read_status, write_status
+from mvseg.batch.status import Status, read_status, write_status
 from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_scene
@@ -57,27 +57,23 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
         earlier = read_status(folder)
         try:
             masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
-            key, inputs = _key_of(scene, masks, config, earlier=earlier)
+            key = _key_of(scene, masks, config)
             if earlier is not None and earlier.key == key and _is_done(earlier, scene_result(out, scene.name)):
                 return Finished(earlier, is_kept=True)
-            write_status(folder, Status(state="running", scene=str(scene.folder), key=key, inputs=inputs))
+            write_status(folder, Status(state="running", scene=str(scene.folder), key=key))
             status = _finish(scene, masks, scene_result(out, scene.name), config=config, keep=keep)
         except Exception as error:  # whatever it is, the other scenes go on
-            status, key, inputs = _describe_failure(error, scene), "", {}
+            status, key = _describe_failure(error, scene), ""
         seconds = round(time.monotonic() - started, 3)
-        told = {"key": key, "inputs": inputs, "seconds": seconds, "peak_mb": _peak_mb()}
-        status = status.model_copy(update=told)
+        status = status.model_copy(update={"key": key, "seconds": seconds, "peak_mb": _peak_mb()})
         write_status(folder, status)
     return Finished(status)
 
 
-def _key_of(
-    scene: BatchScene, masks: Path | None, config: RunConfig, *, earlier: Status | None
-) -> tuple[str, dict[str, FileHash]]:
+def _key_of(scene: BatchScene, masks: Path | None, config: RunConfig) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # the run itself gives them
-        loaded = load_scene(scene.folder)
-    return scene_key(loaded, masks, config, known={} if earlier is None else earlier.inputs)
+        return scene_key(load_scene(scene.folder), masks, config)
 
 
 def _is_done(status: Status, result: Path) -> bool:

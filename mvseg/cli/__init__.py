@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Sequence
+from io import TextIOWrapper
 
 INTERRUPTED = 130
 __all__ = ["main"]
@@ -17,6 +18,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         import signal
 
+        for stream in (sys.stdout, sys.stderr):  # a character that the terminal does not have becomes a question mark
+            if isinstance(stream, TextIOWrapper):
+                stream.reconfigure(errors="replace")
         from mvseg.system.sigterm import held_back
 
         with held_back(signal.SIGINT):
@@ -27,8 +31,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if not _is_interruption(error):
             raise
-    if "mvseg.system.atomic" in sys.modules:
-        sys.modules["mvseg.system.atomic"].clear_begun()
     print("mvseg: interrupted", file=sys.stderr)
     return INTERRUPTED
 

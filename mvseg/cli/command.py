@@ -7,9 +7,10 @@ import os
 import sys
 import warnings
 from collections.abc import Sequence
+from importlib.util import find_spec
 from typing import TextIO
 
-from jsonargparse import ArgumentParser, Namespace
+from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
 from mvseg._version import __version__
 from mvseg.cli import batch, check, export, infer, match, models, pose, simulate, track, train
@@ -18,7 +19,6 @@ from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
 from mvseg.cli.short_help import shorten_help
 from mvseg.errors import InputError, InputWarning
-from mvseg.system.atomic import clear_begun
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
 TERMINATED = 143
@@ -72,7 +72,6 @@ def main(argv: Sequence[str] | None = None) -> int:
     except MemoryError as error:
         return complain(InputError(f"there is not enough memory ({str(error) or 'no more is known'})"))
     except Terminated:
-        clear_begun()
         print("mvseg: stopped by SIGTERM", file=sys.stderr)
         return TERMINATED
 
@@ -94,7 +93,11 @@ def _show_warning(
 
 def _parse(arguments: Sequence[str]) -> Namespace:
     try:
-        short = "--help_all" not in arguments
+        if "--print_completion" in arguments:
+            if find_spec("shtab") is None:
+                raise InputError("--print_completion needs shtab: pip install shtab")
+            set_parsing_settings(add_print_completion_argument=True)
+        short = not {"--help_all", "--print_completion"} & {*arguments}
         words = ["--help" if word == "--help_all" else word for word in arguments]
         args = build_parser(short=short).parse_args(words)
         for name in ("quiet", "report", "split_merged", "coco_crowd", "overwrite"):

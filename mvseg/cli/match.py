@@ -12,7 +12,6 @@ from mvseg.cli.options import DEFAULT_OUT, add_matching_options, add_overwrite, 
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
-from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.runs.one_scene import run_one_scene
 
 
@@ -22,8 +21,6 @@ def add(verbs: Any) -> None:
     parser.add_argument("scenes", nargs="+", type=Path, help="scene folders")
     add_matching_options(parser, masks=Path("masks"))
     add_overwrite(parser)
-    help_reconstruct = "has no effect; it lets infer and match share their YAML files"
-    parser.add_argument("--reconstruct", type=ReconstructConfig | None, help=help_reconstruct)
     verbs.add_subcommand("match", parser, help="ids only, of any number of scenes")
 
 

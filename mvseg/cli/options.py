@@ -24,9 +24,7 @@ from mvseg.traits.config import TraitsConfig, Up
 DEFAULT_OUT = Path("results")
 # an installed mvseg carries configs/ inside the package, a checkout has it beside the package
 CONFIG_HOMES = (Path(str(files("mvseg") / "configs")), Path(str(files("mvseg"))).parent / "configs")
-Options = TypeVar(
-    "Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, PoseConfig
-)
+Options = TypeVar("Options", MatchConfig, DetectConfig, ReconstructConfig, TraitsConfig, TrainConfig, PoseConfig)
 
 
 def build_options(kind: type[Options], args: Namespace | None, prefix: str = "") -> Options:
@@ -50,7 +48,7 @@ class CheckedConfig(ActionConfigFile):
 
 
 def find_config(name: str) -> Path:
-    """The YAML file that --config names: a path, or else a file that ships, as fine.yaml or train/rosettes.yaml.
+    """The YAML file that --config names: a path, or else a file that ships, as paper.yaml or train/rosettes.yaml.
 
     Raises:
         InputError: there is neither; the message lists those that ship.
@@ -66,7 +64,7 @@ def find_config(name: str) -> Path:
 
 def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
     """The options of every verb that matches; `masks` is where they are when --masks does not say it."""
-    help_config = "YAML file with any of these options; fine.yaml and paper.yaml ship"
+    help_config = "YAML file with any of these options; paper.yaml ships"
     parser.add_argument("--config", action=CheckedConfig, help=help_config)
     parser.add_argument(
         "--masks",
@@ -112,8 +110,6 @@ def add_run_options(parser: ArgumentParser) -> None:
     parser.add_argument("--up", type=str | list[float] | None, help=help_up)
     help_card = "24-patch colour card that corrects the colours: a photo of it, a card file, or 'find' it in the photos"
     parser.add_argument("--color_card", type=str | None, help=help_card)
-    help_rims = "draw the rims of the surfaces, as the cameras see them, into overlay/"
-    parser.add_argument("--draw_rims", type=bool, default=True, help=help_rims)
 
 
 def build_run(args: Namespace) -> RunConfig:
@@ -123,21 +119,15 @@ def build_run(args: Namespace) -> RunConfig:
         from mvseg.traits.color_correction import read_color_card  # keeps --help quick
 
         card = read_color_card(card)
+    plain = ("scale", "unit", "refine_poses", "split_merged", "report", "coco_crowd", "categories")
     return RunConfig(
         detect=build_options(DetectConfig, args.detect, "detect."),
         match=build_options(MatchConfig, args.match, "match."),
         reconstruct=build_options(ReconstructConfig, args.reconstruct, "reconstruct."),
         traits=build_options(TraitsConfig, args.traits, "traits."),
-        scale=args.scale,
-        unit=args.unit,
         up=read_up(args.up),
-        refine_poses=args.refine_poses,
         color_card=card,
-        split_merged=args.split_merged,
-        draw_rims=args.draw_rims,
-        report=args.report,
-        coco_crowd=args.coco_crowd,
-        categories=args.categories,
+        **{name: args[name] for name in plain},
     )
 
 

@@ -23,7 +23,7 @@ from torch import Tensor
 from mvseg.errors import InputError
 from mvseg.formats.photos import photo_bits
 from mvseg.scene import Scene
-from mvseg.system.atomic import delete_abandoned, is_partial, lock_folder, write_whole
+from mvseg.system.atomic import is_partial, lock_folder, write_whole
 
 KEPT_NAME = re.compile(r"[0-9a-f]{64}\.safetensors")
 SCENE_FILE = ".scene"
@@ -74,11 +74,8 @@ def delete_kept(folder: Path, *, but: Collection[str] = ()) -> None:
     if not folder.is_dir():
         return
     for path in [*folder.iterdir()]:
-        if path.name in but:
-            continue
-        if is_partial(path) and KEPT_NAME.match(path.name[1:]):
-            delete_abandoned(path)
-        elif KEPT_NAME.fullmatch(path.name) or (path.name == SCENE_FILE and not but):
+        is_kept = KEPT_NAME.fullmatch(path.name) or (is_partial(path) and KEPT_NAME.match(path.name[1:]))
+        if path.name not in but and (is_kept or (path.name == SCENE_FILE and not but)):
             path.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
@@ -98,21 +95,23 @@ def claim_kept(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterato
     """
     made = [parent for parent in folder.parents if not parent.exists()]
     folder.mkdir(parents=True, exist_ok=True)
-    with lock_folder(folder):
-        try:
-            owner, place = folder / SCENE_FILE, os.fsencode(os.path.realpath(scene))
-            earlier = owner.read_bytes() if owner.is_file() else place
-            if earlier != place and not overwrite:
-                message = f"keeps what a run that was cut off found in the photos of {os.fsdecode(earlier)}, not of"
-                raise InputError(f"{folder}: {message} {scene}; expected another --out, or --overwrite true")
-            write_whole(owner, lambda partial: partial.write_bytes(place))
-            yield _holds_some(folder)
-        finally:
-            if not _holds_some(folder):
-                delete_kept(folder)
-                with suppress(OSError):  # something else is in there meanwhile
-                    for parent in made:
-                        parent.rmdir()
+    try:
+        with lock_folder(folder):
+            try:
+                owner, place = folder / SCENE_FILE, os.fsencode(os.path.realpath(scene))
+                earlier = owner.read_bytes() if owner.is_file() else place
+                if earlier != place and not overwrite:
+                    message = f"keeps what a run that was cut off found in the photos of {os.fsdecode(earlier)}, not of"
+                    raise InputError(f"{folder}: {message} {scene}; expected another --out, or --overwrite true")
+                write_whole(owner, lambda partial: partial.write_bytes(place))
+                yield _holds_some(folder)
+            finally:
+                if not _holds_some(folder):
+                    delete_kept(folder)
+    finally:
+        with suppress(OSError):  # it holds some, or is another run's
+            for each in (folder, *made):
+                each.rmdir()
 
 
 def _holds_some(folder: Path) -> bool:

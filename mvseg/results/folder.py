@@ -9,7 +9,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -34,7 +33,6 @@ from mvseg.system.atomic import folder_whole
 
 if TYPE_CHECKING:
     from mvseg.poses.refine_poses import RefinedPoses
-    from mvseg.results.rims import Rims
     from mvseg.traits.measure import Traits
 
 REPORT_FILE = "report.html"
@@ -47,7 +45,6 @@ def save_result(
     run: dict[str, Any],
     *,
     progress: bool = False,
-    draw_rims: bool = True,
     report: bool = True,
 ) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
@@ -60,7 +57,6 @@ def save_result(
         out: the folder.
         run: what goes into run.json besides timings and counts: version, config, inputs, warnings.
         progress: show a progress bar over the views.
-        draw_rims: draw the rims of the surfaces into the overlays, where there are surfaces.
         report: write report.html, too.
 
     Raises:
@@ -70,7 +66,7 @@ def save_result(
     check_out(out)
     try:
         with folder_whole(out) as folder:
-            pictures = _write_images(result, folder, progress, draw_rims=draw_rims)
+            pictures = _write_images(result, folder, progress)
             _write_instances(result, folder, progress)
             if result.surfaces is not None or result.voxels is not None:
                 from mvseg.results.plant_files import write_plant  # loads trimesh and scikit-image
@@ -98,11 +94,10 @@ def save_result(
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
 
 
-def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bool) -> list[Picture]:
+def _write_images(result: Result, folder: Path, progress: bool) -> list[Picture]:
     """Labels, overlays and the contact sheet; what the report shows of the photos, which are read only once."""
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
     tiles, pictures = [], []
-    rims = _rims_of(result) if draw_rims else [{}] * len(scene.views)
     views = list(enumerate(scene.views))
     for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
         width, height = scene.cameras.sizes[index].tolist()
@@ -110,7 +105,7 @@ def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bo
         labels = distort(labels, view.lens, scene.cameras.K[index].cpu().numpy())
         write_label_png(folder / "labels" / f"{view.name}.png", labels)
         photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
-        drawn = draw_overlay(photo, masks, view=index, rims=rims[index])
+        drawn = draw_overlay(photo, masks, view=index)
         tiles.append(draw_tile(photo, masks, view=index))
         pictures.append(draw_picture(photo, masks, view=index))
         overlay = folder / "overlay" / f"{view.name}.png"
@@ -118,15 +113,6 @@ def _write_images(result: Result, folder: Path, progress: bool, *, draw_rims: bo
         write_png(overlay, drawn)
     write_png(folder / "contact.png", draw_contact_sheet(tiles, [view.name for view in scene.views]))
     return pictures
-
-
-def _rims_of(result: Result) -> Sequence[Rims]:
-    """{instance id: lines} of each view; empty where there are no surfaces."""
-    if not result.surfaces:
-        return [{}] * len(result.scene.views)
-    from mvseg.results.rims import visible_rims  # loads trimesh
-
-    return visible_rims(result.surfaces, result.scene.cameras)
 
 
 def _write_instances(result: Result, folder: Path, progress: bool) -> None:
@@ -158,9 +144,7 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         source: dict[str, Any] = {"source_label": int(result.regions.labels[region])}
     else:
         is_from_views = bool(result.masks.origin[region] == Origin.OTHER_VIEWS)
-        source = {
-            "score": round(float(result.masks.detection_scores[region]), 4), "from_other_views": is_from_views
-        }
+        source = {"score": round(float(result.masks.detection_scores[region]), 4), "from_other_views": is_from_views}
     return {
         "image_id": view + 1,
         "instance_id": instance,

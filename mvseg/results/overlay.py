@@ -6,15 +6,11 @@ import colorsys
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
 
 from mvseg.masks import SURE, Masks
-
-if TYPE_CHECKING:
-    from mvseg.results.rims import Rims  # loads trimesh
 
 MAX_SIDE = 1600  # pixels of an overlay's longer side
 TILE_WIDTH = 480
@@ -22,8 +18,6 @@ MARGIN = 0.06  # around the plant in a tile, of its longer side
 LEAST_SHARE = 0.05  # of the photo's width that a tile shows; a photo has no more detail
 UNMATCHED = (150, 150, 150)
 CAPITAL = 26  # pixels, height of a digit at scale 1
-EDGE = (20, 20, 20)  # of rims
-SUB_PIXEL_BITS = 4  # of OpenCV's lines
 
 
 def instance_color(instance: int) -> tuple[int, int, int]:
@@ -36,9 +30,7 @@ def instance_color(instance: int) -> tuple[int, int, int]:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def draw_overlay(
-    photo: np.ndarray, masks: Masks, *, view: int, rims: Rims | None = None
-) -> np.ndarray:
+def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
     """Tint the regions of one view in the colours of their instances, with outline and number.
 
     Args:
@@ -46,7 +38,6 @@ def draw_overlay(
         masks: D masks. Unmatched regions are grey and have no number; numbers get a question mark where the
             match score is below 0.5.
         view: index of the view.
-        rims: {instance id: lines}, see `visible_rims`; drawn on top, in the instance's colour with a dark edge.
 
     Returns:
         uint8 RGB, scaled down so that the longer side has at most 1600 pixels.
@@ -55,7 +46,7 @@ def draw_overlay(
     scale = min(1.0, MAX_SIDE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
     window = _Window((0, 0, width, height), size)
-    return _draw(photo, masks, view=view, window=window, rims=rims or {})
+    return _draw(photo, masks, view=view, window=window)
 
 
 def draw_tile(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
@@ -67,12 +58,10 @@ def draw_tile(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
     box = find_plant(masks, view=view, size=(width, height))
     tile_height = max(1, round(TILE_WIDTH * height / width))
     window = _Window(box, (TILE_WIDTH, tile_height))
-    return _draw(photo, masks, view=view, window=window, rims={})
+    return _draw(photo, masks, view=view, window=window)
 
 
-def find_plant(
-    masks: Masks, *, view: int, size: tuple[int, int]
-) -> tuple[int, int, int, int]:
+def find_plant(masks: Masks, *, view: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Box (xyxy, pixels) around all matched regions of one view, with a margin and the proportions of the photo.
 
     Args:
@@ -106,11 +95,6 @@ class _Window:
         x1, y1, x2, y2 = self.box
         return np.asarray(cv2.resize(image[y1:y2, x1:x2], self.size, interpolation=interpolation))
 
-    def place(self, xy: np.ndarray) -> np.ndarray:
-        """Pixel positions (n, 2) of the photo, in the picture."""
-        x1, y1, x2, y2 = self.box
-        return (xy - (x1, y1)) * np.array(self.size) / (x2 - x1, y2 - y1)
-
 
 @dataclass(frozen=True)
 class _Number:
@@ -121,9 +105,7 @@ class _Number:
     radius: float
 
 
-def _draw(
-    photo: np.ndarray, masks: Masks, *, view: int, window: _Window, rims: Rims
-) -> np.ndarray:
+def _draw(photo: np.ndarray, masks: Masks, *, view: int, window: _Window) -> np.ndarray:
     height, width = photo.shape[:2]
     longer = max(window.size)
     enlarges = window.size[0] > window.box[2] - window.box[0]
@@ -151,9 +133,6 @@ def _draw(
             row, column = np.unravel_index(depth.argmax(), depth.shape)
             doubt = "?" if masks.match_scores[index] < SURE else ""
             labels.append(_Number(f"{instance}{doubt}", (x + int(column), y + int(row)), float(depth.max())))
-    for instance, lines in rims.items():
-        placed = [window.place(line) for line in lines]
-        _trace(painted, placed, instance_color(instance), width=max(1, round(longer / 800)))
     _write(painted, labels, scale=max(0.35, longer / 1100))
     return painted
 
@@ -179,13 +158,6 @@ def draw_contact_sheet(overlays: Sequence[np.ndarray], names: Sequence[str]) -> 
     filled += [blank] * (-len(filled) % columns)
     rows = [np.concatenate(filled[start : start + columns], axis=1) for start in range(0, len(filled), columns)]
     return np.concatenate(rows)
-
-
-def _trace(canvas: np.ndarray, lines: list[np.ndarray], color: tuple[int, int, int], *, width: int) -> None:
-    """Lines (n, 2) through pixel positions, with a dark edge, which is seen on any photo."""
-    corners = [np.round((line - 0.5) * (1 << SUB_PIXEL_BITS)).astype(np.int32) for line in lines]
-    for ink, thick in ((EDGE, width + 2), (color, width)):
-        cv2.polylines(canvas, corners, False, ink, thick, cv2.LINE_AA, SUB_PIXEL_BITS)
 
 
 def _write(canvas: np.ndarray, numbers: Sequence[_Number], *, scale: float) -> None:

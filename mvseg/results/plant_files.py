@@ -41,6 +41,4 @@ def _write_shapes(result: Result, folder: Path) -> None:
             voxels = result.voxels[instance].mesh()
             write_ply(folder / "leaves" / f"{name}_voxels.ply", voxels, color, instance_id=instance)
     about, extras = describe_world(result.scene), describe_leaves(result.traits)
-    write_glb(
-        folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras
-    )
+    write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)

@@ -31,7 +31,7 @@ def describe_run(
     if masks is not None:
         del options["detect"]
     if config.reconstruct is None:
-        for name in ("reconstruct", "traits", "scale", "unit", "up", "color_card", "draw_rims"):
+        for name in ("reconstruct", "traits", "scale", "unit", "up", "color_card"):
             del options[name]
     source = masks or _weights_of(config)
     return {

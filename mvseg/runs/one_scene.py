@@ -107,7 +107,7 @@ def save_scene(
     if config.report:
         check = check_scene(result.scene, result.regions, features=False)  # of which the run has warned
         run["checks"] = [asdict(finding) for finding in check.findings]
-    save_result(result, out, run, progress=progress, draw_rims=config.draw_rims, report=config.report)
+    save_result(result, out, run, progress=progress, report=config.report)
 
 
 def find_masks(scene: Path, masks: Path, beside: Path = Path()) -> Path:

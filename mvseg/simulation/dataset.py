@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -20,7 +19,7 @@ from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.scene_writer import write_scene, write_table
 from mvseg.simulation.wild import make_wild
-from mvseg.system.atomic import is_partial, lock_folder, write_text_whole, write_whole
+from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole, write_whole
 from mvseg.system.worker_pool import run_all
 
 Photo = tuple[dict[str, Any], list[dict[str, Any]]]  # COCO image and its annotations, still without ids
@@ -169,11 +168,8 @@ def claim_folder(folder: Path, *, recipe: str) -> None:
         raise InputError(f"{folder}: holds files that are not a data set, expected a new or empty folder")
     if made_from.exists() and made_from.read_text(encoding="utf-8") != recipe:
         raise InputError(f"{folder} holds a data set of another preset or seed, expected an empty folder")
-    for path in [*folder.glob(".*"), *folder.glob("*/.*")]:
-        if is_partial(path) and path.is_dir():
-            shutil.rmtree(path)
-        elif is_partial(path):
-            path.unlink()
+    for each in (folder, *folder.glob("*/")):
+        sweep_folder(each)
     write_text_whole(made_from, recipe)
 
 

@@ -1,9 +1,7 @@
-"""How processes end: SIGTERM as an exception, so that what is half written is cleared away, as after Ctrl-C; and
-workers, which end with the process that started them."""
+"""How a process ends: SIGTERM as an exception, so that what is half written is cleared away, as after Ctrl-C."""
 
 from __future__ import annotations
 
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -51,16 +49,6 @@ def held_back(*signals: signal.Signals) -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, earlier)
-
-
-def end_with_parent() -> None:
-    """Wait until the parent process is gone, then end this one at once; for a thread of a `multiprocessing` process."""
-    import multiprocessing
-
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
 
 
 def _end(how: type[BaseException], *_: object) -> None:

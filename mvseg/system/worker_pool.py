@@ -1,6 +1,6 @@
 """Independent pieces of one job, spread over processes of this machine; the answers come in order.
 
-(A batch of scenes, in which one that dies must not stop the others, has workers of its own: `batch.local_workers`.)
+(In a batch of scenes, one that dies must not stop the others: see `batch.local_workers`.)
 """
 
 from __future__ import annotations
@@ -19,9 +19,6 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-import cv2
-import torch
-
 from mvseg.errors import InputError
 
 Item = TypeVar("Item")
@@ -34,7 +31,7 @@ AHEAD = 16  # items that wait for a worker: an early one that takes long stops n
 def start_workers(num_workers: int) -> Iterator[ProcessPoolExecutor | None]:
     """Up to so many spawned processes, which start when there is work for them; None for one, the caller does it all.
 
-    They are gone afterwards; an exception, Ctrl-C among them, ends them at once.
+    They are gone afterwards, at once, whatever they are doing.
 
     A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes.
 
@@ -46,17 +43,27 @@ def start_workers(num_workers: int) -> Iterator[ProcessPoolExecutor | None]:
     if num_workers == 1:
         yield None
         return
+    with start_pools() as start_pool:
+        yield start_pool(num_workers)
+
+
+@contextmanager
+def start_pools() -> Iterator[Callable[[int], ProcessPoolExecutor]]:
+    """A function that gives a pool of so many processes, as often as it is asked; see `start_workers`."""
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
-    pool = ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,))
+    pools: list[ProcessPoolExecutor] = []
+
+    def start_pool(num_workers: int) -> ProcessPoolExecutor:
+        pools.append(ProcessPoolExecutor(num_workers, context, initializer=_start_worker, initargs=(theirs,)))
+        return pools[-1]
+
     try:
-        yield pool
-    except BaseException:
-        ours.close()
-        raise
+        yield start_pool
     finally:
-        pool.shutdown(cancel_futures=True)
-        ours.close()
+        ours.close()  # taking all modules apart in an orderly way would take seconds
+        for pool in pools:
+            pool.shutdown(cancel_futures=True)
 
 
 def default_workers() -> int:
@@ -114,9 +121,14 @@ def _start_worker(parent: Connection) -> None:
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    import cv2  # takes seconds, in which the parent may be killed
+    import torch
+    from tqdm import tqdm
+
+    tqdm.set_lock(threading.RLock())  # instead of one that all processes share, and that has to be given back
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
 
 
 @contextmanager

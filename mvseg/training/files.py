@@ -14,7 +14,7 @@ from torch import nn
 
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
-from mvseg.system.atomic import is_partial, write_text_whole, write_whole
+from mvseg.system.atomic import write_text_whole, write_whole
 
 logger = logging.getLogger(__name__)
 
@@ -52,13 +52,6 @@ def read_checkpoint(path: Path, device: torch.device) -> dict[str, Any]:
     except Exception as error:  # torch.load has no common exception for a damaged file
         raise InputError(f"{path} is not a checkpoint of a training run ({type(error).__name__})") from error
     return content
-
-
-def delete_partial(folder: Path) -> None:
-    """Delete the files that a killed run left half written."""
-    for path in folder.iterdir():
-        if is_partial(path) and path.is_file():
-            path.unlink()
 
 
 def append_record(path: Path, record: Mapping[str, Any]) -> None:

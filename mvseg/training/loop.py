@@ -38,7 +38,7 @@ from mvseg.detectors.mask_rcnn import count_parameters
 from mvseg.detectors.weights_file import Description
 from mvseg.errors import InputError
 from mvseg.evaluation.average_precision import average_precision
-from mvseg.system.atomic import is_partial, lock_folder, write_text_whole
+from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole
 from mvseg.training.augmentation import Augmentation, AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
@@ -46,7 +46,6 @@ from mvseg.training.data import SampleList, keep_sound, list_samples
 from mvseg.training.files import (
     append_record,
     cut_log,
-    delete_partial,
     open_tensorboard,
     write_config,
     write_metrics,
@@ -333,7 +332,7 @@ def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
 def open_files(run: Run, state: TrainingState) -> Any | None:
     """Write the config, cut the log to the state's step, and open TensorBoard's writer, if it is installed."""
     output = run.config.output
-    delete_partial(output)
+    sweep_folder(output)
     write_config(output / "config.yaml", config_values(run.config))
     cut_log(output / "log.jsonl", state.step)
     return open_tensorboard(output / "tensorboard", state.step)

@@ -40,8 +40,7 @@ def test_every_item_has_its_answer_and_workers_are_used_again() -> None:
 def test_a_process_that_dies_loses_its_own_item_only() -> None:
     answers, _ = run(["kill", "a", "exit", "b", "raise", "c"], 2)
     assert [answers[key][0] for key in (1, 3, 5)] == ["A", "B", "C"]
-    assert answers[0] == Lost("was killed (SIGKILL), as systems do when memory runs out")
-    assert answers[2] == Lost("ended with exit code 7")
+    assert answers[0] == answers[2] == Lost("died, most likely because memory ran out")
     assert answers[4] == Lost("stopped with ValueError: it is broken")
 
 
@@ -56,11 +55,11 @@ def test_nothing_to_do() -> None:
 
 def test_workers_that_cannot_start_are_an_error() -> None:
     work = partial(do_as_told, Unpicklable())  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=r"^no worker can be started: the process ended with exit code 5$"):
+    with pytest.raises(InputError, match=r"^no worker can be started: the process dies before"):
         list(run_locally(work, {0: "a", 1: "b"}, num_workers=2, started=int))
 
 
-def test_workers_clear_up_when_the_caller_has_enough(tmp_path: Path) -> None:
+def test_workers_end_when_the_caller_has_enough(tmp_path: Path) -> None:
     items = {0: f"wait:{tmp_path}", 1: "a"}
     with closing(run_locally(do_as_told, items, num_workers=2, started=int)) as answers:
         assert next(answers)[1][0] == "A"  # type: ignore[index]
@@ -69,7 +68,6 @@ def test_workers_clear_up_when_the_caller_has_enough(tmp_path: Path) -> None:
         process = int((tmp_path / "begun").read_text())
         os.kill(process, signal.SIGINT)  # a terminal sends Ctrl-C to all; the parent alone decides
         time.sleep(0.1)
-        assert not (tmp_path / "cleared").exists()
-    assert (tmp_path / "cleared").exists()
+        os.kill(process, 0)
     with pytest.raises(ProcessLookupError):
         os.kill(process, 0)

@@ -16,7 +16,6 @@ from mvseg.errors import InputError
 from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.pipeline import detect_regions
-from mvseg.system.atomic import MACHINE, write_whole
 from scene_folders import HEIGHT, WIDTH, edit_rig, write_image, write_scene
 
 FOUND = {
@@ -74,22 +73,13 @@ def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     delete_kept(kept)
     write_detections(kept / f"{'0' * 64}.safetensors", FOUND)
-    (kept / f".{'0' * 64}.safetensors.{MACHINE}-0123456789ab.partial").touch()
+    (kept / f".{'0' * 64}.safetensors.partial").touch()
     (kept / "notes.txt").touch()
     delete_kept(kept)
     assert [path.name for path in kept.iterdir()] == ["notes.txt"]
     (kept / "notes.txt").unlink()
     delete_kept(kept)
     assert not kept.exists()
-
-
-def test_another_run_keeps_what_it_is_writing(tmp_path: Path) -> None:
-    def delete(partial: Path) -> None:
-        delete_kept(tmp_path)
-        partial.write_text("whole")
-
-    write_whole(tmp_path / f"{'0' * 64}.safetensors", delete)
-    assert [path.read_text() for path in tmp_path.iterdir()] == ["whole"]
 
 
 class TestClaim:

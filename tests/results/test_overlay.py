@@ -168,24 +168,6 @@ def test_numbers_are_smaller_on_small_leaves() -> None:
     assert 8 <= small < 0.7 * large
 
 
-class TestRims:
-    LINE = np.array([[20.5, 100.5], [280.5, 100.5]])  # pixel centres
-
-    def test_a_line_in_the_colour_of_its_instance_with_a_dark_edge(self, regions: Regions) -> None:
-        nothing = regions.select(regions.view_index == 1)
-        painted = draw_overlay(GREY, masks(nothing, [1, 2]), view=0, rims={3: [self.LINE]})
-        assert np.abs(painted[100, 30:270].astype(int) - instance_color(3)).max() < 30  # versions of OpenCV
-        for row in (99, 101):
-            assert painted[row, 30:270].max() < 90  # darker than the photo
-        assert (np.delete(painted, range(97, 104), axis=0) == 90).all()
-
-    def test_rims_are_scaled_with_the_photo(self) -> None:
-        nothing = regions_from_label_maps([np.zeros((1600, 3200), np.uint16)])
-        photo = np.full((1600, 3200, 3), 90, np.uint8)
-        painted = draw_overlay(photo, masks(nothing, [1, 2]), view=0, rims={3: [4 * self.LINE]})
-        assert (painted[200:202, 100:500] == instance_color(3)).all(2).any(0).all()
-
-
 class TestTiles:
     def test_the_plant_fills_the_tile(self) -> None:
         """A plant of a tenth of the width, and a mask elsewhere that is matched to nothing."""

@@ -193,6 +193,12 @@ def test_hostile_names_are_read_as_text(opened: Opened) -> None:
     assert opened.page.locator("img").count() == 0
 
 
+def test_a_direction_that_is_rounded_to_a_full_turn_is_0(opened: Opened) -> None:
+    numbers = [(359.8, 12, "\u00b0"), (359.8, 1.2, "\u00b0"), (-0.2, 12, "\u00b0"), (359.8, 12, "mm")]
+    written = opened.page.evaluate("(all) => all.map((each) => formatNumber(...each).value)", numbers)
+    assert written == ["0", "359.8", "0", "360"]
+
+
 def test_photos_and_cameras_know_each_other(opened: Opened) -> None:
     opened.page.locator("#tiles figcaption button", has_text="3D").nth(1).click()
     place, center = opened.page.evaluate("[page.camera.position.toArray(), data.space.cameras[1].center]")

@@ -1,8 +1,10 @@
 // Numbers as people write them: as many digits as the standard deviation leaves.
 
-function formatNumber(value, sd) {
+function formatNumber(value, sd, unit) {
   const decimals = countDecimals(value, sd);
-  return { value: write(value, decimals), sd: sd === null || sd === undefined ? null : write(sd, decimals) };
+  const written = write(value, decimals);
+  const isFullTurn = unit === "\u00b0" && Number(written) === 360; // directions are in [0, 360)
+  return { value: isFullTurn ? write(0, decimals) : written, sd: sd === null || sd === undefined ? null : write(sd, decimals) };
 }
 
 // Fewer than none: rounded to tens, hundreds and so on.
@@ -24,7 +26,7 @@ function clamp(value, low, high) {
 
 // "1234 ± 56 mm²"
 function formatTrait(number, unit) {
-  const text = formatNumber(number.value, number.sd);
+  const text = formatNumber(number.value, number.sd, unit);
   const sd = text.sd === null ? "" : ` \u00b1 ${text.sd}`;
   return text.value + sd + (unit === "" ? "" : unit === "\u00b0" ? unit : ` ${unit}`);
 }

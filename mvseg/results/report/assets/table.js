@@ -75,7 +75,7 @@ function listColumns(data) {
     name: nameOf(trait),
     unit: trait.unit,
     meaning: trait.meaning,
-    cell: (leaf) => numberCell(leaf.traits[trait.name]),
+    cell: (leaf) => numberCell(leaf.traits[trait.name], trait.unit),
     key: (leaf) => leaf.traits[trait.name]?.value ?? null,
   }));
   const plain = (name, meaning, key, write = String) => ({
@@ -100,9 +100,9 @@ function leafCell(leaf) {
   return element("td", {}, element("button", name, swatch, ` ${leaf.id}`));
 }
 
-function numberCell(number) {
+function numberCell(number, unit) {
   if (number?.value === undefined) return element("td", { title: number?.why }, "\u2013");
-  const text = formatNumber(number.value, number.sd);
+  const text = formatNumber(number.value, number.sd, unit);
   const sd = text.sd === null ? null : element("span", { class: "sd" }, ` \u00b1 ${text.sd}`);
   return element("td", { title: number.on }, text.value, sd);
 }
