@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from mvseg.checks.check_scene import check_scene as check_scene
     from mvseg.checks.finding import Finding as Finding
     from mvseg.config import RunConfig as RunConfig
+    from mvseg.corrections.file import Corrections as Corrections
+    from mvseg.corrections.file import load_corrections as load_corrections
     from mvseg.demo import demo_scene as demo_scene
     from mvseg.detection.assignment import EpipolarAssignment as EpipolarAssignment
     from mvseg.detection.config import DetectConfig as DetectConfig
@@ -98,6 +100,7 @@ _HOME = {
     "checks.finding": ("Finding",),
     "checks.check_scene": ("Check", "check_scene"),
     "config": ("RunConfig",),
+    "corrections.file": ("Corrections", "load_corrections"),
     "pipeline": ("run_scene",),
     "tracking.track": ("LeafLink", "Tracks", "track_leaves"),
     "system.worker_pool": ("start_workers",),

@@ -27,7 +27,9 @@ class Origin(IntEnum):
     GIVEN = 0  # the user's
     DETECTED = 1
     OTHER_VIEWS = 2  # no detector found it: surfaces fitted to the masks of other views show it
-    CORRECTED = 3  # a person made or confirmed it
+    CORRECTED = 3  # a person drew it; from here on, no stage changes or drops a mask
+    CUT = 4  # a person cut it from another one
+    CONFIRMED = 5  # a person says that it is right
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,6 +112,11 @@ class Masks:
     def view_index(self) -> Tensor:
         """(D,) int64, the view of each."""
         return self.regions.view_index
+
+    @property
+    def is_corrected(self) -> Tensor:
+        """(D,) bool: a person drew, cut or confirmed it."""
+        return self.origin >= Origin.CORRECTED
 
     @property
     def num_instances(self) -> int:

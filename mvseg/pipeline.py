@@ -18,6 +18,8 @@ from tqdm import tqdm
 from mvseg._version import code_hash
 from mvseg.checks.contradictions import warn_of_contradictions
 from mvseg.config import RunConfig
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere
+from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError, InputWarning
@@ -25,7 +27,8 @@ from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, describe_folder
 from mvseg.formats.scene_folder import load_scene, read_masks
-from mvseg.matching.match import check_baselines, match_regions
+from mvseg.masks import Masks, Origin
+from mvseg.matching.match import check_baselines, match_masks, match_regions
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.poses.refine_poses import RefinedPoses, refine_poses
@@ -55,7 +58,10 @@ class State:
         scene: cameras and views.
         photos: of the scene.
         keep, workers, progress: see `run_scene`.
-        match: from cameras to the masks of the scene, matched; what `find` leaves.
+        match: from cameras to the masks of the scene, matched; what `detect` or `load` leaves, or `correct`.
+        find: from cameras to the same masks before they are matched.
+        corrections: of a person; None: there are none.
+        corrected: what came of them.
         matching: the table of masks, and what matching says of the scene.
         poses: what came of refining them; None where that was not asked for.
         starts: {instance id: surface} that the masks were verified with; where the final ones start.
@@ -70,6 +76,9 @@ class State:
     workers: ProcessPoolExecutor | None = None
     progress: bool = False
     match: Match | None = None
+    find: Callable[[Cameras], Masks] | None = None
+    corrections: Corrections | None = None
+    corrected: Corrected | None = None
     matching: Matching | None = None
     poses: RefinedPoses | None = None
     starts: Mapping[int, LeafSurface] = field(default_factory=dict)
@@ -94,6 +103,7 @@ def run_scene(
     masks: Path | None = None,
     config: RunConfig = RunConfig(),
     *,
+    corrections: Corrections | Path | None = None,
     keep: Path | None = None,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
@@ -104,6 +114,7 @@ def run_scene(
         folder: the scene, see `load_scene`.
         masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
         config: the options of all stages.
+        corrections: of a person, or the file of them, see `load_corrections`; without any edits they change nothing.
         keep: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
             from them, and one with other options of later stages uses them again. What it holds of other photos or
             options is deleted; `delete_kept` deletes the rest.
@@ -117,9 +128,13 @@ def run_scene(
         InputError: bad input; see the stages.
     """
     begun = time.perf_counter()
+    if isinstance(corrections, Path):
+        corrections = load_corrections(corrections)
+    has_edits = corrections is not None and len(corrections.edits) > 0
     state = load(folder, masks, config, keep=keep, workers=workers, progress=progress)
+    state = replace(state, corrections=corrections)
     seconds = {"load": time.perf_counter() - begun}
-    for name, stage in list_stages(config, has_masks=masks is not None).items():
+    for name, stage in list_stages(config, has_masks=masks is not None, has_edits=has_edits).items():
         begun = time.perf_counter()
         state = stage(state)
         seconds[name] = time.perf_counter() - begun
@@ -134,10 +149,12 @@ def run_scene(
         seconds=seconds,
         mask_kind=state.mask_kind,
         num_moved=state.num_moved,
+        corrections=corrections,
+        fates=() if state.corrected is None else state.corrected.fates,
     )
 
 
-def list_stages(config: RunConfig, *, has_masks: bool) -> dict[str, Stage]:
+def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) -> dict[str, Stage]:
     """The stages that a config asks for, in their order.
 
     Masks that were given are checked by surfaces where they are to be cut, since these know best which ones show two
@@ -148,12 +165,15 @@ def list_stages(config: RunConfig, *, has_masks: bool) -> dict[str, Stage]:
     is_checked = shapes is not None and shapes.check_ids and shapes.shape != "voxels" and not is_verified
     stages = {
         "detect": None if has_masks else detect,
+        "correct": correct if has_edits else None,
         "match": match_refined if config.refine_poses else match,
+        "correct_instances": correct_instances if has_edits else None,
         "split": split if config.split_merged and not is_checked else None,
         "verify": verify if is_verified else None,
         "check": check_cameras,
         "check_ids": check_ids if is_checked else None,
         "split_checked": split if config.split_merged and is_checked else None,
+        "follow": follow if has_edits and has_masks and shapes is not None else None,
         "reconstruct": None if shapes is None else reconstruct,
         "measure": None if shapes is None else measure,
         "recut": recut if is_verified else None,
@@ -180,7 +200,7 @@ def load(folder: Path, masks: Path | None, config: RunConfig, **how: Any) -> Sta
     found = recognise_masks(scene, masks)
     regions = read_masks(scene, found, crowd=config.coco_crowd, categories=wanted)
     matcher = partial(match_regions, regions, config=config.match, progress=state.progress)
-    return replace(state, match=matcher, mask_kind=found.kind)
+    return replace(state, match=matcher, find=lambda _: Masks.of(regions), mask_kind=found.kind)
 
 
 def detect(state: State) -> State:
@@ -198,9 +218,7 @@ def detect(state: State) -> State:
     options, cameras = state.config.detect, state.scene.cameras
     detector = load_detector(options.weights, image_size=options.image_size, min_score=options.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = MultiViewMaskRCNN(
-        detector, num_iterations=options.num_iterations, match=state.config.match
-    ).to(device)
+    model = MultiViewMaskRCNN(detector, num_iterations=options.num_iterations, match=state.config.match).to(device)
     kept = None if state.keep is None else KeptDetections(state.keep, _describe_detector(options, model, device))
     found, names = _look(model, state, kept=kept)
     # the first look is matched once, and not again by the next stage
@@ -218,7 +236,25 @@ def detect(state: State) -> State:
 
     if state.keep is not None:
         delete_kept(state.keep, but=names)
-    return replace(state, match=matcher)
+    return replace(state, match=matcher, find=lambda cameras: matcher(cameras).masks)
+
+
+def correct(state: State) -> State:
+    """Edits of a person change the masks and link them, see `apply`; the next stage matches these.
+
+    Warns (InputWarning) of each edit that points at nothing, or that a later one contradicts.
+    """
+    assert state.find is not None
+    assert state.corrections is not None
+    corrected = apply(state.corrections, state.find(state.scene.cameras), state.scene)
+    for message in corrected.messages:
+        warnings.warn(message, InputWarning, stacklevel=3)
+
+    def matcher(cameras: Cameras) -> Matching:
+        options = state.config.match
+        return match_masks(corrected.masks, cameras, options, links=corrected.links, progress=state.progress)
+
+    return replace(state, match=matcher, corrected=corrected)
 
 
 def match(state: State) -> State:
@@ -241,6 +277,13 @@ def match_refined(state: State) -> State:
         warnings.warn(message, InputWarning, stacklevel=3)
     scene = replace(state.scene, cameras=poses.cameras)
     return match(replace(state, scene=scene, poses=poses))
+
+
+def correct_instances(state: State) -> State:
+    """Edits of a person about whole instances, see `apply_everywhere`."""
+    assert state.corrected is not None
+    masks = apply_everywhere(state.corrected, state.matched.masks.to("cpu"))
+    return replace(state, matching=state.matched.with_masks(masks))
 
 
 def split(state: State) -> State:
@@ -281,7 +324,7 @@ def check_ids(state: State) -> State:
     before = state.matched.masks
     surfaces = reconstruct(state, with_voxels=False).surfaces
     assert surfaces is not None
-    after = checked_ids.check_ids(before, surfaces, cameras=state.scene.cameras)
+    after = checked_ids.check_ids(before, surfaces, cameras=state.scene.cameras, held=_linked(state))
     known = checked_ids.unchanged_surfaces(before, after, surfaces)
     return replace(
         state,
@@ -289,6 +332,21 @@ def check_ids(state: State) -> State:
         surfaces=after.renumber(known),
         num_moved=int((before.instance_ids != after.instance_ids).sum()),
     )
+
+
+def follow(state: State) -> State:
+    """Where masks are given, the other views of what a person drew get masks, too; all others stay as they are."""
+    from mvseg.verification.other_views import verify_masks
+
+    before = state.matched.masks.to("cpu")
+    drawn = before.instance_ids[(before.origin == Origin.CORRECTED) & (before.instance_ids > 0)]
+    if not len(drawn):
+        return state
+    photos = state.photos if state.photos.exist else None
+    every = torch.ones(len(before), dtype=torch.bool)
+    after, _ = verify_masks(before, cameras=state.scene.cameras, photos=photos, held=every, workers=state.workers)
+    stays = (after.origin != Origin.OTHER_VIEWS) | torch.isin(after.instance_ids, drawn)
+    return replace(state, matching=state.matched.with_masks(after.select(stays)), surfaces=None)
 
 
 def reconstruct(state: State, *, with_voxels: bool = True) -> State:
@@ -364,6 +422,15 @@ def place_scene(scene: Scene, config: RunConfig) -> Scene:
         message = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
         warnings.warn(message, InputWarning, stacklevel=3)
     return scene
+
+
+def _linked(state: State) -> torch.Tensor | None:
+    """(D,) bool, the masks that a person links with others; None without any."""
+    if state.corrected is None or state.corrected.everywhere or not len(state.corrected.links):
+        return None
+    held = torch.zeros(len(state.matched), dtype=torch.bool)
+    held[torch.cat((state.corrected.links.must, state.corrected.links.cannot)).flatten()] = True
+    return held
 
 
 def detect_regions(

@@ -40,7 +40,7 @@ FLOORS = (
     ("masks", "demo"),
     ("formats", "detectors", "matching", "reconstruction"),
     ("verification", "traits", "evaluation", "simulation", "checks", "poses"),
-    ("detection",),
+    ("corrections", "detection"),
     ("config",),
     ("training", "results"),
     ("pipeline", "tracking"),

@@ -18,7 +18,7 @@ from mvseg.results.provenance import hash_files
 from mvseg.scene import Scene
 
 
-def scene_key(scene: Scene, masks: Path | None, config: RunConfig) -> str:
+def scene_key(scene: Scene, masks: Path | None, config: RunConfig, *, corrections: Path | None = None) -> str:
     """The hash of a scene's inputs and options.
 
     It covers the cameras as they were understood; names, sizes and times of photos and masks, which say when one has
@@ -29,6 +29,7 @@ def scene_key(scene: Scene, masks: Path | None, config: RunConfig) -> str:
         scene: the scene.
         masks: its masks; None where a detector finds them.
         config: the options.
+        corrections: the file of a person's corrections; None: there are none.
 
     Raises:
         InputError: a file cannot be read, or the weights are not there.
@@ -41,10 +42,11 @@ def scene_key(scene: Scene, masks: Path | None, config: RunConfig) -> str:
         else:
             del options["detect"]
             others = [_describe_file(path, masks) for path in _mask_files(masks)]
+        edits = None if corrections is None else hash_files(corrections)
         photos = [_describe_file(view.path, view.path.parent) for view in scene.views if view.path.is_file()]
     except OSError as error:
         raise InputError(f"{error.filename}: cannot be read ({error.strerror})") from None
-    told = [code_hash(), _describe_scene(scene), photos, others, options]
+    told = [code_hash(), _describe_scene(scene), photos, others, edits, options]
     return hashlib.sha256(json.dumps(told, default=str).encode()).hexdigest()
 
 

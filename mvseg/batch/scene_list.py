@@ -14,7 +14,7 @@ from mvseg.batch.places import RESERVED, SUMMARY_COLUMNS
 from mvseg.errors import InputError
 from mvseg.system.atomic import resolve_place
 
-OWN_COLUMNS = ("scene", "name", "masks")
+OWN_COLUMNS = ("scene", "name", "masks", "corrections")
 MAX_BYTES = 1 << 26
 FORBIDDEN = "/\\\0" + ('<>:"|?*' if sys.platform == "win32" else "")  # in the name of a folder
 
@@ -27,7 +27,8 @@ class BatchScene:
         name: of its result folder; unique in the batch, also where capitals do not count.
         folder: the scene folder, absolute; it need not exist.
         masks: the path that the table gives, or that of `--masks`; None: a detector finds them.
-        beside: where a relative path of masks may start, besides the scene folder; absolute.
+        corrections: the path that the table gives to a file of corrections; None: there are none.
+        beside: where a relative path of masks or corrections may start, besides the scene folder; absolute.
         carried: what the table says of it, {column: text}: `plant`, `time`, then the table's other columns.
     """
 
@@ -36,6 +37,7 @@ class BatchScene:
     masks: Path | None
     beside: Path
     carried: dict[str, str]
+    corrections: Path | None = None
 
 
 def list_scenes(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene, ...]:
@@ -43,8 +45,8 @@ def list_scenes(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene
 
     Args:
         source: a CSV table with a column `scene`, the path of a scene folder that starts at the table's own folder, and
-            perhaps `name`, `masks`, `plant`, `time` and others; or a folder with one scene in each sub-folder. Hidden
-            sub-folders, and `out`, are none.
+            perhaps `name`, `masks`, `corrections`, `plant`, `time` and others; or a folder with one scene in each
+            sub-folder. Hidden sub-folders, and `out`, are none.
         out: folder of the results.
         masks: of the scenes for which the table names none.
 
@@ -109,9 +111,17 @@ def _read_table(source: Path, masks: Path | None) -> tuple[BatchScene, ...]:
                 masks=Path(row["masks"]) if row.get("masks") else masks,
                 beside=source.parent.absolute() if row.get("masks") else Path.cwd(),
                 carried=carried | {column: row[column] for column in extra},
+                corrections=_beside_table(source, row.get("corrections")),
             )
         )
     return tuple(scenes)
+
+
+def _beside_table(source: Path, path: str | None) -> Path | None:
+    """A path of a cell: at the table's own folder if there is such a file, else as it is (in the scene folder)."""
+    if not path:
+        return None
+    return (source.parent / path).absolute() if (source.parent / path).is_file() else Path(path)
 
 
 def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:

@@ -57,11 +57,13 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
         earlier = read_status(folder)
         try:
             masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
-            key = _key_of(scene, masks, config)
+            corrections = _find_corrections(scene)
+            key = _key_of(scene, masks, config, corrections=corrections)
             if earlier is not None and earlier.key == key and _is_done(earlier, scene_result(out, scene.name)):
                 return Finished(earlier, is_kept=True)
             write_status(folder, Status(state="running", scene=str(scene.folder), key=key))
-            status = _finish(scene, masks, scene_result(out, scene.name), config=config, keep=keep)
+            place = scene_result(out, scene.name)
+            status = _finish(scene, masks, place, config=config, corrections=corrections, keep=keep)
         except Exception as error:  # whatever it is, the other scenes go on
             status, key = _describe_failure(error, scene), ""
         seconds = round(time.monotonic() - started, 3)
@@ -70,10 +72,14 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     return Finished(status)
 
 
-def _key_of(scene: BatchScene, masks: Path | None, config: RunConfig) -> str:
+def _find_corrections(scene: BatchScene) -> Path | None:
+    return None if scene.corrections is None else find_masks(scene.folder, scene.corrections, what="corrections")
+
+
+def _key_of(scene: BatchScene, masks: Path | None, config: RunConfig, *, corrections: Path | None) -> str:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # the run itself gives them
-        return scene_key(load_scene(scene.folder), masks, config)
+        return scene_key(load_scene(scene.folder), masks, config, corrections=corrections)
 
 
 def _is_done(status: Status, result: Path) -> bool:
@@ -84,10 +90,12 @@ def _is_done(status: Status, result: Path) -> bool:
     return all((result / name).is_file() for name in json.loads(run.read_bytes())["files"])
 
 
-def _finish(scene: BatchScene, masks: Path | None, out: Path, *, config: RunConfig, keep: Path) -> Status:
+def _finish(
+    scene: BatchScene, masks: Path | None, out: Path, *, config: RunConfig, corrections: Path | None, keep: Path
+) -> Status:
     sweep_abandoned(out)
     check_out(out)
-    result, messages = solve_scene(scene.folder, masks, config, keep=keep, progress=False)
+    result, messages = solve_scene(scene.folder, masks, config, corrections=corrections, keep=keep, progress=False)
     save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages, progress=False)
     return Status(
         state="done",

@@ -41,6 +41,7 @@ def run(args: Namespace) -> int:
         args.masks,
         out,
         config=build_run(args),
+        corrections=args.corrections,
         num_workers=num_workers,
         overwrite=args.overwrite,
         quiet=args.quiet,

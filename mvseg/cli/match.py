@@ -46,7 +46,15 @@ def run(args: Namespace) -> int:
     )
     for scene, name in zip(args.scenes, names, strict=True):
         try:
-            run_one_scene(scene, args.masks, out / name, config=config, overwrite=args.overwrite, quiet=args.quiet)
+            run_one_scene(
+                scene,
+                args.masks,
+                out / name,
+                config=config,
+                corrections=args.corrections,
+                overwrite=args.overwrite,
+                quiet=args.quiet,
+            )
         except InputError as error:  # the other scenes still get their results
             code = complain(error)
     return code

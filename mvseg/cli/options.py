@@ -91,7 +91,9 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
 
 
 def add_overwrite(parser: ArgumentParser) -> None:
-    """The option of the verbs that write the result of one scene."""
+    """The options of the verbs that write the results of scenes one by one."""
+    help_corrections = "file of a person's corrections, in the scene folder or anywhere; docs/corrections.md"
+    parser.add_argument("--corrections", type=Path | None, help=help_corrections)
     help_overwrite = "replace the result in --out also where it is another scene's"
     parser.add_argument("--overwrite", type=bool, default=False, help=help_overwrite)
 

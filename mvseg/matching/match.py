@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -11,8 +12,10 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
+from mvseg.matching.links import Links, keep_links
 from mvseg.matching.nview.match_nview import WIDENINGS, match_nview
-from mvseg.matching.one_per_view import one_per_view_clusters
+from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
+from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
 from mvseg.matching.pencil import is_coincident
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.symnmf import cluster_affinity
@@ -31,6 +34,7 @@ def match_regions(
     config: MatchConfig = MatchConfig(),
     *,
     residual_px: int | None = None,
+    links: Links | None = None,
     progress: bool = False,
 ) -> Matching:
     """Give every region an instance id by epipolar region matching (Sec. 3.1).
@@ -44,6 +48,8 @@ def match_regions(
         config: method and options.
         residual_px: the reprojection error, one of 1, 2, 4 and 8 pixels, where an earlier matching of these views has
             found it (`Matching.residual_px`); None: it is estimated. Only "nview" makes use of it.
+        links: regions that show one instance, or different ones; these ids hold, and links that the views agree with
+            change nothing.
         progress: show progress bars.
 
     Returns:
@@ -52,8 +58,11 @@ def match_regions(
 
     Raises:
         InputError: fewer than two views, regions and cameras of different numbers of views, cameras that are all at
-            one place, a region that reaches beyond the image of its camera, or another `residual_px`.
+            one place, a region that reaches beyond the image of its camera, another `residual_px`, or links that
+            contradict each other.
     """
+    links = Links.of() if links is None else links
+    links.components(len(regions))
     if residual_px is not None and residual_px not in WIDENINGS:
         raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, WIDENINGS))}")
     cameras = cameras.to(regions.device)
@@ -64,14 +73,52 @@ def match_regions(
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
     method = config.resolved_method
     if method == "nview":
-        matching = match_nview(regions, cameras, affinity, residual_px=residual_px, progress=progress)
+        matching = match_nview(regions, cameras, affinity, residual_px=residual_px, links=links, progress=progress)
         if len(cameras) > 2 and len(regions):
             _warn_of_disagreement(matching)
         return matching
     if method == "one-per-view":
         ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
-        return matching_of_ids(ids, regions, affinity, method=method)
-    return match_graph(affinity, regions, config, method=method, progress=progress)
+        return matching_of_ids(_keep_links(ids, regions, affinity, links), regions, affinity, method=method)
+    matching = match_graph(affinity, regions, config, method=method, progress=progress)
+    ids = _keep_links(matching.instance_ids, regions, affinity, links)
+    return matching if ids is matching.instance_ids else matching_of_ids(ids, regions, affinity, method=method)
+
+
+def _keep_links(ids: Tensor, regions: Regions, affinity: Affinity, links: Links) -> Tensor:
+    """(D,) ids in [1, K] or -1 that agree with the links."""
+    if not len(links):
+        return ids
+    weights, views = affinity.to_dense().cpu().double().numpy(), regions.view_index.cpu().numpy()
+    clusters = separate_unmatched(renumber(ids.cpu().numpy()))
+    kept = keep_links(clusters, ViewGraph(weights, views, regions.num_views), links)
+    return number_instances(drop_singletons(kept)).to(ids.device)
+
+
+def match_masks(
+    masks: Masks, cameras: Cameras, config: MatchConfig = MatchConfig(), *, links: Links, progress: bool = False
+) -> Matching:
+    """Match the masks of a table with links, class by class; what else is known of them stays.
+
+    Args:
+        masks: D masks; their ids are forgotten.
+        cameras: V cameras.
+        config: method and options.
+        links: of their rows; those between masks of different classes have no effect.
+        progress: show progress bars.
+    """
+    parts, rows = [], []
+    for label in masks.classes.unique().tolist() or [1]:
+        members = (masks.classes == label).nonzero()[:, 0]
+        part = match_regions(
+            masks.regions.select(members), cameras, config, links=links.select(members), progress=progress
+        )
+        parts.append(part)
+        rows.append(members)
+    joined = Masks.concatenate([part.masks for part in parts]).select(torch.cat(rows).argsort())
+    kept = replace(joined, detection_scores=masks.detection_scores, classes=masks.classes, origin=masks.origin)
+    report = MatchReport.join([part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts])
+    return Matching(kept, report)
 
 
 def match_graph(

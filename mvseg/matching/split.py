@@ -18,8 +18,10 @@ def split_merged(masks: Masks) -> Masks:
 
     Returns:
         D' >= D masks in the same order, the second part of a mask right after the first. Both have its scores; none
-        shows two instances any more. A mask stays whole if one part would be empty.
+        shows two instances any more. A mask stays whole if one part would be empty, or if a person
+        corrected it.
     """
+    masks = masks.with_merged([each for each in masks.merged if not masks.is_corrected[each.region]])
     rows, boxes, crops, ids = [], [], [], []
     columns = zip(masks.instance_ids.tolist(), masks.second_ids.tolist(), masks.regions.boxes.tolist(), strict=True)
     for row, (own_id, other_id, box) in enumerate(columns):

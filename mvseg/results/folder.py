@@ -37,6 +37,7 @@ if TYPE_CHECKING:
 
 REPORT_FILE = "report.html"
 CAMERAS_FILE = "cameras.json"
+CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED: "confirm"}  # the edit that made a mask
 
 
 def save_result(
@@ -82,7 +83,8 @@ def save_result(
                 if poses.is_refined:
                     write_refined(folder / CAMERAS_FILE, result.scene)
             measured = {} if result.traits is None else {"traits": _describe_traits(result.traits)}
-            said = run | matched | measured | {"counts": counts, "seconds": seconds}
+            corrected = {"corrections": [asdict(each) for each in result.fates]} if result.fates else {}
+            said = run | matched | measured | corrected | {"counts": counts, "seconds": seconds}
             if report:
                 from mvseg.results.report.page import write_report  # loads trimesh
 
@@ -140,11 +142,16 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
     K = result.scene.cameras.K[view].cpu().numpy()
     instance = int(result.matching.instance_ids[region])
     track = {"track_id": instance} if instance > 0 else {}
-    if result.masks.origin[region] == Origin.GIVEN:
-        source: dict[str, Any] = {"source_label": int(result.regions.labels[region])}
-    else:
-        is_from_views = bool(result.masks.origin[region] == Origin.OTHER_VIEWS)
-        source = {"score": round(float(result.masks.detection_scores[region]), 4), "from_other_views": is_from_views}
+    origin, score = Origin(int(result.masks.origin[region])), float(result.masks.detection_scores[region])
+    source: dict[str, Any] = {}
+    if origin == Origin.GIVEN:
+        source["source_label"] = int(result.regions.labels[region])
+    elif math.isfinite(score):
+        source["score"] = round(score, 4)
+    if origin in (Origin.DETECTED, Origin.OTHER_VIEWS):
+        source["from_other_views"] = origin == Origin.OTHER_VIEWS
+    if origin in CORRECTED:
+        source["corrected"] = CORRECTED[origin]
     return {
         "image_id": view + 1,
         "instance_id": instance,

@@ -33,13 +33,17 @@ def describe_run(
     if config.reconstruct is None:
         for name in ("reconstruct", "traits", "scale", "unit", "up", "color_card"):
             del options[name]
-    source = masks or _weights_of(config)
+    sources = [result.scene.source, masks or _weights_of(config)]
+    corrections = None if result.corrections is None else result.corrections.source
+    if corrections is not None:
+        sources.append(corrections)
+        options["corrections"] = str(corrections)
     return {
         **made_by(),
         "torch": torch.__version__,
         "python": platform.python_version(),
         "scene": result.scene.name,
-        "inputs": {str(path): hash_files(path) for path in (result.scene.source, source) if path is not None},
+        "inputs": {str(path): hash_files(path) for path in sources if path is not None},
         "config": {"masks": masks and str(masks)} | options,
         "mask_kind": result.mask_kind or None,
         "warnings": list(messages),

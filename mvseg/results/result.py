@@ -14,6 +14,8 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 if TYPE_CHECKING:  # loads trimesh and scikit-image
+    from mvseg.corrections.apply import Fate
+    from mvseg.corrections.file import Corrections
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.reconstruction.voxels import VoxelGrid
     from mvseg.traits.measure import Traits
@@ -35,6 +37,8 @@ class Result:
         traits: of the plant and its leaves; None when only ids were asked for.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
+        corrections: of a person; None where there were none.
+        fates: what came of each of their edits.
         num_moved: how many masks got another id from the surfaces, see `check_ids`; None where they were not asked.
     """
 
@@ -48,6 +52,8 @@ class Result:
     seconds: dict[str, float] = field(default_factory=dict)
     mask_kind: str = ""
     num_moved: int | None = None
+    corrections: Corrections | None = None
+    fates: tuple[Fate, ...] = ()
 
     @property
     def masks(self) -> Masks:

@@ -25,6 +25,7 @@ def run_one_scene(
     out: Path,
     *,
     config: RunConfig,
+    corrections: Path | None = None,
     num_workers: int = 1,
     overwrite: bool = False,
     quiet: bool,
@@ -46,13 +47,16 @@ def run_one_scene(
         check_same_scene(out, scene)
     replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
     masks = None if masks is None else find_masks(scene, masks)
+    corrections = None if corrections is None else find_masks(scene, corrections, what="corrections")
     place = resolve_place(out)
     keep = place.with_name(f"{place.name}.detections")
     with ExitStack() as stack:
         if masks is None and stack.enter_context(claim_kept(keep, scene, overwrite=overwrite)):
             print(f"mvseg: going on from the detections in {keep}, for equal photos and options", file=sys.stderr)
         with start_workers(num_workers) as workers:
-            result, messages = solve_scene(scene, masks, config, keep=keep, workers=workers, progress=not quiet)
+            result, messages = solve_scene(
+                scene, masks, config, corrections=corrections, keep=keep, workers=workers, progress=not quiet
+            )
         for message in messages:
             print(f"mvseg: warning: {message}", file=sys.stderr)
         save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)
@@ -68,6 +72,7 @@ def solve_scene(
     masks: Path | None,
     config: RunConfig,
     *,
+    corrections: Path | None = None,
     keep: Path,
     workers: ProcessPoolExecutor | None = None,
     progress: bool,
@@ -79,7 +84,7 @@ def solve_scene(
         warnings.simplefilter("always", InputWarning)
         if masks is not None and config.detect != DetectConfig():
             warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
-        result = run_scene(scene, masks, config, keep=keep, workers=workers, progress=progress)
+        result = run_scene(scene, masks, config, corrections=corrections, keep=keep, workers=workers, progress=progress)
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
     # each matching of a detector's loop may repeat a warning
@@ -110,15 +115,18 @@ def save_scene(
     save_result(result, out, run, progress=progress, report=config.report)
 
 
-def find_masks(scene: Path, masks: Path, beside: Path = Path()) -> Path:
-    """A relative path may start at the scene folder or at `beside`, as long as only one of the two exists."""
+def find_masks(scene: Path, masks: Path, beside: Path = Path(), *, what: str = "masks") -> Path:
+    """Where masks, or `what` else is given with a scene, lie.
+
+    A relative path may start at the scene folder or at `beside`, as long as only one of the two exists.
+    """
     from mvseg.formats.find_views import list_some
 
     inside, outside = scene / masks, beside / masks
     if inside.exists() and outside.exists() and not inside.samefile(outside):
-        raise InputError(f"both {inside} and {outside.resolve()} exist, expected --masks with the full path of one")
+        raise InputError(f"both {inside} and {outside.resolve()} exist, expected --{what} with the full path of one")
     if scene.is_dir() and not inside.exists() and not outside.exists() and not masks.is_absolute():
         found = list_some(sorted(path.name for path in scene.iterdir()))
         places = f"in {scene}, which holds {found}, nor in {beside.resolve()}"
-        raise InputError(f"{masks}: no such masks {places}; --masks says where they are")
+        raise InputError(f"{masks}: no such {what} {places}; --{what} says where they are")
     return inside if inside.exists() else outside

@@ -18,6 +18,7 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
+from torch import Tensor
 
 from mvseg.masks import Masks, MergedMask
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -39,7 +40,7 @@ EACH, BOTH = 0.2, 0.7  # of a merged mask, that shows either of its two surfaces
 MOST = 0.5  # of what its view shows of the second one, that lies in the mask
 
 
-def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras) -> Masks:
+def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras, held: Tensor | None = None) -> Masks:
     """Move masks to the instances whose surfaces they show.
 
     First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
@@ -51,6 +52,8 @@ def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras) -> Masks:
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         cameras: V cameras.
+        held: (D,) bool, masks that keep their ids, and whose instances are joined with none: a person knows them.
+            Those that a person corrected do so in any case.
 
     Returns:
         The same masks. Those with a new id have the mean match score of those that had it before. Instances that lost
@@ -58,10 +61,12 @@ def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras) -> Masks:
     """
     on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
     old = masks.instance_ids.cpu().numpy()
-    ids = move_pieces(on_cpu, old, surfaces, cameras=cameras)
+    is_held = (masks.is_corrected if held is None else masks.is_corrected | held).cpu().numpy()
+    ids = np.where(is_held, old, move_pieces(on_cpu, old, surfaces, cameras=cameras))
     left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
-    ids = move_misfits(on_cpu, ids, left, cameras=cameras)
-    ids = join_halves(on_cpu, ids, left, cameras=cameras)
+    ids = np.where(is_held, old, move_misfits(on_cpu, ids, left, cameras=cameras))
+    known = {*old[is_held].tolist()}
+    ids = join_halves(on_cpu, ids, {k: each for k, each in left.items() if k not in known}, cameras=cameras)
     is_moved = ids != old
     scores = masks.match_scores.clone()
     for instance in np.unique(ids[is_moved]).tolist():
@@ -185,9 +190,7 @@ def touched_surface(part: int, surfaces: Surfaces) -> int | None:
     return nearest if nearest is not None and gaps[nearest] <= TOUCHES * surfaces[part].length else None
 
 
-def _is_one_leaf(
-    regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras
-) -> bool:
+def _is_one_leaf(regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras) -> bool:
     """Does one surface fit the masks of two instances no worse than their own surfaces do, in the views of each?"""
     joint = fit_surfaces(regions, torch.from_numpy(np.where(np.isin(ids, pair), 1, -1)), cameras)[1]
     for instance in pair:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import warnings
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 
@@ -55,7 +55,8 @@ def verify_masks(
     masks: Masks,
     *,
     cameras: Cameras,
-    photos: Photos,
+    photos: Photos | None,
+    held: Tensor | None = None,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
@@ -64,7 +65,7 @@ def verify_masks(
     Args:
         masks: D detections, matched.
         cameras: V cameras.
-        photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view.
+        photos, held: see `revise_masks`.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars.
 
@@ -84,7 +85,7 @@ def verify_masks(
         surfaces = fit_surfaces(
             masks.regions, masks.instance_ids, cameras, most_views=ROUGH_VIEWS, workers=workers, progress=progress
         )
-    revised = revise_masks(masks, surfaces, cameras=cameras, photos=photos, progress=progress)
+    revised = revise_masks(masks, surfaces, cameras=cameras, photos=photos, held=held, progress=progress)
     return revised.close_gaps(), revised.renumber(surfaces)
 
 
@@ -108,7 +109,8 @@ def revise_masks(
     surfaces: Mapping[int, LeafSurface],
     *,
     cameras: Cameras,
-    photos: Photos,
+    photos: Photos | None,
+    held: Tensor | None = None,
     progress: bool = False,
 ) -> Masks:
     """Keep, replace, add and drop masks as the surfaces of their instances say.
@@ -130,7 +132,10 @@ def revise_masks(
         masks: D masks on the CPU, as a detector found them, matched.
         surfaces: {instance id: surface} fitted to them.
         cameras: V cameras.
-        photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view.
+        photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view. None: there are none, and
+            colour tells nothing.
+        held: (D,) bool, masks that are certain: they stay as they are, and so do their instances. By default those that
+            a person corrected (`Masks.is_corrected`).
         progress: show a progress bar over the views.
 
     Returns:
@@ -139,12 +144,19 @@ def revise_masks(
         of theirs. One that only the other views show has `Origin.OTHER_VIEWS` and the mean scores of its instance.
     """
     regions, ids = masks.regions, masks.instance_ids
-    colors = _colors_of_leaves(masks, photos)
+    held = masks.is_corrected if held is None else held
+    certain = {*zip(regions.view_index[held].tolist(), ids[held].tolist(), strict=True)}
+    colors = None if photos is None else _colors_of_leaves(masks, photos)
     found: list[_Found] = []
     shown_openly: Counter[int] = Counter()
     for view in tqdm(range(regions.num_views), "verification", unit="view", disable=not progress):
-        colored = has_leaf_color(photos(view), colors)
+        width, height = cameras.sizes[view].tolist()
+        colored = np.ones((height, width), bool)
+        if photos is not None and colors is not None:
+            colored = has_leaf_color(photos(view), colors)
         for leaf in visible_leaves(surfaces, cameras, view):
+            if (view, leaf.instance) in certain:
+                continue
             members = ((regions.view_index == view) & (ids == leaf.instance)).nonzero()[:, 0].tolist()
             x1, y1, x2, y2 = leaf.box
             colored_here = colored[y1:y2, x1:x2]
@@ -155,7 +167,17 @@ def revise_masks(
                 found.append(_found(view, leaf, members, (box, own.numpy()), is_own=True))
             elif _is_leaf(leaf, colored_here):
                 found.append(_found(view, leaf, members, (leaf.box, leaf.mask & colored_here), is_own=False))
-    return _as_masks(masks, _borne_out(found, shown_openly))
+    instances = {instance for _, instance in certain}
+    return _with_held(_as_masks(masks, _borne_out(found, shown_openly, instances)), masks.select(held))
+
+
+def _with_held(revised: Masks, held: Masks) -> Masks:
+    """Revised masks and those that stay as they are, by view."""
+    if not len(held):
+        return revised
+    both = Masks.concatenate((revised, held.with_merged(())))
+    both = replace(both, instance_ids=torch.cat((revised.instance_ids, held.instance_ids)))
+    return both.select(both.view_index.argsort(stable=True))
 
 
 def _as_masks(masks: Masks, found: list[_Found]) -> Masks:
@@ -176,8 +198,9 @@ def _as_masks(masks: Masks, found: list[_Found]) -> Masks:
     detection_scores, classes = revised.detection_scores.clone(), revised.classes.clone()
     for instance in revised.instance_ids[~is_own].unique().tolist():
         of_instance, before = revised.instance_ids == instance, masks.instance_ids == instance
-        best[of_instance & ~is_own] = best[of_instance & is_own].mean().nan_to_num(0)
-        detection_scores[of_instance & ~is_own] = masks.detection_scores[before].mean()
+        own = best[of_instance & is_own]
+        best[of_instance & ~is_own] = (own if len(own) else scores[before]).mean()
+        detection_scores[of_instance & ~is_own] = masks.detection_scores[before].nanmean()
         classes[of_instance & ~is_own] = masks.classes[before].mode()[0]
     revised = revised.with_merged(_still_merged(masks, found))
     return replace(
@@ -233,9 +256,7 @@ def _is_leaf(leaf: VisibleLeaf, colored: Mask) -> bool:
     return _is_open(leaf) and int((leaf.mask & colored).sum()) >= LEAST_COLORED * int(leaf.mask.sum())
 
 
-def _found(
-    view: int, leaf: VisibleLeaf, members: list[int], placed: tuple[Box, Mask], *, is_own: bool
-) -> _Found:
+def _found(view: int, leaf: VisibleLeaf, members: list[int], placed: tuple[Box, Mask], *, is_own: bool) -> _Found:
     (left, top, _, _), mask = placed
     x1, y1, x2, y2 = mask_box(torch.from_numpy(mask))
     crop = torch.from_numpy(mask[y1:y2, x1:x2].copy())
@@ -243,12 +264,13 @@ def _found(
     return _Found(view=view, instance=leaf.instance, members=members, is_own=is_own, box=box, crop=crop)
 
 
-def _borne_out(found: list[_Found], shown_openly: Mapping[int, int]) -> list[_Found]:
-    """Without the instances that have a mask in one view only, or that the detector found in too few of the views that
-    show them openly (`shown_openly`: how many these are)."""
+def _borne_out(found: list[_Found], shown_openly: Mapping[int, int], certain: Set[int]) -> list[_Found]:
+    """Those of `certain` instances; of the others not those that have a mask in one view only, or that the detector
+    found in too few of the views that show them openly (`shown_openly`: how many these are)."""
     masks = Counter(each.instance for each in found)
     seen = Counter(each.instance for each in found if each.is_own)
     return [
         each for each in found
-        if masks[each.instance] > 1 and seen[each.instance] >= LEAST_FOUND * shown_openly[each.instance]
+        if each.instance in certain
+        or (masks[each.instance] > 1 and seen[each.instance] >= LEAST_FOUND * shown_openly[each.instance])
     ]  # fmt: skip

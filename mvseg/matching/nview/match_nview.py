@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity
+from mvseg.matching.links import Links, keep_links
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.label_rows import RowTable, rays_per_region, row_table, row_tables
@@ -42,6 +43,7 @@ def match_nview(
     *,
     config: NViewConfig = NViewConfig(),
     residual_px: int | None = None,
+    links: Links | None = None,
     progress: bool = False,
 ) -> Matching:
     """Match the regions of V >= 2 views by what all views show.
@@ -52,6 +54,7 @@ def match_nview(
         affinity: the epipolar weights of the regions.
         config: costs, gains and thresholds.
         residual_px: the reprojection error where it is known, one of WIDENINGS; None: estimated.
+        links: of the regions, see `keep_links`.
         progress: show progress bars.
 
     Returns:
@@ -70,6 +73,8 @@ def match_nview(
         ordered, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
     )
     scores, clusters = found.scores, found.clusters
+    if links is not None and len(links):
+        clusters = keep_links(clusters, graph, links.select(order))
     evidence = collect_evidence(scores, clusters, pairwise)
     report = MatchReport(
         method=found.method,

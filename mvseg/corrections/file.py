@@ -1,0 +1,203 @@
+"""The file of corrections: what a person says is wrong, photo by photo; see docs/corrections.md.
+
+An edit names things by points, in pixels of the photo as the user has it (with its distortion, the centre of the
+top-left pixel at 0.5, 0.5), never by numbers of a result: numbers change with every run, points do not.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, ClassVar, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic.types import StrictBool
+
+from mvseg.errors import InputError
+from mvseg.system.atomic import write_text_whole
+
+FORMAT = "mvseg-corrections/1"
+MOST_BYTES = 64 * 2**20
+MOST_EDITS = 10_000
+MOST_POINTS = 10_000  # of an outline or a line
+MOST_PLACES = 100  # of a link: each is held against each other
+
+Text = Annotated[str, Field(max_length=1000)]
+Pixel = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e6, le=1e6)]
+Number = Annotated[int | float, Field(ge=-1e18, le=1e18)]
+Point = tuple[Pixel, Pixel]
+Place = tuple[Text, Pixel, Pixel]  # view, x, y
+DatedPlace = tuple[Text, Text, Pixel, Pixel]  # scene, view, x, y
+
+
+class _Edit(BaseModel):
+    """Who made an edit, and when: kept as they are."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+    by: Text | None = None
+    when: Text | Number | None = None
+
+
+class Outline(_Edit):
+    """A mask drawn by hand; it replaces every mask of which it covers more than half. Outlines with one `leaf` word
+    show one leaf."""
+
+    op: Literal["outline"] = "outline"
+    view: Text
+    polygon: Annotated[tuple[Point, ...], Field(min_length=3, max_length=MOST_POINTS)]
+    leaf: Text | None = None
+
+
+class Reject(_Edit):
+    """The mask at a point is no leaf; `everywhere`: neither is the instance that it belongs to."""
+
+    op: Literal["reject"] = "reject"
+    view: Text
+    at: Point
+    everywhere: StrictBool = False
+
+
+class Confirm(_Edit):
+    """The mask at a point is right as it is; `everywhere`: all masks of its instance are."""
+
+    op: Literal["confirm"] = "confirm"
+    view: Text
+    at: Point
+    everywhere: StrictBool = False
+
+
+class Split(_Edit):
+    """The mask at a point shows two leaves: cut along the line."""
+
+    op: Literal["split"] = "split"
+    view: Text
+    at: Point
+    line: Annotated[tuple[Point, ...], Field(min_length=2, max_length=MOST_POINTS)]
+
+
+class Link(_Edit):
+    """The masks at these places show one leaf (`same`), or different ones each (`different`)."""
+
+    op: Literal["same", "different"]
+    at: Annotated[tuple[Place, ...], Field(min_length=2, max_length=MOST_PLACES)]
+
+
+class TrackLink(_Edit):
+    """The same of leaves on different dates: for `mvseg track`; a single scene passes it over."""
+
+    op: Literal["same_track", "different_track"]
+    at: Annotated[tuple[DatedPlace, ...], Field(min_length=2, max_length=MOST_POINTS)]
+
+
+Edit = Outline | Reject | Confirm | Split | Link | TrackLink
+EDITS: dict[str, type[Edit]] = {
+    "outline": Outline,
+    "reject": Reject,
+    "same": Link,
+    "different": Link,
+    "split": Split,
+    "confirm": Confirm,
+    "same_track": TrackLink,
+    "different_track": TrackLink,
+}
+
+
+@dataclass(frozen=True)
+class Corrections:
+    """Edits, which hold in their order: a later one wins.
+
+    Attributes:
+        edits: in the order of the file.
+        source: the file that they were read from, for messages; None in memory.
+    """
+
+    edits: tuple[Edit, ...] = ()
+    source: Path | None = None
+
+
+def load_corrections(path: Path) -> Corrections:
+    """Read a file of corrections.
+
+    Raises:
+        InputError: the file is missing, too large or not JSON; see `parse_corrections`.
+    """
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise InputError(f"{path}: has {path.stat().st_size} bytes, expected at most {MOST_BYTES}")
+        data = json.loads(path.read_text(encoding="utf-8-sig"))
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except InputError:
+        raise
+    except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, numbers of thousands of digits
+        raise InputError(f"{path}: not a whole JSON file ({error})") from None
+    return parse_corrections(data, source=path)
+
+
+def parse_corrections(data: Any, source: Path | None = None) -> Corrections:
+    """Corrections from what a JSON file holds.
+
+    Args:
+        data: {"format": "mvseg-corrections/1", "edits": [{"op": ..., ...}, ...]}.
+        source: the file, for messages.
+
+    Raises:
+        InputError: another format, an unknown operation or key, a number that is not finite, too many edits or points.
+            The message names the file and the edit, counted from 1.
+    """
+    where = source or "corrections"
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        found = data.get("format") if isinstance(data, dict) else None
+        raise InputError(f'{where}: the format is {_short(found)}, expected "format": "{FORMAT}"')
+    unknown = sorted(set(data) - {"format", "edits"})
+    if unknown:
+        raise InputError(f"{where}: the key {_short(unknown[0])} is not known, expected format and edits")
+    edits = data.get("edits")
+    if not isinstance(edits, list):
+        raise InputError(f'{where}: edits is {_short(edits)}, expected a list: "edits": [...]')
+    if len(edits) > MOST_EDITS:
+        raise InputError(f"{where}: has {len(edits)} edits, expected at most {MOST_EDITS}")
+    return Corrections(tuple(_parse(edit, f"{where}: edit {n}") for n, edit in enumerate(edits, start=1)), source)
+
+
+def _parse(edit: Any, where: str) -> Edit:
+    """One edit; `where` begins the message."""
+    if not isinstance(edit, dict):
+        raise InputError(f'{where}: is {_short(edit)}, expected {{"op": ..., ...}}')
+    op = edit.get("op")
+    model = EDITS.get(op) if isinstance(op, str) else None
+    if model is None:
+        raise InputError(f"{where}: op is {_short(op)}, expected one of {', '.join(EDITS)}")
+    try:
+        return model.model_validate(edit)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = "".join(f"[{part}]" if isinstance(part, int) else f".{_plain(part)}" for part in first["loc"]).lstrip(".")
+        if first["type"] == "extra_forbidden":
+            keys = ", ".join(name for name in model.model_fields if name != "op")
+            raise InputError(f"{where} ({op}): the key {key} is not known, expected {keys}") from None
+        raise InputError(f"{where} ({op}): {key}: {first['msg']}") from None
+
+
+def write_corrections(path: Path, corrections: Corrections) -> None:
+    """Write a file of corrections, whole or not at all; `load_corrections` reads the same edits from it."""
+    data = {"format": FORMAT, "edits": dump_edits(corrections.edits)}
+    write_text_whole(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
+
+
+def dump_edits(edits: Sequence[Edit]) -> list[dict[str, Any]]:
+    """The edits as a file holds them, without keys that say nothing."""
+    dumped = [edit.model_dump(mode="json", exclude_none=True) for edit in edits]
+    return [{"op": each.pop("op"), **{k: v for k, v in each.items() if v is not False}} for each in dumped]
+
+
+def _short(value: Any) -> str:
+    return _plain(repr(value))
+
+
+def _plain(text: object) -> str:
+    """Text of a user for a message: one line, not long."""
+    line = str(text).encode("unicode_escape").decode()
+    return line if len(line) <= 60 else f"{line[:57]}..."
