@@ -13,7 +13,7 @@ from typing import TextIO
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
 from mvseg._version import __version__
-from mvseg.cli import batch, check, export, infer, match, models, pose, simulate, track, train
+from mvseg.cli import batch, check, correct, export, infer, match, models, pose, simulate, track, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -27,6 +27,7 @@ VERBS = {
     "pose": pose,
     "check": check,
     "infer": infer,
+    "correct": correct,
     "batch": batch,
     "export": export,
     "track": track,

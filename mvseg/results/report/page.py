@@ -15,6 +15,7 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+from mvseg.results.report.correct import describe_correct, describe_doubts
 from mvseg.results.report.leaves import describe_leaves, describe_plant, describe_plant_traits, describe_traits
 from mvseg.results.report.pictures import Picture
 from mvseg.results.report.space import describe_space
@@ -22,7 +23,8 @@ from mvseg.results.result import Result
 
 ASSETS = files("mvseg.results.report") / "assets"
 SCRIPTS = (
-    "selection.js", "numbers.js", "shapes.js", "space.js", "photos.js", "table.js", "leaf.js", "run.js", "page.js"
+    "selection.js", "numbers.js", "shapes.js", "space.js", "photos.js", "table.js", "leaf.js", "run.js",
+    "lens.js", "edits.js", "pane.js", "queue.js", "panel.js", "correct.js", "server.js", "page.js",
 )  # fmt: skip
 RUN_FIELDS = (
     "mvseg", "torch", "python", "mask_kind", "matched_by", "residual_px", "seconds", "warnings", "checks", "inputs"
@@ -30,47 +32,73 @@ RUN_FIELDS = (
 
 
 def write_report(path: Path, result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> None:
-    """Write the page.
-
-    Args:
-        path: the file.
-        result: what is shown; without shapes the leaves are missing in 3D.
-        pictures: one per view.
-        run: what run.json says.
+    """Write the page, see `build_page`.
 
     Raises:
         OSError: the file cannot be written.
     """
-    page = Template(_read("page.html")).substitute(
+    path.write_text(build_page(result, pictures, run=run), encoding="utf-8", newline="\n")
+
+
+def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any], is_served: bool = False) -> str:
+    """The page.
+
+    Args:
+        result: what is shown; without shapes the leaves are missing in 3D.
+        pictures: one per view.
+        run: what run.json says.
+        is_served: `mvseg correct` serves it: it sends each edit there, and shows what comes of it. Otherwise it
+            connects to nothing.
+    """
+    data = describe_result(result, pictures, run=run)
+    data["correct"]["isServed"] = is_served
+    return Template(_read("page.html")).substitute(
         title=html.escape(f"{result.scene.name} - mvseg"),
-        style=_read("page.css"),
-        data=dump_inside_script(describe_result(result, pictures, run=run)),
+        style=_read("page.css") + _read("correct.css"),
+        connect="; connect-src 'self'" if is_served else "",
+        data=dump_inside_script(data),
         three=_read("three/three.min.js"),
         script="\n".join(_read(name) for name in SCRIPTS),
     )
-    path.write_text(page, encoding="utf-8", newline="\n")
 
 
 def describe_result(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
     """All that the page shows, as its script reads it."""
     scene = result.scene
-    views = [{"name": view.name} | picture.as_json() for view, picture in zip(scene.views, pictures, strict=True)]
-    scores = result.masks.detection_scores.tolist()
-    for mask in (mask for view in views for mask in view["masks"]):
-        if not math.isnan(scores[mask["region"]]):
-            mask["detection_score"] = round(scores[mask["region"]], 4)
+    shown = zip(scene.views, pictures, describe_masks(result, pictures), strict=True)
     return {
         "plant": scene.name,
         "unit": scene.unit or "world unit",
         "numMasks": len(result.regions),
-        "views": views,
+        "views": [{"name": view.name} | picture.as_json() | {"masks": masks} for view, picture, masks in shown],
         "leaves": describe_leaves(result),
         "traits": describe_traits(result.traits),
         "plantTraits": describe_plant_traits(result.traits),
         "whole": describe_plant(result.traits),
         "space": describe_space(result),
+        "correct": describe_correct(result, pictures, run=run),
         "run": {name: value for name, value in run.items() if name in RUN_FIELDS}
         | {"config": json.dumps(run.get("config", {}), indent=1, default=str)},
+    }
+
+
+def describe_masks(result: Result, pictures: Sequence[Picture]) -> list[list[dict[str, Any]]]:
+    """The outlined masks of each view."""
+    found = [[outline.as_json() for outline in picture.outlines] for picture in pictures]
+    scores = result.masks.detection_scores.tolist()
+    for mask in (mask for masks in found for mask in masks):
+        if not math.isnan(scores[mask["region"]]):
+            mask["detection_score"] = round(scores[mask["region"]], 4)
+    return found
+
+
+def describe_update(result: Result, pictures: Sequence[Picture]) -> dict[str, Any]:
+    """What the mode "Correct" shows anew of a result of the same photos; for `pictures` see `Picture.with_masks`."""
+    return {
+        "views": [{"masks": masks} for masks in describe_masks(result, pictures)],
+        "leaves": describe_leaves(result),
+        "doubts": describe_doubts(result, pictures),
+        "numMasks": len(result.regions),
     }
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import cv2
@@ -15,9 +15,9 @@ from mvseg.masks import Masks
 from mvseg.results.overlay import find_plant
 from mvseg.results.report.outlines import Outline, outline_masks
 
-LARGEST_WIDTH, LEAST_WIDTH = 960, 200  # pixels of a picture
-ALL_PIXELS = 10_000_000  # of all pictures together: 2 to 3 MB
-THUMBNAIL_WIDTH = 128
+LARGEST_WIDTH, LEAST_WIDTH = 1600, 200  # pixels of a picture
+ALL_PIXELS = 24_000_000  # of all pictures together: 4 to 9 MB, large enough to correct masks in
+THUMBNAIL_WIDTH = 320  # also what a person sees of the photo around its picture
 QUALITY = 80  # of JPEGs
 
 
@@ -40,14 +40,18 @@ class Picture:
     outlines: list[Outline]
 
     def as_json(self) -> dict[str, Any]:
-        """What the page reads; JPEGs in base64."""
+        """What the page reads; but the masks; JPEGs in base64."""
         return {
             "jpeg": base64.b64encode(self.jpeg).decode("ascii"),
             "thumbnail": base64.b64encode(self.thumbnail).decode("ascii"),
             "box": [round(share, 5) for share in self.box],
             "proportion": round(self.proportion, 5),
-            "masks": [outline.as_json() for outline in self.outlines],
         }
+
+    def with_masks(self, masks: Masks, *, view: int, size: tuple[int, int]) -> Picture:
+        """The same picture with the outlines of other masks; `size`: width and height of the photo, pixels."""
+        x1, y1, x2, y2 = (round(share * side) for share, side in zip(self.box, size * 2, strict=True))
+        return replace(self, outlines=outline_masks(masks, view=view, box=(x1, y1, x2, y2)))
 
 
 def draw_picture(photo: np.ndarray, masks: Masks, *, view: int) -> Picture:

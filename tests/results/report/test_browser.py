@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -10,14 +9,10 @@ from pathlib import Path
 import pytest
 
 from mvseg.results.result import Result
+from report_browser import CHROMIUM, OPTIONS, WAIT_MS, Opened, sync_api
 from report_pages import HOSTILE, rename_hostile, write_page
 
-sync_api = pytest.importorskip("playwright.sync_api")
-NAMES = ("chromium", "chromium-browser", "google-chrome")
-CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
-OPTIONS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
-WAIT_MS = 60_000  # WebGL without a GPU, on a busy machine
 
 
 @pytest.fixture(scope="module")
@@ -36,28 +31,8 @@ def files(balls: Result, tmp_path_factory: pytest.TempPathFactory) -> dict[str, 
     return {kind: write_page(folder / f"{kind}.html", result) for kind, result in kinds.items()}
 
 
-class Opened:
-    """A page that is open, and what it asked for or complained of."""
-
-    def __init__(self, browser: sync_api.Browser, file: Path, size: tuple[int, int]) -> None:
-        self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, offline=True)
-        self.context.set_default_timeout(WAIT_MS)
-        self.problems: list[str] = []
-        self.page = self.context.new_page()
-        self.page.on("console", self._hear)
-        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
-        self.page.on("request", self._see)
-        self.page.on("dialog", lambda dialog: self.problems.append(dialog.message))
-        self.page.goto(file.as_uri())
-        self.page.wait_for_function("Number(document.getElementById('canvas').dataset.frames) > 0")
-
-    def _hear(self, message: sync_api.ConsoleMessage) -> None:
-        if message.type == "error":
-            self.problems.append(message.text)
-
-    def _see(self, request: sync_api.Request) -> None:
-        if not request.url.startswith(("data:", "blob:")) and request.resource_type != "document":
-            self.problems.append(request.url)
+class Viewer(Opened):
+    """What a person sees and does."""
 
     def selected(self) -> dict[str, list[int]]:
         """The leaves that are lit up: in the table, in the photos, in 3D and in the panel."""
@@ -94,18 +69,17 @@ class Opened:
 
 
 @pytest.fixture
-def opened(browser: sync_api.Browser, files: dict[str, Path]) -> Iterator[Opened]:
-    opened = Opened(browser, files["hostile"], (1280, 800))
+def opened(browser: sync_api.Browser, files: dict[str, Path]) -> Iterator[Viewer]:
+    opened = Viewer(browser, files["hostile"], (1280, 800))
     yield opened
-    opened.context.close()
-    assert opened.problems == []
+    opened.close()
 
 
 def everywhere(leaf: int) -> dict[str, list[int]]:
     return {"table": [leaf], "photos": [leaf], "space": [leaf], "panel": [leaf]}
 
 
-def test_a_click_anywhere_selects_the_leaf_everywhere(opened: Opened) -> None:
+def test_a_click_anywhere_selects_the_leaf_everywhere(opened: Viewer) -> None:
     nothing = {"table": [], "photos": [], "space": [], "panel": [0]}
     assert opened.selected() == nothing
     for leaf in (1, 2, 3):
@@ -122,7 +96,7 @@ def test_a_click_anywhere_selects_the_leaf_everywhere(opened: Opened) -> None:
         opened.page.keyboard.press("Escape")
 
 
-def test_the_pointer_lights_a_leaf_up_everywhere(opened: Opened) -> None:
+def test_the_pointer_lights_a_leaf_up_everywhere(opened: Viewer) -> None:
     opened.page.locator("#table tr[data-leaf='2'] td").nth(2).hover()
     lit = "document.querySelectorAll('#tiles path.hovered').length"
     assert opened.page.evaluate(lit) == 4
@@ -133,7 +107,7 @@ def test_the_pointer_lights_a_leaf_up_everywhere(opened: Opened) -> None:
     assert opened.page.evaluate("page.litLeaves()") == []
 
 
-def test_leaves_are_drawn_in_their_colours(opened: Opened) -> None:
+def test_leaves_are_drawn_in_their_colours(opened: Viewer) -> None:
     """The pixel of the screen where a leaf is has the hue of its swatch, and a selected leaf lets the others fade."""
     look = """(leaf) => new Promise((done) => {
       page.drawNow();
@@ -155,7 +129,7 @@ def test_leaves_are_drawn_in_their_colours(opened: Opened) -> None:
     assert opened.page.evaluate(look, 2)[3] < 200 < opened.page.evaluate(look, 1)[3]
 
 
-def test_headers_sort_and_sort_back(opened: Opened, balls: Result) -> None:
+def test_headers_sort_and_sort_back(opened: Viewer, balls: Result) -> None:
     assert balls.traits is not None
     volumes = {leaf.leaf: leaf.numbers["volume"].value for leaf in balls.traits.leaves}
     header = opened.page.locator("#table th", has_text="volume")
@@ -169,7 +143,7 @@ def test_headers_sort_and_sort_back(opened: Opened, balls: Result) -> None:
     assert opened.page.locator("#table th[aria-sort]").count() == 1
 
 
-def test_keys_go_through_the_table(opened: Opened) -> None:
+def test_keys_go_through_the_table(opened: Viewer) -> None:
     opened.page.locator("#table tbody button").first.focus()
     opened.page.keyboard.press("Enter")
     assert opened.selected() == everywhere(1)
@@ -181,7 +155,7 @@ def test_keys_go_through_the_table(opened: Opened) -> None:
     assert opened.selected() == everywhere(2)
 
 
-def test_hostile_names_are_read_as_text(opened: Opened) -> None:
+def test_hostile_names_are_read_as_text(opened: Viewer) -> None:
     assert opened.page.title() == f"plant {HOSTILE} - mvseg"
     assert opened.page.locator("#plant").inner_text() == f"plant {HOSTILE}"
     assert opened.page.locator("#tiles figcaption span").nth(2).inner_text() == f"2 {HOSTILE}"
@@ -193,13 +167,13 @@ def test_hostile_names_are_read_as_text(opened: Opened) -> None:
     assert opened.page.locator("img").count() == 0
 
 
-def test_a_direction_that_is_rounded_to_a_full_turn_is_0(opened: Opened) -> None:
+def test_a_direction_that_is_rounded_to_a_full_turn_is_0(opened: Viewer) -> None:
     numbers = [(359.8, 12, "\u00b0"), (359.8, 1.2, "\u00b0"), (-0.2, 12, "\u00b0"), (359.8, 12, "mm")]
     written = opened.page.evaluate("(all) => all.map((each) => formatNumber(...each).value)", numbers)
     assert written == ["0", "359.8", "0", "360"]
 
 
-def test_photos_and_cameras_know_each_other(opened: Opened) -> None:
+def test_photos_and_cameras_know_each_other(opened: Viewer) -> None:
     opened.page.locator("#tiles figcaption button", has_text="3D").nth(1).click()
     place, center = opened.page.evaluate("[page.camera.position.toArray(), data.space.cameras[1].center]")
     assert place == pytest.approx(center, abs=1e-3)
@@ -229,21 +203,19 @@ def test_photos_and_cameras_know_each_other(opened: Opened) -> None:
 
 
 def test_ids_alone_have_a_page_without_leaves_in_3d(browser: sync_api.Browser, files: dict[str, Path]) -> None:
-    opened = Opened(browser, files["ids"], (1280, 800))
+    opened = Viewer(browser, files["ids"], (1280, 800))
     assert opened.page.locator("#space-note").inner_text().startswith("Cameras only")
     opened.click_on_mask(2)
     assert opened.selected() == everywhere(2) | {"space": []}
     assert opened.page.locator("#table th").all_inner_texts() == ["leaf", "views", "match"]
-    opened.context.close()
-    assert opened.problems == []
+    opened.close()
 
 
 @pytest.mark.parametrize("size", [(390, 800), (800, 1000), (1280, 800)])
 def test_nothing_is_wider_than_the_screen(
     size: tuple[int, int], browser: sync_api.Browser, files: dict[str, Path]
 ) -> None:
-    opened = Opened(browser, files["hostile"], size)
+    opened = Viewer(browser, files["hostile"], size)
     opened.page.evaluate("selection.select(1)")
     assert opened.page.evaluate("document.documentElement.scrollWidth") <= size[0]
-    opened.context.close()
-    assert opened.problems == []
+    opened.close()

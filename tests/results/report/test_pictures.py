@@ -36,7 +36,7 @@ def test_a_picture_is_the_part_with_the_plant() -> None:
     masks = Masks.of(regions_from_label_maps([labels]), torch.tensor([1]), torch.ones(1))
     picture = draw_picture(photo, masks, view=0)
     image, thumbnail = (np.asarray(Image.open(BytesIO(data))) for data in (picture.jpeg, picture.thumbnail))
-    assert thumbnail.shape == (96, 128, 3)
+    assert thumbnail.shape == (240, 320, 3)
     assert image.shape == (67, 90, 3)  # as many pixels as the photo has there
     assert picture.proportion == pytest.approx(0.75, abs=0.01)
     np.testing.assert_allclose(image[33, 45], (20, 160, 40), atol=12)

@@ -28,12 +28,13 @@ function buildPage(data) {
   buildTable(data);
   buildLeafPanel(data, addresses);
   buildTip(data);
+  const modes = buildModes(data, addresses);
   document.addEventListener("keydown", (event) => {
-    if (event.key === "Escape") selection.select(null);
+    if (event.key === "Escape" && !document.querySelector("main").hidden) selection.select(null);
   });
   selection.tell();
-  return space;
+  return { space, modes };
 }
 
 const data = JSON.parse(document.getElementById("data").textContent);
-const page = buildPage(data);
+const { space: page, modes } = buildPage(data);

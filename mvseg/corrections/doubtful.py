@@ -1,0 +1,196 @@
+"""The queue of a person who corrects a result: what is most likely wrong comes first."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras
+from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
+
+Bools = NDArray[np.bool_]
+
+LEAST_DOUBT = 0.3  # what is surer is not asked
+MOST_DOUBTS = 200  # nobody answers more
+OPEN = 0.5  # share of a surface that no nearer one hides, from which its view should show a mask of it
+OPEN_PIXELS = 100  # of that part
+EMPTY = 0.6  # of that part, outside all masks: the mask is missing
+SIMILAR = 0.4  # IoU of that part with a mask of another leaf, that may be it
+SMOOTH = 1.5  # pixels that a proposed outline may be off
+MISSING, COVERED, LONE = 0.8, 0.9, 0.6  # doubt of what cannot be told from scores, at most
+
+Kind = Literal["match", "unmatched", "few", "surface", "covered", "missing"]
+
+
+@dataclass(frozen=True, eq=False)
+class Doubt:
+    """One question to a person.
+
+    Attributes:
+        kind: "match": is the mask of that leaf? "unmatched": is it a leaf, and which? "few": is this a leaf? (it was
+            found in few of the views that should show it); "surface": does the mask show that leaf? (the leaf's
+            surface explains it badly); "covered": the leaf should be where a mask of another one is; "missing": it
+            should be where no mask is.
+        doubt: how likely something is wrong, from 0 to 1; rough, to sort by.
+        view: index of the view.
+        instance: id of the leaf; -1 for "unmatched" without a guess.
+        region: row of the mask; -1 for "missing".
+        other: row of the mask of the same leaf in another view that shows it best; -1 for none.
+        found, expected: number of views that have a mask of the leaf, and that should.
+        outline: (P, 2) float64 pixels, undistorted: where the leaf should be; of "missing" only.
+    """
+
+    kind: Kind
+    doubt: float
+    view: int
+    instance: int
+    region: int = -1
+    other: int = -1
+    found: int = 0
+    expected: int = 0
+    outline: NDArray[np.float64] | None = None
+
+
+def list_doubts(masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cameras: Cameras) -> list[Doubt]:
+    """What a person should look at, the most doubtful first, at most `MOST_DOUBTS`; masks that a person made or
+    confirmed are not asked about, and every other mask once.
+
+    Args:
+        masks: D masks, matched.
+        surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
+        cameras: V cameras.
+    """
+    masks, known = masks.to("cpu"), surfaces or {}
+    found = _doubt_matches(masks)
+    should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
+    for view in range(len(cameras) if known else 0):
+        found += _doubt_view(masks, known, should, view=view, cameras=cameras)
+    found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
+    is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
+    asked: set[tuple[int, ...]] = set()
+    queue = []
+    for each in sorted(found, key=lambda one: (-one.doubt, one.view, one.instance, one.region)):
+        name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
+        if each.doubt >= LEAST_DOUBT and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
+            asked.add(name)
+            queue.append(each)
+    return queue[:MOST_DOUBTS]
+
+
+def best_mask(masks: Masks, instance: int, *, but: int) -> int:
+    """The row of the mask that shows an instance best: the largest of those whose score is at most 0.1 below the best;
+    -1 if no view but `but` has one."""
+    rows = ((masks.instance_ids == instance) & (masks.view_index != but) & (masks.regions.areas > 0)).nonzero()[:, 0]
+    if not len(rows):
+        return -1
+    scores = masks.match_scores[rows]
+    return int(rows[torch.where(scores >= scores.max() - 0.1, masks.regions.areas[rows], -1).argmax()])
+
+
+def _doubt_matches(masks: Masks) -> list[Doubt]:
+    """Low match scores; and masks of some size that were matched to nothing."""
+    ids, areas, views = masks.instance_ids.tolist(), masks.regions.areas, masks.view_index.tolist()
+    matched = areas[masks.instance_ids > 0].float()
+    usual = float(matched.median()) if len(matched) else 1.0
+    found = []
+    for row, score in enumerate(masks.match_scores.tolist()):
+        if ids[row] > 0:
+            other = best_mask(masks, ids[row], but=views[row])
+            found.append(Doubt("match", 1 - score, views[row], ids[row], region=row, other=other))
+        elif areas[row] > 0:
+            doubt = LONE * min(1.0, float(areas[row]) / max(usual, 1.0))
+            found.append(Doubt("unmatched", doubt, views[row], -1, region=row))
+    return found
+
+
+def _doubt_view(
+    masks: Masks, surfaces: Mapping[int, LeafSurface], should: Bools, *, view: int, cameras: Cameras
+) -> list[Doubt]:
+    """What one view should show and does not. `should` (K + 1, V) gets True where it should show an instance."""
+    width, height = cameras.sizes[view].tolist()
+    members = ((masks.view_index == view) & (masks.regions.areas > 0)).nonzero()[:, 0].tolist()
+    taken = np.zeros((height, width), bool)
+    for row in members:
+        x1, y1, x2, y2 = masks.regions.boxes[row].tolist()
+        taken[y1:y2, x1:x2] |= masks.regions.crop(row).numpy()
+    here = {int(masks.instance_ids[row]) for row in members}
+    found = []
+    for leaf in visible_leaves(surfaces, cameras, view):
+        if leaf.share < OPEN or leaf.mask.sum() < OPEN_PIXELS or leaf.instance >= len(should):
+            continue
+        should[leaf.instance, view] = True
+        if leaf.instance in here:
+            continue
+        other = best_mask(masks, leaf.instance, but=view)
+        x1, y1, x2, y2 = leaf.box
+        empty = float((leaf.mask & ~taken[y1:y2, x1:x2]).sum() / leaf.mask.sum())
+        ious = {row: _iou(masks, row, leaf) for row in members}
+        nearest = max(ious, key=lambda row: ious[row], default=-1)
+        if nearest >= 0 and ious[nearest] >= SIMILAR:
+            doubt = COVERED * min(1.0, ious[nearest] / 0.8)
+            found.append(Doubt("covered", doubt, view, leaf.instance, region=nearest, other=other))
+        elif empty >= EMPTY:
+            doubt = MISSING * empty * leaf.share
+            found.append(Doubt("missing", doubt, view, leaf.instance, other=other, outline=_outline(leaf)))
+    return found
+
+
+def _iou(masks: Masks, row: int, leaf: VisibleLeaf) -> float:
+    """Of a mask with what its view shows of a surface."""
+    x1, y1, x2, y2 = masks.regions.boxes[row].tolist()
+    left, top, right, bottom = leaf.box
+    low_x, low_y, high_x, high_y = max(x1, left), max(y1, top), min(x2, right), min(y2, bottom)
+    if low_x >= high_x or low_y >= high_y:
+        return 0.0
+    crop = masks.regions.crop(row).numpy()[low_y - y1 : high_y - y1, low_x - x1 : high_x - x1]
+    common = int((crop & leaf.mask[low_y - top : high_y - top, low_x - left : high_x - left]).sum())
+    return common / (int(masks.regions.areas[row]) + int(leaf.mask.sum()) - common)
+
+
+def _outline(leaf: VisibleLeaf) -> NDArray[np.float64]:
+    """(P, 2) the largest piece of what is seen of a surface, as a polygon; pixels."""
+    lines, _ = cv2.findContours(leaf.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    longest = max(lines, key=cv2.contourArea)
+    points = cv2.approxPolyDP(longest, SMOOTH, True)[:, 0]
+    return np.asarray(points + np.array(leaf.box[:2]) + 0.5, dtype=np.float64)
+
+
+def _doubt_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[Doubt]:
+    """The mask of each leaf that its surface explains worst."""
+    found = []
+    for instance, surface in surfaces.items():
+        if not surface.exists:
+            continue
+        worst = int(surface.iou.nan_to_num(1.0).argmin())
+        view, doubt = int(surface.views[worst]), 1 - float(surface.iou[worst].nan_to_num(1.0))
+        rows = ((masks.instance_ids == instance) & (masks.view_index == view)).nonzero()[:, 0]
+        if len(rows):
+            row = int(rows[masks.regions.areas[rows].argmax()])
+            other = best_mask(masks, instance, but=view)
+            found.append(Doubt("surface", doubt, view, instance, region=row, other=other))
+    return found
+
+
+def _doubt_rare(masks: Masks, should: Bools) -> list[Doubt]:
+    """Leaves that were found in few of the views that should show them; without a credible surface, of all views."""
+    found = []
+    for instance in range(1, masks.num_instances + 1):
+        best = best_mask(masks, instance, but=-1)
+        if best < 0:
+            continue
+        views = set(masks.view_index[masks.instance_ids == instance].tolist())
+        expected = set(np.flatnonzero(should[instance]).tolist()) | views if should[instance].any() else None
+        number = masks.regions.num_views if expected is None else len(expected)
+        doubt, view = 1 - len(views) / number, int(masks.view_index[best])
+        other = best_mask(masks, instance, but=view)
+        seen = len(views)
+        found.append(Doubt("few", doubt, view, instance, region=best, other=other, found=seen, expected=number))
+    return found

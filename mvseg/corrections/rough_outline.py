@@ -1,0 +1,61 @@
+"""A rough box or line around a leaf becomes an outline: where the colours inside differ from those outside.
+
+GrabCut (Rother, Kolmogorov, Blake 2004), as OpenCV has it.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.errors import InputError
+
+LONGEST = 480  # pixels of the part that is looked at
+AROUND = 0.35  # of the rough outline's size, that is looked at beside it
+ROUNDS = 5
+LEAST = 0.05  # of the rough outline's pixels, that the leaf must have
+TOLERANCE = 1.0  # pixels of the part, of the outline
+
+Points = NDArray[np.float64]
+
+
+def refine_outline(photo: NDArray[np.uint8], rough: Points) -> Points:
+    """The outline of what lies inside a rough one.
+
+    Args:
+        photo: (H, W, 3) uint8 RGB.
+        rough: (P, 2) x, y of corners around the leaf, P >= 3, pixels with centres at half integers. Nothing outside it
+            can be leaf.
+
+    Returns:
+        (Q, 2) corners, Q >= 3, in the same pixels.
+
+    Raises:
+        InputError: the rough outline has no area in the photo, or nothing in it differs from what is around it.
+    """
+    height, width = photo.shape[:2]
+    low, high = rough.min(0), rough.max(0)
+    margin = max(AROUND * float((high - low).max()), 4.0)
+    x1, y1 = np.clip(np.floor(low - margin), 0, (width, height)).astype(int).tolist()
+    x2, y2 = np.clip(np.ceil(high + margin), 0, (width, height)).astype(int).tolist()
+    if min(x2 - x1, y2 - y1) < 2:
+        raise InputError("the rough outline is not in the photo, expected one around a leaf")
+    scale = min(1.0, LONGEST / max(x2 - x1, y2 - y1))
+    part = cv2.resize(photo[y1:y2, x1:x2], None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    inside = np.zeros(part.shape[:2], np.uint8)
+    cv2.fillPoly(inside, [np.round((rough - (x1, y1)) * scale - 0.5).astype(np.int32)], 1)
+    if inside.sum() < 16 or inside.all():
+        raise InputError("the rough outline is too small or as large as the photo, expected one around a leaf")
+    state = np.where(inside > 0, cv2.GC_PR_FGD, cv2.GC_BGD).astype(np.uint8)
+    cv2.setRNGSeed(0)
+    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.grabCut(part, state, None, background, foreground, ROUNDS, cv2.GC_INIT_WITH_MASK)  # type: ignore[call-overload]
+    leaf = ((state == cv2.GC_FGD) | (state == cv2.GC_PR_FGD)).astype(np.uint8)
+    leaf = cv2.morphologyEx(leaf, cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    lines, _ = cv2.findContours(leaf, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    largest = max(lines, key=cv2.contourArea, default=None)
+    if largest is None or cv2.contourArea(largest) < LEAST * inside.sum():
+        raise InputError("nothing inside differs from what is around it, expected an outline drawn by hand here")
+    corners = cv2.approxPolyDP(largest, TOLERANCE, True)[:, 0]
+    return np.asarray((corners + 0.5) / scale + (x1, y1), dtype=np.float64)

@@ -1,0 +1,290 @@
+// The mode "Correct": two photos side by side, what a person picks and draws in them, and what they say of it.
+
+const KEYS = { n: "next", s: "same", d: "different", r: "reject", R: "reject-all", c: "confirm", C: "confirm-all",
+  u: "undo", o: "outline", l: "split" };
+
+class Work {
+  constructor(data, addresses) {
+    Object.assign(this, { data, addresses, picks: [], tool: null, draft: null, doubt: null, note: "", server: null });
+    this.frames = data.views.map((view, index) => new Frame(view, data.correct.views[index], data.correct.lenses));
+    this.edits = new Edits(data.correct);
+    this.skipped = new Set();
+    this.read();
+    this.panes = [new Pane(this), new Pane(this)];
+    this.active = this.panes[0];
+    document.getElementById("panes").append(...this.panes.map((pane) => pane.element));
+    this.thumbnails = data.views.map((view, index) => {
+      const image = element("img", { src: addresses.thumbnails[index], alt: "", draggable: "false" });
+      const one = element("button", { type: "button", title: view.name }, image, element("span", {}, view.name));
+      one.addEventListener("click", () => this.active.show(index));
+      return one;
+    });
+    document.getElementById("strip").append(...this.thumbnails);
+    this.panes.forEach((pane, index) => pane.show(Math.min(index, data.views.length - 1)));
+    this.panel = new Panel(this);
+    this.edits.listen(() => {
+      this.picks = [];
+      this.readEdits();
+      for (const pane of this.panes) pane.draw();
+      this.changed();
+    });
+    document.addEventListener("keydown", (event) => this.press(event));
+    this.changed();
+  }
+
+  // What follows from the masks, which may have changed.
+  read() {
+    this.colors = new Map(this.data.leaves.map((leaf) => [leaf.id, leaf.color]));
+    this.doubts = placeDoubts(this.data);
+    this.readEdits();
+  }
+
+  readEdits() {
+    this.places = placesOf(this.edits.list, this);
+    this.open = this.doubts.filter((doubt) => !isAnswered(doubt, this.places));
+  }
+
+  update({ views, leaves, doubts, numMasks }) {
+    views.forEach(({ masks }, index) => { this.data.views[index].masks = masks; });
+    Object.assign(this.data, { leaves, numMasks });
+    this.data.correct.doubts = doubts;
+    [this.picks, this.doubt] = [[], null];
+    this.read();
+    for (const pane of this.panes) pane.draw();
+    this.changed();
+  }
+
+  changed() {
+    if (!this.panel) return;
+    for (const pane of this.panes) {
+      pane.mark();
+      pane.element.classList.toggle("active", pane === this.active);
+      pane.element.classList.toggle("drawing", this.tool !== null);
+    }
+    this.thumbnails.forEach((one, view) => {
+      one.classList.toggle("shown", this.panes.some((pane) => pane.view === view));
+      one.classList.toggle("picked", this.picks.some((pick) => pick.view === view));
+    });
+    this.panel.show();
+  }
+
+  say(text) {
+    this.note = text;
+    this.changed();
+  }
+
+  activate(pane) {
+    if (this.active === pane) return;
+    this.active = pane;
+    this.changed();
+  }
+
+  // --- picking
+
+  pick(pane, path, at) {
+    if (!path) return;
+    const isDrawn = path.dataset.edit !== undefined;
+    const name = isDrawn ? `e${path.dataset.edit}` : `r${path.dataset.region}`;
+    const mask = isDrawn ? null : this.data.views[pane.view].masks.find((one) => `r${one.region}` === name);
+    if (this.doubt) [this.doubt, this.picks] = [null, []];
+    const others = this.picks.filter((pick) => pick.name !== name);
+    this.picks = others.length < this.picks.length ? others : [...others, this.pickOf(pane.view, name, mask, at)];
+    this.note = "";
+    this.changed();
+  }
+
+  // A mask is named by the middle of its thickest place, unless another mask lies there.
+  pickOf(view, name, mask, at) {
+    const top = mask && this.data.views[view].masks.findLast((one) => isOnMask(one, mask.at));
+    return { view, name, mask, at: mask && (top === mask || !at) ? mask.at : at };
+  }
+
+  placeOf({ view, at }) {
+    return [this.data.views[view].name, ...this.frames[view].toPhoto(at)];
+  }
+
+  // --- the queue
+
+  next() {
+    if (this.doubt) this.skipped.add(this.doubt.name);
+    const { open } = this;
+    let left = open.filter((doubt) => !this.skipped.has(doubt.name));
+    if (!left.length && open.length) {
+      this.skipped.clear();
+      left = open;
+    }
+    this.drop();
+    if (left.length) this.ask(left[0]);
+    else this.say("Nothing doubtful is left.");
+  }
+
+  ask(doubt) {
+    this.doubt = doubt;
+    const [first, second] = this.panes;
+    first.show(doubt.view);
+    first.lookAt(doubt.mask ? doubt.mask.box : boxAround(doubt.outline));
+    if (doubt.otherView !== undefined) {
+      second.show(doubt.otherView);
+      second.lookAt(doubt.otherMask.box);
+    }
+    this.active = first;
+    this.picks = [[doubt.view, doubt.mask], [doubt.otherView, doubt.otherMask]]
+      .filter(([, mask]) => mask && (doubt.kind !== "few" || mask === doubt.mask))
+      .map(([view, mask]) => this.pickOf(view, `r${mask.region}`, mask));
+    this.note = "";
+    this.changed();
+  }
+
+  // --- edits
+
+  act(name) {
+    const [op, all] = name.split("-");
+    const wasAsked = this.doubt;
+    if (op === "next") return this.next();
+    if (op === "undo") return this.undo();
+    if (op === "outline" || op === "split") return this.take(op);
+    const found = this.editsOf(op, all !== undefined || wasAsked?.kind === "few");
+    if (!found.length) return;
+    this.note = "";
+    this.add(found);
+    if (wasAsked) this.next();
+  }
+
+  editsOf(op, everywhere) {
+    if (op === "same" || op === "different") return this.linkEdits(op);
+    if (op === "confirm" && this.doubt?.outline) return this.outlineEdits(this.doubt.view, this.doubt.outline);
+    return this.markEdits(op, everywhere);
+  }
+
+  add(edits) {
+    const when = new Date().toISOString();
+    this.drop();
+    this.edits.add(...edits.map((edit) => ({ ...edit, when })));
+  }
+
+  linkEdits(op) {
+    if (this.picks.length < 2) this.say("Click two masks first, in one photo or in two.");
+    return this.picks.length < 2 ? [] : [{ op, at: this.picks.map((pick) => this.placeOf(pick)) }];
+  }
+
+  markEdits(op, everywhere) {
+    if (!this.picks.length) this.say("Click a mask first.");
+    const picks = this.doubt ? this.picks.slice(0, 1) : this.picks; // the second one is only there to compare
+    return picks.map((pick) => {
+      const [view, ...at] = this.placeOf(pick);
+      return { op, view, at, ...(everywhere ? { everywhere } : {}) };
+    });
+  }
+
+  // An outline shows the leaf of the masks that are picked in other photos.
+  outlineEdits(view, points, leaf = "") {
+    const polygon = points.map((point) => this.frames[view].toPhoto(point));
+    const name = this.data.views[view].name;
+    const others = this.picks.filter((pick) => pick.view !== view);
+    const here = [name, ...this.frames[view].toPhoto(insidePoint(points))];
+    const link = { op: "same", at: [here, ...others.map((pick) => this.placeOf(pick))] };
+    return [{ op: "outline", view: name, polygon, ...(leaf ? { leaf } : {}) }, ...(others.length ? [link] : [])];
+  }
+
+  undo() {
+    this.drop();
+    if (this.edits.earlier.length) this.edits.undo();
+    else this.say("There is nothing to undo.");
+  }
+
+  // --- drawing
+
+  take(tool) {
+    this.draft = null;
+    this.tool = this.tool === tool ? null : tool;
+    this.changed();
+  }
+
+  // The line is whole: a cut is made at once, an outline waits for its leaf's word.
+  finish() {
+    const { draft } = this;
+    if (!draft || draft.isClosed) return;
+    if (draft.points.length < (draft.kind === "outline" ? 3 : 2)) return this.say("That is too short.");
+    draft.isClosed = draft.kind === "outline";
+    if (draft.kind === "outline") return this.changed();
+    const { view } = draft.pane;
+    const mask = this.maskUnder(view, draft.points);
+    if (!mask) return this.discard("The line crosses no mask: draw it across the mask that shows two leaves.");
+    const [name, ...at] = this.placeOf({ view, at: mask.at });
+    this.add([{ op: "split", view: name, at, line: draft.points.map((point) => this.frames[view].toPhoto(point)) }]);
+  }
+
+  // The mask that has most of a line.
+  maskUnder(view, points) {
+    const steps = points.slice(1).flatMap((end, n) => [...Array(20).keys()].map((step) =>
+      [0, 1].map((axis) => points[n][axis] + ((end[axis] - points[n][axis]) * step) / 20)));
+    const counts = this.data.views[view].masks.map((mask) => steps.filter((point) => isOnMask(mask, point)).length);
+    const most = Math.max(0, ...counts);
+    return most ? this.data.views[view].masks[counts.lastIndexOf(most)] : null;
+  }
+
+  keep(leaf) {
+    const { pane, points } = this.draft;
+    const wasAsked = this.doubt;
+    this.add(this.outlineEdits(pane.view, points, leaf));
+    if (wasAsked?.outline) this.next();
+  }
+
+  discard(text = "") {
+    [this.draft, this.note] = [null, text];
+    this.changed();
+  }
+
+  drop() {
+    Object.assign(this, { picks: [], tool: null, draft: null, doubt: null, note: "" });
+    this.changed();
+  }
+
+  press(event) {
+    if (document.getElementById("correct").hidden || event.ctrlKey || event.metaKey || event.altKey) return;
+    const isTyping = event.target.matches?.("input, textarea, select");
+    if (event.key === "Escape") {
+      if (this.draft) this.discard();
+      else this.drop();
+    } else if (event.key === "Enter" && this.draft && (isTyping || !event.target.matches?.("button"))) {
+      if (this.draft.isClosed) this.panel.keep();
+      else this.finish();
+    } else if (event.key in KEYS && !isTyping) {
+      this.act(KEYS[event.key]);
+    } else return;
+    event.preventDefault();
+  }
+}
+
+function boxAround(points) {
+  const [xs, ys] = [0, 1].map((axis) => points.map((point) => point[axis]));
+  return [Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)];
+}
+
+// Whether a point, in units of the picture, is on a mask.
+const brush = document.createElement("canvas").getContext("2d");
+function isOnMask(mask, [x, y]) {
+  mask.shape ??= new Path2D(mask.path);
+  return brush.isPointInPath(mask.shape, x, y, "evenodd");
+}
+
+// Changes between looking at the result and correcting it.
+function buildModes(data, addresses) {
+  const parts = { look: document.querySelectorAll("main, #run"), correct: document.querySelectorAll("#correct") };
+  const buttons = { look: document.getElementById("mode-look"), correct: document.getElementById("mode-correct") };
+  const modes = { work: null, show };
+  function show(mode) {
+    if (mode === "look" && modes.work?.server?.isNewer) return window.location.reload();
+    for (const [name, button] of Object.entries(buttons)) {
+      button.setAttribute("aria-pressed", name === mode);
+      for (const part of parts[name]) part.hidden = name !== mode;
+    }
+    if (mode === "correct") {
+      modes.work ??= new Work(data, addresses);
+      if (data.correct.isServed && !modes.work.server) modes.work.server = new Server(modes.work);
+    }
+  }
+  for (const [name, button] of Object.entries(buttons)) button.addEventListener("click", () => show(name));
+  show(data.correct.isServed || window.location.hash === "#correct" ? "correct" : "look");
+  return modes;
+}

@@ -1,0 +1,53 @@
+// The most doubtful first: what the page asks, and in which order.
+
+function askAbout(doubt, { data }) {
+  const view = data.views[doubt.view].name;
+  const leaf = `leaf ${doubt.leaf}`;
+  const other = doubt.otherView === undefined ? null : data.views[doubt.otherView].name;
+  const beside = other === null ? "" : ` Photo ${other} shows that leaf.`;
+  switch (doubt.kind) {
+    case "match": return other === null
+      ? `Photo ${view}: no other photo shows ${leaf}. Is it a leaf?`
+      : `Photo ${view}: is this ${leaf}?${beside}`;
+    case "unmatched": return `Photo ${view}: this mask was found in no other photo. Is it a leaf?`;
+    case "few":
+      return `Leaf ${doubt.leaf} was found in ${doubt.found} of ${doubt.expected} photos that should show it. ` +
+        "Is it a leaf?";
+    case "surface": return `Photo ${view}: this mask does not fit the shape of ${leaf}. Is it that leaf?${beside}`;
+    case "covered": return `Photo ${view}: ${leaf} should be here. Is it this mask?${beside}`;
+    default: return `Photo ${view}: ${leaf} should be here, where no mask is. Is it inside the dashed line?${beside}`;
+  }
+}
+
+// The answers that make sense: [action, text on its button].
+function answersTo(doubt) {
+  const pair = [["same", "Yes, the same leaf"], ["different", "No, another leaf"]];
+  const later = ["next", "I cannot tell"];
+  switch (doubt.kind) {
+    case "missing": return [["confirm", "Yes, keep this outline"], ["next", "No, or not to be seen"]];
+    case "few": return [["confirm", "Yes"], ["reject", "No leaf, nowhere"], later];
+    case "covered": return [...pair, later];
+    default: return doubt.otherView === undefined
+      ? [["confirm", "Yes"], ["reject", "No leaf"], later]
+      : [...pair, ["reject", "No leaf at all"], later];
+  }
+}
+
+// The doubts with what they point at, as places; without those whose masks no picture shows.
+function placeDoubts(data) {
+  const places = new Map();
+  data.views.forEach((view, index) => view.masks.forEach((mask) => places.set(mask.region, { view: index, mask })));
+  return data.correct.doubts.flatMap((doubt) => {
+    const [mask, other] = [places.get(doubt.region)?.mask, places.get(doubt.other)];
+    if (!mask && !doubt.outline) return [];
+    const at = doubt.outline ? insidePoint(doubt.outline).map(Math.round) : mask.at;
+    const name = [doubt.kind, doubt.view, ...at].join(" ");
+    return [{ ...doubt, name, mask, otherView: other?.view, otherMask: other?.mask }];
+  });
+}
+
+// Whether an edit says something of what a doubt points at.
+function isAnswered(doubt, places) {
+  return places.some(({ view, at }) =>
+    view === doubt.view && (doubt.outline ? isInside(at, doubt.outline) : isOnMask(doubt.mask, at)));
+}

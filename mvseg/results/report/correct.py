@@ -1,0 +1,99 @@
+"""What the page needs to correct a result: where its pictures lie in the user's photos, its name, and the doubts."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from mvseg.corrections.apply import APPLIED, PASSED, Fate
+from mvseg.corrections.doubtful import Doubt, list_doubts
+from mvseg.corrections.file import dump_edits
+from mvseg.formats.lens import photo_from_pinhole
+from mvseg.results.report.outlines import UNITS
+from mvseg.results.report.pictures import Picture
+from mvseg.results.result import Result
+from mvseg.scene import Scene
+
+COLUMNS = 33  # of the grid of a lens: between its points, straight lines are less than a pixel off
+
+
+def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
+    """All that the mode "Correct" reads: it begins with the edits of the result, and says what hindered each of them;
+    `run` is what run.json says."""
+    edits = [] if result.corrections is None else dump_edits(result.corrections.edits)
+    name = json.dumps([result.scene.name, run.get("inputs"), run.get("code"), edits], default=str)
+    lenses, of_view = describe_lenses(result.scene)
+    return {
+        "key": hashlib.sha256(name.encode()).hexdigest()[:16],
+        "edits": edits,
+        "outcomes": [describe_fate(fate) for fate in result.fates],
+        "lenses": lenses,
+        "views": [
+            {"size": size, "lens": lens}
+            for size, lens in zip(result.scene.cameras.sizes.tolist(), of_view, strict=True)
+        ],
+        "doubts": describe_doubts(result, pictures),
+    }
+
+
+def describe_fate(fate: Fate) -> str:
+    """What hindered an edit; "" for nothing."""
+    return fate.problem if fate.fate in (APPLIED, PASSED) else f"{fate.fate} {fate.problem}".strip()
+
+
+def describe_lenses(scene: Scene) -> tuple[list[dict[str, Any]], list[int | None]]:
+    """Each lens once, as how far its photo moves the points of a grid over the undistorted one, and the lens of each
+    view; None for a pinhole.
+
+    A grid has its numbers of columns and rows, from edge to edge of the photo, and x and y of the moves, pixels, row by
+    row; 0 where the photo shows nothing.
+    """
+    known: dict[tuple[Any, ...], int] = {}
+    lenses: list[dict[str, Any]] = []
+    of_view: list[int | None] = []
+    for index, view in enumerate(scene.views):
+        if view.lens is None:
+            of_view.append(None)
+            continue
+        (width, height), K = scene.cameras.sizes[index].tolist(), scene.cameras.K[index].cpu().numpy()
+        name = (view.lens.model_name, *view.lens.params, *K.ravel().tolist(), width, height)
+        if name not in known:
+            known[name] = len(lenses)
+            rows = max(2, round(COLUMNS * height / width))
+            x, y = np.meshgrid(np.linspace(0, width, COLUMNS), np.linspace(0, height, rows))
+            points = np.stack((x.ravel(), y.ravel()), 1)
+            moves = np.nan_to_num(photo_from_pinhole(view.lens, K, points) - points, nan=0, posinf=0, neginf=0)
+            lenses.append({"columns": COLUMNS, "rows": rows, "moves": np.round(moves, 2).ravel().tolist()})
+        of_view.append(known[name])
+    return lenses, of_view
+
+
+def describe_doubts(result: Result, pictures: Sequence[Picture]) -> list[dict[str, Any]]:
+    """The queue; outlines in units of the pictures."""
+    cameras = result.scene.cameras.to("cpu")
+    return [
+        _describe_doubt(doubt, pictures[doubt.view], cameras.sizes[doubt.view].tolist())
+        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras)
+    ]
+
+
+def _describe_doubt(doubt: Doubt, picture: Picture, size: list[int]) -> dict[str, Any]:
+    outline = None
+    if doubt.outline is not None:
+        left, top, right = (share * side for share, side in zip(picture.box[:3], [*size, size[0]], strict=True))
+        outline = np.round((doubt.outline - (left, top)) * UNITS / (right - left)).astype(int).tolist()
+    return {
+        "kind": doubt.kind,
+        "doubt": round(doubt.doubt, 3),
+        "view": doubt.view,
+        "leaf": doubt.instance,
+        "region": doubt.region,
+        "other": doubt.other,
+        "found": doubt.found,
+        "expected": doubt.expected,
+        "outline": outline,
+    }

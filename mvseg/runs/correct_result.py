@@ -1,0 +1,237 @@
+"""A result that a person corrects: what a run found is kept in memory, and each change runs only what it touches."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, fields, replace
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from mvseg._version import code_hash
+from mvseg.config import RunConfig
+from mvseg.corrections.apply import APPLIED, PASSED
+from mvseg.corrections.file import Corrections, load_corrections
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
+from mvseg.pipeline import Stage, State, detect, list_stages, load, reconstruct
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.results.earlier import RUN_FILE
+from mvseg.results.result import Result
+from mvseg.scene import Scene
+from mvseg.system.atomic import lock_folder
+
+CORRECTIONS_FILE = "corrections.json"
+NOT_AGAIN = ("detect", "check", "measure", "reconstruct")  # stages whose outcome the page does not show, or that ran
+
+
+class Superseded(Exception):
+    """There are newer edits: nobody waits for these any more."""
+
+
+class OpenResult:
+    """A result folder with its scene, its masks (or what the detector finds), and the surfaces that are known already.
+
+    Attributes:
+        folder: of the result.
+        run: what its run.json says.
+        notice: what a person should know of it; "" for nothing.
+        config: the options of its run.
+    """
+
+    def __init__(self, folder: Path, *, workers: ProcessPoolExecutor | None = None) -> None:
+        """Read the scene and its masks; where a detector made them, find them again.
+
+        Raises:
+            InputError: this is no result, or one that this version does not understand; its scene, its masks or its
+                photos are gone.
+        """
+        self.folder = folder
+        self.run = _read_run(folder)
+        self.config, scene, masks = _read_options(folder, self.run)
+        self.notice = ""
+        if self.run.get("code") != code_hash():
+            self.notice = f"mvseg {str(self.run.get('mvseg'))[:60]} made this result; what you see is computed anew."
+        state = load(scene, masks, self.config, workers=workers)
+        if not state.photos.exist:
+            raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
+        self._found = state if masks is not None else detect(state)
+        self._fitted: dict[str, LeafSurface] = {}
+        self.has_masks = masks is not None
+
+    @property
+    def scene(self) -> Scene:
+        """The scene."""
+        return self._found.scene
+
+    @property
+    def photos(self) -> Photos:
+        """Its photos."""
+        return self._found.photos
+
+    @property
+    def view_names(self) -> list[str]:
+        """The names of its views."""
+        return [view.name for view in self.scene.views]
+
+    def saved_corrections(self) -> Corrections:
+        """What was saved into the result folder before; none without the file."""
+        path = self.folder / CORRECTIONS_FILE
+        return load_corrections(path) if path.is_file() else Corrections()
+
+    def matched(self) -> Result:
+        """The masks with the ids that matching alone gives them, within a moment: for the page to begin with."""
+        return _result_of(list_stages(self.config, has_masks=self.has_masks)["match"](self._found))
+
+    def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
+        """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
+        and the other warnings on the way.
+
+        A surface is fitted anew only where its instance's masks are others than in all results before. (A run from
+        the command line fits all of them: each surface also depends a little on the masks that may hide it.)
+
+        Args:
+            corrections: all edits.
+            is_old: asked between the stages.
+
+        Raises:
+            Superseded: `is_old` said so.
+            InputError: see the stages.
+        """
+        state = replace(self._found, corrections=corrections)
+        messages: list[str] = []
+        for stage in self._stages(has_edits=len(corrections.edits) > 0):
+            if is_old():
+                raise Superseded
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", InputWarning)
+                state = stage(state)
+            messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
+        corrected = state.corrected
+        fates = () if corrected is None else corrected.fates
+        fine = (APPLIED, PASSED)
+        outcomes = [fate.problem if fate.fate in fine else f"{fate.fate} {fate.problem}".strip() for fate in fates]
+        told = () if corrected is None else corrected.messages
+        return _result_of(state), outcomes, [text for text in dict.fromkeys(messages) if text not in told]
+
+    def _stages(self, *, has_edits: bool) -> list[Stage]:
+        named = list_stages(self.config, has_masks=self.has_masks, has_edits=has_edits)
+        stages: list[Stage] = []
+        for name, stage in named.items():
+            if name in ("check_ids", "reconstruct"):
+                stages.append(self._fit)
+            if name not in NOT_AGAIN:
+                stages.append(stage)
+        return stages
+
+    def _fit(self, state: State) -> State:
+        """A surface for every instance; those whose masks had one before keep it."""
+        masks = state.matched.masks
+        ids = masks.instance_ids[masks.instance_ids > 0].unique().tolist()
+        names = {instance: name_masks(masks, instance) for instance in ids}
+        known = {instance: self._fitted[name] for instance, name in names.items() if name in self._fitted}
+        if known and len(known) == len(names):
+            return replace(state, surfaces=known)
+        surfaces = reconstruct(replace(state, surfaces=known), with_voxels=False).surfaces
+        for instance, surface in (surfaces or {}).items():
+            self._fitted[names[instance]] = surface
+        return replace(state, surfaces=surfaces)
+
+
+def name_masks(masks: Masks, instance: int) -> str:
+    """A name that two instances share only if they have the same masks in the same views, whatever their numbers."""
+    own = masks.select(masks.instance_ids == instance).regions.to("cpu")
+    each = [
+        (view, *box, hashlib.sha256(own.crop(row).numpy().tobytes()).hexdigest())
+        for row, (view, box) in enumerate(zip(own.view_index.tolist(), own.boxes.tolist(), strict=True))
+    ]
+    return json.dumps(sorted(each))
+
+
+@contextmanager
+def open_alone(folder: Path) -> Iterator[None]:
+    """Keep a second process from correcting the same result; the system lets go when this one ends, however it does.
+
+    Raises:
+        InputError: another one has it open.
+    """
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(lock_folder(folder))
+        except InputError:
+            raise InputError(f"{folder}: another mvseg correct has this result open, expected one at a time") from None
+        yield
+
+
+def check_writable(folder: Path) -> None:
+    """Raises InputError: nothing can be written to the folder."""
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise InputError(f"{folder}: cannot be written to, so corrections would be lost; expected a copy of your own")
+
+
+def say_how_to_run(result: OpenResult) -> str:
+    """The command that makes the whole result with the corrections."""
+    config = result.run["config"]
+    masks = f" --masks {config['masks']}" if config.get("masks") else ""
+    verb = "match" if result.config.reconstruct is None else "infer"
+    corrections = result.folder / CORRECTIONS_FILE
+    return f"mvseg {verb} {config['scene']}{masks} --out {result.folder} --corrections {corrections}"
+
+
+def _result_of(state: State) -> Result:
+    return Result(
+        scene=state.scene,
+        matching=state.matched,
+        photos=state.photos,
+        poses=state.poses,
+        surfaces=state.surfaces,
+        mask_kind=state.mask_kind,
+    )
+
+
+def _read_run(folder: Path) -> dict[str, Any]:
+    path = folder / RUN_FILE
+    try:
+        run = json.loads(path.read_text(encoding="utf-8"))
+    except OSError:
+        raise InputError(f"{folder}: holds no {RUN_FILE}, expected a result folder of mvseg infer") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a whole JSON file ({error})") from None
+    if not isinstance(run, dict) or not isinstance(run.get("config"), dict) or "scene" not in run["config"]:
+        raise InputError(f"{path}: does not say which scene this is, expected a result of one scene")
+    return run
+
+
+def _read_options(folder: Path, run: dict[str, Any]) -> tuple[RunConfig, Path, Path | None]:
+    """The options, the scene folder and the masks of a result."""
+    options = {name: value for name, value in run["config"].items() if name not in ("scene", "out", "masks")}
+    known = asdict(RunConfig())
+    unknown = sorted(set(options) - {field.name for field in fields(RunConfig)}) + sorted(
+        f"{stage}.{name}"
+        for stage, inside in options.items()
+        if isinstance(inside, dict) and isinstance(known.get(stage), dict)
+        for name in set(inside) - set(known[stage])
+    )
+    try:
+        if unknown:
+            raise InputError(f"unknown option {unknown[0]}")
+        config = TypeAdapter(RunConfig).validate_python({"reconstruct": None, **options})
+    except (ValidationError, InputError) as error:
+        problem = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        made = str(run.get("mvseg"))[:60]
+        message = f"mvseg {made} made this result, with options that this version does not have ({problem})"
+        raise InputError(f"{folder}: {message}; expected one made by this version") from None
+    scene, masks = Path(str(run["config"]["scene"])), run["config"].get("masks")
+    if not scene.exists():
+        raise InputError(f"{scene}: the scene of this result is gone, expected it there")
+    if masks is not None and not Path(str(masks)).exists():
+        raise InputError(f"{masks}: the masks of this result are gone, expected them there")
+    return config, scene, None if masks is None else Path(str(masks))

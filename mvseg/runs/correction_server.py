@@ -1,0 +1,262 @@
+"""The page "Correct" of one result at 127.0.0.1: saves each edit at once, and shows what comes of it.
+
+Only this machine reaches it, and only who knows the token in its address: requests that name another host or come from
+another page's origin are refused, which keeps out other users' browsers and pages that rebind their name.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import secrets
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+
+from mvseg.corrections.file import MOST_BYTES, Corrections, parse_corrections, write_corrections
+from mvseg.corrections.rough_outline import refine_outline
+from mvseg.errors import InputError
+from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
+from mvseg.results.report.page import build_page, describe_update
+from mvseg.results.report.pictures import Picture, draw_picture
+from mvseg.runs.correct_result import CORRECTIONS_FILE, OpenResult, Superseded
+
+HOST = "127.0.0.1"
+WAIT_SECONDS = 20.0  # that a page's question for news stays open
+MOST_CORNERS = 10_000
+
+
+class Refused(Exception):
+    """A request that is not answered, with the status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class Corrector:
+    """One open result, its newest edits, and a thread that computes what comes of them; the newest edits win."""
+
+    def __init__(self, opened: OpenResult) -> None:
+        """Raises InputError: the corrections saved in the folder, or a photo, cannot be read."""
+        self.opened = opened
+        self.corrections = opened.saved_corrections()
+        shown = replace(opened.matched(), corrections=self.corrections)
+        views = range(len(opened.view_names))
+        self.pictures = [draw_picture(opened.photos(view), shown.masks, view=view) for view in views]
+        self.page = build_page(shown, self.pictures, run=opened.run, is_served=True).encode()
+        self.news = threading.Condition()
+        self.wanted, self.computed, self.number = 1, 0, 0
+        self.problem, self.outcomes = opened.notice, [""] * len(self.corrections.edits)
+        self.update: dict[str, Any] | None = None
+        self.is_closing = False
+
+    def save(self, text: bytes) -> int:
+        """Write a list of edits to the result folder and have it computed; returns how many edits there are.
+
+        Raises:
+            InputError: this is no list of edits.
+            OSError: the file cannot be written.
+        """
+        try:
+            corrections = parse_corrections(json.loads(text))
+        except InputError:
+            raise
+        except (ValueError, RecursionError):
+            raise InputError("the edits are not whole JSON") from None
+        with self.news:  # one after another, in the order in which they are wanted
+            write_corrections(self.opened.folder / CORRECTIONS_FILE, corrections)
+            self.corrections = corrections
+            self.wanted += 1
+            self.news.notify_all()
+        return len(corrections.edits)
+
+    def compute(self) -> None:
+        """Work until `close`; for a thread of its own."""
+        while True:
+            with self.news:
+                self.news.wait_for(lambda: self.is_closing or self.wanted > self.computed)
+                if self.is_closing:
+                    return
+                wanted, corrections = self.wanted, self.corrections
+            self._compute_once(wanted, corrections)
+
+    def _compute_once(self, wanted: int, corrections: Corrections) -> None:
+        problem, outcomes = "", [""] * len(corrections.edits)
+        update: dict[str, Any] | None = None
+        try:
+            is_old: Callable[[], bool] = lambda: self.is_closing or self.wanted > wanted  # noqa: E731
+            result, outcomes, messages = self.opened.recompute(corrections, is_old)
+            sizes = result.scene.cameras.sizes.tolist()
+            pictures: Sequence[Picture] = [
+                picture.with_masks(result.masks, view=view, size=tuple(sizes[view]))
+                for view, picture in enumerate(self.pictures)
+            ]
+            update = describe_update(result, pictures)
+            problem = " ".join([self.opened.notice, *messages]).strip()
+        except Superseded:
+            return
+        except InputError as error:
+            problem = str(error)
+        except Exception as error:  # the person must not lose the page over what one list of edits does
+            problem = f"This could not be computed ({type(error).__name__}: {error}); your edits are saved."
+        with self.news:
+            self.problem, self.outcomes = problem, outcomes
+            self.update = update or self.update
+            self.computed, self.number = wanted, self.number + 1
+            self.news.notify_all()
+
+    def state(self, after: int) -> dict[str, Any]:
+        """What the page shows: at once for `after` 0, otherwise as soon as there is something newer."""
+        with self.news:
+            if after > 0:
+                self.news.wait_for(lambda: self.is_closing or self.number > after, WAIT_SECONDS)
+            return {
+                "number": self.number,
+                "isComputing": self.wanted > self.computed,
+                "problem": self.problem,
+                "outcomes": self.outcomes,
+                "update": self.update if self.number > after else None,
+            }
+
+    def outline(self, text: bytes) -> dict[str, Any]:
+        """An outline of what lies in a rough one, both in pixels of the user's photo.
+
+        Raises:
+            InputError: a request of another form, no such view, or nothing to outline.
+        """
+        view, rough = _read_rough(text, self.opened.view_names)
+        scene = self.opened.scene
+        lens, K = scene.views[view].lens, scene.cameras.K[view].cpu().numpy()
+        straight = rough if lens is None else pinhole_from_photo(lens, K, rough)
+        if not np.isfinite(straight).all():
+            raise InputError("the rough outline leaves what the lens shows")
+        found = refine_outline(self.opened.photos(view), straight)
+        placed = found if lens is None else photo_from_pinhole(lens, K, found)
+        return {"polygon": np.round(placed, 2).tolist()}
+
+    def close(self) -> None:
+        """Let everybody who waits go."""
+        with self.news:
+            self.is_closing = True
+            self.news.notify_all()
+
+
+def _read_rough(text: bytes, names: Sequence[str]) -> tuple[int, np.ndarray]:
+    """The view and the corners (P, 2) of a request for an outline."""
+    try:
+        content = json.loads(text)
+        view = names.index(content["view"])
+        rough = np.array(content["polygon"], dtype=np.float64)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise InputError('expected {"view": name of a photo, "polygon": [[x, y], ...]}') from None
+    if rough.ndim != 2 or rough.shape[1] != 2 or not 3 <= len(rough) <= MOST_CORNERS or not (abs(rough) < 1e6).all():
+        raise InputError("the rough outline is no polygon, expected 3 points or more in the photo")
+    return view, rough
+
+
+class CorrectionServer(ThreadingHTTPServer):
+    """Serves one `Corrector` on a free port of this machine.
+
+    Attributes:
+        token: part of every address that is answered.
+        address: of the page.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, corrector: Corrector, port: int = 0) -> None:
+        self.corrector, self.token = corrector, secrets.token_urlsafe(24)
+        super().__init__((HOST, port), _Handler)
+        self.address = f"http://{HOST}:{self.server_port}/{self.token}/"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A page that was closed meanwhile is no news."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: CorrectionServer
+    protocol_version = "HTTP/1.1"
+    timeout = 60
+
+    def do_GET(self) -> None:
+        self._answer({"": self._page, "state": self._state})
+
+    def do_PUT(self) -> None:
+        self._answer({"edits": lambda: self._json({"saved": self.server.corrector.save(self._body())})})
+
+    def do_POST(self) -> None:
+        self._answer({"outline": lambda: self._json(self.server.corrector.outline(self._body()))})
+
+    def _answer(self, places: Mapping[str, Callable[[], None]]) -> None:
+        try:
+            places.get(self._place(), self._nothing)()
+        except Refused as error:
+            self._json({"problem": str(error)}, error.status)
+        except InputError as error:
+            self._json({"problem": str(error)}, HTTPStatus.BAD_REQUEST)
+        except ConnectionError:
+            self.close_connection = True
+        except OSError as error:
+            folder = self.server.corrector.opened.folder
+            sentence = f"{folder}: the edit could not be saved ({error.strerror})"
+            self._json({"problem": sentence}, HTTPStatus.INTERNAL_SERVER_ERROR)
+
+    def _place(self) -> str:
+        """What is asked for, below the token.
+
+        Raises:
+            Refused: by another name of this machine, from another page, or without the token.
+        """
+        own = f"{HOST}:{self.server.server_port}"
+        origin = self.headers.get("Origin")
+        if self.headers.get("Host") != own or (origin is not None and origin != f"http://{own}"):
+            raise Refused(HTTPStatus.FORBIDDEN, "This address is only for the page that mvseg correct opens.")
+        token, _, place = urlsplit(self.path).path.lstrip("/").partition("/")
+        if not hmac.compare_digest(token.encode(), self.server.token.encode()):
+            raise Refused(HTTPStatus.FORBIDDEN, "The token is missing or old: open what mvseg correct prints.")
+        return place
+
+    def _nothing(self) -> None:
+        raise Refused(HTTPStatus.NOT_FOUND, "There is nothing here.")
+
+    def _page(self) -> None:
+        self._send(self.server.corrector.page, "text/html; charset=utf-8")
+
+    def _state(self) -> None:
+        asked = parse_qs(urlsplit(self.path).query).get("after", ["0"])[0]
+        self._json(self.server.corrector.state(int(asked) if asked.isascii() and asked.isdigit() else 0))
+
+    def _body(self) -> bytes:
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit() and len(length) < 16):
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "The request does not say how long it is.")
+        if int(length) > MOST_BYTES:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"More than {MOST_BYTES // 2**20} MiB are not read.")
+        return self.rfile.read(int(length))
+
+    def _json(self, content: Mapping[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
+        if status != HTTPStatus.OK:
+            self.close_connection = True  # what was sent may not have been read
+        self._send(json.dumps(content, default=str).encode(), "application/json", status)
+
+    def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        headers = {"Content-Type": kind, "Content-Length": str(len(body)), "Cache-Control": "no-store",
+                   "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer",
+                   "Cross-Origin-Resource-Policy": "same-origin"}  # fmt: skip
+        if self.close_connection:
+            headers["Connection"] = "close"
+        for name, value in headers.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """The terminal is for the person: nothing."""

@@ -1,0 +1,136 @@
+"""The queue of doubts: three known leaves in six views, and one fault at a time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import as_regions
+from known_leaves import make_surface
+from mvseg.corrections.doubtful import LEAST_DOUBT, Doubt, best_mask, list_doubts
+from mvseg.masks import Masks, Origin
+from mvseg.verification.visible_leaves import visible_leaves
+from three_leaves import CAMERAS, LEAVES, true_maps
+
+TRUE = true_maps()
+
+
+def masks_of(maps: list[np.ndarray]) -> Masks:
+    """Labels from 100 on are masks that were matched to nothing."""
+    regions, numbers = as_regions(maps)
+    ids = torch.where(numbers >= 100, -1, numbers)
+    return Masks.of(regions, ids, torch.where(ids > 0, 0.95, 0.0))
+
+
+def doubts(masks: Masks, **changes: object) -> list[Doubt]:
+    return list_doubts(masks, LEAVES, cameras=CAMERAS, **changes)  # type: ignore[arg-type]
+
+
+def row_of(masks: Masks, *, view: int, leaf: int) -> int:
+    return int(((masks.view_index == view) & (masks.instance_ids == leaf)).nonzero()[0])
+
+
+def changed(view: int, leaf: int, number: int) -> Masks:
+    """The true masks; that of one leaf in one view has another number."""
+    maps = [labels.copy() for labels in TRUE]
+    maps[view][maps[view] == leaf] = number
+    return masks_of(maps)
+
+
+def test_nothing_is_asked_of_a_result_without_faults() -> None:
+    assert doubts(masks_of(TRUE)) == []
+
+
+def test_low_scores_come_first_the_lowest_before_the_others() -> None:
+    masks = masks_of(TRUE)
+    rows = [row_of(masks, view=view, leaf=leaf) for view, leaf in ((1, 2), (4, 3), (0, 1))]
+    masks.match_scores[rows] = torch.tensor([0.5, 0.1, 1 - LEAST_DOUBT + 0.01])
+    found = doubts(masks)
+    assert [(each.kind, each.view, each.instance, each.region) for each in found] == [
+        ("match", 4, 3, rows[1]), ("match", 1, 2, rows[0])
+    ]  # fmt: skip
+    for each in found:  # what it is compared with shows the same leaf elsewhere
+        assert masks.instance_ids[each.other] == each.instance
+        assert masks.view_index[each.other] != each.view
+
+
+def test_a_missing_mask_is_proposed_where_the_surface_is_seen() -> None:
+    (found,) = doubts(changed(2, 1, 0))
+    assert (found.kind, found.view, found.instance, found.region) == ("missing", 2, 1, -1)
+    assert found.outline is not None
+    drawn = cv2.fillPoly(np.zeros(TRUE[2].shape, np.uint8), [np.round(found.outline - 0.5).astype(np.int32)], 1) > 0
+    true = TRUE[2] == 1
+    assert (drawn & true).sum() / (drawn | true).sum() > 0.9
+
+
+def test_a_mask_of_another_leaf_in_the_place_is_asked_about() -> None:
+    masks = changed(2, 1, 100)
+    (found,) = doubts(masks)
+    lone = int((masks.instance_ids == -1).nonzero()[0])
+    assert (found.kind, found.view, found.instance, found.region) == ("covered", 2, 1, lone)
+
+
+def test_a_mask_far_from_all_leaves_may_be_none() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    maps[1][:40, :40] = np.where(maps[1][:40, :40] == 0, 100, maps[1][:40, :40])
+    (found,) = doubts(masks_of(maps))
+    assert (found.kind, found.view, found.instance, found.other) == ("unmatched", 1, -1, -1)
+    maps[1][:40, :40] = np.where(maps[1][:40, :40] == 100, 0, maps[1][:40, :40])
+    maps[1][:3, :3] = 100
+    assert doubts(masks_of(maps)) == []  # a crumb
+
+
+def test_a_leaf_of_few_views_is_asked_about_once() -> None:
+    maps = [np.where((labels == 3) & (view != 0), 0, labels) for view, labels in enumerate(TRUE)]
+    few = [each for each in doubts(masks_of(maps)) if each.kind == "few"]
+    openly = sum(
+        leaf.instance == 3 and leaf.share >= 0.5 for v in range(6) for leaf in visible_leaves(LEAVES, CAMERAS, v)
+    )
+    assert [(each.instance, each.view, each.found, each.expected) for each in few] == [(3, 0, 1, openly)]
+    assert few[0].doubt == pytest.approx(1 - 1 / openly)
+
+
+def test_without_surfaces_every_view_should_show_a_leaf() -> None:
+    maps = [np.where((labels == 3) & (view > 1), 0, labels) for view, labels in enumerate(TRUE)]
+    found = list_doubts(masks_of(maps), None, cameras=CAMERAS)
+    assert [(each.kind, each.instance, each.found, each.expected) for each in found] == [("few", 3, 2, 6)]
+
+
+def test_the_mask_that_its_surface_explains_worst_is_asked_about() -> None:
+    iou = torch.full((6,), 0.9, dtype=torch.float64)
+    iou[4] = 0.4
+    surfaces = LEAVES | {2: replace(make_surface(LEAVES[2].coefficients.numpy()), iou=iou)}
+    masks = masks_of(TRUE)
+    (found,) = list_doubts(masks, surfaces, cameras=CAMERAS)
+    assert (found.kind, found.view, found.region) == ("surface", 4, row_of(masks, view=4, leaf=2))
+    assert found.doubt == pytest.approx(0.6)
+
+
+def test_what_a_person_said_is_not_asked_again() -> None:
+    masks = masks_of(TRUE)
+    row = row_of(masks, view=1, leaf=2)
+    masks.match_scores[row] = 0.1
+    assert [each.region for each in doubts(masks)] == [row]
+    masks.origin[row] = int(Origin.CORRECTED)
+    assert doubts(masks) == []
+
+
+def test_no_masks_and_no_surfaces_are_no_doubts() -> None:
+    empty = masks_of([np.zeros_like(labels) for labels in TRUE])
+    assert list_doubts(empty, None, cameras=CAMERAS) == []
+    assert {each.kind for each in list_doubts(masks_of(TRUE), {}, cameras=CAMERAS)} == set()
+
+
+def test_the_best_mask_is_the_largest_of_the_sure_ones() -> None:
+    masks = masks_of(TRUE)
+    rows = (masks.instance_ids == 1).nonzero()[:, 0]
+    largest = int(rows[masks.regions.areas[rows].argmax()])
+    assert best_mask(masks, 1, but=-1) == largest
+    assert masks.view_index[best_mask(masks, 1, but=int(masks.view_index[largest]))] != masks.view_index[largest]
+    masks.match_scores[largest] = 0.5
+    assert best_mask(masks, 1, but=-1) != largest
+    assert best_mask(masks, 7, but=-1) == -1

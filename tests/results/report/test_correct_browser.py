@@ -1,0 +1,333 @@
+"""The mode "Correct" as a person uses it, in a real browser. Skipped where no chromium is installed."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import pytest
+
+from mvseg.corrections.apply import Fate
+from mvseg.corrections.file import load_corrections, parse_corrections
+from mvseg.formats.lens import photo_from_pinhole
+from mvseg.results.report.page import write_report
+from mvseg.results.result import Result
+from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
+from report_pages import HOSTILE, RUN, draw_pictures, rename_hostile, write_page
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[sync_api.Browser]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)  # the mode needs none
+        yield browser
+        browser.close()
+
+
+@pytest.fixture(scope="module")
+def bent(balls: Result) -> Result:
+    """The balls as a lens with distortion shows them; what their photos show does not matter here."""
+    K, (width, height) = balls.scene.cameras.K[0].numpy(), balls.scene.cameras.sizes[0].tolist()
+    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], -0.9, 0.1, 0.02, -0.03]
+    lens = pycolmap.Camera(model="OPENCV", width=width, height=height, params=params)
+    views = tuple(replace(view, lens=lens) for view in balls.scene.views)
+    return replace(balls, scene=replace(balls.scene, views=views))
+
+
+@pytest.fixture(scope="module")
+def file(bent: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_page(tmp_path_factory.mktemp("correct") / "report.html", bent)
+
+
+@pytest.fixture
+def opened(browser: sync_api.Browser, file: Path) -> Iterator[Person]:
+    opened = Person(browser, file)
+    yield opened
+    opened.close()
+
+
+class Person(Opened):
+    """What a person does in the mode."""
+
+    def __init__(self, browser: sync_api.Browser, file: Path) -> None:
+        super().__init__(browser, file, (1280, 800), has_space=False)
+        self.page.locator("#mode-correct").click()
+
+    def at(self, pane: int, xy: list[float]) -> tuple[float, float]:
+        """Where the screen shows a point of a picture."""
+        place = """([pane, [x, y]]) => {
+          const { picture } = modes.work.panes[pane];
+          const at = new DOMPoint(x, y).matrixTransform(picture.getScreenCTM());
+          return [at.x, at.y];
+        }"""
+        return tuple(self.page.evaluate(place, [pane, xy]))
+
+    def mask(self, view: int, leaf: int) -> dict[str, Any]:
+        found = "([view, leaf]) => data.views[view].masks.find((mask) => mask.leaf === leaf)"
+        return self.page.evaluate(found, [view, leaf])
+
+    def click_mask(self, pane: int, leaf: int) -> None:
+        view = self.page.evaluate("(pane) => modes.work.panes[pane].view", pane)
+        self.page.mouse.click(*self.at(pane, self.mask(view, leaf)["at"]))
+
+    def drag(self, pane: int, line: list[list[float]]) -> None:
+        self.page.mouse.move(*self.at(pane, line[0]))
+        self.page.mouse.down()
+        for point in line[1:]:
+            self.page.mouse.move(*self.at(pane, point), steps=4)
+        self.page.mouse.up()
+
+    def save(self, folder: Path) -> list[dict[str, Any]]:
+        """The edits in the file that the page saves; mvseg reads it."""
+        with self.page.expect_download() as download:
+            self.page.get_by_role("button", name="Save corrections.json").click()
+        path = folder / download.value.suggested_filename
+        download.value.save_as(path)
+        assert path.name == "corrections.json"
+        assert len(load_corrections(path).edits) == self.num_edits()
+        content = json.loads(path.read_text(encoding="utf-8"))
+        assert content.keys() == {"format", "edits"}
+        for edit in content["edits"]:
+            edit.pop("when", None)
+        return content["edits"]
+
+    def num_edits(self) -> int:
+        return self.page.locator("#correct-list li").count()
+
+    def load(self, path: Path) -> str:
+        self.page.locator("#correct input[type=file]").set_input_files(path)
+        self.page.locator("#correct-note:not(:empty)").wait_for()
+        return self.page.locator("#correct-note").inner_text()
+
+
+def photo_point(result: Result, view: int, mask: dict[str, Any], box: list[float]) -> np.ndarray:
+    """Where the user's photo shows the point that names a mask."""
+    width = int(result.scene.cameras.sizes[view, 0])
+    height = int(result.scene.cameras.sizes[view, 1])
+    scale = (box[2] - box[0]) * width / 2000
+    xy = np.array([[box[0] * width, box[1] * height]]) + np.array([mask["at"]]) * scale
+    lens = result.scene.views[view].lens
+    return xy[0] if lens is None else photo_from_pinhole(lens, result.scene.cameras.K[view].numpy(), xy)[0]
+
+
+def test_two_clicks_link_masks_by_points_of_the_photos(opened: Person, bent: Result, tmp_path: Path) -> None:
+    opened.click_mask(0, 1)
+    opened.click_mask(1, 2)
+    opened.page.keyboard.press("d")
+    opened.click_mask(1, 3)
+    opened.click_mask(0, 3)
+    opened.page.get_by_role("button", name="The same leaf").click()
+    opened.click_mask(0, 2)
+    opened.page.keyboard.press("Shift+R")
+    opened.click_mask(0, 1)
+    opened.page.keyboard.press("c")
+    edits = opened.save(tmp_path)
+    assert [edit["op"] for edit in edits] == ["different", "same", "reject", "confirm"]
+    assert [place[0] for place in edits[1]["at"]] == [bent.scene.views[1].name, bent.scene.views[0].name]
+    assert edits[2]["everywhere"] is True
+    assert "everywhere" not in edits[3]
+    boxes = opened.page.evaluate("data.views.map((view) => view.box)")
+    moved = 0.0
+    for place, (view, leaf) in zip(edits[0]["at"] + edits[1]["at"], [(0, 1), (1, 2), (1, 3), (0, 3)], strict=True):
+        wanted = photo_point(bent, view, opened.mask(view, leaf), boxes[view])
+        np.testing.assert_allclose(place[1:], wanted, atol=0.05)
+        straight = photo_point(replace(bent, scene=without_lens(bent)), view, opened.mask(view, leaf), boxes[view])
+        moved = max(moved, float(np.abs(straight - wanted).max()))
+    assert moved > 0.5  # the lens matters in this test
+
+
+def without_lens(result: Result) -> Any:
+    return replace(result.scene, views=tuple(replace(view, lens=None) for view in result.scene.views))
+
+
+def test_an_outline_is_drawn_in_one_go_or_by_its_corners(opened: Person, tmp_path: Path) -> None:
+    circle = [[1000 + 150 * np.cos(turn), 300 + 150 * np.sin(turn)] for turn in np.linspace(0, 6.1, 30)]
+    opened.page.keyboard.press("o")
+    opened.drag(0, circle)
+    opened.page.locator("#leaf-word").fill(HOSTILE)
+    opened.page.get_by_role("button", name="Keep it").click()
+    opened.page.keyboard.press("o")
+    corners = [[700, 200], [900, 200], [900, 400], [700, 200]]
+    for corner in corners:  # the last click is on the first corner
+        opened.page.mouse.click(*opened.at(1, corner))
+    opened.page.keyboard.press("Enter")
+    free, clicked = opened.save(tmp_path)
+    assert free["leaf"] == HOSTILE
+    assert len(free["polygon"]) >= 20
+    assert len(clicked["polygon"]) == 3
+    assert "leaf" not in clicked
+    sizes = opened.page.evaluate("data.correct.views[1].size"), opened.page.evaluate("data.views[1].box")
+    back = opened.page.evaluate(
+        "(points) => points.map((point) => modes.work.frames[1].toPicture(point))", clicked["polygon"]
+    )
+    np.testing.assert_allclose(back, corners[:3], atol=2 * 2000 / (sizes[0][0] * (sizes[1][2] - sizes[1][0])))
+    assert opened.page.locator("svg.work path.drawn").count() == 2
+    assert opened.page.locator("#correct-list li").last.inner_text().startswith("outline drawn in")
+
+
+def test_an_outline_shows_the_leaf_that_is_picked_elsewhere(opened: Person, tmp_path: Path) -> None:
+    opened.click_mask(1, 2)
+    opened.page.keyboard.press("o")
+    opened.drag(
+        0, [[1000, 100], [1200, 100], [1200, 300], [1100, 320], [1000, 300], [1000, 200], [1000, 150], [1000, 110]]
+    )
+    opened.page.keyboard.press("Enter")
+    outline, same = opened.save(tmp_path)
+    assert (outline["op"], same["op"]) == ("outline", "same")
+    xs, ys = np.array(outline["polygon"]).T
+    assert same["at"][0][0] == outline["view"] != same["at"][1][0]
+    assert xs.min() < same["at"][0][1] < xs.max()
+    assert ys.min() < same["at"][0][2] < ys.max()
+
+
+def test_a_cut_goes_through_the_mask_that_it_crosses(opened: Person, tmp_path: Path) -> None:
+    x1, y1, x2, y2 = opened.mask(0, 2)["box"]
+    opened.page.keyboard.press("l")
+    opened.drag(0, [[(x1 + x2) / 2, y1 - 20], [(x1 + x2) / 2, y2 + 20]])
+    (split,) = opened.save(tmp_path)
+    assert split["op"] == "split"
+    boxes = opened.page.evaluate("data.views.map((view) => view.box)")
+    assert len(split["line"]) >= 2
+    assert boxes[0] is not None
+    hit = opened.page.evaluate(
+        "(at) => data.views[0].masks.find((mask) => isOnMask(mask, modes.work.frames[0].toPicture(at))).leaf",
+        split["at"],
+    )
+    assert hit == 2
+    opened.page.keyboard.press("l")
+    opened.drag(0, [[5, 5], [60, 5]])
+    assert opened.num_edits() == 1
+    assert "crosses no mask" in opened.page.locator("#correct-note").inner_text()
+
+
+def test_edits_survive_a_reload_and_can_be_undone(opened: Person, tmp_path: Path) -> None:
+    for leaf, key in ((1, "r"), (2, "c"), (3, "r")):
+        opened.click_mask(0, leaf)
+        opened.page.keyboard.press(key)
+    before = opened.save(tmp_path)
+    opened.page.reload()
+    opened.page.locator("#mode-correct").click()
+    assert opened.save(tmp_path) == before
+    opened.page.get_by_label("delete edit 2").click()
+    assert [edit["op"] for edit in opened.save(tmp_path)] == ["reject", "reject"]
+    opened.page.keyboard.press("u")
+    assert opened.save(tmp_path) == before
+    opened.page.keyboard.press("u")
+    assert "nothing to undo" in opened.page.locator("#correct-note").inner_text()
+
+
+def test_a_file_that_was_saved_is_loaded_as_it_is(opened: Person, bent: Result, tmp_path: Path) -> None:
+    edits = [
+        {"op": "reject", "view": f"images/{bent.scene.views[0].name}.jpg", "at": [3.25, 4], "by": HOSTILE},
+        {"op": "outline", "view": HOSTILE, "polygon": [[1, 2], [3, 4], [5, 9]], "leaf": HOSTILE},
+        {"op": "same_track", "at": [["day 1", "0", 1, 2], ["day 2", "0", 1, 2]]},
+    ]
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({"format": "mvseg-corrections/1", "edits": edits}), encoding="utf-8")
+    assert "3 edits loaded" in opened.load(path)
+    assert opened.page.locator("#correct-list li .doubt").inner_text() == "this result has no such photo"
+    assert HOSTILE in opened.page.locator("#correct-list").inner_text()
+    assert "owned" not in opened.page.title()
+    with opened.page.expect_download() as download:
+        opened.page.get_by_role("button", name="Save corrections.json").click()
+    assert json.loads(Path(download.value.path()).read_text(encoding="utf-8"))["edits"] == edits
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "no whole JSON file"),
+        ('{"format": "other", "edits": []}', 'expected "format": "mvseg-corrections/1"'),
+        ('{"format": "mvseg-corrections/1", "edits": {}}', "is no list"),
+        ('{"format": "mvseg-corrections/1", "edits": [{"op": "toString"}]}', "edit 1: op is none of"),
+        ('{"format": "mvseg-corrections/1", "edits": [{"op": "reject", "view": "0", "at": [1, null]}]}', "two numbers"),
+        ('{"format": "mvseg-corrections/1", "edits": [' + "0," * 10_000 + "0]}", "expected at most 10000"),
+    ],
+)
+def test_a_file_that_is_none_is_one_sentence(content: str, said: str, opened: Person, tmp_path: Path) -> None:
+    opened.click_mask(0, 1)
+    opened.page.keyboard.press("r")
+    path = tmp_path / "broken.json"
+    path.write_text(content, encoding="utf-8")
+    assert re.fullmatch(rf"broken\.json: [^\n]*{re.escape(said)}[^\n]*\.", opened.load(path))
+    assert opened.num_edits() == 1
+
+
+def test_the_most_doubtful_is_asked_first_and_answered_by_a_key(
+    browser: sync_api.Browser, balls: Result, tmp_path: Path
+) -> None:
+    scores = balls.masks.match_scores.clone()
+    rows = [int(((balls.masks.view_index == 2) & (balls.masks.instance_ids == leaf)).nonzero()[0]) for leaf in (1, 3)]
+    scores[rows[0]], scores[rows[1]] = 0.4, 0.2
+    doubtful = balls.matching.with_masks(replace(balls.masks, match_scores=scores))
+    person = Person(browser, write_page(tmp_path / "report.html", replace(balls, matching=doubtful)))
+    person.page.keyboard.press("n")
+    name = balls.scene.views[2].name
+    assert person.page.locator("#correct-ask p").inner_text().startswith(f"Photo {name}: is this leaf 3?")
+    person.page.keyboard.press("s")
+    assert person.page.locator("#correct-ask p").inner_text().startswith(f"Photo {name}: is this leaf 1?")
+    person.page.keyboard.press("n")  # not now: there is nothing else, so it comes again
+    assert "leaf 1?" in person.page.locator("#correct-ask p").inner_text()
+    person.page.keyboard.press("r")
+    assert person.page.locator("#correct-note").inner_text() == "Nothing doubtful is left."
+    same, reject = person.save(tmp_path)
+    assert (same["op"], reject["op"]) == ("same", "reject")
+    assert same["at"][0][0] == reject["view"] == name
+    person.page.keyboard.press("u")
+    assert "1 question " in person.page.locator("#correct-ask").inner_text()
+    person.close()
+
+
+def test_hostile_names_stay_text(browser: sync_api.Browser, balls: Result, tmp_path: Path) -> None:
+    result, path = rename_hostile(balls), tmp_path / "report.html"
+    edits = [{"op": "reject", "view": f"0 {HOSTILE}", "at": [1, 1]}]
+    corrections = parse_corrections({"format": "mvseg-corrections/1", "edits": edits})
+    fates = (Fate(1, "reject", f"bad {HOSTILE}"),)
+    write_report(path, replace(result, corrections=corrections, fates=fates), draw_pictures(result), run=RUN)
+    person = Person(browser, path)
+    assert person.page.locator("#correct-list li button").first.inner_text() == f"no leaf, in 0 {HOSTILE}"
+    assert person.page.locator("#correct-list .doubt").inner_text() == f"bad {HOSTILE}"
+    person.click_mask(0, 1)
+    person.page.keyboard.press("r")
+    assert person.save(tmp_path)[1]["view"] == f"0 {HOSTILE}"
+    person.close()
+
+
+def test_fingers_draw_and_two_of_them_zoom(browser: sync_api.Browser, file: Path) -> None:
+    person = Person(browser, file)
+    send = """([kind, id, x, y]) => {
+      const { picture } = modes.work.panes[0];
+      picture.setPointerCapture = () => {};
+      const event = { pointerId: id, pointerType: "touch", clientX: x, clientY: y, bubbles: true, button: 0 };
+      picture.dispatchEvent(new PointerEvent(kind, event));
+    }"""
+    x, y = person.at(0, [1000, 700])
+    width = "modes.work.panes[0].box.width"
+    before = person.page.evaluate(width)
+    for event in [("pointerdown", 1, x - 20, y), ("pointerdown", 2, x + 20, y), ("pointermove", 2, x + 40, y),
+                  ("pointermove", 1, x - 40, y), ("pointerup", 1, x - 40, y), ("pointerup", 2, x + 40, y)]:  # fmt: skip
+        person.page.evaluate(send, list(event))
+    assert person.page.evaluate(width) == pytest.approx(before / 2, rel=0.05)
+    assert person.page.evaluate("modes.work.picks.length") == 0
+    person.page.keyboard.press("o")
+    person.page.evaluate(send, ["pointerdown", 1, x, y])
+    for turn in range(1, 12):
+        person.page.evaluate(send, ["pointermove", 1, x + 60 * np.sin(turn / 2), y + 60 - 60 * np.cos(turn / 2)])
+    person.page.evaluate(send, ["pointerup", 1, x, y])
+    assert person.page.evaluate("modes.work.draft.isClosed")
+    person.close()
+
+
+@pytest.mark.parametrize("size", [(390, 800), (800, 1000), (1280, 800)])
+def test_nothing_is_wider_than_the_screen(size: tuple[int, int], opened: Person) -> None:
+    opened.page.set_viewport_size({"width": size[0], "height": size[1]})
+    opened.click_mask(0, 1)
+    assert opened.page.evaluate("document.documentElement.scrollWidth") <= size[0]

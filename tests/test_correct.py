@@ -1,0 +1,292 @@
+"""`mvseg correct`: a result is served to its own page only, every edit is saved, and what it changes is shown."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+
+from mvseg.config import RunConfig
+from mvseg.corrections.file import Corrections, load_corrections
+from mvseg.corrections.rough_outline import refine_outline
+from mvseg.errors import InputError
+from mvseg.matching.config import MatchConfig
+from mvseg.pipeline import run_scene
+from mvseg.runs.correct_result import OpenResult, Superseded, name_masks, open_alone
+from mvseg.runs.correction_server import CorrectionServer, Corrector
+from mvseg.runs.one_scene import run_one_scene
+from scene_folders import write_scene
+
+WAIT = 60.0  # seconds, on a busy machine
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A result of three balls in four views, ids only."""
+    place = tmp_path_factory.mktemp("correct")
+    scene = write_scene(place / "balls")
+    run_one_scene(scene, scene / "masks", place / "result", config=RunConfig(reconstruct=None), quiet=True)
+    return place / "result"
+
+
+@pytest.fixture
+def served(folder: Path) -> Iterator[CorrectionServer]:
+    (folder / "corrections.json").unlink(missing_ok=True)
+    corrector = Corrector(OpenResult(folder))
+    with CorrectionServer(corrector) as server:
+        threads = [threading.Thread(target=work) for work in (server.serve_forever, corrector.compute)]
+        for thread in threads:
+            thread.start()
+        yield server
+        corrector.close()
+        server.shutdown()
+        for thread in threads:
+            thread.join()
+
+
+def ask(
+    server: CorrectionServer, method: str, place: str, body: bytes | None = None, **headers: str
+) -> tuple[int, Any]:
+    """Status and content of an answer; `place` below the token, or from the root where it begins with "/"."""
+    address = urlsplit(server.address)
+    connection = http.client.HTTPConnection(address.netloc, timeout=WAIT)
+    path = place if place.startswith("/") else address.path + place
+    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+    answer = connection.getresponse()
+    text = answer.read()
+    connection.close()
+    is_json = answer.headers["Content-Type"] == "application/json"
+    return answer.status, json.loads(text) if is_json else text.decode()
+
+
+def text_of(edits: list[dict[str, Any]]) -> bytes:
+    return json.dumps({"format": "mvseg-corrections/1", "edits": edits}).encode()
+
+
+def wait_until_computed(server: CorrectionServer) -> dict[str, Any]:
+    end = time.monotonic() + WAIT
+    while time.monotonic() < end:
+        status, state = ask(server, "GET", "state?after=0")
+        assert status == 200
+        if not state["isComputing"]:
+            return dict(state)
+        time.sleep(0.02)
+    raise AssertionError("nothing was computed")
+
+
+def middle(opened: OpenResult, row: int) -> tuple[str, list[float]]:
+    """A view's name and a point inside one of its masks."""
+    regions = opened.matched().regions
+    rows, columns = np.nonzero(regions.crop(row).numpy())
+    x, y = regions.boxes[row, :2].tolist()
+    at = [float(x + columns[len(rows) // 2] + 0.5), float(y + rows[len(rows) // 2] + 0.5)]
+    return opened.view_names[int(regions.view_index[row])], at
+
+
+def test_an_edit_is_saved_computed_and_shown(served: CorrectionServer, folder: Path) -> None:
+    before = wait_until_computed(served)
+    view, at = middle(served.corrector.opened, 0)
+    edits = [{"op": "reject", "view": view, "at": at}, {"op": "reject", "view": view, "at": [0.5, 0.5]}]
+    assert ask(served, "PUT", "edits", text_of(edits)) == (200, {"saved": 2})
+    assert json.loads((folder / "corrections.json").read_text())["edits"] == edits
+    after = wait_until_computed(served)
+    assert after["number"] > before["number"]
+    assert after["update"]["numMasks"] == before["update"]["numMasks"] - 1
+    assert after["outcomes"][0] == ""
+    assert "nothing" in after["outcomes"][1]
+    ask(served, "PUT", "edits", text_of([]))
+    assert wait_until_computed(served)["update"] == before["update"]
+
+
+def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
+    opened = OpenResult(folder)
+    view, at = middle(opened, 1)
+    (folder / "corrections.json").write_bytes(text_of([{"op": "reject", "view": view, "at": at}]))
+    corrections = opened.saved_corrections()
+    shown, outcomes, _ = opened.recompute(corrections, lambda: False)
+    config = opened.run["config"]
+    run = run_scene(Path(config["scene"]), Path(config["masks"]), RunConfig(reconstruct=None), corrections=corrections)
+    assert outcomes == [""]
+    assert shown.masks.instance_ids.tolist() == run.masks.instance_ids.tolist()
+    assert name_masks(shown.masks, 1) == name_masks(run.masks, 1) != name_masks(run.masks, 2)
+    with pytest.raises(Superseded):
+        opened.recompute(corrections, lambda: True)
+    (folder / "corrections.json").unlink()
+
+
+def test_only_its_own_page_is_answered(served: CorrectionServer) -> None:
+    status, page = ask(served, "GET", "")
+    assert status == 200
+    assert "connect-src 'self'" in page
+    host = urlsplit(served.address).netloc
+    assert ask(served, "GET", "state", Origin=f"http://{host}")[0] == 200
+    for place, headers in (
+        ("/", {}), ("/state", {}), ("/wrong/", {}), ("/wrong/state?after=0", {}),
+        ("state", {"Host": "leaf.example"}), ("state", {"Host": f"localhost:{served.server_port}"}),
+        ("state", {"Origin": "https://leaf.example"}), ("state", {"Origin": "null"}),
+    ):  # fmt: skip
+        status, answer = ask(served, "GET", place, **headers)
+        assert status == 403, (place, headers)
+        assert served.token not in answer["problem"]
+    assert ask(served, "PUT", "edits", text_of([]), Origin="http://127.0.0.1:1")[0] == 403
+    assert ask(served, "GET", "../run.json")[0] == 404
+    assert served.server_address[0] == "127.0.0.1"
+
+
+@pytest.mark.parametrize(
+    "body",
+    [b"", b"{", b"[" * 100_000, b"\xff\xfe", b"null", b'{"format": "mvseg-corrections/1", "edits": [NaN]}',
+     b'{"format": "mvseg-corrections/1", "edits": [{"op": "reject", "view": "0", "at": [1e999, 1]}]}',
+     b'{"format": "mvseg-corrections/1", "edits": [{"op": "<script>"}]}', b"9" * 10_000],
+)  # fmt: skip
+def test_a_hostile_body_gets_a_sentence_and_changes_nothing(
+    served: CorrectionServer, folder: Path, body: bytes
+) -> None:
+    ask(served, "PUT", "edits", text_of([]))
+    before = (folder / "corrections.json").read_bytes()
+    for method, place in (("PUT", "edits"), ("POST", "outline")):
+        status, answer = ask(served, method, place, body)
+        assert status == 400
+        assert answer["problem"]
+        assert "Traceback" not in answer["problem"]
+    assert (folder / "corrections.json").read_bytes() == before
+
+
+def test_a_body_that_is_too_large_is_not_read(served: CorrectionServer) -> None:
+    status, answer = ask(served, "PUT", "edits", b"{}", Content_Length=str(10**12))
+    assert status == 413
+    assert "64 MiB" in answer["problem"]
+
+
+def test_an_edit_that_cannot_be_saved_says_so(
+    served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("mvseg.runs.correction_server.write_corrections", refuse)
+    status, answer = ask(served, "PUT", "edits", text_of([]))
+    assert status == 500
+    assert answer["problem"] == f"{folder}: the edit could not be saved (Permission denied)"
+
+
+def test_the_newest_edits_win(folder: Path) -> None:
+    """Edits that come while others are computed stop these, and nobody waits for them."""
+    corrector = Corrector(OpenResult(folder))
+    seen: list[int] = []
+
+    def recompute(corrections: Corrections, is_old: Any) -> Any:
+        seen.append(len(corrections.edits))
+        if len(seen) == 1:
+            corrector.save(text_of([{"op": "reject", "view": "x", "at": [1, number]} for number in range(3)]))
+        if is_old():
+            raise Superseded
+        corrector.is_closing = True
+        raise InputError("stop")
+
+    corrector.opened.recompute = recompute  # type: ignore[method-assign]
+    corrector.compute()
+    assert seen == [0, 3]
+    assert corrector.problem == "stop"
+    (folder / "corrections.json").unlink()
+
+
+def test_a_second_process_is_told(folder: Path) -> None:
+    message = "another mvseg correct has this result open"
+    with open_alone(folder), pytest.raises(InputError, match=message), open_alone(folder):
+        pass
+    with open_alone(folder):
+        pass
+
+
+def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
+    run = json.loads((folder / "run.json").read_text())
+
+    def problem_of(change: dict[str, Any], **config: Any) -> str:
+        (tmp_path / "run.json").write_text(json.dumps(run | {"config": run["config"] | config} | change))
+        with pytest.raises(InputError) as caught:
+            OpenResult(tmp_path)
+        return str(caught.value)
+
+    assert "the scene of this result is gone" in problem_of({}, scene=str(tmp_path / "nowhere"))
+    assert "the masks of this result are gone" in problem_of({}, masks=str(tmp_path / "nowhere"))
+    for options in ({"sparkle": 1}, {"match": {"sparkle": 1}}, {"match": {"method": 7}}):
+        assert "options that this version does not have" in problem_of({"mvseg": "9.9"}, **options)
+    assert "does not say which scene" in problem_of({"config": []})
+    (tmp_path / "run.json").write_text("{")
+    with pytest.raises(InputError, match="not a whole JSON file"):
+        OpenResult(tmp_path)
+    (tmp_path / "run.json").write_text(json.dumps(run | {"code": "other", "mvseg": "0.0"}))
+    assert OpenResult(tmp_path).notice == "mvseg 0.0 made this result; what you see is computed anew."
+    assert OpenResult(folder).config.match == MatchConfig()
+
+
+def test_photos_that_are_gone(tmp_path: Path) -> None:
+    scene = write_scene(tmp_path / "balls")
+    run_one_scene(scene, scene / "masks", tmp_path / "out", config=RunConfig(reconstruct=None), quiet=True)
+    for photo in (scene / "images").iterdir():
+        photo.unlink()
+    with pytest.raises(InputError, match="the photos of this result are gone"):
+        OpenResult(tmp_path / "out")
+
+
+def test_what_was_saved_survives_a_kill(folder: Path) -> None:
+    """The process as a person starts it: a second one is refused, and after kill -9 the edits are there."""
+    command = [sys.executable, "-m", "mvseg.cli", "correct", str(folder), "--no_browser", "--num_workers", "1"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        try:
+            assert process.stdout is not None
+            address = urlsplit(process.stdout.readline().strip())
+            second = subprocess.run(command, capture_output=True, text=True, timeout=WAIT, check=False)
+            assert second.returncode == 2
+            assert "another mvseg correct has this result open" in second.stderr
+            edits = [{"op": "same", "at": [["0", 1.5, 2.5], ["1", 3.0, 4.0]]}]
+            connection = http.client.HTTPConnection(address.netloc, timeout=WAIT)
+            connection.request("PUT", f"{address.path}edits", text_of(edits))
+            assert connection.getresponse().status == 200
+            connection.close()
+        finally:
+            os.kill(process.pid, signal.SIGKILL)
+    assert len(load_corrections(folder / "corrections.json").edits) == 1
+    (folder / "corrections.json").unlink()
+
+
+def test_a_rough_box_becomes_the_outline_of_what_is_inside() -> None:
+    photo = np.full((200, 300, 3), (90, 70, 50), np.uint8)
+    rows, columns = np.mgrid[:200, :300] + 0.5
+    disc = (rows - 90) ** 2 + (columns - 160) ** 2 < 40**2
+    photo[disc] = (40, 160, 60)
+    noise = np.random.default_rng(0).integers(-8, 9, photo.shape)
+    photo = np.clip(photo + noise, 0, 255).astype(np.uint8)
+    box = np.array([[108.0, 40], [212, 40], [212, 142], [108, 142]])
+    outline = refine_outline(photo, box)
+    assert np.abs(np.hypot(*(outline - (160, 90)).T) - 40).max() < 3
+    np.testing.assert_array_equal(outline, refine_outline(photo, box))
+    for bad in (box + 1000, np.zeros((3, 2)), np.array([[-50.0, -50], [400, -50], [400, 300], [-50, 300]])):
+        with pytest.raises(InputError, match="expected one around a leaf"):
+            refine_outline(photo, bad)
+
+
+def test_an_outline_is_asked_for_by_the_page(served: CorrectionServer) -> None:
+    regions = served.corrector.opened.matched().regions
+    view, _ = middle(served.corrector.opened, 0)
+    x1, y1, x2, y2 = (regions.boxes[0] + regions.boxes.new_tensor([-4, -4, 4, 4])).tolist()
+    rough = [[x1, y1], [x2, y1], [x2, y2], [x1, y2]]
+    status, answer = ask(served, "POST", "outline", json.dumps({"view": view, "polygon": rough}).encode())
+    assert status == 200
+    middles = np.array(answer["polygon"]).mean(0) - ((x1 + x2) / 2, (y1 + y2) / 2)
+    assert np.abs(middles).max() < 4
+    for content in ({"view": "nowhere", "polygon": rough}, {"view": view, "polygon": rough[:2]}, {"view": view}):
+        assert ask(served, "POST", "outline", json.dumps(content).encode())[0] == 400
