@@ -26,7 +26,7 @@ from mvseg.simulation.dataset import PRESETS, Preset
 from tiny_training import build_tiny
 
 TINY = Preset(plants=(("dev", 4),), leaves=(2,), views=(2,), size=(48, 48), has_coco=True)
-GRACE = 10.0  # seconds; a data loader's process looks every five whether its parent is there
+GRACE = 60.0  # seconds; a worker that is starting notices that its parent is gone when it has loaded this module
 
 
 def run(arguments: list[str], log: str) -> None:

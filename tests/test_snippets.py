@@ -25,6 +25,7 @@ from mvseg import demo_scene, load_scene
 from mvseg.cli import main
 from mvseg.cli.command import build_parser
 from mvseg.cli.options import join_up
+from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.formats.label_png import read_labels, write_label_png
 
 ROOT = Path(__file__).parent.parent
@@ -165,8 +166,11 @@ def test_commands_run(page: Path, desk: Path) -> None:
 
 
 @of_kind("json")
-def test_camera_files_are_read(block: Block, tmp_path: Path) -> None:
+def test_files_that_are_shown_are_read(block: Block, tmp_path: Path) -> None:
     content = json.loads(block.text)
+    if content["format"] == FORMAT:
+        assert len(parse_corrections(content).edits) == len(content["edits"])
+        return
     name = {"mvseg-rig/1": "cameras.json", "mvseg-turntable/1": "turntable.json"}[content["format"]]
     (tmp_path / name).write_text(block.text)
     (tmp_path / "side.yaml").write_text(
