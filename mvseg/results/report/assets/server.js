@@ -69,7 +69,7 @@ class Server {
       this.isNewer ||= !isFirst;
       this.work.update(update);
     }
-    const done = problem ? "" : "What you see follows from all edits.";
+    const done = update || !problem ? "What you see follows from all edits." : "";
     this.tell({ state: problem }, isComputing ? "Computing what follows from the edits\u2026" : done);
   }
 
