@@ -9,7 +9,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ import numpy as np
 import pytest
 
 from mvseg.config import RunConfig
-from mvseg.corrections.file import Corrections, load_corrections
+from mvseg.corrections.file import Corrections, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
@@ -28,8 +27,7 @@ from mvseg.runs.correct_result import OpenResult, Superseded, name_masks, open_a
 from mvseg.runs.correction_server import CorrectionServer, Corrector
 from mvseg.runs.one_scene import run_one_scene
 from scene_folders import write_scene
-
-WAIT = 60.0  # seconds, on a busy machine
+from served_result import WAIT, ask, save, save_text, serve, text_of, wait_until_computed
 
 
 @pytest.fixture(scope="module")
@@ -44,46 +42,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def served(folder: Path) -> Iterator[CorrectionServer]:
     (folder / "corrections.json").unlink(missing_ok=True)
-    corrector = Corrector(OpenResult(folder))
-    with CorrectionServer(corrector) as server:
-        threads = [threading.Thread(target=work) for work in (server.serve_forever, corrector.compute)]
-        for thread in threads:
-            thread.start()
+    with serve(folder) as server:
         yield server
-        corrector.close()
-        server.shutdown()
-        for thread in threads:
-            thread.join()
-
-
-def ask(
-    server: CorrectionServer, method: str, place: str, body: bytes | None = None, **headers: str
-) -> tuple[int, Any]:
-    """Status and content of an answer; `place` below the token, or from the root where it begins with "/"."""
-    address = urlsplit(server.address)
-    connection = http.client.HTTPConnection(address.netloc, timeout=WAIT)
-    path = place if place.startswith("/") else address.path + place
-    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
-    answer = connection.getresponse()
-    text = answer.read()
-    connection.close()
-    is_json = answer.headers["Content-Type"] == "application/json"
-    return answer.status, json.loads(text) if is_json else text.decode()
-
-
-def text_of(edits: list[dict[str, Any]]) -> bytes:
-    return json.dumps({"format": "mvseg-corrections/1", "edits": edits}).encode()
-
-
-def wait_until_computed(server: CorrectionServer) -> dict[str, Any]:
-    end = time.monotonic() + WAIT
-    while time.monotonic() < end:
-        status, state = ask(server, "GET", "state?after=0")
-        assert status == 200
-        if not state["isComputing"]:
-            return dict(state)
-        time.sleep(0.02)
-    raise AssertionError("nothing was computed")
 
 
 def middle(opened: OpenResult, row: int) -> tuple[str, list[float]]:
@@ -99,15 +59,56 @@ def test_an_edit_is_saved_computed_and_shown(served: CorrectionServer, folder: P
     before = wait_until_computed(served)
     view, at = middle(served.corrector.opened, 0)
     edits = [{"op": "reject", "view": view, "at": at}, {"op": "reject", "view": view, "at": [0.5, 0.5]}]
-    assert ask(served, "PUT", "edits", text_of(edits)) == (200, {"saved": 2})
+    status, answer = save(served, edits)
+    assert (status, answer["saved"]) == (200, 2)
     assert json.loads((folder / "corrections.json").read_text())["edits"] == edits
     after = wait_until_computed(served)
     assert after["number"] > before["number"]
     assert after["update"]["numMasks"] == before["update"]["numMasks"] - 1
     assert after["outcomes"][0] == ""
     assert "nothing" in after["outcomes"][1]
-    ask(served, "PUT", "edits", text_of([]))
+    save(served, [])
     assert wait_until_computed(served)["update"] == before["update"]
+
+
+def test_a_reload_shows_all_edits_that_were_saved(served: CorrectionServer) -> None:
+    """Otherwise the next edit would be saved without them."""
+    view, at = middle(served.corrector.opened, 0)
+    edits = [{"op": "reject", "view": view, "at": at}]
+    _, saved = save(served, edits)
+    state = wait_until_computed(served)
+    status, page = ask(served, "GET", "")
+    assert status == 200
+    data = json.loads(page.split('id="data">')[1].split("</script>")[0])
+    assert data["correct"]["edits"] == edits
+    assert data["correct"]["revision"] == saved["revision"] == state["revision"]
+    assert data["numMasks"] == state["update"]["numMasks"]
+
+
+def test_edits_that_another_page_has_changed_are_not_saved_over(served: CorrectionServer, folder: Path) -> None:
+    view, at = middle(served.corrector.opened, 0)
+    first, second = ([{"op": op, "view": view, "at": at}] for op in ("reject", "confirm"))
+    base = name_edits(())
+    status, answer = ask(served, "PUT", f"edits?base={base}", text_of(first))
+    assert status == 200
+    assert ask(served, "PUT", f"edits?base={base}", text_of(first)) == (200, answer)  # its answer was lost
+    for place in (f"edits?base={base}", "edits", "edits?base="):
+        status, refusal = ask(served, "PUT", place, text_of(second))
+        assert status == 409
+        assert refusal["problem"] == "Another page has changed the edits since this one was loaded."
+    assert json.loads((folder / "corrections.json").read_text())["edits"] == first
+    assert ask(served, "PUT", f"edits?base={answer['revision']}", text_of(second))[0] == 200
+
+
+def test_a_page_that_knows_all_waits_for_news(served: CorrectionServer) -> None:
+    number = wait_until_computed(served)["number"]
+    told = threading.Event()
+    waiting = threading.Thread(target=lambda: (ask(served, "GET", f"state?after={number}"), told.set()))
+    waiting.start()
+    assert not told.wait(0.3)
+    save(served, [])
+    assert told.wait(WAIT)
+    waiting.join()
 
 
 def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
@@ -154,10 +155,9 @@ def test_only_its_own_page_is_answered(served: CorrectionServer) -> None:
 def test_a_hostile_body_gets_a_sentence_and_changes_nothing(
     served: CorrectionServer, folder: Path, body: bytes
 ) -> None:
-    ask(served, "PUT", "edits", text_of([]))
+    save(served, [])
     before = (folder / "corrections.json").read_bytes()
-    for method, place in (("PUT", "edits"), ("POST", "outline")):
-        status, answer = ask(served, method, place, body)
+    for status, answer in (save_text(served, body), ask(served, "POST", "outline", body)):
         assert status == 400
         assert answer["problem"]
         assert "Traceback" not in answer["problem"]
@@ -177,7 +177,7 @@ def test_an_edit_that_cannot_be_saved_says_so(
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.setattr("mvseg.runs.correction_server.write_corrections", refuse)
-    status, answer = ask(served, "PUT", "edits", text_of([]))
+    status, answer = save(served, [])
     assert status == 500
     assert answer["problem"] == f"{folder}: the edit could not be saved (Permission denied)"
 
@@ -186,11 +186,12 @@ def test_the_newest_edits_win(folder: Path) -> None:
     """Edits that come while others are computed stop these, and nobody waits for them."""
     corrector = Corrector(OpenResult(folder))
     seen: list[int] = []
+    base = name_edits(())
 
     def recompute(corrections: Corrections, is_old: Any) -> Any:
         seen.append(len(corrections.edits))
         if len(seen) == 1:
-            corrector.save(text_of([{"op": "reject", "view": "x", "at": [1, number]} for number in range(3)]))
+            corrector.save(text_of([{"op": "reject", "view": "x", "at": [1, number]} for number in range(3)]), base)
         if is_old():
             raise Superseded
         corrector.is_closing = True
@@ -254,7 +255,7 @@ def test_what_was_saved_survives_a_kill(folder: Path) -> None:
             assert "another mvseg correct has this result open" in second.stderr
             edits = [{"op": "same", "at": [["0", 1.5, 2.5], ["1", 3.0, 4.0]]}]
             connection = http.client.HTTPConnection(address.netloc, timeout=WAIT)
-            connection.request("PUT", f"{address.path}edits", text_of(edits))
+            connection.request("PUT", f"{address.path}edits?base={name_edits(())}", text_of(edits))
             assert connection.getresponse().status == 200
             connection.close()
         finally:

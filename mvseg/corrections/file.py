@@ -6,6 +6,7 @@ top-left pixel at 0.5, 0.5), never by numbers of a result: numbers change with e
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -191,6 +192,11 @@ def dump_edits(edits: Sequence[Edit]) -> list[dict[str, Any]]:
     """The edits as a file holds them, without keys that say nothing."""
     dumped = [edit.model_dump(mode="json", exclude_none=True) for edit in edits]
     return [{"op": each.pop("op"), **{k: v for k, v in each.items() if v is not False}} for each in dumped]
+
+
+def name_edits(edits: Sequence[Edit]) -> str:
+    """A name that only equal lists of edits share."""
+    return hashlib.sha256(json.dumps(dump_edits(edits)).encode()).hexdigest()[:16]
 
 
 def _short(value: Any) -> str:

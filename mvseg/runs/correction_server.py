@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hmac
 import json
+import re
 import secrets
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -19,12 +20,12 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 
-from mvseg.corrections.file import MOST_BYTES, Corrections, parse_corrections, write_corrections
+from mvseg.corrections.file import MOST_BYTES, Corrections, name_edits, parse_corrections, write_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.errors import InputError
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.results.report.page import build_page, describe_update
-from mvseg.results.report.pictures import Picture, draw_picture
+from mvseg.results.report.pictures import draw_picture
 from mvseg.runs.correct_result import CORRECTIONS_FILE, OpenResult, Superseded
 
 HOST = "127.0.0.1"
@@ -47,21 +48,35 @@ class Corrector:
         """Raises InputError: the corrections saved in the folder, or a photo, cannot be read."""
         self.opened = opened
         self.corrections = opened.saved_corrections()
-        shown = replace(opened.matched(), corrections=self.corrections)
+        self.shown = opened.matched()
         views = range(len(opened.view_names))
-        self.pictures = [draw_picture(opened.photos(view), shown.masks, view=view) for view in views]
-        self.page = build_page(shown, self.pictures, run=opened.run, is_served=True).encode()
+        self.pictures = [draw_picture(opened.photos(view), self.shown.masks, view=view) for view in views]
         self.news = threading.Condition()
         self.wanted, self.computed, self.number = 1, 0, 0
         self.problem, self.outcomes = opened.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
+        self.revision = name_edits(self.corrections.edits)
         self.is_closing = False
 
-    def save(self, text: bytes) -> int:
-        """Write a list of edits to the result folder and have it computed; returns how many edits there are.
+    def page(self) -> bytes:
+        """The page with the newest result, and with all edits that were saved: a reload must not lose any."""
+        with self.news:
+            shown, pictures = replace(self.shown, corrections=self.corrections), self.pictures
+        return build_page(shown, pictures, run=self.opened.run, is_served=True).encode()
+
+    def save(self, text: bytes, base: str) -> dict[str, Any]:
+        """Write a list of edits to the result folder and have it computed.
+
+        Args:
+            text: of a corrections.json.
+            base: the `name_edits` of the list that this one was made from.
+
+        Returns:
+            How many edits there are, and their `name_edits`, the next one's base.
 
         Raises:
             InputError: this is no list of edits.
+            Refused: it was made from another list than the one that is saved: it would undo edits of another page.
             OSError: the file cannot be written.
         """
         try:
@@ -70,12 +85,15 @@ class Corrector:
             raise
         except (ValueError, RecursionError):
             raise InputError("the edits are not whole JSON") from None
+        name = name_edits(corrections.edits)
         with self.news:  # one after another, in the order in which they are wanted
+            if name_edits(self.corrections.edits) not in (base, name):  # the same again: its answer was lost
+                raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
             write_corrections(self.opened.folder / CORRECTIONS_FILE, corrections)
             self.corrections = corrections
             self.wanted += 1
             self.news.notify_all()
-        return len(corrections.edits)
+        return {"saved": len(corrections.edits), "revision": name}
 
     def compute(self) -> None:
         """Work until `close`; for a thread of its own."""
@@ -90,15 +108,16 @@ class Corrector:
     def _compute_once(self, wanted: int, corrections: Corrections) -> None:
         problem, outcomes = "", [""] * len(corrections.edits)
         update: dict[str, Any] | None = None
+        shown, pictures = self.shown, self.pictures
         try:
             is_old: Callable[[], bool] = lambda: self.is_closing or self.wanted > wanted  # noqa: E731
-            result, outcomes, messages = self.opened.recompute(corrections, is_old)
-            sizes = result.scene.cameras.sizes.tolist()
-            pictures: Sequence[Picture] = [
-                picture.with_masks(result.masks, view=view, size=tuple(sizes[view]))
-                for view, picture in enumerate(self.pictures)
+            shown, outcomes, messages = self.opened.recompute(corrections, is_old)
+            sizes = shown.scene.cameras.sizes.tolist()
+            pictures = [
+                picture.with_masks(shown.masks, view=view, size=tuple(sizes[view]))
+                for view, picture in enumerate(pictures)
             ]
-            update = describe_update(result, pictures)
+            update = describe_update(shown, pictures)
             problem = " ".join([self.opened.notice, *messages]).strip()
         except Superseded:
             return
@@ -108,17 +127,21 @@ class Corrector:
             problem = f"This could not be computed ({type(error).__name__}: {error}); your edits are saved."
         with self.news:
             self.problem, self.outcomes = problem, outcomes
-            self.update = update or self.update
+            if update is not None:
+                self.shown, self.pictures, self.update = shown, pictures, update
+            self.revision = name_edits(corrections.edits)
             self.computed, self.number = wanted, self.number + 1
             self.news.notify_all()
 
     def state(self, after: int) -> dict[str, Any]:
-        """What the page shows: at once for `after` 0, otherwise as soon as there is something newer."""
+        """What the page shows, and of which edits (`revision`): at once for an `after` below 0, otherwise as soon as
+        there is something newer."""
         with self.news:
-            if after > 0:
+            if after >= 0:
                 self.news.wait_for(lambda: self.is_closing or self.number > after, WAIT_SECONDS)
             return {
                 "number": self.number,
+                "revision": self.revision,
                 "isComputing": self.wanted > self.computed,
                 "problem": self.problem,
                 "outcomes": self.outcomes,
@@ -189,7 +212,7 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer({"": self._page, "state": self._state})
 
     def do_PUT(self) -> None:
-        self._answer({"edits": lambda: self._json({"saved": self.server.corrector.save(self._body())})})
+        self._answer({"edits": lambda: self._json(self.server.corrector.save(self._body(), self._asked("base")))})
 
     def do_POST(self) -> None:
         self._answer({"outline": lambda: self._json(self.server.corrector.outline(self._body()))})
@@ -227,11 +250,15 @@ class _Handler(BaseHTTPRequestHandler):
         raise Refused(HTTPStatus.NOT_FOUND, "There is nothing here.")
 
     def _page(self) -> None:
-        self._send(self.server.corrector.page, "text/html; charset=utf-8")
+        self._send(self.server.corrector.page(), "text/html; charset=utf-8")
 
     def _state(self) -> None:
-        asked = parse_qs(urlsplit(self.path).query).get("after", ["0"])[0]
-        self._json(self.server.corrector.state(int(asked) if asked.isascii() and asked.isdigit() else 0))
+        asked = self._asked("after")
+        self._json(self.server.corrector.state(int(asked) if re.fullmatch("[0-9]{1,15}", asked) else -1))
+
+    def _asked(self, name: str) -> str:
+        """What the address says after the question mark; "" for nothing."""
+        return parse_qs(urlsplit(self.path).query).get(name, [""])[0]
 
     def _body(self) -> bytes:
         length = self.headers.get("Content-Length", "")

@@ -11,7 +11,7 @@ import numpy as np
 
 from mvseg.corrections.apply import APPLIED, PASSED, Fate
 from mvseg.corrections.doubtful import Doubt, list_doubts
-from mvseg.corrections.file import dump_edits
+from mvseg.corrections.file import dump_edits, name_edits
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.results.report.outlines import UNITS
 from mvseg.results.report.pictures import Picture
@@ -24,12 +24,14 @@ COLUMNS = 33  # of the grid of a lens: between its points, straight lines are le
 def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
     """All that the mode "Correct" reads: it begins with the edits of the result, and says what hindered each of them;
     `run` is what run.json says."""
-    edits = [] if result.corrections is None else dump_edits(result.corrections.edits)
+    made = () if result.corrections is None else result.corrections.edits
+    edits = dump_edits(made)
     name = json.dumps([result.scene.name, run.get("inputs"), run.get("code"), edits], default=str)
     lenses, of_view = describe_lenses(result.scene)
     return {
         "key": hashlib.sha256(name.encode()).hexdigest()[:16],
         "edits": edits,
+        "revision": name_edits(made),
         "outcomes": [describe_fate(fate) for fate in result.fates],
         "lenses": lenses,
         "views": [

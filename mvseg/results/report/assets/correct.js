@@ -48,10 +48,18 @@ class Work {
     views.forEach(({ masks }, index) => { this.data.views[index].masks = masks; });
     Object.assign(this.data, { leaves, numMasks });
     this.data.correct.doubts = doubts;
-    [this.picks, this.doubt] = [[], null];
     this.read();
+    this.picks = this.picks.flatMap((pick) => this.pickAgain(pick));
+    this.doubt &&= this.doubts.find((doubt) => doubt.name === this.doubt.name) ?? null;
     for (const pane of this.panes) pane.draw();
     this.changed();
+  }
+
+  // What is picked when other masks come: the mask at the same point.
+  pickAgain({ view, name, mask, at }) {
+    if (!mask) return [{ view, name, mask, at }];
+    const found = this.data.views[view].masks.findLast((one) => isOnMask(one, at));
+    return found ? [{ view, name: `r${found.region}`, mask: found, at }] : [];
   }
 
   changed() {
@@ -274,6 +282,7 @@ function buildModes(data, addresses) {
   const buttons = { look: document.getElementById("mode-look"), correct: document.getElementById("mode-correct") };
   const modes = { work: null, show };
   function show(mode) {
+    if (data.correct.isServed) window.history.replaceState(null, "", `#${mode}`); // a reload stays in the mode
     if (mode === "look" && modes.work?.server?.isNewer) return window.location.reload();
     for (const [name, button] of Object.entries(buttons)) {
       button.setAttribute("aria-pressed", name === mode);
@@ -285,6 +294,7 @@ function buildModes(data, addresses) {
     }
   }
   for (const [name, button] of Object.entries(buttons)) button.addEventListener("click", () => show(name));
-  show(data.correct.isServed || window.location.hash === "#correct" ? "correct" : "look");
+  const { hash } = window.location;
+  show(hash === "#correct" || (data.correct.isServed && hash !== "#look") ? "correct" : "look");
   return modes;
 }

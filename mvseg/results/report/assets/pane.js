@@ -63,11 +63,16 @@ class Pane {
     this.mark();
   }
 
+  // Outlines that are no masks yet: where the page is served, they soon are.
   drawOutlines(list) {
+    const { data, server } = this.work;
     return list.flatMap((edit, index) => {
-      if (edit.op !== "outline" || viewNamed(edit.view, this.work.data.views) !== this.view) return [];
-      const points = edit.polygon.map((point) => this.frame.toPicture(point).map(Math.round).join(" "));
-      return [drawing("path", { d: `M${points.join("L")}z`, class: "mask drawn", "data-edit": index })];
+      if (edit.op !== "outline" || viewNamed(edit.view, data.views) !== this.view) return [];
+      const points = edit.polygon.map((point) => this.frame.toPicture(point).map(Math.round));
+      const middle = insidePoint(points);
+      if (server && !server.isComputing && data.views[this.view].masks.some((mask) => isOnMask(mask, middle))) return [];
+      const d = `M${points.map((point) => point.join(" ")).join("L")}z`;
+      return [drawing("path", { d, class: "mask drawn", "data-edit": index })];
     });
   }
 
@@ -88,8 +93,9 @@ class Pane {
     }
     const size = 15 * this.unit;
     for (const { at: [x, y], symbol } of this.work.places.filter((place) => place.view === this.view).slice(-300)) {
-      parts.push(drawing("circle", { cx: x, cy: y, r: 0.62 * size, class: "badge" }));
-      parts.push(drawing("text", { x, y, "font-size": size, class: "badge" }, symbol));
+      const above = y - 1.5 * size; // the leaf's number stays to be seen
+      parts.push(drawing("circle", { cx: x, cy: above, r: 0.62 * size, class: "badge" }));
+      parts.push(drawing("text", { x, y: above, "font-size": size, class: "badge" }, symbol));
     }
     if (draft?.pane === this) {
       const points = draft.points.map((point) => point.map((value) => value.toFixed(1)).join(" "));

@@ -50,13 +50,18 @@ class Panel {
     parts.tools.replaceChildren(...this.tools());
     parts.list.replaceChildren(...this.list());
     const notes = [work.note, work.edits.problem, work.server?.problem];
-    parts.note.textContent = notes.filter(Boolean).join(" ");
+    parts.note.replaceChildren(notes.filter(Boolean).join(" "), ...(work.server?.isStale ? this.reload() : []));
     parts.state.textContent = work.server?.state ?? "";
     if (focused === this.word) this.word.focus();
     else if (!focused.isConnected) {
       const all = [...document.querySelectorAll("#correct-side button")];
       all.find((one) => one.textContent === focused.textContent)?.focus();
     }
+  }
+
+  reload() {
+    const text = "This one saves nothing any more: reload it, and go on from what is saved.";
+    return [element("span", {}, ` ${text}`), this.button("Reload", null, () => window.location.reload())];
   }
 
   question() {

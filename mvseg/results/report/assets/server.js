@@ -1,19 +1,24 @@
 // Where `mvseg correct` serves the page: every edit is saved at once, and what changes because of it is shown.
 
-const AGAIN = 2000; // milliseconds until a server that does not answer is asked again
+const AGAIN = 2000; // milliseconds until what failed is tried again
 
 class Server {
   constructor(work) {
     this.work = work;
     this.outcomes = []; // of each edit, what hinders it; "" for nothing
-    this.number = 0; // of the newest state that is known
+    this.number = -1; // of the newest state that is known
     this.isNewer = false; // the page shows another result than it was made of
     this.messages = {}; // problems, by what they are of
     this.state = "";
     this.unsaved = false;
-    this.isSending = false;
+    this.sent = null; // ends when nothing is on its way
+    this.isComputing = true; // the masks do not follow from all edits yet
+    this.base = work.data.correct.revision; // name of the edits that are saved, as far as this page knows
+    this.own = new Set([this.base]); // names of all lists that it started from or saved
+    this.isStale = false; // another page has changed the edits: this one must not save over them
     work.edits.listen(() => {
-      this.unsaved = true;
+      [this.unsaved, this.isComputing] = [true, true];
+      for (const pane of work.panes) pane.draw();
       this.send();
     });
     this.listen();
@@ -26,33 +31,42 @@ class Server {
   async ask(path, options) {
     const answer = await fetch(path, options);
     const content = await answer.json();
-    if (!answer.ok) throw new Error(content.problem);
+    if (!answer.ok) throw Object.assign(new Error(content.problem), { status: answer.status });
     return content;
   }
 
   // One list is on its way at a time; of those that come meanwhile, the newest goes next.
-  async send() {
-    if (this.isSending) return;
-    this.isSending = true;
-    while (this.unsaved) {
+  send() {
+    this.sent ??= this.sendAll().finally(() => { this.sent = null; });
+  }
+
+  async sendAll() {
+    while (this.unsaved && !this.isStale) {
       this.unsaved = false;
-      const text = this.work.edits.text();
+      const before = this.number;
       try {
         this.tell({ saving: "" }, "Saving\u2026");
-        const { saved } = await this.ask("edits", { method: "PUT", body: text });
-        this.tell({ saving: "" }, `${count(saved, "edit")} saved.`);
+        const list = { method: "PUT", body: this.work.edits.text() };
+        const { saved, revision } = await this.ask(`edits?base=${this.base}`, list);
+        this.base = revision;
+        this.own.add(revision);
+        const isDone = this.number > before;
+        this.tell({ saving: "" }, isDone ? this.state : `${count(saved, "edit")} saved. Computing what follows\u2026`);
       } catch (error) {
+        this.isStale = error.status === 409;
+        this.unsaved = !(error.status < 500); // what may go better later
+        if (this.unsaved) setTimeout(() => this.send(), AGAIN);
         this.tell({ saving: `Not saved: ${error.message}` }, "");
-        break;
+        return;
       }
     }
-    this.isSending = false;
   }
 
   async listen() {
-    for (;;) {
+    while (!this.isStale) {
       try {
         const state = await this.ask(`state?after=${this.number}`);
+        await this.sent;
         this.hear(state);
       } catch (error) {
         const advice = "start it again. What was not saved, save as corrections.json before you close this page.";
@@ -62,9 +76,14 @@ class Server {
     }
   }
 
-  hear({ number, outcomes, update, problem, isComputing }) {
-    const isFirst = this.number === 0;
-    Object.assign(this, { number, outcomes });
+  hear({ number, revision, outcomes, update, problem, isComputing }) {
+    if (!this.own.has(revision)) {
+      this.isStale = true;
+      this.tell({ state: "Another page has changed the edits." }, "");
+      return;
+    }
+    const isFirst = this.number < 0;
+    Object.assign(this, { number, outcomes, isComputing: isComputing || this.unsaved });
     if (update) {
       this.isNewer ||= !isFirst;
       this.work.update(update);
@@ -84,6 +103,7 @@ class Server {
       const found = await this.ask("outline", { method: "POST", body });
       draft.points = found.polygon.map((point) => frames[view].toPicture(point));
       this.tell({ fit: "" }, "");
+      document.querySelector("#correct-tools button.main")?.focus(); // Enter keeps it, and does not fit it again
     } catch (error) {
       this.tell({ fit: error.message }, "");
     }

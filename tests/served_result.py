@@ -1,0 +1,74 @@
+"""A result that `mvseg correct` serves, and what its page asks."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+from mvseg.corrections.file import name_edits
+from mvseg.runs.correct_result import OpenResult
+from mvseg.runs.correction_server import CorrectionServer, Corrector
+
+WAIT = 60.0  # seconds, on a busy machine
+
+
+@contextmanager
+def serve(folder: Path) -> Iterator[CorrectionServer]:
+    """The server of a result folder, which computes, too."""
+    corrector = Corrector(OpenResult(folder))
+    with CorrectionServer(corrector) as server:
+        threads = [threading.Thread(target=work) for work in (server.serve_forever, corrector.compute)]
+        for thread in threads:
+            thread.start()
+        yield server
+        corrector.close()
+        server.shutdown()
+        for thread in threads:
+            thread.join()
+
+
+def ask(
+    server: CorrectionServer, method: str, place: str, body: bytes | None = None, **headers: str
+) -> tuple[int, Any]:
+    """Status and content of an answer; `place` below the token, or from the root where it begins with "/"."""
+    address = urlsplit(server.address)
+    connection = http.client.HTTPConnection(address.netloc, timeout=WAIT)
+    path = place if place.startswith("/") else address.path + place
+    connection.request(method, path, body, {name.replace("_", "-"): value for name, value in headers.items()})
+    answer = connection.getresponse()
+    text = answer.read()
+    connection.close()
+    is_json = answer.headers["Content-Type"] == "application/json"
+    return answer.status, json.loads(text) if is_json else text.decode()
+
+
+def text_of(edits: list[dict[str, Any]]) -> bytes:
+    return json.dumps({"format": "mvseg-corrections/1", "edits": edits}).encode()
+
+
+def save(server: CorrectionServer, edits: list[dict[str, Any]]) -> tuple[int, Any]:
+    """Save edits as a page does that knows those before."""
+    return save_text(server, text_of(edits))
+
+
+def save_text(server: CorrectionServer, body: bytes) -> tuple[int, Any]:
+    base = name_edits(server.corrector.corrections.edits)
+    return ask(server, "PUT", f"edits?base={base}", body)
+
+
+def wait_until_computed(server: CorrectionServer) -> dict[str, Any]:
+    end = time.monotonic() + WAIT
+    while time.monotonic() < end:
+        status, state = ask(server, "GET", "state")
+        assert status == 200
+        if not state["isComputing"]:
+            return dict(state)
+        time.sleep(0.02)
+    raise AssertionError("nothing was computed")

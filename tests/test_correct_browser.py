@@ -1,0 +1,137 @@
+"""`mvseg correct` as a person uses it, in a real browser: edit, reload, edit. Skipped without chromium."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mvseg.config import RunConfig
+from mvseg.runs.correction_server import CorrectionServer
+from mvseg.runs.one_scene import run_one_scene
+from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
+from scene_folders import write_scene
+from served_result import serve
+
+pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[sync_api.Browser]:
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)
+        yield browser
+        browser.close()
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A result of three balls in four views, ids only."""
+    scene = write_scene(tmp_path / "balls")
+    run_one_scene(scene, scene / "masks", tmp_path / "result", config=RunConfig(reconstruct=None), quiet=True)
+    return tmp_path / "result"
+
+
+@pytest.fixture
+def served(folder: Path) -> Iterator[CorrectionServer]:
+    with serve(folder) as server:
+        yield server
+
+
+class Tab:
+    """A tab of the browser with the page."""
+
+    def __init__(self, browser: sync_api.Browser, server: CorrectionServer) -> None:
+        self.page = browser.new_page(viewport={"width": 1280, "height": 800})
+        self.page.set_default_timeout(WAIT_MS)
+        self.page.goto(server.address)
+
+    def press_on(self, pane: int, leaf: int, key: str) -> None:
+        """Click a leaf's mask, then a key."""
+        place = """([pane, leaf]) => {
+          const { picture, view } = modes.work.panes[pane];
+          const [x, y] = data.views[view].masks.find((mask) => mask.leaf === leaf).at;
+          const at = new DOMPoint(x, y).matrixTransform(picture.getScreenCTM());
+          return [at.x, at.y];
+        }"""
+        self.page.mouse.click(*self.page.evaluate(place, [pane, leaf]))
+        self.page.keyboard.press(key)
+
+    def wait_for(self, text: str) -> None:
+        self.page.locator("#correct-side").get_by_text(text).first.wait_for()
+
+    def rows(self) -> list[str]:
+        """The edits in the list, the first one first."""
+        return [text.split("\n")[0] for text in self.page.locator("#correct-list li").all_inner_texts()][::-1]
+
+
+def ops(folder: Path) -> list[str]:
+    return [edit["op"] for edit in edits_of(folder)]
+
+
+def edits_of(folder: Path) -> list[dict[str, Any]]:
+    edits: list[dict[str, Any]] = json.loads((folder / "corrections.json").read_text())["edits"]
+    return edits
+
+
+def test_edit_reload_edit(browser: sync_api.Browser, served: CorrectionServer, folder: Path) -> None:
+    tab = Tab(browser, served)
+    tab.wait_for("What you see follows from all edits.")
+    tab.press_on(0, 1, "r")
+    tab.wait_for("What you see follows from all edits.")
+    tab.page.reload()
+    tab.wait_for("What you see follows from all edits.")
+    assert [row.startswith("no leaf") for row in tab.rows()] == [True]
+    assert tab.page.evaluate("data.numMasks") == 11
+    tab.press_on(0, 2, "c")
+    tab.wait_for("What you see follows from all edits.")
+    assert ops(folder) == ["reject", "confirm"]
+    tab.page.get_by_label("delete edit 1").click()
+    tab.wait_for("What you see follows from all edits.")
+    assert ops(folder) == ["confirm"]
+    tab.page.locator("#mode-look").click()
+    tab.page.wait_for_function("!document.querySelector('main').hidden && data.numMasks === 12")
+    tab.page.close()
+
+
+def test_two_tabs_never_save_over_each_other(browser: sync_api.Browser, served: CorrectionServer, folder: Path) -> None:
+    one, other = Tab(browser, served), Tab(browser, served)
+    other.wait_for("What you see follows from all edits.")
+    other.page.evaluate("modes.work.server.hear = () => {}")  # this one sleeps: it does not hear of edits elsewhere
+    one.press_on(0, 1, "r")
+    one.wait_for("What you see follows from all edits.")
+    other.press_on(0, 2, "c")
+    other.wait_for("Not saved: Another page has changed the edits since this one was loaded.")
+    assert ops(folder) == ["reject"]
+    other.page.get_by_role("button", name="Reload").click()
+    other.wait_for("What you see follows from all edits.")
+    assert len(other.rows()) == 1
+    other.press_on(0, 2, "c")
+    one.wait_for("Another page has changed the edits. This one saves nothing any more")
+    assert ops(folder) == ["reject", "confirm"]
+    one.press_on(0, 2, "r")
+    assert ops(folder) == ["reject", "confirm"]
+    for tab in (one, other):
+        tab.page.close()
+
+
+def test_an_edit_that_could_not_be_saved_is_saved_later(
+    browser: sync_api.Browser, served: CorrectionServer, folder: Path
+) -> None:
+    tab = Tab(browser, served)
+    tab.wait_for("What you see follows from all edits.")
+    tab.page.route("**/edits?*", lambda route: route.abort())
+    tab.press_on(0, 1, "r")
+    tab.wait_for("Not saved:")
+    assert not (folder / "corrections.json").exists()
+    with tab.page.expect_download() as download:
+        tab.page.get_by_role("button", name="Save corrections.json").click()
+    saved = json.loads(Path(download.value.path()).read_text())["edits"]
+    assert [edit["op"] for edit in saved] == ["reject"]
+    tab.page.unroute("**/edits?*")
+    tab.wait_for("What you see follows from all edits.")
+    assert edits_of(folder) == saved
+    tab.page.close()
