@@ -296,7 +296,8 @@ def split(state: State) -> State:
 
 
 def verify(state: State) -> State:
-    """The other views correct what the detector found, see `verify_masks`."""
+    """The other views correct what the detector found, see `verify_masks`, and `select_by_views` for the rest."""
+    from mvseg.detection.few_views import select_by_views
     from mvseg.verification.other_views import verify_masks
 
     masks, starts = verify_masks(
@@ -306,7 +307,9 @@ def verify(state: State) -> State:
         workers=state.workers,
         progress=state.progress,
     )
-    return replace(state, matching=state.matched.with_masks(masks), starts=starts)
+    masks = select_by_views(masks, state.matched.masks, min_views=state.config.detect.min_views)
+    matching = state.matched.with_masks(masks.close_gaps())
+    return replace(state, matching=matching, starts=masks.renumber(starts))
 
 
 def check_cameras(state: State) -> State:
@@ -471,6 +474,6 @@ def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: s
 
     weights = find_weights(detect.weights) or Path(detect.weights)
     options = asdict(detect) | {"weights": hash_files(weights)}
-    options |= {"num_iterations": None, "verify": None, "crop": None}
+    options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
     return json.dumps(options | {"torch": torch.__version__, "device": device})

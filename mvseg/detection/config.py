@@ -26,6 +26,8 @@ class DetectConfig:
         verify: let surfaces that are fitted to the matched masks correct them: the other views show which masks are
             no leaves or pieces of one, and which leaves were missed (`mvseg.verification.other_views`). Finds leaves:
             not for other things.
+        min_views: of what verification leaves, a leaf must have masks in so many photos. 1 keeps, too, what one or two
+            photos show and no other view verifies: as it was found, and marked.
     """
 
     weights: str = "leaf-lite"
@@ -34,6 +36,7 @@ class DetectConfig:
     crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
     verify: bool = True
+    min_views: int = 2
 
     def __post_init__(self) -> None:
         if not 0 <= self.min_score <= 1:
@@ -42,3 +45,5 @@ class DetectConfig:
             raise InputError(f"detect.image_size is {self.image_size}, expected at least 32, at most {MAX_IMAGE_SIZE}")
         if self.num_iterations < 0:
             raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")
+        if self.min_views < 1:
+            raise InputError(f"detect.min_views is {self.min_views}, expected 1 or more")

@@ -1,8 +1,8 @@
 """Results as training samples: what `mvseg infer` found and the other views verified, or a person corrected.
 
 A mask is a label when it was matched with a score of at least 0.5 and its edges come from the photo, or when a person
-made or confirmed it. All others are ignored, not background: a mask that only the other views show, one that matches
-nothing, one that matches badly.
+made or confirmed it. All others are ignored, not background: a mask that only the other views show, or one or two
+views, one that matches nothing, one that matches badly.
 """
 
 from __future__ import annotations
@@ -26,12 +26,13 @@ class _Mask(CocoAnnotation):
     instance_id: int
     match_score: float
     from_other_views: bool = False
+    from_few_views: bool = False
     corrected: str | None = None
 
     @property
     def is_label(self) -> bool:
-        is_sure = self.instance_id > 0 and self.match_score >= SURE and not self.from_other_views
-        return self.corrected is not None or is_sure
+        is_sure = self.instance_id > 0 and self.match_score >= SURE
+        return self.corrected is not None or (is_sure and not self.from_other_views and not self.from_few_views)
 
 
 class _Masks(CocoFile):
