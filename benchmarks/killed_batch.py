@@ -21,8 +21,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from mvseg.results.provenance import hash_files
 from mvseg.simulation.dataset import Preset, list_scenes, write_dataset
+from mvseg.system.file_hash import hash_files
 
 ROOT = Path(__file__).parents[1]
 NIGHT = Preset(plants=(("night", 24),), leaves=(3,), views=(5,), size=(240, 240))

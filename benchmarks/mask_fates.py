@@ -16,8 +16,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.found_leaves import FOUND_IOU, tied_instances
-from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
+from mvseg.detection.detect_scene import detect_scene
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
@@ -25,7 +25,6 @@ from mvseg.formats.lens import undistort
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks, Origin
-from mvseg.pipeline import detect_regions
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
@@ -77,11 +76,12 @@ def count_fates(
     return fates
 
 
-def judge(folder: Path, config: RunConfig, keep: Path | None) -> Counter[tuple[str, bool | None]]:
+def judge(folder: Path, config: DetectConfig, keep: Path | None) -> Counter[tuple[str, bool | None]]:
     """Detect, match and verify the masks of a scene; prints its MV-PQ before and after."""
     scene = load_scene(folder)
     truth, photos = true_maps(folder, scene), Photos(scene)
-    before = detect_regions(scene, config, keep=None if keep is None else keep / folder.name).masks.to("cpu")
+    cache = None if keep is None else keep / folder.name
+    before = detect_scene(photos, config, cache=cache)(scene.cameras).masks.to("cpu")
     surfaces = fit_surfaces(before.regions, before.instance_ids, scene.cameras, most_views=ROUGH_VIEWS)
     after = revise_masks(before, surfaces, cameras=scene.cameras, photos=photos)
     fates = count_fates(before, after, surfaces, right=find_right(before, truth))
@@ -115,7 +115,7 @@ def main() -> None:
     parser.add_argument("--image_size", type=int)
     parser.add_argument("--keep", type=Path)
     args = parser.parse_args()
-    config, total = RunConfig(detect=DetectConfig(image_size=args.image_size)), Counter()
+    config, total = DetectConfig(image_size=args.image_size), Counter()
     warnings.simplefilter("ignore")
     for folder in args.scenes:
         fates = judge(folder, config, args.keep)

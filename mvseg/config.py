@@ -58,3 +58,8 @@ class RunConfig:
             raise InputError(f"scale is {self.scale:g}, expected a positive number")
         if self.up is not None and not isinstance(self.up, str) and not 0 < math.hypot(*self.up) < math.inf:
             raise InputError(f"up is {self.up}, expected a direction: three finite numbers, not all 0")
+
+    @property
+    def category_names(self) -> list[str]:
+        """`categories` as a list; empty for all."""
+        return [] if self.categories is None else [name.strip() for name in self.categories.split(",")]

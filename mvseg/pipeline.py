@@ -2,51 +2,39 @@
 
 from __future__ import annotations
 
-import json
 import time
 import warnings
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, dataclass, field, replace
-from functools import lru_cache, partial
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import torch
-from tqdm import tqdm
-
-from mvseg._version import code_hash
 from mvseg.checks.contradictions import warn_of_contradictions
 from mvseg.config import RunConfig
 from mvseg.corrections.apply import Corrected, apply, apply_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
-from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
-from mvseg.detection.config import DetectConfig
-from mvseg.errors import InputError, InputWarning
-from mvseg.formats.lens import opencv_distortion
+from mvseg.errors import InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
-from mvseg.formats.photos import Photos, check_photos, describe_folder
+from mvseg.formats.photos import Photos, check_photos, require_photos
 from mvseg.formats.scene_folder import load_scene, read_masks
-from mvseg.masks import Masks, Origin
+from mvseg.masks import Masks
 from mvseg.matching.match import check_baselines, match_masks, match_regions
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
-from mvseg.poses.refine_poses import RefinedPoses, refine_poses
-from mvseg.results.provenance import hash_files
+from mvseg.poses.refine_poses import RefinedPoses, refine_scene
 from mvseg.results.result import Result
 from mvseg.scene import Cameras, Scene
-from mvseg.traits.up import find_up
+from mvseg.traits.world_frame import place_scene
 
 if TYPE_CHECKING:
-    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.reconstruction.voxels import VoxelGrid
     from mvseg.traits.measure import Traits
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
-
-Match = Callable[[Cameras], Matching]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +46,8 @@ class State:
         scene: cameras and views.
         photos: of the scene.
         keep, workers, progress: see `run_scene`.
-        match: from cameras to the masks of the scene, matched; what `detect` or `load` leaves, or `correct`.
-        find: from cameras to the same masks before they are matched.
+        find: from cameras to the masks of the scene; what `load` or `detect` leaves.
+        match: from cameras to the same masks, matched; what `load`, `detect` or `correct` leaves.
         corrections: of a person; None: there are none.
         corrected: what came of them.
         matching: the table of masks, and what matching says of the scene.
@@ -75,8 +63,8 @@ class State:
     keep: Path | None = None
     workers: ProcessPoolExecutor | None = None
     progress: bool = False
-    match: Match | None = None
     find: Callable[[Cameras], Masks] | None = None
+    match: Callable[[Cameras], Matching] | None = None
     corrections: Corrections | None = None
     corrected: Corrected | None = None
     matching: Matching | None = None
@@ -93,6 +81,10 @@ class State:
         """The matching, for the stages after it."""
         assert self.matching is not None
         return self.matching
+
+    def with_masks(self, masks: Masks) -> State:
+        """The same with another state of the table of masks."""
+        return replace(self, matching=self.matched.with_masks(masks))
 
 
 Stage = Callable[[State], State]
@@ -186,56 +178,25 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
 
 def load(folder: Path, masks: Path | None, config: RunConfig, **how: Any) -> State:
     """Cameras, and the masks if there are any."""
-    scene = place_scene(load_scene(folder), config)
+    scene = place_scene(load_scene(folder), scale=config.scale, unit=config.unit, up=config.up)
     check_photos(scene)
     check_baselines(scene.cameras)
     state = State(config=config, scene=scene, photos=Photos(scene), **how)
     if masks is None:
-        if not state.photos.exist:
-            beside = describe_folder(scene.views[0].path.parent)
-            end = f"; {beside}" if beside else ""
-            raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them{end}")
+        require_photos(scene, folder)
         return state
-    wanted = () if config.categories is None else [name.strip() for name in config.categories.split(",")]
     found = recognise_masks(scene, masks)
-    regions = read_masks(scene, found, crowd=config.coco_crowd, categories=wanted)
+    regions = read_masks(scene, found, crowd=config.coco_crowd, categories=config.category_names)
     matcher = partial(match_regions, regions, config=config.match, progress=state.progress)
     return replace(state, match=matcher, find=lambda _: Masks.of(regions), mask_kind=found.kind)
 
 
 def detect(state: State) -> State:
-    """Find instances in every photo, and again, larger, where the plant fills a small part of the photos.
+    """Find instances in every photo, see `detect_scene`."""
+    from mvseg.detection.detect_scene import detect_scene
 
-    Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps.
-
-    Raises:
-        InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
-    """
-    from mvseg.detection.crops import boxes_to_look_at, crop_cameras, place_crops
-    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
-    from mvseg.detectors.zoo import load_detector
-
-    options, cameras = state.config.detect, state.scene.cameras
-    detector = load_detector(options.weights, image_size=options.image_size, min_score=options.min_score)
-    device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = MultiViewMaskRCNN(detector, num_iterations=options.num_iterations, match=state.config.match).to(device)
-    kept = None if state.keep is None else KeptDetections(state.keep, _describe_detector(options, model, device))
-    found, names = _look(model, state, kept=kept)
-    # the first look is matched once, and not again by the next stage
-    matcher: Match = lru_cache(maxsize=1)(partial(model.match_detections, found, progress=state.progress))
-    boxes = None
-    if options.crop == "auto":
-        boxes = boxes_to_look_at(matcher(cameras).masks, cameras, longest=model.transform.max_size)
-    if boxes is not None:
-        in_crops, more_names = _look(model, state, boxes, kept=kept)
-        names |= more_names
-
-        def matcher(cameras: Cameras) -> Matching:
-            matching = model.match_detections(in_crops, crop_cameras(cameras, boxes), progress=state.progress)
-            return matching.with_masks(place_crops(matching.masks, boxes))
-
-    if state.keep is not None:
-        delete_kept(state.keep, but=names)
+    options = state.config
+    matcher = detect_scene(state.photos, options.detect, match=options.match, cache=state.keep, progress=state.progress)
     return replace(state, match=matcher, find=lambda cameras: matcher(cameras).masks)
 
 
@@ -249,11 +210,8 @@ def correct(state: State) -> State:
     corrected = apply(state.corrections, state.find(state.scene.cameras), state.scene)
     for message in corrected.messages:
         warnings.warn(message, InputWarning, stacklevel=3)
-
-    def matcher(cameras: Cameras) -> Matching:
-        options = state.config.match
-        return match_masks(corrected.masks, cameras, options, links=corrected.links, progress=state.progress)
-
+    options = state.config.match
+    matcher = partial(match_masks, corrected.masks, config=options, links=corrected.links, progress=state.progress)
     return replace(state, match=matcher, corrected=corrected)
 
 
@@ -268,22 +226,16 @@ def match(state: State) -> State:
 
 
 def match_refined(state: State) -> State:
-    """The same with refined poses, see `refine_poses`. Warns (InputWarning) of cameras that no rig file can hold."""
+    """The same with refined poses, see `refine_scene`."""
     assert state.match is not None
-    poses = refine_poses(state.scene.cameras, state.match)
-    odd = [view for view in state.scene.views if view.lens is not None and opencv_distortion(view.lens) is None]
-    if odd and poses.is_refined:
-        message = f"the refined cameras are not written: view {odd[0].name} has a lens that no rig file can hold"
-        warnings.warn(message, InputWarning, stacklevel=3)
-    scene = replace(state.scene, cameras=poses.cameras)
+    scene, poses = refine_scene(state.scene, state.match)
     return match(replace(state, scene=scene, poses=poses))
 
 
 def correct_instances(state: State) -> State:
     """Edits of a person about whole instances, see `apply_everywhere`."""
     assert state.corrected is not None
-    masks = apply_everywhere(state.corrected, state.matched.masks.to("cpu"))
-    return replace(state, matching=state.matched.with_masks(masks))
+    return state.with_masks(apply_everywhere(state.corrected, state.matched.masks.to("cpu")))
 
 
 def split(state: State) -> State:
@@ -292,7 +244,7 @@ def split(state: State) -> State:
 
     before, after = state.matched.masks, split_merged(state.matched.masks)
     surfaces = None if state.surfaces is None else unchanged_surfaces(before, after, state.surfaces)
-    return replace(state, matching=state.matched.with_masks(after), surfaces=surfaces)
+    return replace(state.with_masks(after), surfaces=surfaces)
 
 
 def verify(state: State) -> State:
@@ -308,8 +260,7 @@ def verify(state: State) -> State:
         progress=state.progress,
     )
     masks = select_by_views(masks, state.matched.masks, min_views=state.config.detect.min_views)
-    matching = state.matched.with_masks(masks.close_gaps())
-    return replace(state, matching=matching, starts=masks.renumber(starts))
+    return replace(state.with_masks(masks.close_gaps()), starts=masks.renumber(starts))
 
 
 def check_cameras(state: State) -> State:
@@ -322,34 +273,24 @@ def check_cameras(state: State) -> State:
 
 def check_ids(state: State) -> State:
     """Surfaces correct the ids, see `mvseg.verification.checked_ids`; those of the other instances are known then."""
+    from mvseg.corrections.follow import linked_masks
     from mvseg.verification import checked_ids
 
-    before = state.matched.masks
-    surfaces = reconstruct(state, with_voxels=False).surfaces
-    assert surfaces is not None
-    after = checked_ids.check_ids(before, surfaces, cameras=state.scene.cameras, held=_linked(state))
-    known = checked_ids.unchanged_surfaces(before, after, surfaces)
-    return replace(
-        state,
-        matching=state.matched.with_masks(after.close_gaps()),
-        surfaces=after.renumber(known),
-        num_moved=int((before.instance_ids != after.instance_ids).sum()),
-    )
+    before, surfaces = state.matched.masks, reconstruct(state, with_voxels=False).surfaces or {}
+    held = linked_masks(state.corrected)
+    after = checked_ids.check_ids(before, surfaces, cameras=state.scene.cameras, held=held)
+    known = after.renumber(checked_ids.unchanged_surfaces(before, after, surfaces))
+    num_moved = int((before.instance_ids != after.instance_ids).sum())
+    return replace(state.with_masks(after.close_gaps()), surfaces=known, num_moved=num_moved)
 
 
 def follow(state: State) -> State:
-    """Where masks are given, the other views of what a person drew get masks, too; all others stay as they are."""
-    from mvseg.verification.other_views import verify_masks
+    """Where masks are given, the other views of what a person drew get masks, too, see `add_other_views`."""
+    from mvseg.corrections.follow import add_other_views
 
-    before = state.matched.masks.to("cpu")
-    drawn = before.instance_ids[(before.origin == Origin.CORRECTED) & (before.instance_ids > 0)]
-    if not len(drawn):
-        return state
-    photos = state.photos if state.photos.exist else None
-    every = torch.ones(len(before), dtype=torch.bool)
-    after, _ = verify_masks(before, cameras=state.scene.cameras, photos=photos, held=every, workers=state.workers)
-    stays = (after.origin != Origin.OTHER_VIEWS) | torch.isin(after.instance_ids, drawn)
-    return replace(state, matching=state.matched.with_masks(after.select(stays)), surfaces=None)
+    before = state.matched.masks
+    after = add_other_views(before, state.scene.cameras, photos=state.photos, workers=state.workers)
+    return state if after is before else replace(state.with_masks(after), surfaces=None)
 
 
 def reconstruct(state: State, *, with_voxels: bool = True) -> State:
@@ -393,87 +334,5 @@ def recut(state: State) -> State:
     """Cut the detector's masks anew by their surfaces, see `recut_masks`."""
     from mvseg.verification.recut import recut_masks
 
-    masks = recut_masks(state.matched.masks, state.surfaces or state.starts, cameras=state.scene.cameras)
-    return replace(state, matching=state.matched.with_masks(masks))
-
-
-# --- parts of the stages
-
-
-def place_scene(scene: Scene, config: RunConfig) -> Scene:
-    """The scene in the world that the user asks for: scale, unit and direction of up.
-
-    Warns (InputWarning) of a unit that contradicts the scene's and comes without a scale, and of an up that the cameras
-    contradict (`Scene.seems_upside_down`).
-
-    Raises:
-        InputError: a scale of cameras that say their unit, without the unit of the lengths after it; up cannot be
-            found, see `find_up`.
-    """
-    if config.scale is not None:
-        if config.unit is None and scene.unit and config.scale != 1:
-            problem = f"scale is {config.scale:g} without a unit, but the cameras are in {scene.unit}"
-            raise InputError(f"{problem}: expected the unit of the scaled lengths, too, as in --unit {scene.unit}")
-        scene = replace(scene, cameras=scene.cameras.scale(config.scale))
-    if config.unit is not None:
-        if scene.unit not in ("", config.unit) and config.scale is None:
-            message = f"the cameras are in {scene.unit}: unit {config.unit} without a scale only renames it"
-            warnings.warn(message, InputWarning, stacklevel=3)
-        scene = replace(scene, unit=config.unit)
-    scene = find_up(scene, config.up)
-    if scene.seems_upside_down:
-        message = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
-        warnings.warn(message, InputWarning, stacklevel=3)
-    return scene
-
-
-def _linked(state: State) -> torch.Tensor | None:
-    """(D,) bool, the masks that a person links with others; None without any."""
-    if state.corrected is None or state.corrected.everywhere or not len(state.corrected.links):
-        return None
-    held = torch.zeros(len(state.matched), dtype=torch.bool)
-    held[torch.cat((state.corrected.links.must, state.corrected.links.cannot)).flatten()] = True
-    return held
-
-
-def detect_regions(
-    scene: Scene, config: RunConfig = RunConfig(), *, keep: Path | None = None, progress: bool = False
-) -> Matching:
-    """Find and match the instances in the photos of a scene: the stages `detect` and `match`.
-
-    For `keep` see `run_scene`.
-    """
-    return match(detect(State(config=config, scene=scene, photos=Photos(scene), keep=keep, progress=progress))).matched
-
-
-def _look(
-    model: MultiViewMaskRCNN, state: State, boxes: torch.Tensor | None = None, *, kept: KeptDetections | None
-) -> tuple[list[dict[str, torch.Tensor]], set[str]]:
-    """What the detector finds in every photo, or in its box (V, 4) xyxy, and the names of the files that keep it."""
-    found, names, scene = [], set(), state.scene
-    device = next(model.parameters()).device
-    for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not state.progress):
-        box = None if boxes is None else boxes[view].tolist()
-        path = kept.path(scene, view, box) if kept is not None and state.photos.exist else None
-        shown = None if path is None else read_detections(path)
-        if shown is None:
-            x1, y1, x2, y2 = box or (0, 0, *scene.cameras.sizes[view].tolist())
-            photo = torch.from_numpy(state.photos(view)[y1:y2, x1:x2].copy()).to(device).permute(2, 0, 1)
-            shown = model.detect(photo.float().div_(255))
-            if path is not None:
-                write_detections(path, shown)
-        if path is not None:
-            names.add(path.name)
-        found.append(shown)
-    return found, names
-
-
-def _describe_detector(detect: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
-    """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
-    from mvseg.detectors.zoo import find_weights
-
-    weights = find_weights(detect.weights) or Path(detect.weights)
-    options = asdict(detect) | {"weights": hash_files(weights)}
-    options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None}
-    options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
-    return json.dumps(options | {"torch": torch.__version__, "device": device})
+    surfaces = state.surfaces or state.starts
+    return state.with_masks(recut_masks(state.matched.masks, surfaces, cameras=state.scene.cameras))

@@ -22,8 +22,8 @@ import pytest
 from mvseg.batch import run_batch
 from mvseg.cli import main
 from mvseg.detectors.weights_file import read_weights
-from mvseg.results.provenance import hash_files
 from mvseg.results.read import read_instances
+from mvseg.system.file_hash import hash_files
 from mvseg.training.files import read_checkpoint
 from scene_folders import write_scene
 from tiny_training import write_photos

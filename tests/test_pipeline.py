@@ -33,11 +33,12 @@ from mvseg import (
 )
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
+from mvseg.detection.detect_scene import detect_scene
 from mvseg.formats.image_file import read_rgb, write_png
-from mvseg.formats.photos import read_photo
+from mvseg.formats.photos import Photos, read_photo
 from mvseg.masks import Masks, MergedMask, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import State, detect_regions
+from mvseg.pipeline import State
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
@@ -92,7 +93,7 @@ def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.M
     better = replace(given, t=given.t + 0.01)
 
     poses = RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2))
-    monkeypatch.setattr(mvseg.pipeline, "refine_poses", lambda *_: poses)
+    monkeypatch.setattr("mvseg.poses.refine_poses.refine_poses", lambda *_: poses)
     result = run_scene(plant, plant / "masks", replace(IDS_ONLY, refine_poses=True))
     assert result.scene.cameras is better
     assert result.poses is poses
@@ -370,15 +371,16 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
         write_png(views[-1].path, photo)
     scene = Scene("far", tuple(views), cameras)
     kept = tmp_path / "kept"
-    first = detect_regions(scene, RunConfig(detect=DetectConfig(crop="off"))).masks
-    again = detect_regions(scene, keep=kept).masks
+    first = detect_scene(Photos(scene), DetectConfig(crop="off"))(cameras).masks
+    again = detect_scene(Photos(scene), cache=kept)(cameras).masks
     assert len(again) > len(first)
     assert len([*kept.iterdir()]) == 2 * len(chosen)
 
     boxes = plant_boxes(first, cameras)
     for view, (x1, y1, x2, y2) in zip(views, boxes.tolist(), strict=True):
         write_png(view.path, np.ascontiguousarray(read_rgb(view.path)[y1:y2, x1:x2]))
-    expected = detect_regions(Scene("cut", tuple(views), crop_cameras(cameras, boxes))).masks
+    cut = Scene("cut", tuple(views), crop_cameras(cameras, boxes))
+    expected = detect_scene(Photos(cut))(cut.cameras).masks
     placed = place_crops(expected, boxes)
     assert torch.equal(again.regions.boxes, placed.regions.boxes)
     assert torch.equal(again.regions.crops, placed.regions.crops)

@@ -14,8 +14,8 @@ from mvseg.config import RunConfig
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.formats.masks.yolo import NAME_FILES
-from mvseg.results.provenance import hash_files
 from mvseg.scene import Scene
+from mvseg.system.file_hash import hash_files
 
 
 def scene_key(scene: Scene, masks: Path | None, config: RunConfig, *, corrections: Path | None = None) -> str:

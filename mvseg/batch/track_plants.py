@@ -20,8 +20,8 @@ from mvseg.batch.lost import Lost
 from mvseg.batch.places import scene_result, tables_folder
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
-from mvseg.results.provenance import hash_files
 from mvseg.system.atomic import folder_whole
+from mvseg.system.file_hash import hash_files
 from mvseg.tracking.corrections import LinkEdit, find_links, read_link_edits
 from mvseg.tracking.dates import read_date
 from mvseg.tracking.growth import measure_growth

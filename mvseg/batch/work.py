@@ -22,9 +22,9 @@ from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, check_out
-from mvseg.results.provenance import hash_files
 from mvseg.runs.one_scene import find_masks, save_scene, solve_scene
 from mvseg.system.atomic import lock_folder, sweep_abandoned
+from mvseg.system.file_hash import hash_files
 
 _one_at_a_time = threading.Lock()  # Dask's workers may have threads; warnings are caught for the whole process
 

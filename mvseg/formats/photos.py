@@ -222,6 +222,14 @@ def describe_folder(folder: Path) -> str:
     return f"found {', '.join(pictures[:3])}{more}" if pictures else ""
 
 
+def require_photos(scene: Scene, folder: Path) -> None:
+    """Raises InputError: a scene folder without masks has no photos either."""
+    if not scene.views[0].path.is_file():
+        beside = describe_folder(scene.views[0].path.parent)
+        end = f"; {beside}" if beside else ""
+        raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them{end}")
+
+
 def photo_bits(scene: Scene, view: int) -> int:
     """How many bits the numbers in the photo of a view are taken to have: 8 or, for a file of 16 bits, as many as those
     of any photo of the scene, so that one range brightens them all."""

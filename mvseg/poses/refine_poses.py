@@ -13,11 +13,13 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from mvseg.errors import InputWarning
+from mvseg.formats.lens import opencv_distortion
 from mvseg.masks import Masks
 from mvseg.matching.outline_gaps import Gaps, Outlines, find_outlines, measure_gaps, move_cameras, pair_outlines
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions
-from mvseg.scene import Cameras
+from mvseg.scene import Cameras, Scene
 
 Match = Callable[[Cameras], Matching]
 
@@ -75,6 +77,16 @@ def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
     is_off = gap_px[0] >= LEAST_GAP
     is_better = is_off and gap_px[1] <= CLEAR * gap_px[0] and mean_score(matching) >= mean_score(given) - LOSS
     return RefinedPoses(cameras=refined if is_better else cameras, is_refined=is_better, gap_px=gap_px)
+
+
+def refine_scene(scene: Scene, match: Match) -> tuple[Scene, RefinedPoses]:
+    """A scene with refined poses, see `refine_poses`. Warns (InputWarning) of cameras that no rig file can hold."""
+    poses = refine_poses(scene.cameras, match)
+    odd = [view.name for view in scene.views if view.lens is not None and opencv_distortion(view.lens) is None]
+    if odd and poses.is_refined:
+        message = f"the refined cameras are not written: view {odd[0]} has a lens that no rig file can hold"
+        warnings.warn(message, InputWarning, stacklevel=4)
+    return replace(scene, cameras=poses.cameras), poses
 
 
 def _is_same(before: Masks, after: Masks) -> bool:

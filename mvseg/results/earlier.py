@@ -12,8 +12,8 @@ import shutil
 from pathlib import Path
 
 from mvseg.errors import InputError
-from mvseg.results.provenance import hash_files
 from mvseg.system.atomic import resolve_place
+from mvseg.system.file_hash import hash_files
 
 RUN_FILE = "run.json"
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import platform
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -14,6 +13,7 @@ import torch
 from mvseg._version import made_by
 from mvseg.config import RunConfig
 from mvseg.results.result import Result
+from mvseg.system.file_hash import hash_files
 
 
 def describe_run(
@@ -54,12 +54,3 @@ def _weights_of(config: RunConfig) -> Path:
     from mvseg.detectors.zoo import find_weights  # loads torchvision
 
     return find_weights(config.detect.weights) or Path(config.detect.weights)
-
-
-def hash_files(path: Path) -> str:
-    """SHA-256 of a file; of a folder, that of the lines "<SHA-256 of the file>  <its path>", sorted by path."""
-    if not path.is_dir():
-        return hashlib.sha256(path.read_bytes()).hexdigest()
-    files = sorted(file for file in path.rglob("*") if file.is_file())
-    lines = [f"{hash_files(file)}  {file.relative_to(path).as_posix()}\n" for file in files]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()

@@ -8,14 +8,13 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.config import RunConfig
 from mvseg.detection import mask_rcnn
 from mvseg.detection.cached_detections import KeptDetections, claim_kept, delete_kept, read_detections, write_detections
 from mvseg.detection.config import DetectConfig
+from mvseg.detection.detect_scene import detect_scene
 from mvseg.errors import InputError
-from mvseg.formats.photos import read_photo
+from mvseg.formats.photos import Photos, read_photo
 from mvseg.formats.scene_folder import load_scene
-from mvseg.pipeline import detect_regions
 from scene_folders import HEIGHT, WIDTH, edit_rig, write_image, write_scene
 
 FOUND = {
@@ -118,19 +117,17 @@ class TestClaim:
 def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, names = load_scene(write_scene(tmp_path / "plant", 2)), []
     for code in ("one", "other"):
-        monkeypatch.setattr("mvseg.pipeline.code_hash", lambda code=code: code)
-        detect_regions(scene, RunConfig(detect=DetectConfig(min_score=0.05)), keep=tmp_path / "kept")
+        monkeypatch.setattr("mvseg.detection.detect_scene.code_hash", lambda code=code: code)
+        detect_scene(Photos(scene), DetectConfig(min_score=0.05), cache=tmp_path / "kept")
         names.append({path.name for path in (tmp_path / "kept").iterdir()})
     assert [len(each) for each in names] == [2, 2]
     assert not names[0] & names[1]
 
 
-def test_a_run_that_was_cut_off_goes_on_from_its_detections(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, keep = load_scene(write_scene(tmp_path / "plant")), tmp_path / "kept"
-    config = RunConfig(detect=DetectConfig(min_score=0.05))
-    whole = detect_regions(scene, config).masks
+    config = DetectConfig(min_score=0.05)
+    whole = detect_scene(Photos(scene), config)(scene.cameras).masks
     assert len(whole.regions)
     ran: list[tuple[int, ...]] = []
     run_heads = mask_rcnn.run_heads
@@ -143,13 +140,13 @@ def test_a_run_that_was_cut_off_goes_on_from_its_detections(
 
     monkeypatch.setattr(mask_rcnn, "run_heads", count)
     with pytest.raises(KeyboardInterrupt):
-        detect_regions(scene, config, keep=keep)
+        detect_scene(Photos(scene), config, cache=keep)
     assert len(list(keep.iterdir())) == 2
-    resumed = detect_regions(scene, config, keep=keep).masks
+    resumed = detect_scene(Photos(scene), config, cache=keep)(scene.cameras).masks
     assert len(ran) == 3 + 2  # the first two photos were not looked at again
     assert torch.equal(resumed.regions.crops, whole.regions.crops)
     assert torch.equal(resumed.detection_scores, whole.detection_scores)
     assert torch.equal(resumed.instance_ids, whole.instance_ids)
-    detect_regions(scene, RunConfig(detect=DetectConfig(min_score=0.06)), keep=keep)
+    detect_scene(Photos(scene), DetectConfig(min_score=0.06), cache=keep)
     assert len(ran) == 3 + 2 + 4
     assert len(list(keep.iterdir())) == 4  # those of other options are gone

@@ -1,0 +1,112 @@
+"""Instances in the photos of a scene: every photo once, and again, larger, where the plant fills a small part."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict
+from functools import lru_cache, partial
+from pathlib import Path
+
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from mvseg._version import code_hash
+from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
+from mvseg.detection.config import DetectConfig
+from mvseg.detection.crops import boxes_to_look_at, crop_cameras, place_crops
+from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+from mvseg.detectors.zoo import find_weights, load_detector
+from mvseg.formats.photos import Photos
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.result import Matching
+from mvseg.scene import Cameras
+from mvseg.system.file_hash import hash_files
+
+
+def detect_scene(
+    photos: Photos,
+    config: DetectConfig = DetectConfig(),
+    *,
+    match: MatchConfig = MatchConfig(),
+    cache: Path | None = None,
+    progress: bool = False,
+) -> Callable[[Cameras], Matching]:
+    """Find instances in every photo, and again, larger, where the plant fills a small part of the photos.
+
+    Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps.
+
+    Args:
+        photos: of the scene, with its cameras.
+        config: which detector, and what it finds; `config.verify` is a stage of its own.
+        match: how detections are matched.
+        cache: folder for the detections, see `cached_detections`; those of other photos or options are deleted there.
+        progress: show progress bars.
+
+    Returns:
+        From V cameras to what was found, matched. Those that the photos have are matched already where the plant fills
+        the photos.
+
+    Raises:
+        InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
+    """
+    detector = load_detector(config.weights, image_size=config.image_size, min_score=config.min_score)
+    device = "cuda" if torch.cuda.is_available() else "cpu"
+    model = MultiViewMaskRCNN(detector, num_iterations=config.num_iterations, match=match).to(device)
+    cached = None if cache is None else KeptDetections(cache, describe_detector(config, model, device))
+    found, names = _detect_photos(model, photos, cached=cached, progress=progress)
+    # whole photos are matched here to find the plant, and not again by who asks for that
+    match_found = lru_cache(maxsize=1)(partial(model.match_detections, found, progress=progress))
+    boxes, cameras = None, photos.scene.cameras
+    if config.crop == "auto":
+        boxes = boxes_to_look_at(match_found(cameras).masks, cameras, longest=model.transform.max_size)
+    if boxes is not None:
+        in_crops, more_names = _detect_photos(model, photos, boxes, cached=cached, progress=progress)
+        names |= more_names
+    if cache is not None:
+        delete_kept(cache, but=names)
+    if boxes is None:
+        return match_found
+
+    def match_crops(cameras: Cameras) -> Matching:
+        matching = model.match_detections(in_crops, crop_cameras(cameras, boxes), progress=progress)
+        return matching.with_masks(place_crops(matching.masks, boxes))
+
+    return match_crops
+
+
+def _detect_photos(
+    model: MultiViewMaskRCNN,
+    photos: Photos,
+    boxes: Tensor | None = None,
+    *,
+    cached: KeptDetections | None,
+    progress: bool,
+) -> tuple[list[dict[str, Tensor]], set[str]]:
+    """What the detector finds in every photo, or in its box (V, 4) xyxy, and the names of the files that cache it."""
+    found, names, scene = [], set(), photos.scene
+    device = next(model.parameters()).device
+    for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress):
+        box = None if boxes is None else boxes[view].tolist()
+        path = cached.path(scene, view, box) if cached is not None and photos.exist else None
+        detections = None if path is None else read_detections(path)
+        if detections is None:
+            x1, y1, x2, y2 = box or (0, 0, *scene.cameras.sizes[view].tolist())
+            photo = torch.from_numpy(photos(view)[y1:y2, x1:x2].copy()).to(device).permute(2, 0, 1)
+            detections = model.detect(photo.float().div_(255))
+            if path is not None:
+                write_detections(path, detections)
+        if path is not None:
+            names.add(path.name)
+        found.append(detections)
+    return found, names
+
+
+def describe_detector(config: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
+    """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
+    weights = find_weights(config.weights) or Path(config.weights)
+    options = asdict(config) | {"weights": hash_files(weights)}
+    options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None}
+    options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
+    return json.dumps(options | {"torch": torch.__version__, "device": device})
