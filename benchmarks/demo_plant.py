@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvseg.simulation.blades import Leaf, measure_leaf
+from mvseg.simulation.blades import Leaf, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.scene_writer import write_scene
@@ -48,10 +48,10 @@ def grow_later(plant: Plant) -> Plant:
 
     def grown(leaf: Leaf) -> Leaf:
         larger = leaf.vertices[0] + (1 + 0.6 * (1 - leaf.length / longest)) * (leaf.vertices - leaf.vertices[0])
-        return measure_leaf(leaf.leaf_id, larger)
+        return leaf_from_blade(leaf.leaf_id, larger)
 
     turned = Rotation.from_euler("z", 90, degrees=True).apply(0.6 * (nearest.vertices - nearest.vertices[0]))
-    new = measure_leaf(len(plant.leaves) + 1, tip + (0.0, 0.0, 3.0) + turned)
+    new = leaf_from_blade(len(plant.leaves) + 1, tip + (0.0, 0.0, 3.0) + turned)
     leaves = (*(grown(leaf) for leaf in plant.leaves if leaf is not lowest), new)
     return move_plant(replace(plant, leaves=leaves), LATER_POT)
 

@@ -25,7 +25,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import Affinity, region_affinity
-from mvseg.matching.nview.config import Gains, NViewConfig, RowCosts, Thresholds
+from mvseg.matching.nview.config import Gains, HypothesisCosts, NViewConfig, Thresholds
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.symnmf import cluster_affinity
@@ -54,11 +54,11 @@ def nview_ids(
 METHODS: dict[str, Method] = {"symnmf": symnmf_ids, "one-per-view": one_per_view_ids, "nview": nview_ids}
 ABLATIONS = {
     "no weights": NViewConfig(gains=Gains(weight=0, weight_few=0)),
-    "no landing": NViewConfig(gains=Gains(landing=0)),
-    "missed=absent": NViewConfig(costs=RowCosts(absent=RowCosts.missing)),
-    "hidden is free": NViewConfig(costs=RowCosts(hidden=0)),
-    "pieces alone": NViewConfig(thresholds=Thresholds(piece_landing=math.inf)),
-    "few views kept": NViewConfig(thresholds=Thresholds(few_landing=math.inf)),
+    "no coverage": NViewConfig(gains=Gains(coverage=0)),
+    "missed=absent": NViewConfig(costs=HypothesisCosts(absent=HypothesisCosts.missing)),
+    "hidden is free": NViewConfig(costs=HypothesisCosts(hidden=0)),
+    "pieces alone": NViewConfig(thresholds=Thresholds(fragment_coverage=math.inf)),
+    "few views kept": NViewConfig(thresholds=Thresholds(few_coverage=math.inf)),
 }
 METHODS |= {name: partial(nview_ids, config=config) for name, config in ABLATIONS.items()}
 

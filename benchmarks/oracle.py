@@ -27,9 +27,9 @@ from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import row_table
+from mvseg.matching.nview.initialisation import em_affinities
+from mvseg.matching.nview.plane_sweep import sweep_planes
 from mvseg.matching.nview.search import refine, search
-from mvseg.matching.nview.soft_start import em_affinities
 from mvseg.matching.one_per_view import ViewGraph, link_average, one_per_view_clusters
 from mvseg.matching.partition import renumber, separate_unmatched
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes
@@ -37,13 +37,13 @@ from mvseg.system.worker_pool import run_all
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
-STARTS = [(iteration, stop) for iteration in (1, 5) for stop in (0.1, 0.2, 0.3, 0.45)]
+INITIALISATIONS = [(iteration, stop) for iteration in (1, 5) for stop in (0.1, 0.2, 0.3, 0.45)]
 ROUNDS = 3  # of set packing and refinement
 
 
 def value_clusters(scores: ClusterScores, clusters: list[Ints]) -> Floats:
     """What each cluster adds to the value of a partition: this depends on its own members only."""
-    views = scores.table.view_index
+    views = scores.sweep.view_index
     evidence = scores.evidence * (views[:, None] != views)
     values, waiting = np.zeros(len(clusters)), list(range(len(clusters)))
     while waiting:  # disjoint clusters are scored together
@@ -63,23 +63,23 @@ def value_clusters(scores: ClusterScores, clusters: list[Ints]) -> Floats:
 
 def search_more(scores: ClusterScores, partitions: list[Ints]) -> Ints:
     """The best of some partitions and of those that eight starts and set packing lead to."""
-    table, history = scores.table, em_affinities(scores.table)
-    tried = [refine(scores, clusters, join_pieces=True) for clusters in partitions] + partitions
-    for iteration, stop in STARTS:
-        clusters = link_average(ViewGraph(history[iteration], table.view_index, table.num_views), stop)
-        for join_pieces in (False, True):
-            clusters = refine(scores, clusters, join_pieces=join_pieces)
+    sweep, history = scores.sweep, em_affinities(scores.sweep)
+    tried = [refine(scores, clusters, join_fragments=True) for clusters in partitions] + partitions
+    for iteration, stop in INITIALISATIONS:
+        clusters = link_average(ViewGraph(history[iteration], sweep.view_index, sweep.num_views), stop)
+        for join_fragments in (False, True):
+            clusters = refine(scores, clusters, join_fragments=join_fragments)
             tried.append(clusters)
     for _ in range(ROUNDS):
         tried.append(pack(scores))
-        tried.append(refine(scores, tried[-1], join_pieces=True))
+        tried.append(refine(scores, tried[-1], join_fragments=True))
     return max(tried, key=scores.value)
 
 
 def pack(scores: ClusterScores) -> Ints:
-    """The disjoint clusters of largest value together, among all whose landings were computed; others are alone."""
-    pool = [members for members in scores.landed_clusters() if len(members) > 1]
-    values, num_regions = value_clusters(scores, pool), len(scores.table.view_index)
+    """The disjoint clusters of largest value together, among all whose coverages were computed; others are alone."""
+    pool = [members for members in scores.covered_clusters() if len(members) > 1]
+    values, num_regions = value_clusters(scores, pool), len(scores.sweep.view_index)
     owner = np.repeat(np.arange(len(pool)), [len(members) for members in pool])
     holds = csc_array((np.ones(len(owner)), (np.concatenate(pool), owner)), shape=(num_regions, len(pool)))
     best = milp(-values, constraints=LinearConstraint(holds, ub=1), integrality=1, bounds=Bounds(0, 1))
@@ -95,14 +95,14 @@ def judge_scene(spec: SceneSpec, *, cache: Path, kind: str) -> tuple[int, int, l
     scene = load_maps(spec, cache)
     num_views = len(scene.cameras)
     regions, truth = scene.masks(kind)
-    affinity, table = region_affinity(regions, scene.cameras), row_table(regions, scene.cameras)
-    graph = ViewGraph(affinity.to_dense().double().numpy(), table.view_index, num_views)
-    scores = ClusterScores(table, graph, NViewConfig().for_views(num_views))
+    affinity, sweep = region_affinity(regions, scene.cameras), sweep_planes(regions, scene.cameras)
+    graph = ViewGraph(affinity.to_dense().double().numpy(), sweep.view_index, num_views)
+    scores = ClusterScores(sweep, graph, NViewConfig().for_views(num_views))
     pairwise = renumber(separate_unmatched(one_per_view_clusters(affinity, regions.view_index, num_views).numpy()))
     matched = search(scores, pairwise)
-    longer = search_more(ClusterScores(table, graph, scores.config), [pairwise, matched])
+    longer = search_more(ClusterScores(sweep, graph, scores.config), [pairwise, matched])
     true = renumber(truth.numpy())
-    refined = refine(scores, true, join_pieces=True)
+    refined = refine(scores, true, join_fragments=True)
     figures: list[float] = []
     for clusters in (matched, longer, refined, true):
         figures += [matching_metrics(torch.from_numpy(clusters), truth).ari, scores.value(clusters)]

@@ -20,7 +20,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.rig import write_rig
 from mvseg.scene import Cameras, Scene, View
-from mvseg.simulation.blades import BLADE_COLUMNS, Leaf, measure_leaf
+from mvseg.simulation.blades import BLADE_COLUMNS, Leaf, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.ray_cast import build_stage, render_stage
@@ -47,7 +47,7 @@ def curl(leaf: Leaf, rng: np.random.Generator) -> Leaf:
     along = np.concatenate([[0.0], np.repeat(np.linspace(0, 1, rows), BLADE_COLUMNS), [1.0]])
     height = WAVE * leaf.length * rng.normal() * np.sin(2 * np.pi * (rng.uniform(0.7, 2) * along + rng.random()))
     waved = vertices + (height - height[0])[:, None] * rng.normal(0, 0.3, 3) + (height - height[0])[:, None] * [0, 0, 1]
-    return replace(measure_leaf(leaf.leaf_id, waved), dryness=leaf.dryness)
+    return replace(leaf_from_blade(leaf.leaf_id, waved), dryness=leaf.dryness)
 
 
 def sway(plant: Plant, rng: np.random.Generator) -> Plant:

@@ -45,7 +45,7 @@ class State:
         config: the options of all stages.
         scene: cameras and views.
         photos: of the scene.
-        keep, workers, progress: see `run_scene`.
+        cache, workers, progress: see `run_scene`.
         find: from cameras to the masks of the scene; what `load` or `detect` leaves.
         match: from cameras to the same masks, matched; what `load`, `detect` or `correct` leaves.
         corrections: of a person; None: there are none.
@@ -60,7 +60,7 @@ class State:
     config: RunConfig
     scene: Scene
     photos: Photos
-    keep: Path | None = None
+    cache: Path | None = None
     workers: ProcessPoolExecutor | None = None
     progress: bool = False
     find: Callable[[Cameras], Masks] | None = None
@@ -96,7 +96,7 @@ def run_scene(
     config: RunConfig = RunConfig(),
     *,
     corrections: Corrections | Path | None = None,
-    keep: Path | None = None,
+    cache: Path | None = None,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> Result:
@@ -107,14 +107,14 @@ def run_scene(
         masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
         config: the options of all stages.
         corrections: of a person, or the file of them, see `load_corrections`; without any edits they change nothing.
-        keep: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
+        cache: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
             from them, and one with other options of later stages uses them again. What it holds of other photos or
-            options is deleted; `delete_kept` deletes the rest.
+            options is deleted; `delete_cached` deletes the rest.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars.
 
     Returns:
-        The result; nothing is written but what `keep` says.
+        The result; nothing is written but what `cache` says.
 
     Raises:
         InputError: bad input; see the stages.
@@ -123,7 +123,7 @@ def run_scene(
     if isinstance(corrections, Path):
         corrections = load_corrections(corrections)
     has_edits = corrections is not None and len(corrections.edits) > 0
-    state = load(folder, masks, config, keep=keep, workers=workers, progress=progress)
+    state = load(folder, masks, config, cache=cache, workers=workers, progress=progress)
     state = replace(state, corrections=corrections)
     seconds = {"load": time.perf_counter() - begun}
     for name, stage in list_stages(config, has_masks=masks is not None, has_edits=has_edits).items():
@@ -195,8 +195,8 @@ def detect(state: State) -> State:
     """Find instances in every photo, see `detect_scene`."""
     from mvseg.detection.detect_scene import detect_scene
 
-    options = state.config
-    matcher = detect_scene(state.photos, options.detect, match=options.match, cache=state.keep, progress=state.progress)
+    config = state.config
+    matcher = detect_scene(state.photos, config.detect, match=config.match, cache=state.cache, progress=state.progress)
     return replace(state, match=matcher, find=lambda cameras: matcher(cameras).masks)
 
 

@@ -92,7 +92,7 @@ def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.M
     given = load_scene(plant).cameras
     better = replace(given, t=given.t + 0.01)
 
-    poses = RefinedPoses(cameras=better, is_refined=True, gap_px=(2.0, 0.2))
+    poses = RefinedPoses(cameras=better, is_refined=True, residual_px=(2.0, 0.2))
     monkeypatch.setattr("mvseg.poses.refine_poses.refine_poses", lambda *_: poses)
     result = run_scene(plant, plant / "masks", replace(IDS_ONLY, refine_poses=True))
     assert result.scene.cameras is better
@@ -262,7 +262,7 @@ def show_two(masks: Masks) -> Masks:
 
 
 @pytest.mark.parametrize("is_checked", [True, False])
-def test_masks_are_cut_once_the_surfaces_were_heard_and_both_leaves_are_fitted_again(
+def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_again(
     plant: Path, monkeypatch: pytest.MonkeyPatch, is_checked: bool
 ) -> None:
     fits: list[tuple[list[int], list[int]]] = []

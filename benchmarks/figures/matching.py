@@ -1,4 +1,4 @@
-"""Draws docs/matching.jpg: one leaf, its bands, its rows and its cluster: `python benchmarks/figures/matching.py`"""
+"""Draws docs/matching.jpg: a leaf's bands, hypotheses and cluster: `python benchmarks/figures/matching.py`"""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 from mvseg import Matching, Regions, Scene, epipolar_map, load_masks, load_scene, match_regions
 from mvseg.demo import demo_scene
 from mvseg.formats.photos import read_photo
-from mvseg.matching.nview.label_rows import row_table
+from mvseg.matching.nview.plane_sweep import sweep_planes
 from mvseg.results.overlay import draw_overlay
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -87,22 +87,22 @@ def draw_bands(example: Example) -> list[np.ndarray]:
     return tiles
 
 
-def draw_rows(example: Example) -> list[np.ndarray]:
-    """One pixel of the leaf, and the rows of the table along its ray; the row with most members is a large dot."""
-    cameras, table = example.scene.cameras, row_table(example.regions, example.scene.cameras)
-    pixels = np.flatnonzero(table.pixel_region == example.leaf)
+def draw_hypotheses(example: Example) -> list[np.ndarray]:
+    """One pixel of the leaf, and the hypotheses along its ray; the one with most members is a large dot."""
+    cameras, sweep = example.scene.cameras, sweep_planes(example.regions, example.scene.cameras)
+    pixels = np.flatnonzero(sweep.pixel_region == example.leaf)
     pixel = pixels[len(pixels) // 2]
-    u, v = table.pixel_xy[pixel]
+    u, v = sweep.pixel_xy[pixel]
     source = example.photo(SOURCE)
     example.outline(source, example.leaf, ORANGE)
     cv2.circle(source, (round(float(u)), round(float(v))), 7, WHITE, -1)
     tiles = [caption(source, "one of its pixels")]
-    on_ray = np.flatnonzero(table.pixel == pixel)
+    on_ray = np.flatnonzero(sweep.pixel == pixel)
     K, R, t = (part[SOURCE].numpy() for part in (cameras.K, cameras.R, cameras.t))
-    depths = 1 / table.inverse_depth[on_ray]
+    depths = 1 / sweep.inverse_depth[on_ray]
     points = (np.stack([u, v, 1.0]) @ np.linalg.inv(K).T * depths[:, None] - t) @ R  # world
     seen = cameras.project(torch.from_numpy(points))[0].numpy()
-    num_members = (np.isin(table.labels[on_ray], np.flatnonzero(example.members.numpy()))).sum(1)
+    num_members = (np.isin(sweep.labels[on_ray], np.flatnonzero(example.members.numpy()))).sum(1)
     for view in OTHERS:
         canvas = example.photo(view)
         for region in example.in_view(view):
@@ -111,7 +111,7 @@ def draw_rows(example: Example) -> list[np.ndarray]:
         for spot in spots:
             cv2.circle(canvas, tuple(spot), 4, WHITE, -1)
         cv2.circle(canvas, tuple(spots[num_members.argmax()]), 8, ORANGE, -1)
-        tiles.append(caption(canvas, f"view {view}: its rows, dots on the ray"))
+        tiles.append(caption(canvas, f"view {view}: its hypotheses, dots on the ray"))
     return tiles
 
 
@@ -131,7 +131,7 @@ def draw_cluster(example: Example) -> list[np.ndarray]:
 
 def main() -> None:
     example = choose_example()
-    rows = [draw_bands(example), draw_rows(example), draw_cluster(example)]
+    rows = [draw_bands(example), draw_hypotheses(example), draw_cluster(example)]
     image = np.concatenate([np.concatenate(row, 1) for row in rows])
     image = cv2.resize(image, None, fx=0.6, fy=0.6, interpolation=cv2.INTER_AREA)
     cv2.imwrite(str(DOCS / "matching.jpg"), cv2.cvtColor(image, cv2.COLOR_RGB2BGR), [cv2.IMWRITE_JPEG_QUALITY, 85])

@@ -11,7 +11,7 @@ SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds"
 
 
 def scene_state(out: Path, name: str) -> Path:
-    """The folder of a scene's status and its kept detections; locked while a process works on the scene."""
+    """The folder of a scene's status and its cached detections; locked while a process works on the scene."""
     return out / STATE / name
 
 

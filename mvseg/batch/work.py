@@ -50,7 +50,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     """
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    keep = scene_detections(out, scene.name)
+    cache = scene_detections(out, scene.name)
     folder, started = scene_state(out, scene.name), time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     with _one_at_a_time, lock_folder(folder, wait=True):
@@ -63,7 +63,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
                 return Finished(earlier, is_kept=True)
             write_status(folder, Status(state="running", scene=str(scene.folder), key=key))
             place = scene_result(out, scene.name)
-            status = _finish(scene, masks, place, config=config, corrections=corrections, keep=keep)
+            status = _finish(scene, masks, place, config=config, corrections=corrections, cache=cache)
         except Exception as error:  # whatever it is, the other scenes go on
             status, key = _describe_failure(error, scene), ""
         seconds = round(time.monotonic() - started, 3)
@@ -91,11 +91,11 @@ def _is_done(status: Status, result: Path) -> bool:
 
 
 def _finish(
-    scene: BatchScene, masks: Path | None, out: Path, *, config: RunConfig, corrections: Path | None, keep: Path
+    scene: BatchScene, masks: Path | None, out: Path, *, config: RunConfig, corrections: Path | None, cache: Path
 ) -> Status:
     sweep_abandoned(out)
     check_out(out)
-    result, messages = solve_scene(scene.folder, masks, config, corrections=corrections, keep=keep, progress=False)
+    result, messages = solve_scene(scene.folder, masks, config, corrections=corrections, cache=cache, progress=False)
     save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages, progress=False)
     return Status(
         state="done",

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.checks.finding import Finding, Rule, list_findings
-from mvseg.matching.outline_gaps import touches_border, without_specks
+from mvseg.matching.tangency import touches_border, without_small_components
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -14,7 +14,7 @@ TINY_PX = 30  # pixels of a mask that says nothing
 MANY = 0.25  # share of the masks
 FEW = 0.34  # of the median number of masks per view
 COVERS = 0.8  # of the photo: the background
-BEYOND = 0.1  # of the photo's longer side: how far specks reach beyond the rest of their mask
+BEYOND = 0.1  # of the photo's longer side: how far small components reach beyond the rest of their mask
 
 
 def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
@@ -25,7 +25,7 @@ def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) ->
     return [
         *_count_findings(regions.num_per_view.numpy(), names),
         *_size_findings(regions, cameras, names),
-        *_speck_findings(regions, cameras, names),
+        *_small_component_findings(regions, cameras, names),
     ]
 
 
@@ -50,7 +50,7 @@ def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -
     tiny = areas < TINY_PX
     if tiny.mean() > MANY:
         sizes = f"fewer than {TINY_PX} pixels (median {np.median(areas):.0f})"
-        what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: drop the crumbs, or segment larger photos"
+        what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove them, or segment larger photos"
         findings.append(Finding(where="masks", what=what, level="warning"))
     photo = cameras.sizes[view].prod(1).numpy()
     whole = sorted(set(view.numpy()[areas > COVERS * photo].tolist()))
@@ -63,13 +63,13 @@ def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -
     return findings
 
 
-def _speck_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
+def _small_component_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
     """Masks with stray pixels: the shape of such a leaf is looked for in a space that is much too large."""
     longest = cameras.sizes.amax(1).tolist()
     views: set[int] = set()
     for index in range(len(regions)):
         view, crop = int(regions.view_index[index]), regions.crop(index).numpy()
-        kept = without_specks(crop).astype(bool)
+        kept = without_small_components(crop).astype(bool)
         reach = max(crop.shape[axis] - np.ptp(np.flatnonzero(kept.any(1 - axis))) - 1 for axis in (0, 1))
         if reach > BEYOND * longest[view]:
             views.add(view)

@@ -18,8 +18,8 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.checks.finding import Finding, Level, Rule, list_findings
-from mvseg.matching.outline_gaps import WIDEST, hull_corners, touches_border
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
+from mvseg.matching.tangency import WIDEST, hull_corners, touches_border
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 

@@ -104,7 +104,7 @@ def _print_table(check: Check) -> None:
 def _rows(check: Check) -> list[dict[str, Any]]:
     """What the table and check.json say about each view; None where there is nothing to say."""
     from mvseg.checks.poses import view_agreement
-    from mvseg.matching.outline_gaps import touches_border
+    from mvseg.matching.tangency import touches_border
 
     num, regions = len(check.scene.views), check.regions
     counts: list[Any] = [None] * num

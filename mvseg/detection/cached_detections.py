@@ -1,4 +1,4 @@
-"""Detections kept while a scene is worked on, so that a run that was cut off goes on from them.
+"""Detections cached while a scene is worked on, so that a run that was cut off goes on from them.
 
 One .safetensors file per photo, in a folder that `mvseg infer` deletes when the result is there, and that `mvseg batch`
 keeps for the next batch. Its name is a hash of everything that the detections depend on: the photo, its camera, the
@@ -25,14 +25,14 @@ from mvseg.formats.photos import photo_bits
 from mvseg.scene import Scene
 from mvseg.system.atomic import is_partial, lock_folder, write_whole
 
-KEPT_NAME = re.compile(r"[0-9a-f]{64}\.safetensors")
+CACHED_NAME = re.compile(r"[0-9a-f]{64}\.safetensors")
 SCENE_FILE = ".scene"
 FIELDS = {"boxes", "labels", "scores", "masks", "frame"}
 
 
 @dataclass(frozen=True)
-class KeptDetections:
-    """Where the detections of a run are kept.
+class CachedDetections:
+    """Where the detections of a run are cached.
 
     Attributes:
         folder: of the files; made with the first of them.
@@ -54,7 +54,7 @@ class KeptDetections:
 
 
 def write_detections(path: Path, detections: dict[str, Tensor]) -> None:
-    """Keep what a detector found in one photo: float and int64 tensors on the CPU, see `run_heads`."""
+    """Cache what a detector found in one photo: float and int64 tensors on the CPU, see `run_heads`."""
     path.parent.mkdir(parents=True, exist_ok=True)
     content = safetensors.torch.save({key: value.contiguous() for key, value in detections.items()})
     write_whole(path, lambda partial: partial.write_bytes(content))
@@ -69,24 +69,24 @@ def read_detections(path: Path) -> dict[str, Tensor] | None:
     return detections if detections.keys() == FIELDS else None
 
 
-def delete_kept(folder: Path, *, but: Collection[str] = ()) -> None:
-    """Delete the kept detections but those of the given names, and the folder if nothing else is in it."""
+def delete_cached(folder: Path, *, but: Collection[str] = ()) -> None:
+    """Delete the cached detections but those of the given names, and the folder if nothing else is in it."""
     if not folder.is_dir():
         return
     for path in [*folder.iterdir()]:
-        is_kept = KEPT_NAME.fullmatch(path.name) or (is_partial(path) and KEPT_NAME.match(path.name[1:]))
-        if path.name not in but and (is_kept or (path.name == SCENE_FILE and not but)):
+        is_cached = CACHED_NAME.fullmatch(path.name) or (is_partial(path) and CACHED_NAME.match(path.name[1:]))
+        if path.name not in but and (is_cached or (path.name == SCENE_FILE and not but)):
             path.unlink(missing_ok=True)
     if not any(folder.iterdir()):
         folder.rmdir()
 
 
 @contextmanager
-def claim_kept(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterator[bool]:
-    """Have the folder of kept detections of a scene for one run, which may delete it; gives whether it holds some.
+def claim_cache(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterator[bool]:
+    """Have the folder of cached detections of a scene for one run, which may delete it; gives whether it holds some.
 
     Args:
-        folder: made if it is missing; deleted in the end if nothing was kept.
+        folder: made if it is missing; deleted in the end if nothing was cached.
         scene: the scene folder.
         overwrite: take it also when it holds what was found in another scene's photos.
 
@@ -107,7 +107,7 @@ def claim_kept(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterato
                 yield _holds_some(folder)
             finally:
                 if not _holds_some(folder):
-                    delete_kept(folder)
+                    delete_cached(folder)
     finally:
         with suppress(OSError):  # it holds some, or is another run's
             for each in (folder, *made):
@@ -115,4 +115,4 @@ def claim_kept(folder: Path, scene: Path, *, overwrite: bool = False) -> Iterato
 
 
 def _holds_some(folder: Path) -> bool:
-    return folder.is_dir() and any(KEPT_NAME.fullmatch(path.name) for path in folder.iterdir())
+    return folder.is_dir() and any(CACHED_NAME.fullmatch(path.name) for path in folder.iterdir())

@@ -20,8 +20,8 @@ class DetectConfig:
             sees a leaf, times the expected IoU of its mask.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the
             size given with the weights, smaller ones stay as they are.
-        crop: auto: where the plant fills a small part of large photos, they are cut to it after a first look and looked
-            at again: leaves are seen larger. off: one look at whole photos.
+        crop: auto: where the plant fills a small part of large photos, a second pass runs on their parts that show
+            it: leaves are seen larger. off: one pass over whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
         verify: let surfaces that are fitted to the matched masks correct them: the other views show which masks are
             no leaves or pieces of one, and which leaves were missed (`mvseg.verification.other_views`). Finds leaves:

@@ -1,4 +1,4 @@
-"""Where the plant is in every photo, once its leaves are matched: a second look sees it larger.
+"""Where the plant is in every photo, once its leaves are matched: a second pass sees it larger.
 
 Not in the paper.
 """
@@ -16,10 +16,10 @@ from mvseg.scene import Cameras
 
 LEAST_VIEWS = 3  # of an instance that is part of the plant; all views where there are fewer
 MARGIN = 0.1  # of the longer side of a box, on each side: leaves that were missed
-LEAST_GAIN = 1.5  # by which a second look must see the plant larger, for most photos
+LEAST_GAIN = 1.5  # by which a second pass must see the plant larger, for most photos
 
 
-def boxes_to_look_at(masks: Masks, cameras: Cameras, *, longest: int) -> Tensor | None:
+def boxes_for_second_pass(masks: Masks, cameras: Cameras, *, longest: int) -> Tensor | None:
     """`plant_boxes`, if a detector that scales larger images down to a longer side of `longest` pixels sees the plant
     at least `LEAST_GAIN` times as large in them, in most views; else None."""
     boxes = plant_boxes(masks, cameras)

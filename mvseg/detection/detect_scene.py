@@ -13,9 +13,9 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg._version import code_hash
-from mvseg.detection.cached_detections import KeptDetections, delete_kept, read_detections, write_detections
+from mvseg.detection.cached_detections import CachedDetections, delete_cached, read_detections, write_detections
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.crops import boxes_to_look_at, crop_cameras, place_crops
+from mvseg.detection.crops import boxes_for_second_pass, crop_cameras, place_crops
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.zoo import find_weights, load_detector
 from mvseg.formats.photos import Photos
@@ -54,18 +54,18 @@ def detect_scene(
     detector = load_detector(config.weights, image_size=config.image_size, min_score=config.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(detector, num_iterations=config.num_iterations, match=match).to(device)
-    cached = None if cache is None else KeptDetections(cache, describe_detector(config, model, device))
+    cached = None if cache is None else CachedDetections(cache, describe_detector(config, model, device))
     found, names = _detect_photos(model, photos, cached=cached, progress=progress)
     # whole photos are matched here to find the plant, and not again by who asks for that
     match_found = lru_cache(maxsize=1)(partial(model.match_detections, found, progress=progress))
     boxes, cameras = None, photos.scene.cameras
     if config.crop == "auto":
-        boxes = boxes_to_look_at(match_found(cameras).masks, cameras, longest=model.transform.max_size)
+        boxes = boxes_for_second_pass(match_found(cameras).masks, cameras, longest=model.transform.max_size)
     if boxes is not None:
         in_crops, more_names = _detect_photos(model, photos, boxes, cached=cached, progress=progress)
         names |= more_names
     if cache is not None:
-        delete_kept(cache, but=names)
+        delete_cached(cache, but=names)
     if boxes is None:
         return match_found
 
@@ -81,7 +81,7 @@ def _detect_photos(
     photos: Photos,
     boxes: Tensor | None = None,
     *,
-    cached: KeptDetections | None,
+    cached: CachedDetections | None,
     progress: bool,
 ) -> tuple[list[dict[str, Tensor]], set[str]]:
     """What the detector finds in every photo, or in its box (V, 4) xyxy, and the names of the files that cache it."""

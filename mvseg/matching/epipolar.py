@@ -131,9 +131,7 @@ def bin_histogram(bins: Bins, angles: Tensor, samples: Samples) -> Tensor:
 
     Pixels whose half-plane lies outside the bins are left out.
     """
-    spans = Spans(
-        low=angles, high=angles, owner=samples.owner, weight=samples.weight, num_regions=samples.num_regions
-    )
+    spans = Spans(low=angles, high=angles, owner=samples.owner, weight=samples.weight, num_regions=samples.num_regions)
     return span_histogram(bins, spans)
 
 

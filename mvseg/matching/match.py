@@ -13,7 +13,7 @@ from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links, keep_links
-from mvseg.matching.nview.match_nview import WIDENINGS, match_nview
+from mvseg.matching.nview.match_nview import DILATIONS, match_nview
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
 from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
 from mvseg.matching.pencil import is_coincident
@@ -63,8 +63,8 @@ def match_regions(
     """
     links = Links.of() if links is None else links
     links.components(len(regions))
-    if residual_px is not None and residual_px not in WIDENINGS:
-        raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, WIDENINGS))}")
+    if residual_px is not None and residual_px not in DILATIONS:
+        raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, DILATIONS))}")
     cameras = cameras.to(regions.device)
     check_views(regions, cameras)
     check_baselines(cameras)
@@ -205,7 +205,7 @@ def _warn_of_disagreement(matching: Matching) -> None:
     assert matching.view_explained is not None
     is_matched = matching.instance_ids > 0
     sure = float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
-    is_capped, odd = matching.residual_px == WIDENINGS[-1], odd_views(matching.view_explained)
+    is_capped, odd = matching.residual_px == DILATIONS[-1], odd_views(matching.view_explained)
     if sure >= TRUSTED and not is_capped and not odd:
         return
     facts = f"{sure:.0%} of the ids are expected to be right, rays explain {matching.explained:.0%} of the masks"

@@ -49,9 +49,7 @@ class Samples:
         step = torch.arange(len(run), device=xy.device) - (length.cumsum(0) - length)[run]
         pitch = (last - xy) / (length - 1).clamp(min=1)[:, None]
         every = (xy[run] + step[:, None] * pitch[run]).T.contiguous().T
-        return Samples(
-            xy=every, owner=owner[run], weight=(weight / length)[run], num_regions=self.num_regions
-        )
+        return Samples(xy=every, owner=owner[run], weight=(weight / length)[run], num_regions=self.num_regions)
 
 
 def view_samples(regions: Regions) -> tuple[list[Samples], list[Tensor]]:
@@ -87,9 +85,7 @@ def view_runs(regions: Regions, max_per_region: int | None = None) -> tuple[list
             pitch, weight = steps[owner], length * (areas / chosen.areas.clamp(min=1)).float()[owner]
             xy = ((lattice_xy - 0.5) * pitch[:, None] + origin[owner]).T.contiguous().T
         last = torch.stack((xy[:, 0] + (length - 1) * pitch, xy[:, 1])).T
-        samples.append(
-            Samples(xy=xy, owner=owner, weight=weight, num_regions=len(nodes), last_xy=last, length=length)
-        )
+        samples.append(Samples(xy=xy, owner=owner, weight=weight, num_regions=len(nodes), last_xy=last, length=length))
     return samples, members
 
 

@@ -10,7 +10,7 @@ from typing import TypeVar
 import pycolmap
 
 Answer = TypeVar("Answer")
-WAIT = 0.1  # seconds after which a signal is heard at the latest
+WAIT = 0.1  # seconds after which a signal is noticed at the latest
 ERRORS_ONLY = 2  # of COLMAP's log
 
 

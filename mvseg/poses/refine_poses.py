@@ -1,6 +1,6 @@
 """Poses that are a few pixels off, refined with the masks as the only evidence.
 
-Every leaf that two views show whole tells by how many pixels their epipolar lines miss (`outline_gaps.py`), and that is
+Every leaf that two views show whole tells by how many pixels their epipolar lines miss (`tangency.py`), and that is
 far more than the six unknowns of each pose. Not in the paper.
 """
 
@@ -16,22 +16,29 @@ from torch import Tensor
 from mvseg.errors import InputWarning
 from mvseg.formats.lens import opencv_distortion
 from mvseg.masks import Masks
-from mvseg.matching.outline_gaps import Gaps, Outlines, find_outlines, measure_gaps, move_cameras, pair_outlines
 from mvseg.matching.result import Matching
+from mvseg.matching.tangency import (
+    Outlines,
+    TangencyResiduals,
+    find_outlines,
+    move_cameras,
+    pair_outlines,
+    tangency_residuals,
+)
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene
 
 Match = Callable[[Cameras], Matching]
 
 ROUNDS = 3  # of refining and matching again, at most
-LEAST_GAP = 1.0  # pixels; a smaller gap of the given poses is the masks' own error
-CLEAR = 0.8  # share of the gap that may be left of refined poses
+LEAST_RESIDUAL = 1.0  # pixels; a smaller residual of the given poses is the masks' own error
+CLEAR = 0.8  # share of the residual that may be left of refined poses
 LOSS = 0.02  # of the mean match score, that does not count as one
 STEPS = 20  # of Gauss-Newton, at most
 CONVERGED = 0.02  # units, largest step
 # In units of one pixel, or more where photos are large: masks of these are drawn less exactly.
 POSE, GROWTH = 10.0, 2.0  # standard deviations of poses, along each axis, and of how tightly a mask is drawn
-LEAST_SPREAD, DOUBTED = 0.5, 2.0  # of gaps; and the number of spreads from which a gap is doubted
+LEAST_SIGMA, DOUBTED = 0.5, 2.0  # of residuals; and the number of standard deviations from which a residual is doubted
 FOLDS = 5  # of the instances
 
 
@@ -42,21 +49,22 @@ class RefinedPoses:
     Attributes:
         cameras: V cameras, the given ones unless they are refined.
         is_refined: whether refined poses were taken.
-        gap_px: by how many pixels outlines of one leaf miss the same epipolar lines, with the poses as given, and with
-            poses refined without that leaf; NaN where no leaf tells.
+        residual_px: by how many pixels outlines of one leaf miss the same epipolar lines, with the poses as given, and
+            with poses refined without that leaf; NaN where no leaf tells.
     """
 
     cameras: Cameras
     is_refined: bool
-    gap_px: tuple[float, float]
+    residual_px: tuple[float, float]
 
 
 def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
     """Match, refine the poses, match with these, and so on until no id changes.
 
-    Poses whose gaps are below `LEAST_GAP` stay. Refined ones are taken when they explain leaves that they were not
-    fitted to, in turn a fifth of them, clearly better than the given ones do, and ids are as sure as with these.
-    Otherwise the given ones stay as if nothing had been tried. What matching warns of on the way is not passed on.
+    Poses whose residuals are below `LEAST_RESIDUAL` stay. Refined ones are taken when they explain leaves that they
+    were not fitted to, in turn a fifth of them, clearly better than the given ones do, and ids are as sure as with
+    these. Otherwise the given ones stay as if nothing had been tried. What matching warns of on the way is not passed
+    on.
 
     Args:
         cameras: V cameras, as they are given.
@@ -65,18 +73,18 @@ def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         given = matching = match(cameras)
-        refined, gap_px = cameras, held_out_gaps(matching.masks, cameras)
+        refined, residual_px = cameras, held_out_residuals(matching.masks, cameras)
         for _ in range(ROUNDS):
-            if not (gap_px[0] >= LEAST_GAP and gap_px[1] < gap_px[0]):
+            if not (residual_px[0] >= LEAST_RESIDUAL and residual_px[1] < residual_px[0]):
                 break
             refined = fit_poses(adjust(matching.masks, cameras)).to(cameras.device)
             before, matching = matching.masks, match(refined)
             if _is_same(before, matching.masks):
                 break
-            gap_px = held_out_gaps(matching.masks, cameras)
-    is_off = gap_px[0] >= LEAST_GAP
-    is_better = is_off and gap_px[1] <= CLEAR * gap_px[0] and mean_score(matching) >= mean_score(given) - LOSS
-    return RefinedPoses(cameras=refined if is_better else cameras, is_refined=is_better, gap_px=gap_px)
+            residual_px = held_out_residuals(matching.masks, cameras)
+    is_off = residual_px[0] >= LEAST_RESIDUAL
+    is_better = is_off and residual_px[1] <= CLEAR * residual_px[0] and mean_score(matching) >= mean_score(given) - LOSS
+    return RefinedPoses(cameras=refined if is_better else cameras, is_refined=is_better, residual_px=residual_px)
 
 
 def refine_scene(scene: Scene, match: Match) -> tuple[Scene, RefinedPoses]:
@@ -125,14 +133,14 @@ class Adjustment:
         outlines = self.outlines.select(index)
         return replace(self, outlines=outlines, pairs=pair_outlines(outlines, self.cameras))
 
-    def gaps(self, cameras: Cameras) -> Gaps:
-        """All gaps with these cameras."""
-        return measure_gaps(self.outlines, self.pairs, cameras, world_per_px=self.world_per_px)
+    def residuals(self, cameras: Cameras) -> TangencyResiduals:
+        """All residuals with these cameras."""
+        return tangency_residuals(self.outlines, self.pairs, cameras, world_per_px=self.world_per_px)
 
-    def weights(self, gaps: Gaps, left_px: Tensor) -> Tensor:
+    def weights(self, residuals: TangencyResiduals, left_px: Tensor) -> Tensor:
         """(T,) weights by Geman and McClure: what a neighbour hides ends elsewhere, and so does another leaf."""
-        spread = max(LEAST_SPREAD * self.unit_px, 1.4826 * float(left_px.abs().median()))
-        return gaps.weight / spread**2 / (1 + (left_px / (DOUBTED * spread)) ** 2) ** 2
+        sigma = max(LEAST_SIGMA * self.unit_px, 1.4826 * float(left_px.abs().median()))
+        return residuals.weight / sigma**2 / (1 + (left_px / (DOUBTED * sigma)) ** 2) ** 2
 
 
 def adjust(masks: Masks, cameras: Cameras) -> Adjustment:
@@ -157,25 +165,25 @@ def distances(regions: Regions, cameras: Cameras) -> Tensor:
 
 
 def fit_poses(problem: Adjustment) -> Cameras:
-    """The cameras with the smallest gaps, by Gauss-Newton with robust weights.
+    """The cameras with the smallest residuals, by Gauss-Newton with robust weights.
 
     Beside the poses, how tightly every mask is drawn is unknown (a segmenter's masks are all a little too large or too
     small). What the masks do not tell, as the similarity of the world, stays as given: the poses have a prior there.
     """
     num_views, num_outlines = len(problem.cameras), len(problem.outlines.view)
-    spreads = torch.cat((torch.full((6 * num_views,), POSE), torch.full((num_outlines,), GROWTH))).double()
-    prior = (spreads * problem.unit_px) ** -2
+    sigmas = torch.cat((torch.full((6 * num_views,), POSE), torch.full((num_outlines,), GROWTH))).double()
+    prior = (sigmas * problem.unit_px) ** -2
     state, cameras = torch.zeros(len(prior)).double(), problem.cameras
     for _ in range(STEPS):
-        gaps = problem.gaps(cameras)
-        if not len(gaps.px):
+        residuals = problem.residuals(cameras)
+        if not len(residuals.px):
             break
-        of_growth = 6 * num_views + gaps.outlines[..., None]
-        of_pose = 6 * problem.outlines.view[gaps.outlines][..., None] + torch.arange(6)
+        of_growth = 6 * num_views + residuals.outlines[..., None]
+        of_pose = 6 * problem.outlines.view[residuals.outlines][..., None] + torch.arange(6)
         columns = torch.cat((of_pose, of_growth), 2).flatten(1)
-        slopes = torch.cat((gaps.by_pose, gaps.by_growth[..., None]), 2).flatten(1)
-        left_px = gaps.px + (gaps.by_growth * state[of_growth[..., 0]]).sum(1)
-        step = _solve(columns, slopes, left_px, weights=problem.weights(gaps, left_px), prior=prior, state=state)
+        slopes = torch.cat((residuals.by_pose, residuals.by_growth[..., None]), 2).flatten(1)
+        left_px = residuals.px + (residuals.by_growth * state[of_growth[..., 0]]).sum(1)
+        step = _solve(columns, slopes, left_px, weights=problem.weights(residuals, left_px), prior=prior, state=state)
         state = state + step
         cameras = move_cameras(cameras, step[: 6 * num_views].reshape(-1, 6), problem.world_per_px)
         if step.abs().max() < CONVERGED * problem.unit_px:
@@ -198,38 +206,38 @@ def _solve(columns: Tensor, slopes: Tensor, left: Tensor, *, weights: Tensor, pr
     return torch.zeros_like(right) if info else torch.cholesky_solve(right[:, None], factor)[:, 0]
 
 
-def held_out_gaps(masks: Masks, cameras: Cameras) -> tuple[float, float]:
-    """Pixels; mean over the views of the median gap of their leaves: with the given cameras, and with cameras that are
-    refined without the leaves that are looked at. NaN where there are no gaps."""
+def held_out_residuals(masks: Masks, cameras: Cameras) -> tuple[float, float]:
+    """Pixels; mean over the views of the median residual of their leaves, with the given cameras, and with cameras that
+    are refined without these leaves. NaN where there are no residuals."""
     problem, parts = adjust(masks, cameras), []
     fold = problem.outlines.instance % FOLDS
     for number in range(FOLDS):
         if (fold == number).any():
             looked_at, fitted = problem.select(fold == number), fit_poses(problem.select(fold != number))
-            parts.append([_remaining_gaps(looked_at, cameras) for cameras in (problem.cameras, fitted)])
+            parts.append([_remaining_residuals(looked_at, cameras) for cameras in (problem.cameras, fitted)])
     if not parts:
         return float("nan"), float("nan")
-    before, after = (torch.cat(gaps, 1) for gaps in zip(*parts, strict=True))
+    before, after = (torch.cat(residuals, 1) for residuals in zip(*parts, strict=True))
     return _mean_of_views(before), _mean_of_views(after)
 
 
-def _remaining_gaps(problem: Adjustment, cameras: Cameras) -> Tensor:
-    """(3, T) float64: what is left of each gap when masks may be drawn too tightly, and its two views."""
-    gaps = problem.gaps(cameras)
+def _remaining_residuals(problem: Adjustment, cameras: Cameras) -> Tensor:
+    """(3, T) float64: what is left of each residual when masks may be drawn too tightly, and its two views."""
+    residuals = problem.residuals(cameras)
     prior = torch.full((len(problem.outlines.view),), (GROWTH * problem.unit_px) ** -2).double()
-    growth, left_px = torch.zeros_like(prior), gaps.px
-    for _ in range(STEPS if len(gaps.px) else 0):
-        weights = problem.weights(gaps, left_px)
-        step = _solve(gaps.outlines, gaps.by_growth, left_px, weights=weights, prior=prior, state=growth)
+    growth, left_px = torch.zeros_like(prior), residuals.px
+    for _ in range(STEPS if len(residuals.px) else 0):
+        weights = problem.weights(residuals, left_px)
+        step = _solve(residuals.outlines, residuals.by_growth, left_px, weights=weights, prior=prior, state=growth)
         growth = growth + step
-        left_px = gaps.px + (gaps.by_growth * growth[gaps.outlines]).sum(1)
+        left_px = residuals.px + (residuals.by_growth * growth[residuals.outlines]).sum(1)
         if step.abs().max() < CONVERGED * problem.unit_px:
             break
-    return torch.cat((left_px.abs()[None], problem.outlines.view[gaps.outlines].T.double()))
+    return torch.cat((left_px.abs()[None], problem.outlines.view[residuals.outlines].T.double()))
 
 
-def _mean_of_views(gaps: Tensor) -> float:
-    px, views = gaps[0], gaps[1:]
+def _mean_of_views(residuals: Tensor) -> float:
+    px, views = residuals[0], residuals[1:]
     if not len(px):
         return float("nan")
     return float(torch.stack([px[(views == view).any(0)].median() for view in views.unique()]).mean())

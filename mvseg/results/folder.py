@@ -177,9 +177,9 @@ def write_refined(path: Path, scene: Scene) -> None:
 
 
 def _describe_poses(poses: RefinedPoses) -> dict[str, Any]:
-    """What run.json says of the poses: whether they were refined, and the gaps before and after."""
-    gaps = [None if math.isnan(gap) else round(gap, 3) for gap in poses.gap_px]
-    return {"refined": poses.is_refined, "gap_px": gaps}
+    """What run.json says of the poses: whether they were refined, and the residuals before and after."""
+    residuals = [None if math.isnan(residual) else round(residual, 3) for residual in poses.residual_px]
+    return {"refined": poses.is_refined, "residual_px": residuals}
 
 
 def _describe_traits(traits: Traits) -> dict[str, Any]:

@@ -46,7 +46,7 @@ def describe_world(scene: Scene) -> dict[str, Any]:
     return {"plant": scene.name, "unit": scene.unit or None, "up": up, **placed}
 
 
-def describe_leaves(traits: Traits | None) -> dict[str, dict[str, Any]]:
+def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
     """{name of a leaf's node: its extras}: id, unit, method, quality, and the numbers there are, with deviations."""
     found: dict[str, dict[str, Any]] = {}
     if traits is None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from mvseg.formats.mesh import simplify_mesh, write_glb, write_ply
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.results.gltf import describe_leaves, describe_world, gltf_from_world
+from mvseg.results.gltf import describe_world, gltf_from_world, leaf_extras
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
 from mvseg.traits.table import write_long, write_wide
@@ -40,5 +40,5 @@ def _write_shapes(result: Result, folder: Path) -> None:
         if isinstance(shape, LeafSurface) and result.voxels and instance in result.voxels:
             voxels = result.voxels[instance].mesh()
             write_ply(folder / "leaves" / f"{name}_voxels.ply", voxels, color, instance_id=instance)
-    about, extras = describe_world(result.scene), describe_leaves(result.traits)
+    about, extras = describe_world(result.scene), leaf_extras(result.traits)
     write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)

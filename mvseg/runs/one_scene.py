@@ -36,7 +36,7 @@ def run_one_scene(
         InputError: bad input; `out` holds a result of another scene, or what a run found in its photos, and `overwrite`
             is not set; or another run detects for `out` now.
     """
-    from mvseg.detection.cached_detections import claim_kept, delete_kept
+    from mvseg.detection.cached_detections import claim_cache, delete_cached
     from mvseg.results.earlier import check_out, check_same_scene
     from mvseg.system.atomic import resolve_place, sweep_abandoned
     from mvseg.system.worker_pool import start_workers
@@ -49,19 +49,19 @@ def run_one_scene(
     masks = None if masks is None else find_masks(scene, masks)
     corrections = None if corrections is None else find_masks(scene, corrections, what="corrections")
     place = resolve_place(out)
-    keep = place.with_name(f"{place.name}.detections")
+    cache = place.with_name(f"{place.name}.detections")
     with ExitStack() as stack:
-        if masks is None and stack.enter_context(claim_kept(keep, scene, overwrite=overwrite)):
-            print(f"mvseg: going on from the detections in {keep}, for equal photos and options", file=sys.stderr)
+        if masks is None and stack.enter_context(claim_cache(cache, scene, overwrite=overwrite)):
+            print(f"mvseg: going on from the detections in {cache}, for equal photos and options", file=sys.stderr)
         with start_workers(num_workers) as workers:
             result, messages = solve_scene(
-                scene, masks, config, corrections=corrections, keep=keep, workers=workers, progress=not quiet
+                scene, masks, config, corrections=corrections, cache=cache, workers=workers, progress=not quiet
             )
         for message in messages:
             print(f"mvseg: warning: {message}", file=sys.stderr)
         save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)
         if masks is None:
-            delete_kept(keep)
+            delete_cached(cache)
     num_masks, num_views = len(result.regions), len(result.scene.views)
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
     print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
@@ -73,7 +73,7 @@ def solve_scene(
     config: RunConfig,
     *,
     corrections: Path | None = None,
-    keep: Path,
+    cache: Path,
     workers: ProcessPoolExecutor | None = None,
     progress: bool,
 ) -> tuple[Result, list[str]]:
@@ -84,7 +84,9 @@ def solve_scene(
         warnings.simplefilter("always", InputWarning)
         if masks is not None and config.detect != DetectConfig():
             warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
-        result = run_scene(scene, masks, config, corrections=corrections, keep=keep, workers=workers, progress=progress)
+        result = run_scene(
+            scene, masks, config, corrections=corrections, cache=cache, workers=workers, progress=progress
+        )
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
     # each matching of a detector's loop may repeat a warning

@@ -157,7 +157,7 @@ def place_blade(blade: Blade, base: Floats, *, azimuth: float, elevation: float)
     return np.concatenate([base[None], grid.reshape(-1, 3), tip[None]])
 
 
-def measure_leaf(leaf_id: int, vertices: Floats) -> Leaf:
+def leaf_from_blade(leaf_id: int, vertices: Floats) -> Leaf:
     """The leaf whose vertices (P, 3) `place_blade` returned, with its length, width and area."""
     grid = vertices[1:-1].reshape(-1, BLADE_COLUMNS, 3)
     faces = blade_faces(len(grid))

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from mvseg.errors import InputError
-from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, measure_leaf, place_blade
+from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, leaf_from_blade, place_blade
 from mvseg.simulation.families import FAMILIES, Family, draw_blade
 from mvseg.simulation.pot import Part, Pot, draw_pot, lift, make_tube, pot_parts
 
@@ -92,7 +92,7 @@ def grow_plant(family: str, num_leaves: int, seed: int) -> Plant:
     for node, num_blades in zip(nodes, blade_counts, strict=True):
         fronds.append(place_frond(node, ranges, rng, num_blades=num_blades, pot=pot, others=fronds))
     blades = [blade for frond in fronds for blade in frond.blades]
-    leaves = tuple(measure_leaf(index + 1, blade) for index, blade in enumerate(blades))
+    leaves = tuple(leaf_from_blade(index + 1, blade) for index, blade in enumerate(blades))
     tubes = [make_tube("stem", stem, radius=ranges.stem_radius, taper=0.5) for stem in stems]
     tubes += [make_tube("stem", frond.rachis, radius=frond.radius, taper=0.7) for frond in fronds]
     if rng.random() < 0.2:

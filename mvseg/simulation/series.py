@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
 from mvseg.scene import Cameras
-from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, measure_leaf
+from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES, Family
 from mvseg.simulation.growth import (
@@ -141,7 +141,7 @@ class GrowingPlant:
             frond = self._frond(seat, day, stems[seat.shoot], family)
             tubes.append(make_tube("stem", frond.rachis, radius=frond.radius, taper=0.7))
             for number, blade in zip(seat.ids, frond.blades, strict=True):
-                leaves.append(_age(measure_leaf(number, blade), (day - seat.yellows) / YELLOWING))
+                leaves.append(_age(leaf_from_blade(number, blade), (day - seat.yellows) / YELLOWING))
         parts = (*tubes, *pot_parts(self.pot, np.random.default_rng([self.spec.seed, 1])))
         return Plant(family=self.spec.family, leaves=tuple(leaves), parts=parts, stems=tuple(stems))
 
@@ -237,7 +237,7 @@ def _age(leaf: Leaf, share: float) -> Leaf:
     if share <= 0:
         return leaf
     rolled = roll_up(leaf.vertices, 1.2 * share)
-    return replace(measure_leaf(leaf.leaf_id, hang(rolled, 0.9 * share)), dryness=min(share, 1.0))
+    return replace(leaf_from_blade(leaf.leaf_id, hang(rolled, 0.9 * share)), dryness=min(share, 1.0))
 
 
 def draw_pots(spec: SeriesSpec) -> list[PotPlace]:

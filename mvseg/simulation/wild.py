@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mvseg.simulation.blades import BLADE_COLUMNS, Arc, Blade, Floats, Leaf, arc_points, measure_leaf, place_blade
+from mvseg.simulation.blades import BLADE_COLUMNS, Arc, Blade, Floats, Leaf, arc_points, leaf_from_blade, place_blade
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import Plant
 from mvseg.simulation.pot import Part, make_tube
@@ -45,7 +45,7 @@ def make_wild(plant: Plant, seed: int) -> Plant:
         parts.append(grow_twig(plant.stems[rng.integers(len(plant.stems))], rng))
     if len(leaves) <= MOST_LEAVES_WITH_COTYLEDONS and rng.random() < 0.3:
         blades, petioles = grow_cotyledons(plant.stems[0], rng)
-        leaves += [measure_leaf(len(leaves) + 1 + index, blade) for index, blade in enumerate(blades)]
+        leaves += [leaf_from_blade(len(leaves) + 1 + index, blade) for index, blade in enumerate(blades)]
         parts += petioles
     return replace(plant, leaves=tuple(leaves), parts=tuple(parts), is_wild=True)
 
@@ -58,7 +58,7 @@ def wither(leaf: Leaf, rng: np.random.Generator) -> Leaf:
     dryness = rng.uniform(0.2, 1.0)
     shrunk = leaf.vertices[0] + (1 - 0.35 * dryness * rng.random()) * (leaf.vertices - leaf.vertices[0])
     rolled = roll_up(shrunk, dryness * rng.uniform(-1.5, 3.0))
-    return replace(measure_leaf(leaf.leaf_id, hang(rolled, dryness * rng.uniform(0.0, 1.8))), dryness=dryness)
+    return replace(leaf_from_blade(leaf.leaf_id, hang(rolled, dryness * rng.uniform(0.0, 1.8))), dryness=dryness)
 
 
 def roll_up(vertices: Floats, turn: float) -> Floats:

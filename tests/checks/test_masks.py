@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mvseg.checks.masks import mask_findings
-from mvseg.matching.outline_gaps import touches_border
+from mvseg.matching.tangency import touches_border
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene
 from synthetic import BallScene, ball_scene

@@ -17,7 +17,7 @@ from mvseg.checks.finding import Finding
 from mvseg.checks.poses import _chosen_pairs, pairwise_agreement, pose_findings, view_agreement
 from mvseg.errors import InputWarning
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.matching.outline_gaps import SPECK, without_specks
+from mvseg.matching.tangency import SMALL_COMPONENT, without_small_components
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
 from synthetic import ball_scene, cameras_at, moved, render_balls
@@ -173,12 +173,12 @@ def test_cut_masks_and_the_epipole_are_left_out() -> None:
 def test_specks_do_not_end_a_mask() -> None:
     mask = np.zeros((60, 80), bool)
     mask[20:50, 10:60] = True
-    assert np.array_equal(without_specks(mask).astype(bool), mask)
+    assert np.array_equal(without_small_components(mask).astype(bool), mask)
     dirty = mask.copy()
     dirty[2, 70] = True
-    assert SPECK * mask.sum() > 1
-    assert np.array_equal(without_specks(dirty).astype(bool), mask)
-    assert without_specks(np.ones((1, 1), bool)).tolist() == [[1]]
+    assert SMALL_COMPONENT * mask.sum() > 1
+    assert np.array_equal(without_small_components(dirty).astype(bool), mask)
+    assert without_small_components(np.ones((1, 1), bool)).tolist() == [[1]]
 
 
 def test_many_views_are_compared_with_some() -> None:

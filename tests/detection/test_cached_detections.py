@@ -9,7 +9,13 @@ import pytest
 import torch
 
 from mvseg.detection import mask_rcnn
-from mvseg.detection.cached_detections import KeptDetections, claim_kept, delete_kept, read_detections, write_detections
+from mvseg.detection.cached_detections import (
+    CachedDetections,
+    claim_cache,
+    delete_cached,
+    read_detections,
+    write_detections,
+)
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.errors import InputError
@@ -49,7 +55,7 @@ def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> No
     names = []
 
     def note(made_by: str = "leaf-slim") -> None:
-        names.append(KeptDetections(tmp_path / "kept", made_by).path(load_scene(folder), 1))
+        names.append(CachedDetections(tmp_path / "kept", made_by).path(load_scene(folder), 1))
 
     note()
     note("another")
@@ -70,14 +76,14 @@ def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> No
 
 def test_only_what_mvseg_put_there_is_deleted(tmp_path: Path) -> None:
     kept = tmp_path / "kept"
-    delete_kept(kept)
+    delete_cached(kept)
     write_detections(kept / f"{'0' * 64}.safetensors", FOUND)
     (kept / f".{'0' * 64}.safetensors.partial").touch()
     (kept / "notes.txt").touch()
-    delete_kept(kept)
+    delete_cached(kept)
     assert [path.name for path in kept.iterdir()] == ["notes.txt"]
     (kept / "notes.txt").unlink()
-    delete_kept(kept)
+    delete_cached(kept)
     assert not kept.exists()
 
 
@@ -86,30 +92,30 @@ class TestClaim:
 
     def test_only_of_the_same_scene(self, tmp_path: Path) -> None:
         kept, scene = tmp_path / "kept", tmp_path / "a"
-        with claim_kept(kept, scene) as holds_some:
+        with claim_cache(kept, scene) as holds_some:
             assert not holds_some
             write_detections(kept / self.NAME, FOUND)
-        with claim_kept(kept, scene) as holds_some:
+        with claim_cache(kept, scene) as holds_some:
             assert holds_some
         message = rf"kept: keeps what .* found in the photos of {scene}, not of .*b; expected another --out, or"
         with pytest.raises(InputError, match=message):
-            claim_kept(kept, tmp_path / "b").__enter__()
+            claim_cache(kept, tmp_path / "b").__enter__()
         assert (kept / self.NAME).is_file()
-        with claim_kept(kept, tmp_path / "b", overwrite=True):
-            delete_kept(kept)
+        with claim_cache(kept, tmp_path / "b", overwrite=True):
+            delete_cached(kept)
         assert list(tmp_path.iterdir()) == []
 
     def test_by_one_run_at_a_time(self, tmp_path: Path) -> None:
-        with claim_kept(tmp_path / "kept", tmp_path), pytest.raises(InputError, match="another run is writing"):
-            claim_kept(tmp_path / "kept", tmp_path).__enter__()
+        with claim_cache(tmp_path / "kept", tmp_path), pytest.raises(InputError, match="another run is writing"):
+            claim_cache(tmp_path / "kept", tmp_path).__enter__()
 
     def test_a_run_that_fails_before_leaves_nothing(self, tmp_path: Path) -> None:
-        with pytest.raises(InputError), claim_kept(tmp_path / "new" / "er" / "kept", tmp_path):
+        with pytest.raises(InputError), claim_cache(tmp_path / "new" / "er" / "kept", tmp_path):
             raise InputError
         assert list(tmp_path.iterdir()) == []
         (tmp_path / "kept").mkdir()
         (tmp_path / "kept" / "notes.txt").touch()
-        with claim_kept(tmp_path / "kept", tmp_path):
+        with claim_cache(tmp_path / "kept", tmp_path):
             pass
         assert [path.name for path in (tmp_path / "kept").iterdir()] == ["notes.txt"]
 

@@ -10,7 +10,7 @@ from mvseg.matching.nview.match_scores import IdEvidence, features, match_scores
 
 def evidence(**changes: float) -> IdEvidence:
     """One region with good evidence, with changes."""
-    plain = {"score": 0.8, "margin": 0.9, "landing": 0.9, "weight": 0.8, "num_partners": 4, "num_pieces": 1}
+    plain = {"score": 0.8, "margin": 0.9, "coverage": 0.9, "weight": 0.8, "num_partners": 4, "num_fragments": 1}
     plain = plain | {"agreement": 1.0} | changes
     return IdEvidence(**{name: np.array([value]) for name, value in plain.items()}, num_views=5)
 
@@ -23,7 +23,7 @@ def test_alone_is_zero() -> None:
     assert match_scores(evidence(num_partners=0))[0] == 0
 
 
-@pytest.mark.parametrize(("name", "worse"), [("score", 0.2), ("margin", 0.05), ("weight", 0.3), ("num_pieces", 2)])
+@pytest.mark.parametrize(("name", "worse"), [("score", 0.2), ("margin", 0.05), ("weight", 0.3), ("num_fragments", 2)])
 def test_less_evidence_is_less_sure(name: str, worse: float) -> None:
     assert match_scores(evidence(**{name: worse}))[0] < match_scores(evidence())[0]
 
@@ -35,7 +35,7 @@ def test_a_close_rival_means_doubt() -> None:
 
 def test_by_hand_and_limited_to_what_the_plants_fill() -> None:
     assert features(evidence())[0].tolist() == [0.8, 0.9, 0.9, 0.8, 1.0, 0.25, 0.0]
-    far = features(evidence(score=-3, margin=9, landing=2, weight=-1, num_partners=9, num_pieces=3))[0]
+    far = features(evidence(score=-3, margin=9, coverage=2, weight=-1, num_partners=9, num_fragments=3))[0]
     assert far.tolist() == pytest.approx([-0.2, 1.5, 1, 0, 1, 1 / 9, 1])
 
 

@@ -9,9 +9,9 @@ from sklearn.metrics import adjusted_rand_score
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import row_table
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.nview.merged_masks import second_part
+from mvseg.matching.nview.plane_sweep import sweep_planes
 from mvseg.matching.one_per_view import ViewGraph
 from mvseg.matching.partition import renumber
 from synthetic import ball_scene, merged_balls
@@ -38,9 +38,9 @@ def test_either_ball_is_the_part_that_the_true_image_shows() -> None:
     regions, numbers, region = merged_balls(scene)
     x1, y1, x2, y2 = regions.boxes[region].tolist()
     true = torch.from_numpy(scene.label_maps[int(regions.view_index[region])][y1:y2, x1:x2])
-    mask, table = regions.crop(region), row_table(regions, scene.cameras)
-    no_weights = ViewGraph(np.zeros((len(regions), len(regions))), table.view_index, table.num_views)
-    scores = ClusterScores(table, no_weights, NViewConfig())
+    mask, sweep = regions.crop(region), sweep_planes(regions, scene.cameras)
+    no_weights = ViewGraph(np.zeros((len(regions), len(regions))), sweep.view_index, sweep.num_views)
+    scores = ClusterScores(sweep, no_weights, NViewConfig())
     for own, other in (numbers, numbers[::-1]):
         labels = regions.labels.clone()
         labels[region] = own

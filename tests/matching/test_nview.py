@@ -15,19 +15,19 @@ from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.nview.cluster_scores import ClusterScores, members_of
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import (
+from mvseg.matching.nview.hypothesis_index import index_hypotheses
+from mvseg.matching.nview.initialisation import em_affinities
+from mvseg.matching.nview.match_nview import match_nview
+from mvseg.matching.nview.plane_sweep import (
     EMPTY,
     OUTSIDE,
-    RowTable,
+    PlaneSweep,
     blocks_of_runs,
-    row_table,
-    row_tables,
     run_starts,
+    sweep_dilated,
+    sweep_planes,
 )
-from mvseg.matching.nview.match_nview import match_nview
-from mvseg.matching.nview.row_index import index_rows
 from mvseg.matching.nview.search import refine, search
-from mvseg.matching.nview.soft_start import em_affinities
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
 from mvseg.matching.partition import renumber
 from mvseg.matching.result import Matching
@@ -61,24 +61,24 @@ def balls() -> BallScene:
 
 
 @pytest.fixture(scope="module")
-def table(balls: BallScene) -> RowTable:
-    return row_table(balls.regions, balls.cameras)
+def sweep(balls: BallScene) -> PlaneSweep:
+    return sweep_planes(balls.regions, balls.cameras)
 
 
 @pytest.fixture
-def scores(balls: BallScene, table: RowTable) -> ClusterScores:
+def scores(balls: BallScene, sweep: PlaneSweep) -> ClusterScores:
     weights = region_affinity(balls.regions, balls.cameras).to_dense().double().numpy()
-    return ClusterScores(table, ViewGraph(weights, table.view_index, table.num_views), NViewConfig())
+    return ClusterScores(sweep, ViewGraph(weights, sweep.view_index, sweep.num_views), NViewConfig())
 
 
 # --- slow twins
 
 
-def row_score_reference(table: RowTable, row: int, members: set[int]) -> float:
-    """Score of one row in a cluster, from the definition."""
-    has_mask = {int(table.view_index[m]) for m in members}
+def hypothesis_score_reference(sweep: PlaneSweep, row: int, members: set[int]) -> float:
+    """Score of one hypothesis in a cluster, from the definition."""
+    has_mask = {int(sweep.view_index[m]) for m in members}
     total, inside = 0.0, 0
-    for view, label in enumerate(table.labels[row].tolist()):
+    for view, label in enumerate(sweep.labels[row].tolist()):
         if label == OUTSIDE:
             continue
         inside += 1
@@ -89,105 +89,105 @@ def row_score_reference(table: RowTable, row: int, members: set[int]) -> float:
     return total / inside
 
 
-def score_reference(table: RowTable, region: int, members: set[int]) -> float:
+def score_reference(sweep: PlaneSweep, region: int, members: set[int]) -> float:
     """S(n, c) from the definition."""
     scores = []
-    for pixel in np.flatnonzero(table.pixel_region == region):
-        rows = np.flatnonzero(table.pixel == pixel)
-        scores.append(max([-COSTS.hidden] + [row_score_reference(table, int(row), members) for row in rows]))
+    for pixel in np.flatnonzero(sweep.pixel_region == region):
+        rows = np.flatnonzero(sweep.pixel == pixel)
+        scores.append(max([-COSTS.hidden] + [hypothesis_score_reference(sweep, int(row), members) for row in rows]))
     return float(np.mean(scores))
 
 
-def some_ids(table: RowTable, seed: int) -> np.ndarray:
-    return renumber(np.random.default_rng(seed).integers(0, 6, len(table.view_index)))
+def some_ids(sweep: PlaneSweep, seed: int) -> np.ndarray:
+    return renumber(np.random.default_rng(seed).integers(0, 6, len(sweep.view_index)))
 
 
-def test_scores_agree_with_the_definition(table: RowTable, scores: ClusterScores) -> None:
-    clusters = some_ids(table, 0)
+def test_scores_agree_with_the_definition(sweep: PlaneSweep, scores: ClusterScores) -> None:
+    clusters = some_ids(sweep, 0)
     for view in (0, 3):
         view_scores = scores.scores(view, clusters)
-        for row, region in enumerate(np.flatnonzero(table.view_index == view).tolist()):
+        for row, region in enumerate(np.flatnonzero(sweep.view_index == view).tolist()):
             for cluster in range(clusters.max() + 1):
-                members = set(np.flatnonzero((clusters == cluster) & (table.view_index != view)).tolist())
-                assert view_scores[row, cluster] == pytest.approx(score_reference(table, region, members), abs=1e-5)
+                members = set(np.flatnonzero((clusters == cluster) & (sweep.view_index != view)).tolist())
+                assert view_scores[row, cluster] == pytest.approx(score_reference(sweep, region, members), abs=1e-5)
 
 
-def test_own_scores_agree_with_the_definition(table: RowTable, scores: ClusterScores) -> None:
-    ids = some_ids(table, 1)
+def test_own_scores_agree_with_the_definition(sweep: PlaneSweep, scores: ClusterScores) -> None:
+    ids = some_ids(sweep, 1)
     own_scores = scores.own(ids)
     for region in range(0, len(ids), 3):
         members = {m for m in np.flatnonzero(ids == ids[region]).tolist() if m != region}
-        assert own_scores[region] == pytest.approx(score_reference(table, region, members | {region}), abs=1e-5)
+        assert own_scores[region] == pytest.approx(score_reference(sweep, region, members | {region}), abs=1e-5)
 
 
-def test_landing_agrees_with_the_definition(table: RowTable, scores: ClusterScores) -> None:
-    ids = some_ids(table, 2)
-    cluster_landings = scores.landings(ids)
+def test_coverage_agrees_with_the_definition(sweep: PlaneSweep, scores: ClusterScores) -> None:
+    ids = some_ids(sweep, 2)
+    cluster_coverages = scores.coverages(ids)
     view, cluster = 2, int(ids[0])
     hits, pixels = np.zeros(len(ids)), 0
     members = set(np.flatnonzero(ids == cluster).tolist())
-    labels = np.where(np.arange(table.num_views) == view, OUTSIDE, table.labels)
-    masked_table = dataclasses.replace(table, labels=labels)
-    for pixel, region in enumerate(table.pixel_region.tolist()):
-        rows = np.flatnonzero(table.pixel == pixel)
-        if region not in members or table.view_index[region] == view or not len(rows):
+    labels = np.where(np.arange(sweep.num_views) == view, OUTSIDE, sweep.labels)
+    masked_sweep = dataclasses.replace(sweep, labels=labels)
+    for pixel, region in enumerate(sweep.pixel_region.tolist()):
+        rows = np.flatnonzero(sweep.pixel == pixel)
+        if region not in members or sweep.view_index[region] == view or not len(rows):
             continue
         values = []
         for row in rows.tolist():
-            is_alone = (masked_table.labels[row] == OUTSIDE).all()
-            values.append(0.0 if is_alone else row_score_reference(masked_table, row, members))
+            is_alone = (masked_sweep.labels[row] == OUTSIDE).all()
+            values.append(0.0 if is_alone else hypothesis_score_reference(masked_sweep, row, members))
         best = [row for row, value in zip(rows.tolist(), values, strict=True) if value >= max(values) - 1e-6]
         if max(values) >= 0:
             pixels += 1
             for row in best:
-                if table.labels[row, view] >= 0:
-                    hits[table.labels[row, view]] += 1 / len(best)
+                if sweep.labels[row, view] >= 0:
+                    hits[sweep.labels[row, view]] += 1 / len(best)
     np.testing.assert_allclose(
-        cluster_landings[cluster, table.view_index == view], (hits / pixels)[table.view_index == view], atol=1e-5
+        cluster_coverages[cluster, sweep.view_index == view], (hits / pixels)[sweep.view_index == view], atol=1e-5
     )
 
 
-def test_cached_scores_are_what_computing_again_gives(table: RowTable, scores: ClusterScores) -> None:
+def test_cached_scores_are_what_computing_again_gives(sweep: PlaneSweep, scores: ClusterScores) -> None:
     """Scores are cached by members; between the steps, some regions change their cluster."""
-    clusters = some_ids(table, 3)
+    clusters = some_ids(sweep, 3)
     for step in range(3):
         clusters = renumber(np.where(np.arange(len(clusters)) % 7 == step, np.roll(clusters, 1), clusters))
-        fresh = ClusterScores(table, scores.graph, scores.config)
-        np.testing.assert_allclose(scores.landings(clusters), fresh.landings(clusters), atol=1e-6)
+        fresh = ClusterScores(sweep, scores.graph, scores.config)
+        np.testing.assert_allclose(scores.coverages(clusters), fresh.coverages(clusters), atol=1e-6)
         for _ in range(2):
             np.testing.assert_array_equal(scores.own(clusters), fresh.own(clusters))
             assert scores.value(clusters) == fresh.value(clusters)
-        for view in range(table.num_views):
+        for view in range(sweep.num_views):
             np.testing.assert_allclose(scores.scores(view, clusters), fresh.scores(view, clusters), atol=1e-6)
 
 
-def test_regions_of_the_view_itself_do_not_matter(table: RowTable, scores: ClusterScores) -> None:
-    clusters = some_ids(table, 4)
-    reassigned = np.where(table.view_index == 1, 0, clusters)
+def test_regions_of_the_view_itself_do_not_matter(sweep: PlaneSweep, scores: ClusterScores) -> None:
+    clusters = some_ids(sweep, 4)
+    reassigned = np.where(sweep.view_index == 1, 0, clusters)
     np.testing.assert_array_equal(scores.scores(1, clusters), scores.scores(1, reassigned))
     left_out = np.where(clusters == 0, -1, clusters)
     np.testing.assert_array_equal(scores.scores(1, clusters)[:, 1:], scores.scores(1, left_out)[:, 1:])
-    assert scores.scores(1, np.full(len(clusters), -1)).shape == (int((table.view_index == 1).sum()), 0)
+    assert scores.scores(1, np.full(len(clusters), -1)).shape == (int((sweep.view_index == 1).sum()), 0)
 
 
-def test_rows_are_what_points_on_the_ray_show(balls: BallScene, table: RowTable) -> None:
-    """Every row is shown, label by label, by the label maps at the projections of its mean depth, or next to them."""
+def test_hypotheses_are_what_points_on_the_ray_show(balls: BallScene, sweep: PlaneSweep) -> None:
+    """Every hypothesis is shown, label by label, by the label maps where its mean depth projects, or next to it."""
     rng = np.random.default_rng(0)
-    for row in rng.choice(len(table.labels), 60, replace=False).tolist():
-        pixel = table.pixel[row]
-        view = int(table.view_index[table.pixel_region[pixel]])
-        ray = balls.cameras.world_from_px[view] @ torch.tensor([*table.pixel_xy[pixel], 1.0]).double()
-        point = balls.cameras.centers[view] + ray / float(table.inverse_depth[row])
+    for row in rng.choice(len(sweep.labels), 60, replace=False).tolist():
+        pixel = sweep.pixel[row]
+        view = int(sweep.view_index[sweep.pixel_region[pixel]])
+        ray = balls.cameras.world_from_px[view] @ torch.tensor([*sweep.pixel_xy[pixel], 1.0]).double()
+        point = balls.cameras.centers[view] + ray / float(sweep.inverse_depth[row])
         xy, depth = balls.cameras.project(point[None])
-        assert table.labels[row, view] == OUTSIDE
-        for other, label in enumerate(table.labels[row].tolist()):
+        assert sweep.labels[row, view] == OUTSIDE
+        for other, label in enumerate(sweep.labels[row].tolist()):
             u, v = (int(x) for x in xy[other, 0].floor())
             if other == view or label == OUTSIDE or depth[other] <= 0:
                 continue
             patch = balls.label_maps[other][max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
             shown = {number for number in np.unique(patch).tolist() if number}
-            numbers = balls.regions.labels[table.view_index == other].tolist()
-            regions = np.flatnonzero(table.view_index == other)
+            numbers = balls.regions.labels[sweep.view_index == other].tolist()
+            regions = np.flatnonzero(sweep.view_index == other)
             near = {int(regions[numbers.index(number)]) for number in shown}
             assert label in near if label >= 0 else 0 in patch
 
@@ -210,7 +210,7 @@ def test_members_are_in_rising_order_and_the_unmatched_are_left_out() -> None:
 
 
 def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvseg.matching.nview.label_rows.BLOCK_ROWS", 10)
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.BLOCK_SIZE", 10)
     runs = np.repeat(np.arange(40), np.random.default_rng(0).integers(1, 9, 40))
     runs = np.append(runs, [40] * 35)  # longer than a block
     blocks = blocks_of_runs(run_starts(runs), len(runs))
@@ -223,34 +223,36 @@ def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.M
 def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
     scores: ClusterScores, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clusters = some_ids(scores.table, 5)
-    expected = scores.own(clusters), scores.landings(clusters), em_affinities(scores.table)[-1]
-    monkeypatch.setattr("mvseg.matching.nview.label_rows.BLOCK_ROWS", 50)
-    monkeypatch.setattr("mvseg.matching.nview.soft_start.BLOCK_ROWS", 7)
-    again = ClusterScores(scores.table, scores.graph, scores.config)
-    found = again.own(clusters), again.landings(clusters), em_affinities(scores.table)[-1]
+    clusters = some_ids(scores.sweep, 5)
+    expected = scores.own(clusters), scores.coverages(clusters), em_affinities(scores.sweep)[-1]
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.BLOCK_SIZE", 50)
+    monkeypatch.setattr("mvseg.matching.nview.initialisation.BLOCK_SIZE", 7)
+    again = ClusterScores(scores.sweep, scores.graph, scores.config)
+    found = again.own(clusters), again.coverages(clusters), em_affinities(scores.sweep)[-1]
     for each, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(each, wanted, atol=1e-5)
 
 
 def test_own_scores_are_kept_cluster_by_cluster(scores: ClusterScores) -> None:
-    clusters = some_ids(scores.table, 6)
+    clusters = some_ids(scores.sweep, 6)
     scores.own(clusters)
     moved_on = renumber(np.where(np.arange(len(clusters)) == 3, clusters.max() + 1, clusters))
-    fresh = ClusterScores(scores.table, scores.graph, scores.config)
+    fresh = ClusterScores(scores.sweep, scores.graph, scores.config)
     np.testing.assert_array_equal(scores.own(moved_on), fresh.own(moved_on))
 
 
-def test_rows_are_found_by_the_regions_that_they_name(table: RowTable) -> None:
-    index, members = index_rows(table.labels, len(table.view_index)), [np.array([0, 9, 17]), np.zeros(0, np.int64)]
-    expected = [np.isin(table.labels, cluster).sum(1) for cluster in members]
+def test_hypotheses_are_found_by_the_regions_that_they_name(sweep: PlaneSweep) -> None:
+    index = index_hypotheses(sweep.labels, len(sweep.view_index))
+    members = [np.array([0, 9, 17]), np.zeros(0, np.int64)]
+    expected = [np.isin(sweep.labels, cluster).sum(1) for cluster in members]
     np.testing.assert_array_equal(index.count(members), expected)
 
 
-def test_label_maps_that_grow_step_by_step_give_the_tables_of_each_step(balls: BallScene) -> None:
-    widenings = (1, 2, 5)
-    for widen_px, grown in zip(widenings, row_tables(balls.regions, balls.cameras, widenings=widenings), strict=True):
-        expected = row_table(balls.regions, balls.cameras, widen_px=widen_px)
+def test_label_maps_that_grow_step_by_step_give_the_sweep_of_each_step(balls: BallScene) -> None:
+    dilations = (1, 2, 5)
+    sweeps = sweep_dilated(balls.regions, balls.cameras, dilations=dilations)
+    for dilation_px, grown in zip(dilations, sweeps, strict=True):
+        expected = sweep_planes(balls.regions, balls.cameras, dilation_px=dilation_px)
         np.testing.assert_array_equal(grown.labels, expected.labels)
         np.testing.assert_array_equal(grown.pixel, expected.pixel)
 
@@ -368,11 +370,11 @@ def test_refinement_never_ends_below_the_truth_on_clear_scenes(balls: BallScene,
     assert scores.value(partition) >= scores.value(truth) - 1e-6
 
 
-def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, table: RowTable) -> None:
-    A = em_affinities(table)[-1]
+def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, sweep: PlaneSweep) -> None:
+    A = em_affinities(sweep)[-1]
     np.testing.assert_allclose(A, A.T)
     same = (balls.regions.labels[:, None] == balls.regions.labels).numpy()
-    across = table.view_index[:, None] != table.view_index
+    across = sweep.view_index[:, None] != sweep.view_index
     assert A.min() >= 0
     assert A.max() <= 1 + 1e-6
     assert A[same & across].mean() > 0.6 > 0.1 > A[~same & across].mean()
@@ -381,25 +383,25 @@ def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, tabl
 
 def test_soft_affinity_agrees_with_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = ball_scene(3, 4, seed=2)
-    monkeypatch.setattr("mvseg.matching.nview.label_rows.PIXELS", 4)
-    table = row_table(scene.regions, scene.cameras)
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.PIXELS", 4)
+    sweep = sweep_planes(scene.regions, scene.cameras)
     expected = soft_affinity_reference(
-        table.labels.tolist(),
-        table.pixel.tolist(),
-        table.pixel_region.tolist(),
-        num_regions=len(table.view_index),
+        sweep.labels.tolist(),
+        sweep.pixel.tolist(),
+        sweep.pixel_region.tolist(),
+        num_regions=len(sweep.view_index),
         sharpness=[8.0, 12.0],
     )
-    np.testing.assert_allclose(em_affinities(table)[1], expected, atol=2e-4)
+    np.testing.assert_allclose(em_affinities(sweep)[1], expected, atol=2e-4)
 
 
 def test_a_few_of_many_views_tell_the_soft_affinity(
-    balls: BallScene, table: RowTable, monkeypatch: pytest.MonkeyPatch
+    balls: BallScene, sweep: PlaneSweep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mvseg.matching.nview.soft_start.EM_VIEWS", 4)
-    A = em_affinities(table)[-1]
+    monkeypatch.setattr("mvseg.matching.nview.initialisation.EM_VIEWS", 4)
+    A = em_affinities(sweep)[-1]
     same = (balls.regions.labels[:, None] == balls.regions.labels).numpy()
-    across = table.view_index[:, None] != table.view_index
+    across = sweep.view_index[:, None] != sweep.view_index
     assert A[same & across].mean() > 0.6 > 0.1 > A[~same & across].mean()
 
 
@@ -483,7 +485,7 @@ def test_the_reprojection_error_may_be_known_from_an_earlier_matching(monkeypatc
     scene = ball_scene(6, 6, seed=7, radius=0.1)
     cameras = turned_a_little(scene.cameras, 0.008)
     first, affinity = solve(scene.regions, cameras), region_affinity(scene.regions, cameras)
-    monkeypatch.setattr("mvseg.matching.nview.match_nview.row_tables", None)  # nothing is tried
+    monkeypatch.setattr("mvseg.matching.nview.match_nview.sweep_dilated", None)  # nothing is tried
     again = match_nview(scene.regions, cameras, affinity, residual_px=first.residual_px)
     assert torch.equal(again.instance_ids, first.instance_ids)
     assert again.residual_px == first.residual_px
@@ -522,10 +524,10 @@ def test_regions_without_a_pixel_and_very_many_views(balls: BallScene, monkeypat
     assert matching.instance_ids[0] == -1
     assert same_partition(matching.instance_ids[1:], regions.labels[1:])
     # as with 500 times as many views: still one pixel per region
-    monkeypatch.setattr("mvseg.matching.nview.label_rows.PLENTY", 0.01)
-    table = row_table(balls.regions, balls.cameras)
-    assert np.bincount(table.pixel_region).tolist() == [1] * len(balls.regions)
-    assert np.isfinite(em_affinities(table)[-1]).all()
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.PLENTY", 0.01)
+    sweep = sweep_planes(balls.regions, balls.cameras)
+    assert np.bincount(sweep.pixel_region).tolist() == [1] * len(balls.regions)
+    assert np.isfinite(em_affinities(sweep)[-1]).all()
 
 
 def turned_a_little(cameras: Cameras, radians: float) -> Cameras:

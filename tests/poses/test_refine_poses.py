@@ -15,9 +15,9 @@ from benchmarks.faults import disc
 from matched import matched
 from mvseg.errors import InputWarning
 from mvseg.matching.match import match_regions
-from mvseg.matching.outline_gaps import move_cameras
 from mvseg.matching.result import Matching
-from mvseg.poses.refine_poses import RefinedPoses, adjust, fit_poses, held_out_gaps, refine_poses
+from mvseg.matching.tangency import move_cameras
+from mvseg.poses.refine_poses import RefinedPoses, adjust, fit_poses, held_out_residuals, refine_poses
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from synthetic import BallScene, ball_scene, cameras_at, moved, permute_views
@@ -65,7 +65,7 @@ def refine(scene: BallScene, cameras: Cameras, regions: Regions | None = None) -
 def test_noise_gets_smaller(scene: BallScene, noisy: Cameras) -> None:
     poses = refine_poses(noisy, partial(match_regions, scene.regions))
     assert poses.is_refined
-    assert poses.gap_px[1] < 0.3 * poses.gap_px[0]
+    assert poses.residual_px[1] < 0.3 * poses.residual_px[0]
     assert pose_error(noisy, scene) > 2
     assert pose_error(poses.cameras, scene) < 0.4
 
@@ -112,13 +112,13 @@ def test_the_world_may_be_moved(scene: BallScene, noisy: Cameras) -> None:
 def test_the_world_stays_where_it_was(scene: BallScene, noisy: Cameras) -> None:
     """What masks cannot tell, scale and axes, is that of the given poses."""
     refined = fit_poses(adjust(true_matching(scene).masks, noisy))
-    spread = [(cameras.centers - cameras.centers.mean(0)).norm() for cameras in (noisy, refined)]
-    assert float(spread[1] / spread[0]) == pytest.approx(1, abs=0.01)
+    deviation = [(cameras.centers - cameras.centers.mean(0)).norm() for cameras in (noisy, refined)]
+    assert float(deviation[1] / deviation[0]) == pytest.approx(1, abs=0.01)
     assert float((refined.centers.mean(0) - noisy.centers.mean(0)).norm()) < 0.1
 
 
 def test_gaps_of_leaves_left_out_grow_with_exact_poses(scene: BallScene) -> None:
-    before, after = held_out_gaps(true_matching(scene).masks, scene.cameras)
+    before, after = held_out_residuals(true_matching(scene).masks, scene.cameras)
     assert 0 < before < 0.5
     assert before < after < 1
 
@@ -149,7 +149,7 @@ def test_nothing_to_refine_with(scene: BallScene) -> None:
     empty = regions_from_label_maps([np.zeros_like(labels) for labels in scene.label_maps])
     poses = refine_poses(scene.cameras, partial(match_regions, empty))
     assert not poses.is_refined
-    assert all(np.isnan(gap) for gap in poses.gap_px)
+    assert all(np.isnan(residual) for residual in poses.residual_px)
     alone = regions_from_label_maps([(labels == 1).astype(np.int64) for labels in scene.label_maps])
     assert not refine(scene, scene.cameras, alone).is_refined
 
@@ -168,4 +168,4 @@ def test_a_leaf_that_no_pair_of_views_tells_anything_of() -> None:
     labels = np.zeros((240, 320), np.int64)
     labels[100:140, 140:180] = 1
     regions = regions_from_label_maps([labels, labels])
-    assert np.isnan(held_out_gaps(matched(regions).masks, cameras)).all()
+    assert np.isnan(held_out_residuals(matched(regions).masks, cameras)).all()

@@ -110,8 +110,8 @@ def with_poses(result: Result, *, is_refined: bool) -> Result:
     scene = result.scene
     if is_refined:
         scene = replace(scene, cameras=replace(scene.cameras, t=scene.cameras.t + 0.1))
-    gaps = (3.14159, 0.5) if is_refined else (float("nan"), float("nan"))
-    poses = RefinedPoses(cameras=scene.cameras, is_refined=is_refined, gap_px=gaps)
+    residuals = (3.14159, 0.5) if is_refined else (float("nan"), float("nan"))
+    poses = RefinedPoses(cameras=scene.cameras, is_refined=is_refined, residual_px=residuals)
     return replace(ids_only(result), scene=scene, poses=poses)
 
 
@@ -120,7 +120,7 @@ def test_refined_cameras_can_be_read_back(result: Result, plant: Path, tmp_path:
     refined = with_poses(result, is_refined=True)
     save_result(refined, tmp_path / "out", {}, report=False)
     run = json.loads((tmp_path / "out" / "run.json").read_text())
-    assert run["poses"] == {"refined": True, "gap_px": [3.142, 0.5]}
+    assert run["poses"] == {"refined": True, "residual_px": [3.142, 0.5]}
     assert "cameras.json" in run["files"]
     again = shutil.copytree(plant, tmp_path / "plant")
     shutil.copy(tmp_path / "out" / "cameras.json", again)
@@ -140,7 +140,7 @@ def test_poses_that_stay_are_not_written(result: Result, tmp_path: Path) -> None
     save_result(with_poses(result, is_refined=False), tmp_path / "out", {})
     assert files_below(tmp_path / "out") == IDS_FILES
     assert json.loads((tmp_path / "out" / "run.json").read_text())["poses"] == {
-        "refined": False, "gap_px": [None, None]
+        "refined": False, "residual_px": [None, None]
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from blade_scene import ring_cameras
-from mvseg.results.gltf import describe_leaves, describe_world, gltf_from_world
+from mvseg.results.gltf import describe_world, gltf_from_world, leaf_extras
 from mvseg.scene import Scene, View
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
@@ -47,8 +47,8 @@ def test_leaves_say_their_numbers_and_no_others() -> None:
     }
     leaf = LeafTraits(leaf=12, numbers=numbers, method="surface", reasons=("one", "two"), rejection=None)
     traits = Traits(plant="basil", unit="mm", leaves=(leaf,), whole={}, up=None)
-    assert describe_leaves(traits) == {"leaf_012": {
+    assert leaf_extras(traits) == {"leaf_012": {
         "leaf": 12, "unit": "mm", "method": "surface", "quality": "one; two",
         "traits": {"area": 1234.57, "num_views": 4}, "sd": {"area": 12.3457},
     }}  # fmt: skip
-    assert describe_leaves(None) == {}
+    assert leaf_extras(None) == {}

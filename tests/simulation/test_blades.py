@@ -17,7 +17,7 @@ from mvseg.simulation.blades import (
     arc_points,
     blade_stations,
     half_widths,
-    measure_leaf,
+    leaf_from_blade,
     place_blade,
 )
 
@@ -26,7 +26,7 @@ BENT = dataclasses.replace(FLAT, droop=1.2, sweep=-0.3, twist=0.5, roll=0.2, fol
 
 
 def make_leaf(blade: Blade, azimuth: float = 0.4, elevation: float = 0.0) -> Leaf:
-    return measure_leaf(1, place_blade(blade, np.array([3.0, -2.0, 50.0]), azimuth=azimuth, elevation=elevation))
+    return leaf_from_blade(1, place_blade(blade, np.array([3.0, -2.0, 50.0]), azimuth=azimuth, elevation=elevation))
 
 
 def test_flat_blade_has_the_area_of_its_outline() -> None:

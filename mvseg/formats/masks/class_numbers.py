@@ -13,7 +13,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.regions import Regions
 
 SIDE = 256  # pixels: larger masks are looked at so small
-COMPARABLE = 0.2  # of the largest piece's area: smaller ones are crumbs
+COMPARABLE = 0.2  # of the largest piece's area: smaller ones are too small to tell
 FAR = 0.5  # gap between pieces, in the square root of the smaller one's area
 MANY = 0.5  # share of the photos, or of the numbers of one
 PHOTO = 50  # numbers of a label image: with more, it may be a photo

@@ -1,4 +1,4 @@
-"""Parameters of the N-view matcher: costs of a row, gains of a region, thresholds of the search.
+"""Parameters of the N-view matcher: costs of a hypothesis, gains of a region, thresholds of the search.
 
 They were chosen on simulated development plants, with true and degraded masks (`benchmarks/matching.py --split dev`).
 """
@@ -9,8 +9,8 @@ from dataclasses import dataclass, field, replace
 
 
 @dataclass(frozen=True)
-class RowCosts:
-    """What a view that does not show the cluster costs in a row, where one that shows it scores 1.
+class HypothesisCosts:
+    """What a view that does not show the cluster costs in a hypothesis, where one that shows it scores 1.
 
     Attributes:
         missing: cost of no region there, although the cluster has one in this view.
@@ -28,14 +28,14 @@ class Gains:
     """What a region gains from a cluster in addition to its score there.
 
     Attributes:
-        landing: gain of a region on which all best rows of the cluster land.
+        coverage: gain of a region that all best hypotheses of the cluster show.
         weight: gain per unit of epipolar evidence for a pair of regions (`ClusterScores.evidence`), over V - 1. With
             few views there is little other evidence: `weight_few` / (V - 1) is added to it.
         weight_few: see `weight`.
         alone: gain of a region that stays alone.
     """
 
-    landing: float = 0.5
+    coverage: float = 0.5
     weight: float = 2.0
     weight_few: float = 2.0
     alone: float = 0.0
@@ -51,19 +51,19 @@ class Thresholds:
     """When regions join a cluster that has a region in their view already, and when a mask covers two instances.
 
     Attributes:
-        piece_landing: least landing of such a cluster on a left-over region that joins it.
-        piece_score: least score of the left-over region, as a share of the score of the region already there.
+        fragment_coverage: least coverage of such a cluster on a left-over region that joins it.
+        fragment_score: least score of the left-over region, as a share of the score of the region already there.
         few: clusters that at most this share of the views show are doubted.
-        few_landing: least landing of a cluster on a region that it takes over from a doubted one.
-        merged_landing: least landing of a cluster on a region that it may share with another cluster.
+        few_coverage: least coverage of a cluster on a region that it takes over from a doubted one.
+        merged_coverage: least coverage of a cluster on a region that it may share with another cluster.
         merged_share: least share of the pixels of such a region that only the second cluster explains.
     """
 
-    piece_landing: float = 0.05
-    piece_score: float = 0.5
+    fragment_coverage: float = 0.05
+    fragment_score: float = 0.5
     few: float = 0.25
-    few_landing: float = 0.02
-    merged_landing: float = 0.25
+    few_coverage: float = 0.02
+    merged_coverage: float = 0.25
     merged_share: float = 0.2
 
 
@@ -71,13 +71,20 @@ class Thresholds:
 class NViewConfig:
     """All parameters of the N-view matcher."""
 
-    costs: RowCosts = field(default_factory=RowCosts)
+    costs: HypothesisCosts = field(default_factory=HypothesisCosts)
     gains: Gains = field(default_factory=Gains)
     thresholds: Thresholds = field(default_factory=Thresholds)
 
     def for_views(self, num_views: int) -> NViewConfig:
-        """The parameters for V views: stricter about pieces up to three, too few to tell a piece from a neighbour."""
+        """The parameters for V views: stricter about fragments up to three, too few to tell a fragment from a
+        neighbour."""
         if num_views > 3:
             return self
-        piece_landing, piece_score = max(self.thresholds.piece_landing, 0.1), max(self.thresholds.piece_score, 0.8)
-        return replace(self, thresholds=replace(self.thresholds, piece_landing=piece_landing, piece_score=piece_score))
+        fragment_coverage, fragment_score = (
+            max(self.thresholds.fragment_coverage, 0.1),
+            max(self.thresholds.fragment_score, 0.8),
+        )
+        return replace(
+            self,
+            thresholds=replace(self.thresholds, fragment_coverage=fragment_coverage, fragment_score=fragment_score),
+        )

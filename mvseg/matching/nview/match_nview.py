@@ -1,9 +1,9 @@
 """Matching by what all views show, from start to finish.
 
 Pairs of views cannot tell apart leaves that share their epipolar lines; a third view can. What the views show along the
-rays of each region (`label_rows.py`) gives a start (`soft_start.py`); the search (`search.py`) improves it by how well
-clusters explain all views (`cluster_scores.py`); then every id gets a probability (`match_scores.py`), and masks that
-cover two instances are found (`merged_masks.py`).
+rays of each region (`plane_sweep.py`) gives initial partitions (`initialisation.py`); the search (`search.py`) improves
+them by how well clusters explain all views (`cluster_scores.py`); then every id gets a probability (`match_scores.py`),
+and masks that cover two instances are found (`merged_masks.py`).
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from mvseg.matching.affinity import Affinity
 from mvseg.matching.links import Links, keep_links
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.label_rows import RowTable, rays_per_region, row_table, row_tables
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
+from mvseg.matching.nview.plane_sweep import PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import search
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
 from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
@@ -31,9 +31,9 @@ from mvseg.scene import Cameras
 
 Ints = NDArray[np.int64]
 
-WIDENINGS = (1, 2, 4, 8)  # reprojection errors that are tried, pixels
-PROBE_RAYS = 1500  # tell whether a widening helps, at least about this many
-EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean score above which the poses are sound; below which the rows are useless
+DILATIONS = (1, 2, 4, 8)  # reprojection errors that are tried, pixels
+PROBE_RAYS = 1500  # tell whether a dilation helps, at least about this many
+EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean score above which the poses are sound; below which the hypotheses are useless
 
 
 def match_nview(
@@ -53,12 +53,12 @@ def match_nview(
         cameras: V cameras.
         affinity: the epipolar weights of the regions.
         config: costs, gains and thresholds.
-        residual_px: the reprojection error where it is known, one of WIDENINGS; None: estimated.
+        residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
         links: of the regions, see `keep_links`.
         progress: show progress bars.
 
     Returns:
-        The matching, on the device of the regions. Its method is "one-per-view" where the rows do not explain the
+        The matching, on the device of the regions. Its method is "one-per-view" where the hypotheses do not explain the
         regions (poses too far off) or there are two views. It is deterministic and does not depend on the order of
         views and regions unless two choices tie exactly. Without regions or edges all ids are -1.
     """
@@ -96,8 +96,8 @@ class FoundClusters:
 
     Attributes:
         clusters: (D,) int64 in [0, K), regions alone included.
-        scores: of the rows.
-        residual_px: see `fit_poses`.
+        scores: of the hypotheses.
+        residual_px: see `select_dilation`.
         method: "nview", or "one-per-view" where these are the pairwise clusters.
     """
 
@@ -117,7 +117,7 @@ def find_clusters(
     residual_px: int | None = None,
     progress: bool = False,
 ) -> FoundClusters:
-    """The clusters that explain all views best, or where rows explain too little, those from the weights alone.
+    """The clusters that explain all views best, or where hypotheses explain too little, those from the weights alone.
 
     Args:
         regions: D regions, ordered by view.
@@ -125,10 +125,10 @@ def find_clusters(
         graph: their epipolar weights.
         pairwise: (D,) int64, clusters from the weights alone, in [0, K).
         config: costs, gains and thresholds.
-        residual_px: the reprojection error where it is known, one of WIDENINGS; None: estimated.
+        residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
         progress: show progress bars.
     """
-    scores, residual_px = fit_poses(
+    scores, residual_px = select_dilation(
         regions, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
     )
     clusters, method = pairwise, "one-per-view"
@@ -139,7 +139,7 @@ def find_clusters(
     return FoundClusters(clusters=clusters, scores=scores, residual_px=residual_px, method=method)
 
 
-def fit_poses(
+def select_dilation(
     regions: Regions,
     cameras: Cameras,
     graph: ViewGraph,
@@ -149,27 +149,27 @@ def fit_poses(
     residual_px: int | None = None,
     progress: bool = False,
 ) -> tuple[ClusterScores, int]:
-    """The scores of the row table whose label maps are widened by the reprojection error, and that error in pixels.
+    """The scores of the plane sweep whose label maps are dilated by the reprojection error, and that error in pixels.
 
-    The error is the least widening with which the rows explain the pairwise clusters nearly as well as with any; a few
-    rays of each region tell that of all but the first. A `residual_px` that is known is not estimated.
+    The error is the least dilation with which the hypotheses explain the pairwise clusters nearly as well as with any;
+    a few rays of each region tell that of all but the first. A `residual_px` that is known is not estimated.
     """
     config = config.for_views(len(cameras))
 
-    def score(table: RowTable) -> ClusterScores:
-        return ClusterScores(table, graph, config)
+    def score(sweep: PlaneSweep) -> ClusterScores:
+        return ClusterScores(sweep, graph, config)
 
-    first = score(row_table(regions, cameras, widen_px=residual_px or WIDENINGS[0], progress=progress))
+    first = score(sweep_planes(regions, cameras, dilation_px=residual_px or DILATIONS[0], progress=progress))
     explained = [first.explained(pairwise)]
     if residual_px is not None or explained[0] >= EXPLAINED:
-        return first, residual_px or WIDENINGS[0]
+        return first, residual_px or DILATIONS[0]
     rays = min(rays_per_region(len(cameras)), -(-PROBE_RAYS // max(len(regions), 1)))
-    for table in row_tables(regions, cameras, widenings=WIDENINGS[1:], rays=rays, progress=progress):
-        explained.append(score(table).explained(pairwise))
+    for sweep in sweep_dilated(regions, cameras, dilations=DILATIONS[1:], rays=rays, progress=progress):
+        explained.append(score(sweep).explained(pairwise))
     best = int(np.argmax(np.array(explained) >= max(explained) - 0.05))
     if best == 0:
-        return first, WIDENINGS[0]
-    return score(row_table(regions, cameras, widen_px=WIDENINGS[best], progress=progress)), WIDENINGS[best]
+        return first, DILATIONS[0]
+    return score(sweep_planes(regions, cameras, dilation_px=DILATIONS[best], progress=progress)), DILATIONS[best]
 
 
 def _final_numbers(ids: torch.Tensor) -> torch.Tensor:

@@ -36,20 +36,20 @@ class IdEvidence:
     Attributes:
         score: (D,) leave-one-out score in the region's cluster.
         margin: (D,) gain of the region's cluster minus that of the best alternative: another cluster, or being alone.
-        landing: (D,) share of the cluster's pixels in other views that land on the region.
+        coverage: (D,) share of the cluster's pixels in other views that are covered by the region.
         weight: (D,) mean epipolar weight to the members in other views.
         num_partners: (D,) int64, members of the cluster in other views; 0 for a region that is alone.
-        num_pieces: (D,) int64, members of the cluster in the region's own view, itself included.
+        num_fragments: (D,) int64, members of the cluster in the region's own view, itself included.
         agreement: (D,) share of the regions of other views in this cluster or in the pairwise one that are in both.
         num_views: V.
     """
 
     score: Floats
     margin: Floats
-    landing: Floats
+    coverage: Floats
     weight: Floats
     num_partners: Ints
-    num_pieces: Ints
+    num_fragments: Ints
     agreement: Floats
     num_views: int
 
@@ -62,30 +62,30 @@ def collect_evidence(scores: ClusterScores, clusters: Ints, pairwise: Ints) -> I
         clusters: (D,) int64, the cluster of each region in [0, K).
         pairwise: (D,) int64, likewise, from the epipolar weights alone: a second opinion.
     """
-    table, alone = scores.table, scores.config.gains.alone
-    landings = scores.landings(clusters)
-    score, own_gain, rival_gain, landing = (np.zeros(len(clusters)) for _ in range(4))
-    for view in np.unique(table.view_index).tolist():
-        here = table.bounds.regions(view)
-        gains = scores.gains(view, clusters, landings)
+    sweep, alone = scores.sweep, scores.config.gains.alone
+    coverages = scores.coverages(clusters)
+    score, own_gain, rival_gain, coverage = (np.zeros(len(clusters)) for _ in range(4))
+    for view in np.unique(sweep.view_index).tolist():
+        here = sweep.bounds.regions(view)
+        gains = scores.gains(view, clusters, coverages)
         is_own = clusters[here][:, None] == gains.clusters
         score[here] = (gains.score * is_own).sum(1)
         own_gain[here] = (gains.total * is_own).sum(1)
         rival_gain[here] = np.where(is_own, alone, gains.total).max(1, initial=alone)
-        landing[here] = (gains.landing * is_own).sum(1)
+        coverage[here] = (gains.coverage * is_own).sum(1)
     is_partner = scores.together(clusters)
-    is_same_view = table.view_index[:, None] == table.view_index
+    is_same_view = sweep.view_index[:, None] == sweep.view_index
     num_partners = is_partner.sum(1)
     is_paired = scores.together(pairwise)
     return IdEvidence(
         score=score,
         margin=own_gain - rival_gain,
-        landing=landing,
+        coverage=coverage,
         weight=(scores.graph.weights * is_partner).sum(1) / np.maximum(num_partners, 1),
         num_partners=num_partners,
-        num_pieces=((clusters[:, None] == clusters) & is_same_view).sum(1),
+        num_fragments=((clusters[:, None] == clusters) & is_same_view).sum(1),
         agreement=(is_partner & is_paired).sum(1) / np.maximum((is_partner | is_paired).sum(1), 1),
-        num_views=table.num_views,
+        num_views=sweep.num_views,
     )
 
 
@@ -96,11 +96,11 @@ def features(evidence: IdEvidence) -> Floats:
         [
             np.clip(evidence.score, -0.2, 1),
             np.clip(evidence.margin, -1, 1.5),
-            np.clip(evidence.landing, 0, 1),
+            np.clip(evidence.coverage, 0, 1),
             np.clip(evidence.weight, 0, 1),
             np.minimum(evidence.num_partners / others, 1),
             1 / np.maximum(evidence.num_partners, 1),
-            evidence.num_pieces > 1,
+            evidence.num_fragments > 1,
         ],
         1,
     )

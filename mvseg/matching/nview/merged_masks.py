@@ -19,7 +19,7 @@ HALF_AS_GOOD = 0.5  # share of a cluster's median score from which it explains a
 def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tuple[MergedMask, ...]:
     """Masks that cover two instances: two clusters explain disjoint parts of them.
 
-    A cluster that has no region in a view, but lands on one that belongs to another cluster, may share it. A pixel is
+    A cluster that has no region in a view, but covers one that belongs to another cluster, may share it. A pixel is
     explained by a cluster when it scores at least half of the median score of the cluster's regions. Of several such
     clusters, the one that explains most of the pixels that the region's own cluster does not is its second.
 
@@ -33,7 +33,7 @@ def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tupl
     """
     is_second = _may_be_second(scores, clusters)
     merged = []
-    for view in range(scores.table.num_views):
+    for view in range(scores.sweep.num_views):
         for region, second in _shared_in_view(scores, clusters, view, is_second=is_second):
             part = second_part(scores, clusters, regions, region=region, second=second)
             merged.append(MergedMask(region=region, own=int(clusters[region]) + 1, other=second + 1, part=part))
@@ -41,13 +41,13 @@ def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tupl
 
 
 def _may_be_second(scores: ClusterScores, clusters: Ints) -> NDArray[np.bool_]:
-    """(K, D) bool: the cluster is seen in enough views, has no region in the region's view, and lands on the region."""
-    views, thresholds = scores.table.view_index, scores.config.thresholds
-    landings = scores.landings(clusters)
-    is_shown = np.zeros((len(landings), scores.table.num_views), bool)
+    """(K, D) bool: the cluster is seen in enough views, has no region in the region's view, and covers the region."""
+    views, thresholds = scores.sweep.view_index, scores.config.thresholds
+    coverages = scores.coverages(clusters)
+    is_shown = np.zeros((len(coverages), scores.sweep.num_views), bool)
     is_shown[clusters, views] = True
-    is_seen_enough = is_shown.sum(1) >= max(2, thresholds.few * scores.table.num_views)
-    is_second = (landings >= thresholds.merged_landing) & is_seen_enough[:, None] & is_seen_enough[clusters]
+    is_seen_enough = is_shown.sum(1) >= max(2, thresholds.few * scores.sweep.num_views)
+    is_second = (coverages >= thresholds.merged_coverage) & is_seen_enough[:, None] & is_seen_enough[clusters]
     return is_second & ~is_shown[:, views]
 
 
@@ -55,7 +55,7 @@ def _shared_in_view(
     scores: ClusterScores, clusters: Ints, view: int, *, is_second: NDArray[np.bool_]
 ) -> list[tuple[int, int]]:
     """Regions of one view that two clusters share, with the second cluster."""
-    here = np.flatnonzero(scores.table.view_index == view)
+    here = np.flatnonzero(scores.sweep.view_index == view)
     shared = here[is_second[:, here].any(0)]
     if not len(shared):
         return []
@@ -65,7 +65,7 @@ def _shared_in_view(
     own, members = scores.own(clusters), members_of(clusters, len(is_second))
     median_score = np.array([np.median(own[members[number]]) for number in asked])
     is_explained = scores.pixel_scores(view, column[clusters]) >= HALF_AS_GOOD * median_score
-    pixel_region = scores.table.pixel_region[scores.table.bounds.pixels(view)]
+    pixel_region = scores.sweep.pixel_region[scores.sweep.bounds.pixels(view)]
     pairs = []
     for region in shared.tolist():
         candidates = np.append(clusters[region], np.flatnonzero(is_second[:, region]))
@@ -90,17 +90,17 @@ def second_part(scores: ClusterScores, clusters: Ints, regions: Regions, *, regi
     Returns:
         (h, w) bool on the CPU, in the region's box and inside its mask; nowhere for a region without sampled pixels.
     """
-    table = scores.table
-    view = int(table.view_index[region])
-    pixels = table.bounds.pixels(view)
-    is_here = table.pixel_region[pixels] == region
+    sweep = scores.sweep
+    view = int(sweep.view_index[region])
+    pixels = sweep.bounds.pixels(view)
+    is_here = sweep.pixel_region[pixels] == region
     mask = regions.crop(region).cpu()
     part, mask_pixels = torch.zeros_like(mask), mask.nonzero()
     if not is_here.any():
         return part
     pair = np.where(clusters == clusters[region], 0, np.where(clusters == second, 1, -1))
     pixel_scores = scores.pixel_scores(view, pair)[is_here]
-    sampled = torch.from_numpy(table.pixel_xy[pixels][is_here]) - regions.boxes[region, :2].cpu()
+    sampled = torch.from_numpy(sweep.pixel_xy[pixels][is_here]) - regions.boxes[region, :2].cpu()
     nearest = torch.cdist(mask_pixels.flip(1) + 0.5, sampled).topk(min(NEIGHBOURS, len(sampled)), largest=False).indices
     advantage = torch.from_numpy(pixel_scores[:, 1] - pixel_scores[:, 0])[nearest].mean(1)
     part[mask_pixels[:, 0], mask_pixels[:, 1]] = advantage > 0

@@ -2,7 +2,7 @@
 
 Each start is refined by one assignment problem per view, as in `one_per_view.py`, but decided by how well the clusters
 explain the regions in all views. A left-over region may join a cluster that has a region in its view already, if the
-cluster lands there too: pieces of an instance that the segmenter split, or that a stem in front of it divides.
+cluster covers it too: fragments of an instance that the segmenter split, or that a stem in front of it divides.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.soft_start import soft_starts
+from mvseg.matching.nview.initialisation import initial_partitions
 from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_order
 from mvseg.matching.partition import renumber
 
@@ -40,8 +40,8 @@ def search(scores: ClusterScores, pairwise: Ints, *, progress: bool = False) -> 
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
     refined = []
-    for start in soft_starts(scores.table):
-        refined.append(refine(scores, refine(scores, start, progress=progress), join_pieces=True, progress=progress))
+    for start in initial_partitions(scores.sweep):
+        refined.append(refine(scores, refine(scores, start, progress=progress), join_fragments=True, progress=progress))
     values = [scores.value(clusters) for clusters in (pairwise, *refined)]
     best = pairwise
     if max(values) - values[0] > (1 - AS_GOOD) * abs(max(values)):
@@ -50,31 +50,31 @@ def search(scores: ClusterScores, pairwise: Ints, *, progress: bool = False) -> 
     return join_few(scores, best)
 
 
-def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False, progress: bool = False) -> Ints:
+def refine(scores: ClusterScores, clusters: Ints, *, join_fragments: bool = False, progress: bool = False) -> Ints:
     """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
 
     Args:
         scores: of D regions.
         clusters: (D,) clusters to start from.
-        join_pieces: left-over regions may join a cluster that has a region in their view already.
+        join_fragments: left-over regions may join a cluster that has a region in their view already.
         progress: show a progress bar over the views of each sweep.
 
     Returns:
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
-    clusters, bounds = renumber(clusters), scores.table.bounds
+    clusters, bounds = renumber(clusters), scores.sweep.bounds
     order = view_order(scores.graph)
     for _ in range(MAX_SWEEPS):
-        before, landings = clusters, scores.landings(clusters)
+        before, coverages = clusters, scores.coverages(clusters)
         clusters = before.copy()
         for view in tqdm(order.tolist(), desc="search", unit="view", leave=False, disable=not progress):
             here = bounds.regions(view)
             if here.start == here.stop:
                 continue
-            gains = scores.gains(view, clusters, landings)
+            gains = scores.gains(view, clusters, coverages)
             chosen = assign_one_to_one(gains.total, scores.config.gains.alone)
-            if join_pieces:
-                chosen = _join_pieces(chosen, gains, scores.config)
+            if join_fragments:
+                chosen = _join_fragments(chosen, gains, scores.config)
             fresh = clusters.max() + 1 + np.arange(len(chosen))
             clusters[here] = np.append(gains.clusters, fresh)[chosen]
         clusters = renumber(clusters)
@@ -84,11 +84,12 @@ def refine(scores: ClusterScores, clusters: Ints, *, join_pieces: bool = False, 
 
 
 def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
-    """Dissolve clusters that few views show into larger ones that land on their regions.
+    """Dissolve clusters that few views show into larger ones that cover their regions.
 
-    Pieces of split masks, and masks that are merged with something else, find each other across views and form spurious
-    instances. A region of such a cluster joins the larger one that lands most on it and explains some of it, if there
-    is one, whether or not that one has a region in the view already. With fewer than four views nothing is dissolved.
+    Fragments of over-segmented masks, and masks that are merged with something else, find each other across views and
+    form spurious instances. A region of such a cluster joins the larger one that covers most of it and explains some of
+    it, if there is one, whether or not that one has a region in the view already. With fewer than four views nothing is
+    dissolved.
 
     Args:
         scores: of D regions.
@@ -97,31 +98,31 @@ def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
     Returns:
         (D,) int64, the remaining clusters, numbered likewise.
     """
-    table, thresholds = scores.table, scores.config.thresholds
-    is_shown = np.zeros((int(clusters.max(initial=-1)) + 1, table.num_views), bool)
-    is_shown[clusters, table.view_index] = True
-    is_few = is_shown.sum(1) <= max(1, thresholds.few * table.num_views)
-    if table.num_views < 4 or not is_few.any():
+    sweep, thresholds = scores.sweep, scores.config.thresholds
+    is_shown = np.zeros((int(clusters.max(initial=-1)) + 1, sweep.num_views), bool)
+    is_shown[clusters, sweep.view_index] = True
+    is_few = is_shown.sum(1) <= max(1, thresholds.few * sweep.num_views)
+    if sweep.num_views < 4 or not is_few.any():
         return clusters
-    landings, joined = scores.landings(clusters), clusters.copy()
-    for view in np.unique(table.view_index[is_few[clusters]]).tolist():
-        here = table.bounds.regions(view)
-        gains = scores.gains(view, clusters, landings)
-        fits = ~is_few[gains.clusters] & (gains.landing >= thresholds.few_landing) & (gains.score > 0)
+    coverages, joined = scores.coverages(clusters), clusters.copy()
+    for view in np.unique(sweep.view_index[is_few[clusters]]).tolist():
+        here = sweep.bounds.regions(view)
+        gains = scores.gains(view, clusters, coverages)
+        fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.few_coverage) & (gains.score > 0)
         moves = is_few[clusters[here]] & fits.any(1)
         if moves.any():
-            joined[here][moves] = gains.clusters[np.where(fits, gains.landing, -1)[moves].argmax(1)]
+            joined[here][moves] = gains.clusters[np.where(fits, gains.coverage, -1)[moves].argmax(1)]
     return renumber(joined)
 
 
-def _join_pieces(chosen: Ints, gains: ViewGains, config: NViewConfig) -> Ints:
-    """Put left-over regions into taken clusters that land on them and explain them well."""
+def _join_fragments(chosen: Ints, gains: ViewGains, config: NViewConfig) -> Ints:
+    """Put left-over regions into taken clusters that cover them and explain them well."""
     is_assigned = chosen < len(gains.clusters)
     holder_score = np.full(len(gains.clusters), np.inf)
     holder_score[chosen[is_assigned]] = gains.score[is_assigned, chosen[is_assigned]]
-    fits = (gains.landing >= config.thresholds.piece_landing) & (gains.score > 0)
-    fits &= gains.score >= config.thresholds.piece_score * holder_score
-    value = np.where(fits, gains.score + config.gains.landing * gains.landing, -np.inf)
+    fits = (gains.coverage >= config.thresholds.fragment_coverage) & (gains.score > 0)
+    fits &= gains.score >= config.thresholds.fragment_score * holder_score
+    value = np.where(fits, gains.score + config.gains.coverage * gains.coverage, -np.inf)
     joins = ~is_assigned & fits.any(1)
     chosen = chosen.copy()
     if joins.any():

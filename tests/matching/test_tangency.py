@@ -1,4 +1,4 @@
-"""Gaps between outlines: 0 on exact scenes, and their derivatives."""
+"""TangencyResiduals between outlines: 0 on exact scenes, and their derivatives."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 
 from matched import matched
 from mvseg.masks import Masks
-from mvseg.matching.outline_gaps import Outlines, find_outlines, measure_gaps, move_cameras, pair_outlines
+from mvseg.matching.tangency import Outlines, find_outlines, move_cameras, pair_outlines, tangency_residuals
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from synthetic import BallScene, arc_positions, ball_scene, cameras_at
@@ -35,9 +35,9 @@ def test_balls_begin_and_end_on_the_same_lines() -> None:
     scene = ball_scene(5, 6, seed=3, radius=0.25)
     outlines = find_outlines(true_masks(scene), scene.cameras)
     pairs = pair_outlines(outlines, scene.cameras)
-    gaps = measure_gaps(outlines, pairs, scene.cameras, world_per_px=torch.ones(6))
-    assert len(gaps.px) == 2 * len(pairs) > 100
-    assert gaps.px.abs().median() < 0.5  # a pixel's centre is up to half a pixel from the ball's edge
+    residuals = tangency_residuals(outlines, pairs, scene.cameras, world_per_px=torch.ones(6))
+    assert len(residuals.px) == 2 * len(pairs) > 100
+    assert residuals.px.abs().median() < 0.5  # a pixel's centre is up to half a pixel from the ball's edge
 
 
 def test_wrong_poses_leave_gaps_of_about_their_error() -> None:
@@ -46,8 +46,8 @@ def test_wrong_poses_leave_gaps_of_about_their_error() -> None:
     steps = torch.from_numpy(np.random.default_rng(0).normal(0, 6, (6, 6)))
     steps[:, 3:] = 0
     turned = move_cameras(scene.cameras, steps, torch.ones(6))
-    gaps = measure_gaps(outlines, pair_outlines(outlines, turned), turned, world_per_px=torch.ones(6))
-    assert 2 < gaps.px.abs().median() < 12
+    residuals = tangency_residuals(outlines, pair_outlines(outlines, turned), turned, world_per_px=torch.ones(6))
+    assert 2 < residuals.px.abs().median() < 12
 
 
 def test_derivatives_are_those_of_differences() -> None:
@@ -58,7 +58,7 @@ def test_derivatives_are_those_of_differences() -> None:
     world_per_px = torch.tensor([0.02, 0.03, 0.02, 0.01]).double()
     start = move_cameras(cameras, torch.from_numpy(rng.normal(0, 3, (4, 6))), world_per_px)
     pairs = pair_outlines(outlines, start)
-    gaps = measure_gaps(outlines, pairs, start, world_per_px=world_per_px)
+    residuals = tangency_residuals(outlines, pairs, start, world_per_px=world_per_px)
     for view in range(4):
         for axis in range(6):
             sides = []
@@ -66,9 +66,9 @@ def test_derivatives_are_those_of_differences() -> None:
                 steps = torch.zeros(4, 6).double()
                 steps[view, axis] = sign * 1e-4
                 moved = move_cameras(start, steps, world_per_px)
-                sides.append(measure_gaps(outlines, pairs, moved, world_per_px=world_per_px).px)
-            expected = (gaps.by_pose[..., axis] * (outlines.view[gaps.outlines] == view)).sum(1)
-            # the gap's own scale changes, too, which Gauss-Newton leaves out: a few per cent of a pixel per pixel
+                sides.append(tangency_residuals(outlines, pairs, moved, world_per_px=world_per_px).px)
+            expected = (residuals.by_pose[..., axis] * (outlines.view[residuals.outlines] == view)).sum(1)
+            # the residual's own scale changes, too, which Gauss-Newton leaves out: a few per cent of a pixel per pixel
             assert torch.allclose((sides[0] - sides[1]) / 2e-4, expected, atol=0.05)
 
 
@@ -77,14 +77,14 @@ def test_growth_moves_both_ends_outwards() -> None:
     points = torch.from_numpy(np.random.default_rng(2).normal(0, 0.3, (1, 20, 3)))
     outlines = points_as_outlines(cameras, points)
     pairs = torch.tensor([[0, 1]])
-    gaps = measure_gaps(outlines, pairs, cameras, world_per_px=torch.ones(2))
+    residuals = tangency_residuals(outlines, pairs, cameras, world_per_px=torch.ones(2))
     away = outlines.corners[0] - outlines.middle[0]
     corners = outlines.corners.clone()
     corners[0] += 0.1 * away / away.norm(dim=1, keepdim=True)
     grown = Outlines(corners, outlines.middle, outlines.view, outlines.instance, outlines.weight)
-    change = measure_gaps(grown, pairs, cameras, world_per_px=torch.ones(2)).px - gaps.px
-    assert (change.sign() == gaps.by_growth[:, 0].sign()).all()
-    assert (gaps.by_growth.abs() <= 1).all()
+    change = tangency_residuals(grown, pairs, cameras, world_per_px=torch.ones(2)).px - residuals.px
+    assert (change.sign() == residuals.by_growth[:, 0].sign()).all()
+    assert (residuals.by_growth.abs() <= 1).all()
 
 
 def test_masks_that_end_elsewhere_are_left_out() -> None:
@@ -108,5 +108,6 @@ def test_without_masks_there_are_no_gaps(num_views: int) -> None:
     regions = regions_from_label_maps(list(np.zeros((num_views, 60, 80), np.int64)))
     cameras = cameras_at(arc_positions(num_views), width=80, height=60)
     outlines = find_outlines(Masks.of(regions), cameras)
-    gaps = measure_gaps(outlines, pair_outlines(outlines, cameras), cameras, world_per_px=torch.ones(num_views))
-    assert len(gaps.px) == len(gaps.weight) == 0
+    pairs = pair_outlines(outlines, cameras)
+    residuals = tangency_residuals(outlines, pairs, cameras, world_per_px=torch.ones(num_views))
+    assert len(residuals.px) == len(residuals.weight) == 0

@@ -1,11 +1,11 @@
-"""What the other views show along the ray of a pixel, as rows of region labels (a plane sweep of label maps).
+"""What the other views show along the ray of a pixel: a plane sweep of label maps.
 
 Every hypothesis about a pixel's depth predicts one label per view: the point projects onto this region, onto no region,
-or outside the image. These labels form a row. Most depths give the same row as their neighbours, so that few distinct
-rows are left per pixel; everything later works on those.
+or outside the image. Most depths predict the same labels as their neighbours, so that few distinct hypotheses are left
+per pixel; everything later works on those.
 
 This is the one border between torch and NumPy in the N-view matcher: regions and cameras come in as tensors on any
-device, labels and everything from the table on are NumPy (which compares and looks up small integers much faster).
+device, labels and everything from the sweep on are NumPy (which compares and looks up small integers much faster).
 """
 
 from __future__ import annotations
@@ -21,18 +21,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from mvseg.matching.nview.row_index import RowsOfRegions, index_rows
+from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hypotheses
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-EMPTY, OUTSIDE = -1, -2  # labels of a row: no region there; outside the image, behind the camera, or the own view
+EMPTY, OUTSIDE = (
+    -1,
+    -2,
+)  # labels of a hypothesis: no region there; outside the image, behind the camera, or the own view
 PIXELS = 24  # rays per region, at most
 PLENTY = 10  # with more views than this fewer rays are cast: each shows more
 DEPTHS = 96  # along a ray
 NEAREST = 0.05  # no depth below this fraction of the longest baseline
 MAX_EMPTY = 0.5  # share of the other views that may show no region
 DOMINANCE_PASSES = 3
-BLOCK_ROWS = 2048  # rows at a time: what is computed from them fits into the cache
+BLOCK_SIZE = 2048  # hypotheses at a time: what is computed from them fits into the cache
 CHUNK = 512  # rays at a time: their samples fit into the cache
 
 Floats = NDArray[np.float32]
@@ -41,11 +44,11 @@ Ints = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class ViewBounds:
-    """Where each view starts in a `RowTable`: (V + 1,) offsets of its regions, pixels and rows."""
+    """Where each view starts in a `PlaneSweep`: (V + 1,) offsets of its regions, pixels and hypotheses."""
 
     region_starts: Ints
     pixel_starts: Ints
-    row_starts: Ints
+    hypothesis_starts: Ints
 
     def regions(self, view: int) -> slice:
         """The regions of one view."""
@@ -55,20 +58,20 @@ class ViewBounds:
         """The sampled pixels of one view."""
         return slice(int(self.pixel_starts[view]), int(self.pixel_starts[view + 1]))
 
-    def rows(self, view: int) -> slice:
-        """The rows on rays of one view."""
-        return slice(int(self.row_starts[view]), int(self.row_starts[view + 1]))
+    def hypotheses(self, view: int) -> slice:
+        """The hypotheses on rays of one view."""
+        return slice(int(self.hypothesis_starts[view]), int(self.hypothesis_starts[view + 1]))
 
 
 @dataclass(frozen=True, eq=False)
-class RowTable:
-    """Rows of the sampled pixels of D regions.
+class PlaneSweep:
+    """Hypotheses of the sampled pixels of D regions.
 
     Attributes:
-        labels: (I, V) int16 or int32, the rows: region index, EMPTY or OUTSIDE; by pixel, then from far to near.
-        pixel: (I,) int64, the pixel in [0, Q) whose ray each row lies on.
-        inverse_depth: (I,) float32, 1 / depth of the row in the pixel's own camera, mean over its samples.
-        pixel_region: (Q,) int64, ordered: the region of each pixel; some pixels have no row.
+        labels: (I, V) int16 or int32, the hypotheses: region index, EMPTY or OUTSIDE; by pixel, then from far to near.
+        pixel: (I,) int64, the pixel in [0, Q) whose ray each hypothesis lies on.
+        inverse_depth: (I,) float32, 1 / depth of the hypothesis in the pixel's own camera, mean over its samples.
+        pixel_region: (Q,) int64, ordered: the region of each pixel; some pixels have no hypothesis.
         pixel_xy: (Q, 2) float32, centres.
         view_index: (D,) int64, ordered.
         num_views: V.
@@ -81,63 +84,65 @@ class RowTable:
     pixel_xy: Floats
     view_index: Ints
     num_views: int
-    _rows_of_regions: dict[int, RowsOfRegions] = field(default_factory=dict, init=False, repr=False)
+    _hypotheses_of_regions: dict[int, HypothesesOfRegions] = field(default_factory=dict, init=False, repr=False)
 
     @cached_property
     def bounds(self) -> ViewBounds:
-        """Where each view starts in the table."""
+        """Where each view starts in the sweep."""
         numbers = np.arange(self.num_views + 1)
         pixel_starts = np.searchsorted(self.view_index[self.pixel_region], numbers)
         return ViewBounds(
             region_starts=np.searchsorted(self.view_index, numbers),
             pixel_starts=pixel_starts,
-            row_starts=np.searchsorted(self.pixel, pixel_starts),
+            hypothesis_starts=np.searchsorted(self.pixel, pixel_starts),
         )
 
-    def rows_of_regions(self, view: int) -> RowsOfRegions:
-        """Which rows on rays of one view name which regions; kept for the next call."""
-        if view not in self._rows_of_regions:
-            self._rows_of_regions[view] = index_rows(self.labels[self.bounds.rows(view)], len(self.view_index))
-        return self._rows_of_regions[view]
+    def hypotheses_of_regions(self, view: int) -> HypothesesOfRegions:
+        """Which hypotheses on rays of one view name which regions; cached for the next call."""
+        if view not in self._hypotheses_of_regions:
+            self._hypotheses_of_regions[view] = index_hypotheses(
+                self.labels[self.bounds.hypotheses(view)], len(self.view_index)
+            )
+        return self._hypotheses_of_regions[view]
 
 
-def row_table(regions: Regions, cameras: Cameras, *, widen_px: int = 1, progress: bool = False) -> RowTable:
+def sweep_planes(regions: Regions, cameras: Cameras, *, dilation_px: int = 1, progress: bool = False) -> PlaneSweep:
     """Sweep the rays of all regions through the label maps of all other views.
 
     Args:
         regions: D regions ordered by view (int64 `view_index` must not decrease).
         cameras: V cameras.
-        widen_px: regions grow this far into unlabelled pixels; about the expected reprojection error.
+        dilation_px: regions grow this far into unlabelled pixels; about the expected reprojection error.
         progress: show a progress bar over the views.
 
     Returns:
-        The table. A row is kept when at least one view shows a region, at most half of the views that the point lies in
-        show none (one always may), and no neighbour on the ray shows the same regions and more.
+        The sweep. A hypothesis is kept when at least one view shows a region, at most half of the views that the point
+        lies in show none (one always may), and no neighbour on the ray shows the same regions and more.
     """
-    return next(row_tables(regions, cameras, widenings=(widen_px,), progress=progress))
+    return next(sweep_dilated(regions, cameras, dilations=(dilation_px,), progress=progress))
 
 
-def row_tables(
+def sweep_dilated(
     regions: Regions,
     cameras: Cameras,
     *,
-    widenings: Sequence[int],
+    dilations: Sequence[int],
     rays: int | None = None,
     progress: bool = False,
-) -> Iterator[RowTable]:
-    """The table of each of several widenings, in ascending order; see `row_table`. `rays` of each region are swept, at
-    most; None: `rays_per_region`."""
+) -> Iterator[PlaneSweep]:
+    """The sweep of each of several dilations, in ascending order; see `sweep_planes`. `rays` of each region are swept,
+    at most; None: `rays_per_region`."""
     regions, cameras = regions.to("cpu"), cameras.to("cpu")
     sizes = cameras.sizes.tolist()
     maps, grown_px = [_padded_labels(regions, view, size) for view, size in enumerate(sizes)], 0
     xy, region = regions.spread_pixels(rays_per_region(len(cameras)) if rays is None else rays)
-    for widen_px in widenings:
+    for dilation_px in dilations:
         boxes = [regions.boxes[regions.view_index == view] for view in range(len(cameras))]
         for labels, of_view in zip(maps, boxes, strict=True):
-            _widen(labels, of_view, start_px=grown_px, stop_px=widen_px)
-        grown_px = widen_px
-        sweep = _Sweep(cameras, maps, [_label_box(labels) for labels in maps])
-        yield _sweep_views(sweep, regions, xy, region=region, title=f"rays, {widen_px} px" if progress else "")
+            _dilate(labels, of_view, start_px=grown_px, stop_px=dilation_px)
+        grown_px = dilation_px
+        label_maps = _LabelMaps(cameras, maps, [_label_box(labels) for labels in maps])
+        yield _sweep_views(label_maps, regions, xy, region=region, title=f"rays, {dilation_px} px" if progress else "")
 
 
 def rays_per_region(num_views: int) -> int:
@@ -145,19 +150,19 @@ def rays_per_region(num_views: int) -> int:
     return max(1, round(PIXELS * min(1, PLENTY / num_views)))
 
 
-def _sweep_views(sweep: _Sweep, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> RowTable:
-    """The table of the rays through pixels `xy` (Q, 2) of `region` (Q,); a title shows a progress bar."""
-    num_views = len(sweep.maps)
+def _sweep_views(label_maps: _LabelMaps, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> PlaneSweep:
+    """The sweep of the rays through pixels `xy` (Q, 2) of `region` (Q,); a title shows a progress bar."""
+    num_views = len(label_maps.maps)
     pixels, inverse = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
-    labels = [np.zeros((0, num_views), sweep.maps[0].numpy().dtype)]
+    labels = [np.zeros((0, num_views), label_maps.maps[0].numpy().dtype)]
     for view in tqdm(range(num_views), desc=title, unit="view", disable=not title):
         here = (regions.view_index[region] == view).nonzero()[:, 0]
         for chunk in torch.split(here, CHUNK) if len(here) else ():
-            pixel, label, inverse_depth = _join_equal(*sweep.rows(view, xy[chunk]))
+            pixel, label, inverse_depth = _join_equal(*label_maps.hypotheses(view, xy[chunk]))
             pixels.append(pixel + int(chunk[0]))
             labels.append(np.ascontiguousarray(label.T))
             inverse.append(inverse_depth)
-    return RowTable(
+    return PlaneSweep(
         labels=np.concatenate(labels),
         pixel=np.concatenate(pixels),
         inverse_depth=np.concatenate(inverse),
@@ -176,7 +181,7 @@ def _padded_labels(regions: Regions, view: int, size: list[int]) -> Tensor:
     return torch.nn.functional.pad(labels, (1, 1, 1, 1), value=OUTSIDE)
 
 
-def _widen(padded: Tensor, boxes: Tensor, *, start_px: int, stop_px: int) -> None:
+def _dilate(padded: Tensor, boxes: Tensor, *, start_px: int, stop_px: int) -> None:
     """Grow the regions of a padded label map into EMPTY pixels, in place, from `start_px` to `stop_px` pixels; `boxes`
     (N, 4) are those of the regions before they grew. Nothing changes far from them."""
     if not len(boxes):
@@ -213,7 +218,7 @@ def _label_box(labels: Tensor) -> tuple[float, float, float, float] | None:
 
 
 @dataclass(frozen=True, eq=False)
-class _Sweep:
+class _LabelMaps:
     """The label maps of V views, on the CPU, ready to be looked up along rays.
 
     Attributes:
@@ -226,8 +231,8 @@ class _Sweep:
     maps: list[Tensor]
     boxes: list[tuple[float, float, float, float] | None]
 
-    def rows(self, view: int, xy: Tensor) -> tuple[Ints, NDArray[np.integer], Floats]:
-        """Rows along the rays of P pixels of one view: pixel (I,) in [0, P), labels (V, I), inverse depth (I,)."""
+    def hypotheses(self, view: int, xy: Tensor) -> tuple[Ints, NDArray[np.integer], Floats]:
+        """Along the rays of P pixels of one view: pixel (I,) in [0, P), labels (V, I), inverse depth (I,)."""
         others = torch.tensor([other for other in range(len(self.maps)) if other != view])
         bases, offsets = self._project_rays(view, xy, others)
         low, high = self._inverse_range(bases, offsets, others)
@@ -303,11 +308,9 @@ def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tens
     return found
 
 
-def _join_equal(
-    pixel: Ints, labels: NDArray[np.integer], inverse: Floats
-) -> tuple[Ints, NDArray[np.integer], Floats]:
-    """Join runs of equal rows on a ray; discard rows that equal a neighbour's but lack some of its regions. The rows
-    are the columns of `labels` (V, I): neighbours are compared view by view, many of them at a time."""
+def _join_equal(pixel: Ints, labels: NDArray[np.integer], inverse: Floats) -> tuple[Ints, NDArray[np.integer], Floats]:
+    """Join runs of equal hypotheses on a ray; discard hypotheses that equal a neighbour's but lack some of its regions.
+    The hypotheses are the columns of `labels` (V, I): neighbours are compared view by view, many of them at a time."""
     if not len(pixel):
         return pixel, labels, inverse
     is_new = np.append(True, (labels[:, 1:] != labels[:, :-1]).any(0) | (pixel[1:] != pixel[:-1]))
@@ -335,9 +338,9 @@ def run_starts(values: NDArray[np.integer]) -> Ints:
     return np.flatnonzero(np.append(True, values[1:] != values[:-1])) if len(values) else np.zeros(0, np.int64)
 
 
-def blocks_of_runs(start: Ints, num_rows: int) -> list[slice]:
-    """Consecutive slices of rows, of about BLOCK_ROWS each; no run is cut. `start` is where the runs start."""
+def blocks_of_runs(start: Ints, num_hypotheses: int) -> list[slice]:
+    """Consecutive slices of hypotheses, of about BLOCK_SIZE each; no run is cut. `start` is where the runs start."""
     if not len(start):
         return []
-    first = start[run_starts(start // BLOCK_ROWS)].tolist()
-    return [slice(begin, end) for begin, end in pairwise([*first, num_rows])]
+    first = start[run_starts(start // BLOCK_SIZE)].tolist()
+    return [slice(begin, end) for begin, end in pairwise([*first, num_hypotheses])]

@@ -21,7 +21,7 @@ from mvseg.matching.pencil import epipolar_pencils, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-SPECK = 0.002  # share of a mask's pixels
+SMALL_COMPONENT = 0.002  # share of a mask's pixels
 WIDEST = 1.5  # radians; a mask that fills more of the pencil holds the epipole and begins and ends nowhere
 
 
@@ -55,7 +55,7 @@ class Outlines:
 
 
 @dataclass(frozen=True, eq=False)
-class Gaps:
+class TangencyResiduals:
     """T pairs of points at which two outlines of an instance touch an epipolar line, and how far apart the lines are.
 
     Attributes:
@@ -113,14 +113,14 @@ def _pad(hulls: list[Tensor]) -> Tensor:
 
 def _hull(regions: Regions, index: int) -> Tensor:
     """(P, 2) float64, the corners of a region's hull, pixel centres."""
-    corners = cv2.convexHull(cv2.findNonZero(without_specks(regions.crop(index).numpy())))[:, 0]
+    corners = cv2.convexHull(cv2.findNonZero(without_small_components(regions.crop(index).numpy())))[:, 0]
     return torch.from_numpy(corners + regions.boxes[index, :2].numpy() + 0.5)
 
 
-def without_specks(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A mask (H, W) without its specks, the pieces with less than 0.2 % of its pixels: they would be its ends."""
+def without_small_components(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A mask (H, W) without the components of less than 0.2 % of its pixels: they would be its ends."""
     _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    is_kept = stats[:, cv2.CC_STAT_AREA] >= SPECK * mask.sum()
+    is_kept = stats[:, cv2.CC_STAT_AREA] >= SMALL_COMPONENT * mask.sum()
     is_kept[0] = False
     return is_kept[pieces].astype(np.uint8) if is_kept.any() else mask.astype(np.uint8)
 
@@ -132,8 +132,10 @@ def pair_outlines(outlines: Outlines, cameras: Cameras) -> Tensor:
     return (is_same & has_baseline).triu(1).nonzero()
 
 
-def measure_gaps(outlines: Outlines, pairs: Tensor, cameras: Cameras, *, world_per_px: Tensor) -> Gaps:
-    """The gaps at both ends of pairs of outlines; masks that hold the epipole have none.
+def tangency_residuals(
+    outlines: Outlines, pairs: Tensor, cameras: Cameras, *, world_per_px: Tensor
+) -> TangencyResiduals:
+    """The residuals at both ends of pairs of outlines; masks that hold the epipole have none.
 
     Args:
         outlines: N outlines.
@@ -150,7 +152,7 @@ def measure_gaps(outlines: Outlines, pairs: Tensor, cameras: Cameras, *, world_p
     kept = pairs[is_narrow]
     ends = [torch.stack([pick(angle, 1)[is_narrow] for angle in angles], 1) for pick in (torch.argmin, torch.argmax)]
     at = torch.cat([outlines.corners[kept, corner] for corner in ends])
-    return _linear_gaps(outlines, torch.cat((kept, kept)), at, cameras=cameras, world_per_px=world_per_px)
+    return _linear_residuals(outlines, torch.cat((kept, kept)), at, cameras=cameras, world_per_px=world_per_px)
 
 
 def _pencil_frames(cameras: Cameras, views: Tensor) -> Tensor:
@@ -161,10 +163,12 @@ def _pencil_frames(cameras: Cameras, views: Tensor) -> Tensor:
     return frames[which]
 
 
-def _linear_gaps(outlines: Outlines, pairs: Tensor, at: Tensor, *, cameras: Cameras, world_per_px: Tensor) -> Gaps:
-    """The gaps between the points (T, 2, 2) at which pairs of outlines (T, 2) end.
+def _linear_residuals(
+    outlines: Outlines, pairs: Tensor, at: Tensor, *, cameras: Cameras, world_per_px: Tensor
+) -> TangencyResiduals:
+    """The residuals between the points (T, 2, 2) at which pairs of outlines (T, 2) end.
 
-    To first order, a gap does not change when the outlines touch elsewhere: the derivatives are those of fixed points.
+    To first order, a residual stays when the outlines touch elsewhere: the derivatives are those of fixed points.
     """
     view = outlines.view[pairs]
     pixels = torch.cat((at, torch.ones_like(at[..., :1])), 2)
@@ -181,7 +185,7 @@ def _linear_gaps(outlines: Outlines, pairs: Tensor, at: Tensor, *, cameras: Came
     normal = torch.linalg.cross(rays[:, 0], rays[:, 1])[:, None] * torch.tensor([1.0, -1.0]).double()[:, None]
     by_shift = (cameras.R[view] @ normal[..., None])[..., 0] * world_per_px[view][..., None]
     outwards = (by_px * (at - outlines.middle[pairs])).sum(2).sign()
-    return Gaps(
+    return TangencyResiduals(
         outlines=pairs,
         px=volume / slope,
         by_pose=torch.cat((by_turn, by_shift), 2) / slope[:, None, None],

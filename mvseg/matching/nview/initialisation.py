@@ -1,0 +1,170 @@
+"""Initial partitions of the search: soft multi-view stereo on region labels, before there is any cluster.
+
+How likely two regions are one instance follows from which hypothesis of each ray is right, and the reverse: EM
+estimates both. Average linkage of the affinity gives the clusters that the search refines.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.matching.nview.plane_sweep import BLOCK_SIZE, EMPTY, PLENTY, PlaneSweep, blocks_of_runs, run_starts
+from mvseg.matching.one_per_view import ViewGraph, link_average
+
+SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the hypotheses of a pixel, one per iteration
+EMPTY_COST = 0.7  # of a hypothesis in which all views show no region
+EM_PIXELS = 12  # pixels per region, at most
+NEGLIGIBLE = 1e-5  # belief in a hypothesis that is left out
+EM_VIEWS = 30  # of a hypothesis are compared with each other, at most
+INITIALISATIONS = ((-1, 0.3), (1, 0.1))  # iteration whose affinity is clustered, and where the linkage stops
+MANY_VIEWS = 8  # with more than this, one start will do
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.int64]
+
+
+def initial_partitions(sweep: PlaneSweep) -> list[Ints]:
+    """One or, with few views, two partitions (D,) to start the search from; clusters in [0, K)."""
+    history = em_affinities(sweep)
+    partitions = []
+    for iteration, stop in INITIALISATIONS[: 1 if sweep.num_views > MANY_VIEWS else None]:
+        graph = ViewGraph(history[iteration].astype(np.float64), sweep.view_index, sweep.num_views)
+        partitions.append(link_average(graph, stop))
+    return partitions
+
+
+def em_affinities(sweep: PlaneSweep) -> list[NDArray[np.floating]]:
+    """How likely two regions are one instance, from the hypotheses alone, by expectation maximisation.
+
+    E step: the hypotheses of a pixel share one unit of belief by a soft maximum of their mean affinity between all
+    regions that they name (the pixel's own included), less EMPTY_COST for views that show nothing. With many views,
+    EM_VIEWS of them are compared with each other. M step: the affinity of region n to m is the belief in hypotheses
+    with m, averaged over the pixels of n, and made symmetric.
+
+    Args:
+        sweep: hypotheses of D regions.
+
+    Returns:
+        The affinity after each iteration: (D, D) float32 in [0, 1], symmetric, 0 within a view.
+    """
+    num = len(sweep.view_index)
+    is_used = _spread_pixels(sweep)
+    hypotheses = np.flatnonzero(is_used[sweep.pixel])
+    start = run_starts(sweep.pixel[hypotheses])
+    if not len(start):
+        return [np.zeros((num, num), np.float32)] * len(SHARPNESS)
+    num_pixels = np.maximum(np.bincount(sweep.pixel_region[is_used], minlength=num), 1).astype(np.float32)[:, None]
+    run_lengths = np.diff(np.append(start, len(hypotheses)))
+    blocks = [_compare_views(sweep, hypotheses[block]) for block in blocks_of_runs(start, len(hypotheses))]
+    affinity = _symmetric(_count_shown(sweep, hypotheses, start) / num_pixels)
+    history = []
+    for beta in SHARPNESS:
+        score = np.concatenate([block.scores(affinity) for block in blocks])
+        best = np.maximum.reduceat(score, start)
+        belief = np.exp(beta * (score - np.repeat(best, run_lengths))).astype(np.float64)
+        belief /= np.repeat(np.add.reduceat(belief, start), run_lengths)
+        is_believed = belief > NEGLIGIBLE
+        affinity = _symmetric(_share_belief(sweep, hypotheses[is_believed], belief[is_believed]) / num_pixels)
+        history.append(affinity)
+    return history
+
+
+def _symmetric(A: Floats) -> Floats:
+    mean: Floats = (A + A.T) / np.float32(2)
+    return mean
+
+
+def _spread_pixels(sweep: PlaneSweep) -> NDArray[np.bool_]:
+    """(Q,) the pixels that EM uses: at most EM_PIXELS of each region, fewer with many views."""
+    most = max(1, round(EM_PIXELS * min(1, PLENTY / sweep.num_views)))
+    counts = np.bincount(sweep.pixel_region, minlength=len(sweep.view_index))
+    rank = np.arange(len(sweep.pixel_region)) - np.searchsorted(sweep.pixel_region, sweep.pixel_region)
+    is_used: NDArray[np.bool_] = rank % np.maximum(1, -(-counts // most))[sweep.pixel_region] == 0
+    return is_used
+
+
+@dataclass(frozen=True, eq=False)
+class _ComparedHypotheses:
+    """R hypotheses and the regions whose affinity to each other says how likely each hypothesis is.
+
+    Attributes:
+        labels: (N, R) int64, the regions of each hypothesis, the pixel's own first; hypotheses with the most regions
+        first.
+        num_labels: (R,) how many of the N entries hold a region.
+        order: (R,) the place of each hypothesis in the sweep's order.
+        num_empty: (R,) compared views that show no region.
+        num_inside: (R,) compared views that the point lies in.
+    """
+
+    labels: Ints
+    num_labels: Ints
+    order: Ints
+    num_empty: Ints
+    num_inside: Ints
+
+    def scores(self, affinity: Floats) -> Floats:
+        """(R,) float32, in the sweep's order: mean affinity (D, D) of the regions, less what empty views cost."""
+        flat, num = affinity.ravel(), len(affinity)
+        total = np.zeros(len(self.order), np.float32)
+        for index in range(1, len(self.labels)):
+            stop = int(np.searchsorted(-self.num_labels, -index))  # hypotheses with more labels than `index`
+            cell = self.labels[index, :stop] * num + self.labels[:index, :stop]
+            total[:stop] += np.take(flat, cell).sum(0)
+        pairs = np.maximum(self.num_inside * (self.num_inside + 1), 1)
+        score = np.empty_like(total)
+        score[self.order] = 2 * total / pairs - EMPTY_COST * self.num_empty / np.maximum(self.num_inside, 1)
+        return score
+
+
+def _compare_views(sweep: PlaneSweep, hypotheses: Ints) -> _ComparedHypotheses:
+    """The hypotheses, with what EM_VIEWS views show at most; those are spread evenly, starting with the pixel's own."""
+    num, owner = len(sweep.view_index), sweep.pixel_region[sweep.pixel[hypotheses]]
+    labels = sweep.labels[hypotheses]
+    if sweep.num_views > EM_VIEWS:
+        steps = np.arange(EM_VIEWS) * sweep.num_views // EM_VIEWS
+        labels = np.take_along_axis(labels, (sweep.view_index[owner][:, None] + steps) % sweep.num_views, 1)
+    named = np.where(labels < 0, num, labels).astype(np.int64)
+    named = np.column_stack((owner, np.sort(named, 1)))
+    num_labels = (named < num).sum(1)
+    order = np.argsort(-num_labels, kind="stable")
+    return _ComparedHypotheses(
+        labels=np.ascontiguousarray(named[order, : int(num_labels.max())].T),
+        num_labels=num_labels[order],
+        order=order,
+        num_empty=(labels == EMPTY).sum(1)[order],
+        num_inside=(labels >= EMPTY).sum(1)[order],
+    )
+
+
+def _count_shown(sweep: PlaneSweep, hypotheses: Ints, start: Ints) -> Floats:
+    """(D, D) float32: on the rays of how many pixels of the first region some hypothesis names the second."""
+    num = len(sweep.view_index)
+    shown = np.zeros((num, num), np.float32)
+    for block in blocks_of_runs(start, len(hypotheses)):
+        here = sweep.labels[hypotheses[block]].astype(np.int64)
+        first = run_starts(sweep.pixel[hypotheses[block]])
+        run = np.repeat(np.arange(len(first)), np.diff(np.append(first, len(here))))
+        is_shown = np.zeros((len(first), num + 1), bool)  # the last column collects what is no region
+        is_shown[run[:, None], np.maximum(here, -1)] = True
+        owner = sweep.pixel_region[sweep.pixel[hypotheses[block]][first]]
+        begin = run_starts(owner)
+        shown[owner[begin]] += np.add.reduceat(is_shown[:, :num], begin, 0, dtype=np.float32)
+    return shown
+
+
+def _share_belief(sweep: PlaneSweep, hypotheses: Ints, belief: Floats) -> Floats:
+    """(D, D) float32: the summed belief in hypotheses on rays of the first region that name the second."""
+    num = len(sweep.view_index)
+    mass = np.zeros((num, num), np.float32)
+    for begin in range(0, len(hypotheses), BLOCK_SIZE):
+        block = hypotheses[begin : begin + BLOCK_SIZE]
+        owner = sweep.pixel_region[sweep.pixel[block]]
+        low, high = int(owner[0]), int(owner[-1]) + 1
+        cell = ((owner - low) * (num + 1))[:, None] + np.where(sweep.labels[block] < 0, num, sweep.labels[block])
+        weight = np.broadcast_to(belief[begin : begin + BLOCK_SIZE, None], cell.shape)
+        local = np.bincount(cell.ravel(), weight.ravel(), (high - low) * (num + 1))
+        mass[low:high] += local.reshape(high - low, num + 1)[:, :num]
+    return mass
