@@ -199,8 +199,9 @@ def test_sources_that_nobody_installed_have_a_version(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_the_readmes_examples_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    examples = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+def test_both_doors_have_an_example_that_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pages = [(ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/detector.md")]
+    examples = [example for page in pages for example in re.findall(r"```python\n(.*?)```", page, re.DOTALL)]
     assert len(examples) == 2
     monkeypatch.chdir(tmp_path)
     masks_given, masks_found = scopes = [{}, {}]
