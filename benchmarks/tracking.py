@@ -3,6 +3,7 @@
     python -m benchmarks.tracking simulated --num_plants 12            leaves as seen: meshes with noise, no photos
     python -m benchmarks.tracking results TABLE RESULTS                results of mvseg batch, or of `prepare`
     python -m benchmarks.tracking prepare TABLE RESULTS                surfaces from true masks with true ids
+    python -m benchmarks.tracking prepare TABLE RESULTS --masks degraded    from degraded masks, matched by mvseg
 
 TABLE has the columns scene, name, plant, time; RESULTS/NAME is the result of a scene, whose truth is scene/truth. The
 baselines get the alignment of dates that mvseg finds, or find their own (cpd); pycpd is only needed for that one. In
@@ -27,11 +28,15 @@ import numpy as np
 import torch
 from scipy.optimize import linear_sum_assignment
 
+from benchmarks.faults import Faults, degrade_labels
+from mvseg.formats.label_png import read_labels
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks
+from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.shapes import reconstruct_shapes
+from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import save_result
 from mvseg.results.read import read_instances
 from mvseg.results.result import Result
@@ -217,17 +222,26 @@ def track_by(name: str, dates: Sequence[PlantOnDate], poses: np.ndarray) -> Labe
 # --- results on disk
 
 
-def prepare(table: Path, results: Path) -> None:
-    """Surfaces from the true masks with true ids, as results; scenes that are there already are kept."""
+def prepare(table: Path, results: Path, *, masks: str = "true") -> None:
+    """Surfaces from the true masks with true ids, or from degraded ones with the ids that the matcher gives them, as
+    results; those that are there already are kept."""
     for row in csv.DictReader(table.open(encoding="utf-8")):
         scene_folder, place = table.parent / row["scene"], results / row["name"]
         if place.exists():
             continue
         scene = load_scene(scene_folder)
         regions = load_masks(scene, scene_folder / "truth")
-        number = {label: n for n, label in enumerate(sorted(set(regions.labels.tolist()) - {IGNORED}), start=1)}
-        ids = torch.tensor([number.get(label, -1) for label in regions.labels.tolist()])
-        matching = Matching(Masks.of(regions, ids, (ids > 0).float()), MatchReport(method="truth"))
+        if masks == "degraded":
+            maps = [read_labels(scene_folder / "truth" / f"{view.name}.png") for view in scene.views]
+            seeds = np.random.SeedSequence([*row["name"].encode()]).generate_state(len(maps))
+            degraded = [degrade_labels(of_view, Faults(), seed=int(n)) for of_view, n in zip(maps, seeds, strict=True)]
+            regions = regions_from_label_maps(degraded)
+            matching = match_regions(regions, scene.cameras)
+        else:
+            number = {label: n for n, label in enumerate(sorted(set(regions.labels.tolist()) - {IGNORED}), start=1)}
+            ids = torch.tensor([number.get(label, -1) for label in regions.labels.tolist()])
+            matching = Matching(Masks.of(regions, ids, (ids > 0).float()), MatchReport(method="truth"))
+        ids = matching.instance_ids
         surfaces, voxels = reconstruct_shapes(regions, ids, scene.cameras, config=ReconstructConfig())
         traits = measure_plant(scene, matching, surfaces=surfaces, voxels=voxels)
         result = Result(scene=scene, matching=matching, surfaces=surfaces, voxels=voxels, traits=traits)
@@ -324,11 +338,12 @@ def main() -> None:
     parser.add_argument("places", type=Path, nargs="*")
     parser.add_argument("--num_plants", type=int, default=12)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--masks", choices=("true", "degraded"), default="true", help="of prepare")
     parser.add_argument("--methods", nargs="*", default=["nearest base", "shape", "rank", "cpd"])
     args = parser.parse_args()
     torch.set_num_threads(1)
     if args.what == "prepare":
-        prepare(*args.places)
+        prepare(*args.places, masks=args.masks)
     elif args.what == "results":
         compare(read_series(*args.places), args.methods)
     else:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Generator, Mapping, Sequence
+import shutil
+from collections.abc import Callable, Generator, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from functools import partial
@@ -18,15 +19,16 @@ from mvseg.batch.dask_workers import connect, run_on_dask
 from mvseg.batch.local_workers import run_locally
 from mvseg.batch.lost import Lost
 from mvseg.batch.places import scene_result, tables_folder
+from mvseg.corrections.file import TrackLink
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.system.atomic import folder_whole
 from mvseg.system.file_hash import hash_files
-from mvseg.tracking.corrections import LinkEdit, find_links, read_link_edits
+from mvseg.tracking.corrections import find_links, read_track_links
 from mvseg.tracking.dates import read_date
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import INDEX_FILE, write_index, write_page
-from mvseg.tracking.tables import COLUMNS, Row, table_rows, write_tables
+from mvseg.tracking.tables import join_tables, write_tables
 from mvseg.tracking.track import track_leaves
 
 
@@ -41,10 +43,8 @@ class PlantResults:
 
 @dataclass(frozen=True)
 class TrackedPlant:
-    """What is left of a plant when its pages are written: rows of the tables, counts, warnings; a sentence where it
-    failed."""
+    """What is left of a plant when its tables and pages are written: counts, warnings; a sentence where it failed."""
 
-    rows: Mapping[str, Sequence[Row]]
     dates: int = 0
     tracks: int = 0
     warnings: tuple[str, ...] = ()
@@ -95,7 +95,7 @@ def track_plants(
 ) -> list[TrackedPlant]:
     """Track plants and write the folder `out`, whole or not at all; an earlier one is replaced.
 
-    One plant is in memory at a time in each process. A plant that fails is told in its `sentence`; the others go on.
+    Each process has one plant in memory at a time. A plant that fails is told in its `sentence`; the others go on.
 
     Args:
         plants: see `list_plants`.
@@ -113,17 +113,26 @@ def track_plants(
     if num_workers < 1:
         raise InputError(f"{num_workers} workers asked for, expected at least 1")
     check_out(out)
-    edits = [] if corrections is None else read_link_edits(corrections)
+    edits = [] if corrections is None else read_track_links(corrections)
     try:
         with folder_whole(out) as folder:
-            work = partial(_track_plant, folder if report else None, edits, is_alone=len(plants) == 1)
-            tracked = _work_on_all(plants, work, num_workers=num_workers, scheduler=scheduler, quiet=quiet)
+            places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
+            places = places if len(plants) > 1 else [folder]
+            work = partial(_track_plant, edits, report=report)
+            tracked = _work_on_all(
+                list(zip(plants, places, strict=True)), work, num_workers=num_workers, scheduler=scheduler, quiet=quiet
+            )
             if all(plant.sentence for plant in tracked):
                 raise InputError(tracked[0].sentence)
-            write_tables(folder, {name: [row for plant in tracked for row in plant.rows[name]] for name in COLUMNS})
-            if report and len(plants) > 1:
-                write_index(folder / INDEX_FILE, [(plant.plant, each.dates, each.tracks)
-                                                  for plant, each in zip(plants, tracked, strict=True)])  # fmt: skip
+            if len(plants) > 1:
+                join_tables(folder, places)
+                if report:
+                    pages = [
+                        (plant.plant, each.dates, each.tracks) for plant, each in zip(plants, tracked, strict=True)
+                    ]
+                    write_index(folder / INDEX_FILE, pages)
+                else:
+                    shutil.rmtree(folder / "plants")
             _write_run(folder, plants, tracked, corrections)
             keep_user_files(out, folder)
     except OSError as error:
@@ -132,14 +141,14 @@ def track_plants(
 
 
 def _work_on_all(
-    plants: Sequence[PlantResults],
-    work: Callable[[tuple[int, PlantResults]], TrackedPlant],
+    plants: Sequence[tuple[PlantResults, Path]],
+    work: Callable[[tuple[PlantResults, Path]], TrackedPlant],
     *,
     num_workers: int,
     scheduler: str | None,
     quiet: bool,
 ) -> list[TrackedPlant]:
-    items, done = dict(enumerate(enumerate(plants))), {}
+    items, done = dict(enumerate(plants)), {}
     with ExitStack() as stack:
         answers: Generator[tuple[int, Any], None, None]
         if scheduler is not None:
@@ -152,7 +161,9 @@ def _work_on_all(
         stack.enter_context(closing(answers))
         for index, answer in tqdm(answers, total=len(plants), desc="track", unit="plant", disable=quiet):
             if isinstance(answer, Lost):
-                answer = _failed(f"{plants[index].plant}: the process that worked on it {answer.reason}")
+                answer = TrackedPlant(
+                    sentence=f"{plants[index][0].plant}: the process that worked on it {answer.reason}"
+                )
             done[index] = answer
     return [done[index] for index in range(len(plants))]
 
@@ -161,11 +172,9 @@ def _ignore(_: int) -> None:
     """Nobody is told which plant is worked on."""
 
 
-def _track_plant(
-    folder: Path | None, edits: Sequence[LinkEdit], item: tuple[int, PlantResults], *, is_alone: bool
-) -> TrackedPlant:
-    """Track one plant and write its page into `folder`, if there is one."""
-    index, plant = item
+def _track_plant(edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *, report: bool) -> TrackedPlant:
+    """Track one plant and write its tables, and its page, into its place."""
+    plant, place = item
     try:
         missing = [where.name for where, time in zip(plant.folders, plant.times, strict=True) if not time]
         if missing:
@@ -173,19 +182,15 @@ def _track_plant(
         dates = [read_date(where, time) for where, time in zip(plant.folders, plant.times, strict=True)]
         links, lost = find_links(edits, dates)
         tracks = track_leaves(dates, links=links, plant=plant.plant)
-        growth = measure_growth(tracks)
-        if folder is not None:
-            place = folder if is_alone else folder / "plants" / f"{index + 1:05d}"
-            place.mkdir(parents=True, exist_ok=True)
-            write_page(place, tracks, growth)
     except InputError as error:
-        return _failed(f"plant {plant.plant}: {error}")
+        return TrackedPlant(sentence=f"plant {plant.plant}: {error}")
+    growth = measure_growth(tracks)
+    place.mkdir(parents=True, exist_ok=True)
+    write_tables(place, tracks, growth)
+    if report:
+        write_page(place, tracks, growth)
     warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.warnings, *lost))
-    return TrackedPlant(table_rows(tracks, growth), len(tracks.dates), tracks.num_tracks, warnings)
-
-
-def _failed(sentence: str) -> TrackedPlant:
-    return TrackedPlant(rows={name: [] for name in COLUMNS}, sentence=sentence)
+    return TrackedPlant(len(tracks.dates), tracks.num_tracks, warnings)
 
 
 def _write_run(

@@ -65,19 +65,19 @@ def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Alig
         reason = f"{fewer or 'no'} {'leaf' if fewer == 1 else 'leaves'} cannot tell how the pot stands"
         return Alignment(np.eye(4), np.zeros((0, 2), int), reason=reason)
     scale, middle = typical_length(first, second), first.midribs.mean((0, 1))
-    poses = np.concatenate([np.eye(4)[None], _hypotheses(first, second, knows_up=knows_up)])
-    scores = _coarse_scores(first, second, poses, scale=scale)
+    poses = np.concatenate([np.eye(4)[None], draw_poses(first, second, knows_up=knows_up)])
+    scores = alikeness(first, second, poses, scale=scale).sum(1)
     scores[0] += 1e6  # always looked at
     found: list[Alignment] = []
     left = np.argsort(-scores, kind="stable")
     while len(left) and len(found) < NUM_REFINED:
         found.append(refine(first, second, poses[left[0]], days=days, knows_up=knows_up))
-        left = left[_distances(poses[left[0]], poses[left], middle, scale=scale) > SAME]
+        left = left[pose_distances(poses[left[0]], poses[left], middle, scale=scale) > SAME]
     every = np.stack([each.pose for each in found])
     scores = np.array([each.gain for each in found])
-    scores += WORLD_PRIOR * np.exp(-0.5 * _distances(np.eye(4), every, middle, scale=scale) ** 2)
+    scores += WORLD_PRIOR * np.exp(-0.5 * pose_distances(np.eye(4), every, middle, scale=scale) ** 2)
     place = int(scores.argmax())
-    best, others = found[place], scores[_distances(every[place], every, middle, scale=scale) >= 1]
+    best, others = found[place], scores[pose_distances(every[place], every, middle, scale=scale) >= 1]
     margin, reason = float(scores[place] - others.max(initial=0.0)), ""
     if len(best.pairs) < max(LEAST_PAIRS, 0.4 * fewer):
         reason = f"only {len(best.pairs)} of {fewer} leaves are alike, however the pot is turned"
@@ -88,14 +88,14 @@ def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Alig
     return replace(best, margin=margin, reason=reason)
 
 
-def _distances(pose: Floats, others: Floats, middle: Floats, *, scale: float) -> Floats:
+def pose_distances(pose: Floats, others: Floats, middle: Floats, *, scale: float) -> Floats:
     """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of NEAR and NEAR_SHIFT; `middle` (3,) of the plant."""
     turned = np.arccos(np.clip((np.einsum("ij,hij->h", pose[:3, :3], others[:, :3, :3]) - 1) / 2, -1, 1))
     moved = np.linalg.norm((others - pose)[:, :3] @ np.append(middle, 1.0), axis=1)
     return np.hypot(turned / NEAR, moved / (NEAR_SHIFT * scale))
 
 
-def _hypotheses(first: Leaves, second: Leaves, *, knows_up: bool) -> Floats:
+def draw_poses(first: Leaves, second: Leaves, *, knows_up: bool) -> Floats:
     """(H, 4, 4) poses, one or more for every pair of leaves."""
     one, other = np.repeat(np.arange(len(first)), len(second)), np.tile(np.arange(len(second)), len(first))
     ratio = np.abs(np.log(second.lengths[other] / first.lengths[one]))
@@ -132,18 +132,18 @@ def make_poses(rotations: Floats, shifts: Floats) -> Floats:
     return poses
 
 
-def _coarse_scores(first: Leaves, second: Leaves, poses: Floats, *, scale: float) -> Floats:
-    """(H,) how many leaves find one like them under each hypothesis, softly."""
+def alikeness(first: Leaves, second: Leaves, poses: Floats, *, scale: float) -> Floats:
+    """(H, N + M) in [0, 1] how alike the most alike leaf of the other date is under each of the poses (H, 4, 4)."""
     size = np.square(np.log(second.lengths[None] / first.lengths[:, None]) / COARSE[2])
-    scores = []
+    found = []
     for part in np.array_split(poses, 1 + len(poses) // 200):  # bounds the memory
         bases = np.einsum("hij,nj->hni", part[:, :3, :3], first.bases) + part[:, None, :3, 3]
         chords = np.einsum("hij,nj->hni", part[:, :3, :3], first.chords)
         away = np.square(bases[:, :, None] - second.bases).sum(-1) / (COARSE[0] * scale) ** 2
         turn = 2 * (1 - np.einsum("hni,mi->hnm", chords, second.chords)) / COARSE[1] ** 2
         alike = np.exp(-0.25 * (away + turn + size))
-        scores.append(alike.max(2).sum(1) + alike.max(1).sum(1))
-    return np.concatenate(scores)
+        found.append(np.concatenate([alike.max(2), alike.max(1)], 1))
+    return np.concatenate(found)
 
 
 def refine(first: Leaves, second: Leaves, pose: Floats, *, days: float, knows_up: bool) -> Alignment:

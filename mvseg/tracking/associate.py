@@ -20,6 +20,7 @@ from mvseg.errors import InputError
 from mvseg.tracking.align import Alignment, align, refine
 from mvseg.tracking.costs import ACROSS, Leaves, cloud_costs, pair_costs, typical_length
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.motions import Motion, find_motion
 
 Sight = tuple[int, int]  # index of the date, row of its `Leaves`
 MOST_GAP = 3  # dates from one sight to another that it is compared with, at most: two dates may hide a leaf
@@ -43,12 +44,14 @@ class Comparison:
             way of others.
         roots: (T,) index of that date; its own where there is no other.
         reasons: (T - 1,) why each date cannot be aligned surely with the next one alone, "" where it can.
+        motions: {(earlier, later): of leaves that moved otherwise than the rest}, where there are any.
     """
 
     costs: Mapping[tuple[int, int], Floats]
     poses: Floats
     roots: np.ndarray
     reasons: tuple[str, ...]
+    motions: Mapping[tuple[int, int], Motion]
 
 
 @dataclass(frozen=True)
@@ -70,14 +73,25 @@ def compare_dates(dates: Sequence[Leaves], times: Sequence[float], *, knows_up: 
              for later in range(len(dates)) for earlier in range(max(later - MOST_GAP, 0), later)}  # fmt: skip
     alone = {pair: align(one, other, days=days, knows_up=knows_up) for pair, (one, other, days) in pairs.items()}
     poses, roots = place_dates(len(dates), alone)
-    costs = {}
-    for (earlier, later), (first, second, days) in pairs.items():
-        if roots[earlier] == roots[later]:
-            pose = np.linalg.inv(poses[later]) @ poses[earlier]
-            alignment = refine(first, second, pose, days=days, knows_up=knows_up)
-            if len(alignment.pairs):
-                costs[earlier, later] = _bent_costs(first, second, alignment, days=days)
-    return Comparison(costs, poses, roots, tuple(alone[n, n + 1].reason for n in range(len(dates) - 1)))
+    costs: dict[tuple[int, int], Floats] = {}
+    motions: dict[tuple[int, int], Motion] = {}
+    for earlier, later in sorted((pair for pair in pairs if roots[pair[0]] == roots[pair[1]]), key=np.ptp):
+        first, second, days = pairs[earlier, later]
+        pose = np.linalg.inv(poses[later]) @ poses[earlier]
+        alignment = refine(first, second, pose, days=days, knows_up=knows_up)
+        if not len(alignment.pairs):
+            continue
+        costs[earlier, later] = _bent_costs(first, second, alignment, days=days)
+        is_step = roots[later] not in roots[earlier + 1 : later]
+        if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
+            motion = find_motion(first, second, alignment.pose, days=days, knows_up=knows_up)
+            if motion is not None:
+                motions[earlier, later] = motion
+                costs[earlier, later] = _parted_costs(
+                    first, second, motion, costs[earlier, later], days=days, knows_up=knows_up
+                )
+    reasons = tuple(alone[n, n + 1].reason for n in range(len(dates) - 1))
+    return Comparison(costs, poses, roots, reasons, motions)
 
 
 def place_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment]) -> tuple[Floats, np.ndarray]:
@@ -124,6 +138,21 @@ def _bent_costs(first: Leaves, second: Leaves, alignment: Alignment, *, days: fl
     by_cloud = clouds + CLOUD_COUNTS * np.clip(costs, -MOST_HELP, MOST_HELP)
     in_part = np.abs(np.log(second.lengths[None] / first.lengths[:, None])) > IN_PART
     return np.where(both, np.where(in_part, np.minimum(by_midrib, by_cloud), by_midrib), by_cloud)
+
+
+def _parted_costs(
+    first: Leaves, second: Leaves, motion: Motion, costs: Floats, *, days: float, knows_up: bool
+) -> Floats:
+    """The costs where the leaves of a second motion are linked with each other only, and only if it is sure."""
+    rows, columns = motion.pairs.T
+    parted = costs.copy()
+    parted[rows], parted[:, columns] = np.maximum(parted[rows], UNLINKED), np.maximum(parted[:, columns], UNLINKED)
+    if motion.is_sure:
+        one, other = first.take(rows), second.take(columns)
+        alignment = refine(one, other, motion.pose, days=days, knows_up=knows_up)
+        if len(alignment.pairs):
+            parted[np.ix_(rows, columns)] = _bent_costs(one, other, alignment, days=days)
+    return parted
 
 
 def link_leaves(

@@ -8,7 +8,7 @@ surfaces carry and by the days in between, and heavy tails: one odd number does 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
@@ -65,6 +65,10 @@ class Leaves:
         """(N, 3) unit directions from base to tip."""
         ahead = self.midribs[:, -1] - self.midribs[:, 0]
         return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+
+    def take(self, rows: np.ndarray) -> Leaves:
+        """Some of the leaves."""
+        return Leaves(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
 
     def moved(self, pose: Floats) -> Leaves:
         """In another frame, by its pose (4, 4)."""

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from itertools import islice
 from pathlib import Path
 
 from mvseg.tracking.growth import Growth
 from mvseg.tracking.track import Tracks
 from mvseg.traits.table import as_cells, write_csv
 
-Row = list[str | int]
 COLUMNS = {
     "tracks.csv": ("plant", "time", "scene", "leaf", "track", "probability", "state"),
     "growth.csv": ("plant", "track", "trait", "time", "value", "sd", "unit", "rate", "rate_sd"),
@@ -23,9 +23,9 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def table_rows(tracks: Tracks, growth: Growth) -> dict[str, list[Row]]:
-    """{file: rows} of one plant, as in COLUMNS."""
-    rows: dict[str, list[Row]] = {name: [] for name in COLUMNS}
+def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
+    """Write the four tables of one plant."""
+    rows: dict[str, list[list[str | int]]] = {name: [] for name in COLUMNS}
 
     def add(file: str, *values: str | float | None) -> None:
         rows[file].append(as_cells(tracks.plant, *values))
@@ -45,10 +45,20 @@ def table_rows(tracks: Tracks, growth: Growth) -> dict[str, list[Row]]:
     for curve in growth.curves:
         found = [number for pair in zip(curve.parameters, curve.sds, strict=True) for number in pair]
         add("curves.csv", curve.track, curve.trait, curve.model, *found, curve.residual)
-    return rows
-
-
-def write_tables(folder: Path, rows: Mapping[str, Sequence[Row]]) -> None:
-    """Write the four tables."""
     for name, columns in COLUMNS.items():
         write_csv(folder / name, columns, rows[name])
+
+
+def join_tables(folder: Path, parts: Sequence[Path]) -> None:
+    """Move the tables of plants from their folders into one of each, one below the other; plants without any failed.
+
+    One line is in memory at a time: an experiment may have thousands of plants.
+    """
+    for name in COLUMNS:
+        is_first = True
+        with (folder / name).open("wb") as whole:
+            for path in (part / name for part in parts if (part / name).is_file()):
+                with path.open("rb") as table:
+                    whole.writelines(table if is_first else islice(table, 1, None))
+                path.unlink()
+                is_first = False

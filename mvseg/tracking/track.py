@@ -183,6 +183,11 @@ def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[st
             reason = compared.reasons[later - 1]
             pair = f"{dates[later - 1].scene} and {dates[later].scene}"
             yield f"{pair} cannot be aligned surely ({reason}): their leaves are not linked"
+    for (earlier, later), motion in sorted(compared.motions.items()):
+        if compared.roots[later] not in compared.roots[earlier + 1 : later]:
+            pair = f"{dates[earlier].scene} and {dates[later].scene}"
+            what = f"{len(motion.pairs)} leaves moved otherwise than the rest, as a second plant or a bent shoot would"
+            yield f"{pair}: {what}; they are linked {'by themselves' if motion.is_sure else 'by other dates only'}"
     if not all(date.knows_up for date in dates):
         yield "up is not known on all dates (--up): any turn of the plant was looked at, which is less sure"
     shapeless = sum(len(date.leaves) - len(date.shaped) for date in dates)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mvseg.batch.track_plants import list_plants
+from mvseg.batch.track_plants import list_plants, track_plants
 from mvseg.cli import main
 from mvseg.errors import InputError
 from tests.plants_over_days import grow_blades, grown, write_result
@@ -70,8 +70,31 @@ def test_all_plants_of_a_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "1 plants have one date and are left out" in said
     assert "plant b: b1 has no time" in said
     assert {row["plant"] for row in read(tmp_path / "out" / "tracks.csv")} == {"a"}
-    assert (tmp_path / "out" / "plants" / "00001" / "tracks.html").is_file()
+    assert {path.name for path in (tmp_path / "out" / "plants" / "00001").iterdir()} == {"tracks.html", "growth.png"}
     assert 'href="plants/00001/tracks.html"' in (tmp_path / "out" / "tracks.html").read_text()
+
+
+def test_tables_of_many_plants_are_those_of_each_one_below_the_other(tmp_path: Path) -> None:
+    rows = [(f"{plant}{day}", plant, str(day)) for plant in "ab" for day in (0, 1)]
+    batch = write_batch(tmp_path / "batch", rows)
+    track_plants(list_plants(batch)[0], tmp_path / "all", report=False, quiet=True)
+    assert sorted(path.name for path in (tmp_path / "all").iterdir()) == [
+        "curves.csv", "growth.csv", "plants.csv", "run.json", "tracks.csv",
+    ]  # fmt: skip
+    for plant in list_plants(batch)[0]:
+        track_plants([plant], tmp_path / plant.plant, report=False, quiet=True)
+    for name in ("tracks.csv", "growth.csv", "plants.csv"):
+        assert read(tmp_path / "all" / name) == [*read(tmp_path / "a" / name), *read(tmp_path / "b" / name)]
+
+
+def test_plants_are_tracked_on_a_dask_cluster(tmp_path: Path) -> None:
+    distributed = pytest.importorskip("distributed")
+    rows = [(f"{plant}{day}", plant, str(day)) for plant in "ab" for day in (0, 1)]
+    batch = write_batch(tmp_path / "batch", rows)
+    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster:
+        arguments = ["track", str(batch), "--out", str(tmp_path / "out"), "--quiet", "--report", "false"]
+        assert main([*arguments, "--scheduler", cluster.scheduler_address]) == 0
+    assert {row["plant"] for row in read(tmp_path / "out" / "tracks.csv")} == {"a", "b"}
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.tracking.corrections import find_links, read_link_edits
+from mvseg.tracking.corrections import find_links, read_track_links
 from mvseg.tracking.dates import read_date
 from mvseg.tracking.track import LeafLink
 from tests.plants_over_days import grow_blades, write_result
@@ -26,12 +26,12 @@ def test_points_become_leaves(tmp_path: Path) -> None:
     dates = [read_date(tmp_path / name, time) for time, name in enumerate(("a", "b"))]
     path = write(
         tmp_path / "corrections.json",
-        {"op": "reject", "view": "000", "at": [1, 2]},  # of a single scene
-        {"op": "same_track", "at": [["a", "000", 5.5, 20], ["b", "000", 30.2, 20]]},
+        {"op": "reject", "view": "000", "at": [1.0, 2.0]},  # of a single scene
+        {"op": "same_track", "at": [["a", "000", 5.5, 20], ["b", "000.jpg", 30.2, 20]]},
         {"op": "different_track", "at": [["a", "000", 5.5, 20], ["b", "000", 0.5, 0.5]]},  # no leaf is there
         {"op": "same_track", "at": [["x", "000", 5, 5], ["y", "000", 5, 5]]},  # another plant
     )
-    links, lost = find_links(read_link_edits(path), dates)
+    links, lost = find_links(read_track_links(path), dates)
     assert links == [LeafLink(True, (("a", 1), ("b", 2)))]
     assert lost == ["different_track: there is no leaf at (0.5, 0.5) in view 000 of b"]
 
@@ -42,10 +42,10 @@ def test_views_that_are_not_there(tmp_path: Path, view: str) -> None:
         write_result(tmp_path / name, grow_blades(3, 1))
     dates = [read_date(tmp_path / name, time) for time, name in enumerate(("a", "b"))]
     path = write(tmp_path / "c.json", {"op": "same_track", "at": [["a", view, 900, 900], ["b", "000", 5.5, 20]]})
-    assert find_links(read_link_edits(path), dates)[0] == []
+    assert find_links(read_track_links(path), dates)[0] == []
 
 
 @pytest.mark.parametrize("at", [None, [["a", "000", 1, 2]], [["a", 1], ["b", 2]]])
 def test_broken_links_are_refused(tmp_path: Path, at: Any) -> None:
-    with pytest.raises(InputError, match=r"edits\[0\]"):
-        read_link_edits(write(tmp_path / "c.json", {"op": "same_track", "at": at}))
+    with pytest.raises(InputError, match=r"edit 1 \(same_track\)"):
+        read_track_links(write(tmp_path / "c.json", {"op": "same_track", "at": at}))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from mvseg.errors import InputError
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import LeafLink, track_leaves
-from tests.plants_over_days import grow_blades, grown, see, true_tracks
+from tests.plants_over_days import Blades, grow_blades, grown, see, true_tracks
 
 BLADES = grow_blades(10, 4)
 
@@ -65,29 +65,42 @@ def test_a_repotted_plant_gets_tracks_of_its_own_and_a_sentence() -> None:
     np.testing.assert_array_equal(tracks.poses[2], np.eye(4))
 
 
-def two_in_a_pot(turn: float) -> tuple[list[PlantOnDate], list[list[int]]]:
-    """Two plants side by side on two dates; the second one is set back, turned against the first."""
-    other = {leaf + 10: blade + (250.0, 0, 0) for leaf, blade in grow_blades(8, 31).items()}
+def two_in_a_pot(turn: float, other: Blades, *, count: int = 2) -> tuple[list[PlantOnDate], list[list[int]]]:
+    """Two plants side by side; after the first date the second one is set back, turned against the first."""
     pot = Rotation.from_euler("z", turn, degrees=True)
-    turned = {leaf: pot.apply((blade - (250.0, 0, 0)).reshape(-1, 3)).reshape(blade.shape) + (250.0, 0, 0)
+    still = {leaf + 10: blade + (250.0, 0, 0) for leaf, blade in other.items()}
+    turned = {leaf + 10: pot.apply(blade.reshape(-1, 3)).reshape(blade.shape) + (250.0, 0, 0)
               for leaf, blade in other.items()}  # fmt: skip
-    seen = [see(BLADES | other, 0), see(BLADES | turned, 1, turn=50)]
+    seen = [see(BLADES | (turned if day else still), day, turn=50 * day) for day in range(count)]
     return [date for date, _ in seen], [truth for _, truth in seen]
 
 
 def test_two_plants_in_one_pot_are_tracked_as_one() -> None:
-    dates, truths = two_in_a_pot(0)
+    dates, truths = two_in_a_pot(0, grow_blades(8, 31))
     tracks = track_leaves(dates)
+    assert tracks.warnings == ()
     assert tracks.num_tracks == 18
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
 
 
-def test_of_two_plants_that_moved_against_each_other_the_larger_one_is_tracked() -> None:
-    dates, truths = two_in_a_pot(60)
+@pytest.mark.parametrize(("turn", "count"), [(60, 2), (120, 2), (200, 2), (60, 3)])
+def test_two_plants_that_moved_against_each_other_are_linked_each_by_itself(turn: float, count: int) -> None:
+    dates, truths = two_in_a_pot(turn, grow_blades(8, 31), count=count)
     tracks = track_leaves(dates)
-    right = [leaves for leaves in true_tracks(tracks, truths).values() if leaves <= set(BLADES)]
-    assert sorted(map(len, right)) == [1] * 10  # of the other one, wrong leaves are linked: docs/tracking.md says so
-    assert sum(row.leaf is not None and truths[row.date][row.leaf - 1] <= 10 for row in tracks.rows) == 20
+    (sentence,) = tracks.warnings
+    assert sentence.startswith("day-0 and day-1: 8 leaves moved otherwise than the rest")
+    assert tracks.num_tracks == 18
+    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
+
+
+def test_a_second_plant_that_could_have_been_turned_in_more_than_one_way_is_not_linked() -> None:
+    half = grow_blades(4, 5)
+    same = half | {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # looks the same from two sides
+    dates, truths = two_in_a_pot(60, same)
+    tracks = track_leaves(dates)
+    assert "linked by other dates only" in tracks.warnings[0]
+    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
+    assert tracks.num_tracks == 10 + 2 * 8
 
 
 def test_a_plant_with_one_leaf_and_a_date_without_leaves() -> None:

@@ -1,0 +1,98 @@
+"""Leaves that moved otherwise than the rest between two dates: a second plant in the pot, a shoot that was bent.
+
+One pose cannot hold for both. The leaves that it does not explain are then linked with others that happen to stand
+where they stood, and nothing in their costs says so. So every alignment is held against a second motion: a pose of
+some leaves under which both together are far likelier.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from mvseg.tracking.align import (
+    LEAST_PAIRS,
+    SAME,
+    SURE_MARGIN,
+    alikeness,
+    best_pairs,
+    draw_poses,
+    pose_distances,
+    refine,
+)
+from mvseg.tracking.costs import Leaves, pair_costs, typical_length
+from mvseg.tracking.dates import Floats
+
+TRIED = 8  # poses, of those that explain most of what the alignment does not
+LEAST_GAIN = 20.0  # of a second motion; of plants whose leaves only grew the largest are about 15
+CLEARLY = 2.0  # a leaf is of the second motion where that is so much cheaper
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """How some leaves of a date moved to another one, otherwise than the rest.
+
+    Attributes:
+        pose: (4, 4) second_from_first.
+        pairs: (P, 2) these leaves on the two dates (rows of `Leaves`).
+        gain: how much likelier it is that they moved so than with the rest, a natural logarithm.
+        margin: by how much it is likelier than that they moved in the best way that pairs them otherwise.
+    """
+
+    pose: Floats
+    pairs: np.ndarray
+    gain: float
+    margin: float
+
+    @property
+    def is_sure(self) -> bool:
+        return self.margin >= SURE_MARGIN
+
+
+def find_motion(first: Leaves, second: Leaves, pose: Floats, *, days: float, knows_up: bool) -> Motion | None:
+    """The best second motion; None where one is enough.
+
+    Args:
+        first, second: N and M leaves, each in its date's frame.
+        pose: (4, 4) of their alignment.
+        days, knows_up: see `align`.
+    """
+    if min(len(first), len(second)) < LEAST_PAIRS:
+        return None
+    scale, middle = typical_length(first, second), first.midribs.mean((0, 1))
+    poses = np.concatenate([pose[None], draw_poses(first, second, knows_up=knows_up)])
+    alike = alikeness(first, second, poses, scale=scale)[:, : len(first)]
+    better = np.maximum(alike - alike[0], 0).sum(1)
+    better[pose_distances(pose, poses, middle, scale=scale) < 1] = 0
+    costs = pair_costs(first.moved(pose), second, days=days, scale=scale)
+    alone, found = _total(costs), []
+    left = np.argsort(-better, kind="stable")
+    for _ in range(TRIED):
+        if not len(left) or not better[left[0]]:
+            break
+        at, own = poses[left[0]], np.flatnonzero(alike[left[0]] > alike[0])
+        left = left[pose_distances(at, poses[left], middle, scale=scale) > SAME]
+        refined = refine(first.take(own), second, at, days=days, knows_up=knows_up)
+        is_other = pose_distances(pose, refined.pose[None], middle, scale=scale)[0] >= 1
+        if len(refined.pairs) >= LEAST_PAIRS and is_other:
+            others = pair_costs(first.moved(refined.pose), second, days=days, scale=scale)
+            rows, columns = best_pairs(np.minimum(costs, others)).T
+            keep = others[rows, columns] < costs[rows, columns] - CLEARLY
+            pairs = np.stack([rows[keep], columns[keep]], 1)
+            found.append(Motion(refined.pose, pairs, alone - _total(np.minimum(costs, others)), margin=0.0))
+    best = max(found, key=lambda motion: motion.gain, default=None)
+    if best is None or best.gain < LEAST_GAIN or len(best.pairs) < LEAST_PAIRS:
+        return None
+    rivals = (motion.gain for motion in found if _contradicts(motion.pairs, best.pairs))
+    return Motion(best.pose, best.pairs, best.gain, margin=best.gain - max(rivals, default=0.0))
+
+
+def _total(costs: Floats) -> float:
+    return float(costs[tuple(best_pairs(costs).T)].sum())
+
+
+def _contradicts(pairs: np.ndarray, others: np.ndarray) -> bool:
+    """Does the one pair half of the leaves of the others with different ones?"""
+    clashes = (pairs[:, None] == others).sum(2) == 1  # one leaf of two in common
+    return bool(2 * clashes.any(1).sum() >= len(others))
