@@ -29,7 +29,14 @@ ORDER = {
     "Method": ("matching.md", "surfaces.md", "traits.md", "detector.md"),
     "How well it works": ("gallery.md", "benchmarks.md", "performance.md", "reliability.md"),
     "Python": ("api.md",),
-    "Notes": ("notes/matching.md", "notes/detector.md", "notes/surfaces.md", "notes/check.md", "notes/tracking.md", "notes/performance.md"),
+    "Notes": (
+        "notes/matching.md",
+        "notes/detector.md",
+        "notes/surfaces.md",
+        "notes/check.md",
+        "notes/tracking.md",
+        "notes/performance.md",
+    ),
 }
 
 

@@ -1,7 +1,8 @@
-"""Which mvseg this is: a version for people, and a hash of the code for all that asks "made by the same one?".
+"""Which mvseg this is: a version for people, and a hash of the code that tells whether a result was made by the same
+code.
 
 The version is the installation's, which the build takes from git. It says nothing of what was changed since in an
-editable checkout, or of a source tree that was never installed; the hash does.
+editable checkout, or of a source tree that was never installed; the hash covers both.
 """
 
 from __future__ import annotations

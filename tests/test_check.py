@@ -37,7 +37,7 @@ def test_a_good_scene(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     said = capsys.readouterr().out
     assert "9 cameras, unit mm, up 0.00 0.00 1.00" in said
     assert "9 of 9 look at one point; 9 photos; 108 masks" in said
-    assert said.endswith("\nnothing would go wrong\n")
+    assert said.endswith("\nno problems found\n")
     content = json.loads((tmp_path / "out" / "check.json").read_text())
     assert content["findings"] == []
     assert [view["masks"] for view in content["views"]] == [12] * 9
@@ -131,7 +131,7 @@ def test_masks_that_cannot_be_read_come_after_what_can(plant: Path, capsys: pyte
     captured = capsys.readouterr()
     assert "9 of 9 look at one point; 0 photos" in captured.out
     assert "neither photos nor masks" not in captured.out
-    assert "nothing would go wrong" not in captured.out
+    assert "no problems found" not in captured.out
     assert captured.err.startswith("mvseg: error: ")
     assert "64 x 48" in captured.err
 

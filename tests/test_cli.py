@@ -383,7 +383,7 @@ def test_scripts_of_the_checkout_are_verbs(
         ("match: {num_pionts: 3}", [], "match.num_pionts"),
         ("colour: red", [], "colour"),
         ("reconstruct: {threshold: high}", [], "reconstruct.threshold"),
-        ("match: {num_points: [3", [], "run.yaml: is no YAML file"),
+        ("match: {num_points: [3", [], "run.yaml: is not a YAML file"),
         ("", ["--match.num_pionts", "3"], "--match.num_pionts"),
         ("", ["--match.num_points", "many"], "match.num_points"),
         ("", ["--config", "absent.yaml"], "absent.yaml"),
@@ -848,7 +848,7 @@ def test_an_output_that_links_to_itself(
     given = {"pose": plant / "images", "batch": tmp_path}.get(verb, plant)
     assert main([verb, str(given), "--out", str(tmp_path / "self"), "--quiet"]) == 2
     assert "self" in (said := complaint(capsys))
-    assert said.endswith("its links lead in a circle, expected a folder or a new name")
+    assert said.endswith("its links form a loop, expected a folder or a new name")
 
 
 def test_a_full_disk_while_detecting_is_named(

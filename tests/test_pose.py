@@ -106,7 +106,7 @@ def test_options_become_config(photos: Path, tmp_path: Path, quick: list, capsys
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--distance", "a", "b", "c"], "distance: 'c' is no length"),
+        (["--distance", "a", "b", "c"], "distance: 'c' is not a length"),
         (["--distance", "a", "b", "0"], "distance is 0 long"),
         (["--marker", "3", "--distance", "a", "b", "1"], "marker and distance both give a scale"),
         ([*BOARD, "--marker", "30"], "board and marker both give a scale"),

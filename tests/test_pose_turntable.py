@@ -122,11 +122,11 @@ def write_disturbed(path: Path, scene: Path, *, degrees: float = 0.3) -> list[fl
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--angles", "10"], "--angles: of no use without --turntable and a turntable.json"),
+        (["--angles", "10"], "--angles has no effect without --turntable and a turntable.json"),
         (["--turntable", "board"], "needs the board"),
-        (["--turntable", "board", "--marker", "30"], "marker: of no use with --turntable board"),
-        (["--turntable", "t.json", "--unit", "mm", "--up", "rig"], "unit, up: of no use with --turntable t.json"),
-        (["--turntable", "board", *OPTIONS, "--image_size", "800"], "the options of structure from motion: of no use"),
+        (["--turntable", "board", "--marker", "30"], "marker: no effect with --turntable board"),
+        (["--turntable", "t.json", "--unit", "mm", "--up", "rig"], "unit, up: no effect with --turntable t.json"),
+        (["--turntable", "board", *OPTIONS, "--image_size", "800"], "the options of structure from motion: no effect"),
         (["--turntable", "nowhere.json"], "nowhere.json: cannot be read"),
     ],
 )

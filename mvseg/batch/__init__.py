@@ -1,1 +1,1 @@
-"""Scenes from their folders to result folders: one, or a night's plants."""
+"""Many scenes: their list, workers on this machine or a cluster, resume, and the joined tables."""

@@ -12,7 +12,7 @@ FROM_TABLE = {"studyDbId": "Study unique ID", "germplasmDbId": "Biological mater
 
 
 def brapi_observations(observations: Sequence[Observation]) -> dict[str, Any]:
-    """The answer of a server that holds these observations; all values are text, as BrAPI wants them.
+    """The answer of a server that holds these observations; all values are text, as BrAPI requires.
 
     What BrAPI has no key for (scene, leaf, sd, unit, method, ontology, and a `time` that is no date) is in
     `additionalInfo`.

@@ -32,7 +32,7 @@ def connect(scheduler: str) -> Client:
         scheduler: its address ("tcp://node-07:8786"), or the file that `dask scheduler --scheduler-file FILE` wrote.
 
     Raises:
-        InputError: Dask is not installed, the file is not there or broken, or nobody answers.
+        InputError: Dask is not installed, the file is missing or broken, or no scheduler answers.
     """
     try:
         from distributed import Client
@@ -57,16 +57,16 @@ def run_on_dask(
 ) -> Generator[tuple[int, Answer | Lost], None, None]:
     """The answers of `work` in the order in which they come, each with the key of its item.
 
-    When a worker dies, the scheduler gives its items to others, as often as its `allowed-failures` says; then they are
-    lost. When the iterator is closed before its end, items that no worker has begun are taken back; workers finish
-    those that they have begun.
+    When a worker dies, the scheduler gives its items to others, up to `allowed-failures` times; then they are lost.
+    When the iterator is closed early, items that no worker has started are cancelled; workers finish those that they
+    have started.
 
     Args:
         work: what a module holds, or `partial` of it.
         items: items that can be pickled, by key.
         client: see `connect`.
-        at_once: at most that many items are in the cluster's hands; None for no limit.
-        started: is told the key of an item when the cluster gets it.
+        at_once: most items that are submitted to the cluster at a time; None for no limit.
+        started: called with the key of an item when it is submitted.
     """
     from distributed import as_completed
 
@@ -102,7 +102,7 @@ def _read_answer(future: Any) -> Any:
     if error is None:
         return future.result()
     if type(error).__name__ == "KilledWorker":
-        return Lost("died with its worker, most likely because memory ran out; the worker's log tells")
+        return Lost("died with its worker, most likely because memory ran out; see the worker's log")
     return Lost(f"stopped with {type(error).__name__}: {' '.join(str(error).split())}")
 
 
@@ -134,5 +134,5 @@ def _read_scheduler_file(path: Path) -> str:
         message = f"cannot be read ({error.strerror}), expected the address of a Dask scheduler, or its file"
         raise InputError(f"{path}: {message}") from None
     except (ValueError, KeyError, TypeError):
-        raise InputError(f"{path}: is no scheduler file of Dask, expected that of dask scheduler") from None
+        raise InputError(f"{path}: is not a scheduler file of Dask, expected that of dask scheduler") from None
     return str(address)

@@ -1,4 +1,4 @@
-"""The traits of a batch in the forms that data bases and journals ask for."""
+"""The traits of a batch in the forms that databases and journals require."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def export_batch(batch: Path, out: Path, *, miappe: bool, brapi: bool, factors: 
         How many observations there are.
 
     Raises:
-        InputError: neither form is asked for, the batch cannot be read, or its table does not say enough.
+        InputError: neither form is requested, the batch cannot be read, or its table lacks required columns.
         OSError: the folder cannot be written.
     """
     if not miappe and not brapi:
-        raise InputError("nothing is asked for, expected --miappe, --brapi or both")
+        raise InputError("neither --miappe nor --brapi is given, expected one or both")
     check_out(out)
     observations = read_observations(batch)
     tables = describe_batch(observations, factors) if miappe else {}

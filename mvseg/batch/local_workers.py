@@ -1,7 +1,7 @@
-"""Processes on this machine that work through a list, one item after another.
+"""Processes on this machine that work on a list, one item at a time.
 
-A pool of `concurrent.futures` is given up when one of its processes is killed. Here each process is a pool of its own:
-one that dies loses its own item only.
+A pool of `concurrent.futures` breaks when one of its processes is killed. So each process is a pool of its own here: if
+it dies, only its own item is lost.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ def run_locally(
 ) -> Generator[tuple[int, Answer | Lost], None, None]:
     """The answers of `work` in the order in which they come, each with the key of its item.
 
-    Workers are spawned, run on one thread, and end with this process, however that ends. When the iterator is closed
-    before its end, they end at once.
+    Workers are spawned, use one thread, and end with this process, however that ends. When the iterator is closed
+    early, they are stopped at once.
 
     Args:
         work: what a module holds, or `partial` of it.
         items: items that can be pickled, by key.
         num_workers: at most that many processes, >= 1.
-        started: is told the key of an item when a worker takes it.
+        started: called with the key of an item when a worker takes it.
 
     Raises:
         InputError: no worker can be started.
@@ -69,13 +69,14 @@ def run_locally(
 def _start_worker(
     worker: ProcessPoolExecutor, work: Callable[[Any], Any]
 ) -> dict[Future[Any], tuple[None, ProcessPoolExecutor]]:
-    # it inherits what is held back: Ctrl-C is for the parent alone to hear
+    # it inherits the blocked signals: Ctrl-C is left to the parent
     with one_thread(), held_back(signal.SIGINT):
         return {worker.submit(_load, work): (None, worker)}
 
 
 def _load(work: Callable[[Any], Any]) -> None:
-    """In a worker: have the modules that `work` needs, without pycolmap's handler, which prints a trace on SIGTERM."""
+    """In a worker: import the modules that `work` needs, without pycolmap's handler, which prints a trace on
+    SIGTERM."""
     import pycolmap  # noqa: F401
 
     signal.signal(signal.SIGTERM, signal.SIG_DFL)

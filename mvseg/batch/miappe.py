@@ -1,9 +1,9 @@
 """The traits of a batch by MIAPPE 1.1, the minimum information about a plant phenotyping experiment: a table for each
 section of its checklist, with the checklist's own names as columns.
 
-What mvseg does not know (who, where, which species) comes from the columns of the batch's table that are called as in
-the checklist: "Study title", "Organism", ... Leaves are below the level of observation units, which are plants: their
-numbers are observations of the plant, by variables that speak of one leaf.
+What mvseg does not know (who, where, which species) comes from columns of the batch's table that are named as in the
+checklist: "Study title", "Organism", ... Leaves are below the level of observation units, which are plants: their
+numbers are observations of the plant, with variables of single leaves.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def describe_batch(observations: Sequence[Observation], factors: Sequence[str] =
         factors: columns of the batch's table that are experimental factors.
 
     Raises:
-        InputError: the batch's table does not say what MIAPPE needs, the sentence names all of it; it has no column of
+        InputError: the batch's table lacks what MIAPPE requires (the sentence names all of it); it has no column of
             a factor, a factor with one value, several investigations, or two descriptions of one plant.
     """
     plants = list({tuple(each.facts.items()): each.facts for each in observations}.values())
@@ -80,8 +80,8 @@ def describe_batch(observations: Sequence[Observation], factors: Sequence[str] =
     facts = [_complete(plant, factors) for plant in plants]
     missing = _missing(facts)
     if missing:
-        what = "the batch's table does not say what MIAPPE needs, expected a column for each, filled in every row"
-        raise InputError(f"{what}: {', '.join(missing)}; mvseg batch --resume true takes them over")
+        what = "the batch's table lacks what MIAPPE requires, expected a column for each, filled in every row"
+        raise InputError(f"{what}: {', '.join(missing)}; mvseg batch --resume true copies them")
     sections = ("investigation", "study", "person", "data_file", "biological_material", "observation_unit")
     tables = {section: _table(section, facts) for section in sections}
     _check_once(tables["investigation"], "Investigation title", one="investigation")
@@ -102,7 +102,7 @@ def _needed(section: str) -> list[bool]:
 
 
 def _complete(plant: Mapping[str, str], factors: Sequence[str]) -> dict[str, str]:
-    """What is known of a plant by the checklist's names; capitals do not matter in the table's columns."""
+    """What is known of a plant, by the checklist's names; the case of the table's columns is ignored."""
     said = {name.casefold(): cell for name, cell in plant.items() if cell}
     names = {name for section in FIELDS for name in _columns(section)}
     facts = KNOWN | {name: said[name.casefold()] for name in names if name.casefold() in said}
@@ -113,7 +113,7 @@ def _complete(plant: Mapping[str, str], factors: Sequence[str]) -> dict[str, str
 
 
 def _missing(facts: Sequence[Mapping[str, str]]) -> list[str]:
-    """What must be there and is not there for every plant."""
+    """Required fields that are not filled for every plant."""
     sections = ("investigation", "study", "person", "biological_material", "observation_unit")
     fields = [pair for section in sections for pair in zip(_columns(section), _needed(section), strict=True)]
     needed = dict.fromkeys(name for name, is_needed in fields if is_needed)
@@ -121,7 +121,7 @@ def _missing(facts: Sequence[Mapping[str, str]]) -> list[str]:
 
 
 def _table(section: str, facts: Iterable[Mapping[str, str]]) -> Table:
-    """Each row once; columns that nothing fills are left out, if they may be."""
+    """Each row once; empty columns are left out unless they are required."""
     columns, needed = _columns(section), _needed(section)
     rows = dict.fromkeys(tuple(each.get(name, "") for name in columns) for each in facts)
     kept = [index for index in range(len(columns)) if needed[index] or any(row[index] for row in rows)]

@@ -1,4 +1,4 @@
-"""The numbers of a batch with what its table says of each plant, as standards for data want them."""
+"""The numbers of a batch with the facts of its table about each plant, as data standards require."""
 
 from __future__ import annotations
 
@@ -36,13 +36,14 @@ class Observation:
 
     @property
     def variable(self) -> str:
-        """What is observed, by whom, in which scale: leaf_area_mvseg_mm2, number_of_leaves_mvseg_1."""
+        """Name of the variable: what is observed, by which method, in which scale: leaf_area_mvseg_mm2."""
         scale = re.sub(r"\W", "", self.unit)
         return f"{'leaf_' if self.leaf else ''}{self.trait}_mvseg_{scale}"
 
     @property
     def time_stamp(self) -> str:
-        """When it was made, in ISO 8601 with a time zone (UTC where `time` names none); "" where `time` is no date."""
+        """Time of the observation in ISO 8601 with a time zone (UTC if `time` names none); "" if `time` is not a
+        date."""
         try:
             time = datetime.fromisoformat(self.facts["time"])
         except ValueError:
@@ -64,7 +65,7 @@ def read_observations(batch: Path) -> list[Observation]:
         what = f"{path}: cannot be read ({error.strerror}), expected the table of a batch"
         raise InputError(f"{what}: mvseg export takes the --out of mvseg batch") from None
     except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: is no CSV table ({error})") from None
+        raise InputError(f"{path}: is not a CSV table ({error})") from None
     missing = [name for name in ("scene", "plant", "time", *OWN_COLUMNS) if rows and name not in rows[0]]
     if missing:
         raise InputError(f"{path}: has no column '{missing[0]}', expected the table of a batch")

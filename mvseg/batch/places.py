@@ -1,4 +1,4 @@
-"""Where a batch keeps what: OUT/NAME holds the result of a scene, and three folders beside them are the batch's own."""
+"""The layout of a batch: OUT/NAME holds the result of a scene, and three folders beside them belong to the batch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sees of a batch while it runs."""
+"""The progress display of a batch."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ SHOWN = 4  # names beside the bar
 
 
 class Progress:
-    """A bar over the scenes, beside it the names of those that are being worked on, and lines above it."""
+    """A progress bar over the scenes with the names of the running ones beside it, and messages above it."""
 
     def __init__(self, names: Sequence[str], *, quiet: bool) -> None:
         self.names = names
@@ -29,7 +29,7 @@ class Progress:
         self._show()
 
     def say(self, text: str) -> None:
-        """A line on stderr, also where there is no bar."""
+        """Print a line on stderr, with or without a bar."""
         tqdm.write(f"mvseg: {text}", file=sys.stderr)
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""A night's plants: scene after scene, on this machine or on a cluster; what is done stays done."""
+"""Runs many scenes, on this machine or on a cluster; finished scenes are not done again."""
 
 from __future__ import annotations
 
@@ -32,7 +32,8 @@ Engine = Callable[[dict[int, BatchScene], int | None, Started], Generator[tuple[
 
 @dataclass(frozen=True)
 class BatchCounts:
-    """What became of the scenes: `kept` are those that were done before; `warned` of those that are done."""
+    """Numbers of scenes by outcome: `kept` are done scenes of an earlier run; `warned` are done scenes with
+    warnings."""
 
     done: int
     kept: int
@@ -51,20 +52,20 @@ def run_batch(
     scheduler: str | None = None,
     quiet: bool = False,
 ) -> BatchCounts:
-    """From scene folders to result folders `out/NAME` and the tables in `out/tables`. A failure is told on stderr.
+    """From scene folders to result folders `out/NAME` and the tables in `out/tables`. Failures are reported on stderr.
 
     Args:
         source: a table or a folder of scenes, see `list_scenes`.
         out: folder of the results; made when missing.
         config: the options of all scenes.
         masks: in each scene folder, or beside them; None: a detector finds them.
-        resume: go on with the batch that `out` holds: scenes that are done with the same inputs and options are kept.
+        resume: continue the batch that `out` holds: scenes that are done with the same inputs and options are kept.
         num_workers: processes, >= 1, where no scheduler is given.
         scheduler: of a Dask cluster, see `connect`.
         quiet: no progress bar.
 
     Raises:
-        InputError: bad input, before any scene is begun: the table, `out`, the scheduler.
+        InputError: bad input, before any scene is started: the table, `out`, the scheduler.
         OSError: the tables cannot be written.
     """
     if num_workers < 1:
@@ -127,7 +128,7 @@ def _claim(out: Path, *, resume: bool) -> None:
 
 @contextmanager
 def _engine(work: Callable[[BatchScene], Finished], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
-    """What does `work` on many scenes, side by side or one after the other."""
+    """The engine that does `work` on many scenes, in parallel or one after another."""
     if scheduler is None:
         yield lambda scenes, at_once, started: run_locally(
             work, scenes, num_workers=at_once or num_workers, started=started
@@ -140,7 +141,8 @@ def _engine(work: Callable[[BatchScene], Finished], num_workers: int, scheduler:
 
 
 def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path, *, quiet: bool) -> dict[int, Finished]:
-    """All scenes, side by side; those whose worker died once more, one after the other, when memory is free again."""
+    """Run all scenes in parallel; those whose worker died are tried once more, one at a time, when memory is free
+    again."""
     finished: dict[int, Finished] = {}
     progress = Progress([scene.name for scene in scenes], quiet=quiet)
     with closing(progress):
@@ -152,7 +154,7 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path, *, qui
                 with closing(engine(left, at_once, progress.start)) as answers:
                     for index, answer in answers:
                         if isinstance(answer, Lost) and at_once is None:
-                            progress.say(f"{scenes[index].name}: the process {answer.reason}; it gets one more try")
+                            progress.say(f"{scenes[index].name}: the process {answer.reason}; it is tried again")
                             progress.stop(index, is_finished=False)
                             continue
                         finished[index] = _give_up(scenes[index], answer, out) if isinstance(answer, Lost) else answer
@@ -161,7 +163,7 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path, *, qui
                             progress.say(f"{scenes[index].name}: {status.sentence}")
                         progress.stop(index, is_finished=True)
             finally:
-                for index in progress.running:  # workers that had to be killed cleared nothing away
+                for index in progress.running:  # killed workers did not clean up
                     sweep_abandoned(scene_result(out, scenes[index].name))
     return finished
 
@@ -171,7 +173,7 @@ def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:
     sentence = f"the process that worked on this scene {lost.reason}, twice"
     folder = scene_state(out, scene.name)
     status = Status(state="failed", scene=str(scene.folder), sentence=sentence)
-    with suppress(OSError):  # the tables tell it, too
+    with suppress(OSError):  # the tables report it, too
         folder.mkdir(parents=True, exist_ok=True)
         write_status(folder, status)
     sweep_abandoned(scene_result(out, scene.name))

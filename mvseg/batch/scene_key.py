@@ -21,9 +21,9 @@ from mvseg.system.file_hash import hash_files
 def scene_key(scene: Scene, masks: Path | None, config: RunConfig, *, corrections: Path | None = None) -> str:
     """The hash of a scene's inputs and options.
 
-    It covers the cameras as they were understood; names, sizes and times of photos and masks, which say when one has
-    changed without reading gigabytes; or else the detector's weights; all options and mvseg's code; not where the files
-    lie. Hidden files count for nothing.
+    It covers the cameras as they were read; names, sizes and times of photos and masks, which reveal changes without
+    reading gigabytes; without masks, the detector's weights; all options and mvseg's code; but not the paths of the
+    files. Hidden files are ignored.
 
     Args:
         scene: the scene.

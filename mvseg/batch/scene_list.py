@@ -24,12 +24,13 @@ class BatchScene:
     """One scene of a batch.
 
     Attributes:
-        name: of its result folder; unique in the batch, also where capitals do not count.
+        name: of its result folder; unique in the batch, case ignored.
         folder: the scene folder, absolute; it need not exist.
         masks: the path that the table gives, or that of `--masks`; None: a detector finds them.
         corrections: the path that the table gives to a file of corrections; None: there are none.
         beside: where a relative path of masks or corrections may start, besides the scene folder; absolute.
-        carried: what the table says of it, {column: text}: `plant`, `time`, then the table's other columns.
+        carried: its cells that are copied into all tables, {column: text}: `plant`, `time`, then the table's other
+            columns.
     """
 
     name: str
@@ -133,11 +134,11 @@ def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
     except OSError as error:
         raise InputError(f"{source}: cannot be read ({error.strerror})") from None
     except UnicodeDecodeError as error:
-        raise InputError(f"{source}: byte {error.start} is no UTF-8, expected a CSV table") from None
+        raise InputError(f"{source}: byte {error.start} is not UTF-8, expected a CSV table") from None
     if len(data) > MAX_BYTES:
         raise InputError(f"{source}: is larger than {MAX_BYTES} bytes, expected a table with one row per scene")
     header = text.partition("\n")[0]
-    delimiter = ";" if ";" in header and "," not in header else ","  # spreadsheets of half of Europe
+    delimiter = ";" if ";" in header and "," not in header else ","  # as spreadsheets of European locales write
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
     rows: list[tuple[int, list[str]]] = []
     try:
@@ -145,7 +146,7 @@ def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
             if any(cell.strip() for cell in cells):
                 rows.append((reader.line_num, [cell.strip() for cell in cells]))
     except csv.Error as error:
-        raise InputError(f"{source}: line {reader.line_num} is no CSV ({error})") from None
+        raise InputError(f"{source}: line {reader.line_num} is not CSV ({error})") from None
     if not rows:
         raise InputError(f"{source}: is empty, expected a table with a column 'scene'")
     (_, columns), *rows = rows

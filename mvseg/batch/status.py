@@ -1,4 +1,4 @@
-"""What is known of one scene of a batch: a small JSON file, written whole each time that its state changes."""
+"""The status of one scene of a batch: a small JSON file, written whole whenever it changes."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Status(BaseModel, frozen=True):
         result: SHA-256 of the result's run.json, which lists the hashes of all its files.
         instances, masks, views: how many the result has.
         seconds: from the start of the scene to its result, or to its failure.
-        peak_mb: the most memory that the process has used until then, in MB; None where the system does not tell.
+        peak_mb: the most memory that the process has used until then, in MB; None if the system does not report it.
         warnings: the InputWarnings.
         sentence: why it failed.
-        trace: where, for failures that are mvseg's fault.
+        trace: the traceback, for failures that are bugs of mvseg.
     """
 
     state: Literal["running", "done", "failed"]

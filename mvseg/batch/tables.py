@@ -1,4 +1,4 @@
-"""The tables of a batch: traits of all plants, what became of each scene, and why some failed."""
+"""The tables of a batch: traits of all plants, the outcome of each scene, and the reasons of failures."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def write_tables(
     Args:
         folder: of the tables.
         out: where the results of the scenes that are done lie.
-        scenes: all scenes with what became of them, in the order of the rows.
+        scenes: all scenes with their outcomes, in the order of the rows.
         run: what goes into run.json besides counts.
 
     Returns:
@@ -60,7 +60,7 @@ def write_tables(
 
 
 def _join(path: Path, scenes: Sequence[BatchScene], out: Path, *, carried: Sequence[str]) -> None:
-    """One table of those of the scenes: in front the scene and what the batch's table says of it."""
+    """Join the tables of the scenes; the first columns are the scene and its cells of the batch's table."""
     columns: list[str] = []
     rows: list[list[str | int]] = []
     for scene in scenes:
@@ -91,7 +91,7 @@ def _write_summary(path: Path, scenes: Sequence[tuple[BatchScene, Status]], carr
 
 
 def _cell(text: str) -> str:
-    """Text that no spreadsheet takes for a formula; numbers stay numbers, also negative ones."""
+    """Text that no spreadsheet evaluates as a formula; numbers stay numbers, negative ones, too."""
     try:
         return text if math.isfinite(float(text)) else escape_text(text)
     except ValueError:

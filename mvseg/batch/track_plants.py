@@ -43,7 +43,7 @@ class PlantResults:
 
 @dataclass(frozen=True)
 class TrackedPlant:
-    """What is left of a plant when its tables and pages are written: counts, warnings; a sentence where it failed."""
+    """What is kept of a plant once its tables and pages are written: counts, warnings; a sentence if it failed."""
 
     dates: int = 0
     tracks: int = 0
@@ -62,9 +62,9 @@ def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
         with path.open(newline="", encoding="utf-8") as file:
             rows = [(row["scene"], row["plant"], row["time"]) for row in csv.DictReader(file) if row["state"] == "done"]
     except OSError:
-        raise InputError(f"{batch}: is no output of mvseg batch (tables/summary.csv is missing)") from None
+        raise InputError(f"{batch}: is not an output of mvseg batch (tables/summary.csv is missing)") from None
     except (KeyError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: is no table that mvseg batch wrote ({error})") from None
+        raise InputError(f"{path}: is not a table of mvseg batch ({error})") from None
     scenes: dict[str, list[tuple[str, str]]] = {}
     for scene, plant, time in rows:
         scenes.setdefault(plant, []).append((scene, time))
@@ -95,7 +95,7 @@ def track_plants(
 ) -> list[TrackedPlant]:
     """Track plants and write the folder `out`, whole or not at all; an earlier one is replaced.
 
-    Each process has one plant in memory at a time. A plant that fails is told in its `sentence`; the others go on.
+    One plant is in memory at a time in each process. A plant that fails has a `sentence`; the others continue.
 
     Args:
         plants: see `list_plants`.
@@ -169,7 +169,7 @@ def _work_on_all(
 
 
 def _ignore(_: int) -> None:
-    """Nobody is told which plant is worked on."""
+    """No progress is shown per plant."""
 
 
 def _track_plant(edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *, report: bool) -> TrackedPlant:

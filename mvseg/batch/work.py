@@ -1,5 +1,5 @@
-"""What a worker does with one scene of a batch: nothing if its result is there, else the result; a failure is a
-sentence in the scene's status."""
+"""What a worker does with one scene of a batch: it makes the result unless that exists; a failure becomes a sentence in
+the scene's status."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _one_at_a_time = threading.Lock()  # Dask's workers may have threads; warnings a
 
 @dataclass(frozen=True)
 class Finished:
-    """A scene that is done or has failed; `is_kept`: it had been done before with the same inputs and options."""
+    """A scene that is done or has failed; `is_kept`: an earlier run did it, with the same inputs and options."""
 
     status: Status
     is_kept: bool = False
@@ -64,7 +64,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
             write_status(folder, Status(state="running", scene=str(scene.folder), key=key))
             place = scene_result(out, scene.name)
             status = _finish(scene, masks, place, config=config, corrections=corrections, cache=cache)
-        except Exception as error:  # whatever it is, the other scenes go on
+        except Exception as error:  # whatever it is, the other scenes continue
             status, key = _describe_failure(error, scene), ""
         seconds = round(time.monotonic() - started, 3)
         status = status.model_copy(update={"key": key, "seconds": seconds, "peak_mb": _peak_mb()})
@@ -83,7 +83,7 @@ def _key_of(scene: BatchScene, masks: Path | None, config: RunConfig, *, correct
 
 
 def _is_done(status: Status, result: Path) -> bool:
-    """Whether the result that a status tells of is there."""
+    """Whether the result of a status exists."""
     run = result / RUN_FILE
     if status.state != "done" or not run.is_file() or hash_files(run) != status.result:
         return False
@@ -126,7 +126,7 @@ def _describe_failure(error: Exception, scene: BatchScene) -> Status:
 
 
 def _peak_mb() -> float | None:
-    """The most memory that this process has held. (Linux's `ru_maxrss` starts with what its parent held.)"""
+    """Peak memory of this process. (Linux's `ru_maxrss` starts with that of its parent.)"""
     try:
         lines = Path("/proc/self/status").read_text(encoding="ascii").splitlines()
         return round(next(int(line.split()[1]) for line in lines if line.startswith("VmHWM:")) / 1e3, 1)  # kB

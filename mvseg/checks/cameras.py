@@ -113,11 +113,11 @@ def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]
 
 def _baseline_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -> list[Finding]:
     twins = torch.triu(is_coincident(cameras), diagonal=1).nonzero().flatten().unique().tolist()
-    what = "{} stand where others stand, and tell no depth with them: move the camera"
+    what = "{} have the same position as other cameras, which gives no depth: move the camera"
     findings = list_findings("cameras", [("warning", twins, what)], names)
     spread = _widest_angle(cameras, coverage)
     if coverage.sees.sum() > 1 and spread < NARROW:
-        what = f"the views differ by {spread:.1f} degrees at most: depth is hardly seen; photograph from more sides"
+        what = f"the views differ by {spread:.1f} degrees at most: depth is uncertain; photograph from more sides"
         findings.append(Finding(where="cameras", what=what, level="warning"))
     angle = np.nan_to_num(coverage.angle)
     facts = f"the next view is {angle.max():.0f} degrees away and shows few of the same leaves"

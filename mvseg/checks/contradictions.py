@@ -1,4 +1,4 @@
-"""What a run says of cameras that its masks and photos contradict, although each view agrees with some others."""
+"""Warnings of a run about cameras that its masks and photos contradict, although each view agrees with some others."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from mvseg.scene import Scene
 def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = True, progress: bool = False) -> None:
     """Warn (InputWarning) of views that agree in groups only, and of focal lengths that the photos contradict.
 
-    Masks name groups of views; photos do so where masks do not. Single views that disagree are warned of by the
-    matching, too.
+    Groups of views are found by masks, or else by photos. The matching warns of single views that disagree.
 
     Args:
         scene: of V >= 2 views.

@@ -23,29 +23,29 @@ Floats = NDArray[np.float64]
 
 OFFSET = 1.5  # units; features that miss by less fit the cameras
 CONTRADICTS, AGREES = 0.3, 0.6  # share of the features of one fundamental matrix that fit the cameras', below and above
-FEWEST_PAIRS = 3  # that a focal length is told by
+FEWEST_PAIRS = 3  # needed to judge a focal length
 FACTORS = np.exp(np.linspace(-1, 1, 101))  # of the focal length, in steps of 2 %; the middle one is 1
 LEAST_ERROR = 0.05  # of the focal length's logarithm
 BETTER = 0.5  # of the epipolar distance, with another focal length
 MOST = 0.7  # share of the pairs for which it is better, and fits
 
-ONE_STEP = "it has the pose of another photo, or was moved; mend it or leave it out"
+ONE_STEP = "it has the pose of another photo, or was moved; correct it or leave it out"
 QUESTION = "do R and t map world points to the camera, and does each camera belong to its photo?"
 
 
 def distance_findings(
     matches: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...], *, only_focal: bool = False
 ) -> list[Finding]:
-    """What the features of the photos say against the cameras.
+    """How the features of the photos contradict the cameras.
 
-    Nothing where too few are told apart (plain leaves before black cloth), or where most of them stand still from photo
-    to photo: the plant turns, and what does not turn tells nothing about the cameras round it.
+    Nothing if too few features match (plain leaves before black cloth), or if most of them do not move between photos:
+    on a turntable, what does not turn says nothing about the cameras.
 
     Args:
         matches: see `match_photos`.
         cameras: V cameras on the CPU.
         names: of the V views.
-        only_focal: say nothing of poses, which the masks have spoken of.
+        only_focal: skip poses, of which the masks have warned already.
     """
     num_still = sum(pair.num_still for pair in matches)
     if num_still > sum(pair.xy.shape[1] for pair in matches):

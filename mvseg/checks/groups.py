@@ -1,7 +1,7 @@
-"""Do all views tell of one world? Groups of views that agree within themselves only, by the masks.
+"""Do all views share one world frame? Finds groups of views that agree among themselves only, by the masks.
 
-Views that were calibrated in two goes may have two scales or two sets of axes. Each view then agrees with its group, so
-that none of them stands out alone; between the groups, only chance makes masks end where others do.
+Views from two separate calibrations may have two scales or two sets of axes. Each view then agrees with its group, so
+that no single view stands out; between the groups, masks fit only by chance.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ CHANCE = 0.06  # share of the masks that fit where poses and masks have nothing 
 APART = 0.5  # of the share that fits within the groups: in one world, more fit between them, see docs/check.md
 SMALLEST = 2  # views of a group; one alone is for `view_agreement`
 NAMED = 12  # views of a group that a sentence names
-NEXT_STEP = "were these cameras calibrated apart, in two scales or axes? Calibrate them together, or take one group"
+NEXT_STEP = "were they calibrated separately, with two scales or axes? Calibrate them together, or use one group"
 
 
 def world_groups(pairs: PoseAgreement) -> tuple[tuple[int, ...], ...]:
@@ -87,7 +87,7 @@ def _order(pairs: PoseAgreement, members: NDArray[np.int64]) -> NDArray[np.int64
 
 
 def _contrast(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
-    """Share of the masks that fit between two groups, of that within them, chance aside; 1 where nothing tells."""
+    """Share of the masks that fit between two groups over the share within them, corrected for chance; 1 if unknown."""
     between, _ = _block(pairs, one, other)
     within = np.concatenate((_upper(pairs.fitting, one), _upper(pairs.fitting, other)))
     if np.isnan(between).all() or np.isnan(within).all():

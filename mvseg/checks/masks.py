@@ -50,7 +50,7 @@ def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -
     tiny = areas < TINY_PX
     if tiny.mean() > MANY:
         sizes = f"fewer than {TINY_PX} pixels (median {np.median(areas):.0f})"
-        what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove them, or segment larger photos"
+        what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove small components, or segment larger photos"
         findings.append(Finding(where="masks", what=what, level="warning"))
     photo = cameras.sizes[view].prod(1).numpy()
     whole = sorted(set(view.numpy()[areas > COVERS * photo].tolist()))

@@ -1,6 +1,6 @@
-"""Features of neighbouring photos that are the same: SIFT, on photos scaled down, for few pairs of views.
+"""Matched features of neighbouring photos: SIFT, on photos scaled down, for few pairs of views.
 
-SIFT is OpenCV's: it finds as many common points as COLMAP's does, in half the time, and says nothing to the console.
+SIFT is OpenCV's: it finds as many matches as COLMAP's, in half the time, and prints nothing.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class PhotoMatches:
 
     @property
     def is_telling(self) -> bool:
-        """Whether so many fit one fundamental matrix that it is no chance."""
+        """Whether enough features fit one fundamental matrix to rule out chance."""
         return bool(self.is_rigid.sum() >= max(FEWEST, LEAST_SHARE * len(self.is_rigid)))
 
 
@@ -61,7 +61,7 @@ def match_photos(
     """The features that neighbouring photos share.
 
     Args:
-        read: the photo of a view, (H, W, 3) RGB without distortion; one that it raises InputError for has none.
+        read: the photo of a view, (H, W, 3) RGB without distortion; one for which it raises InputError is skipped.
         cameras: V cameras on the CPU, which say what neighbours are.
         progress: show a progress bar over the photos.
     """

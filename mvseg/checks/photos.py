@@ -1,4 +1,4 @@
-"""Photos against their cameras, and photos that show nothing."""
+"""Checks photos against their cameras, and for useless content."""
 
 from __future__ import annotations
 
@@ -122,12 +122,13 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
 
 
 def _is_blank(photo: PhotoFacts) -> bool:
-    """One colour all over. A dark photo of a plant has little contrast, too: it counts against its level."""
+    """Whether a photo has one colour all over. A dark photo of a plant has little contrast, too, so contrast is judged
+    relative to its level."""
     return photo.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * photo.level))
 
 
 def _beside(scene: Scene, view: int) -> str:
-    """What lies where the photo of a view is missing, as the end of a sentence."""
+    """What is in the folder where the photo of a view is missing, as the end of a sentence."""
     beside = describe_folder(scene.views[view].path.parent)
     return f"; {beside}" if beside else ""
 

@@ -1,10 +1,11 @@
-"""Do the masks of the views agree with the poses? Told by where the masks begin and end, without any matching.
+"""Do the masks of the views agree with the poses? Judged by the epipolar lines tangent to the masks, without any
+matching.
 
-A leaf that two photos show whole touches the same two half-planes of the views' pencil: its mask begins and ends at the
-same angles in both. So with right poses a good part of the masks of a view has a mask in another view that begins and
-ends where it does, to the pixel. With wrong poses only chance makes that so, and how often chance does is measured by
-moving the masks of the other view along the angles. The move at which most masks agree is the error of the epipolar
-lines: it is 0 for right poses. Missing, merged and half-hidden masks cost agreement, but move nothing.
+A leaf that is fully visible in two photos is tangent to the same two half-planes of the views' pencil: its mask begins
+and ends at the same angles in both. So with correct poses many masks of a view have a mask in another view with the
+same tangents, to the pixel. With wrong poses this happens by chance only, and its frequency is measured by shifting the
+masks of the other view along the angles. The shift at which most masks agree is the error of the epipolar lines: 0 for
+correct poses. Missing, merged and partly hidden masks reduce the agreement, but do not shift it.
 """
 
 from __future__ import annotations
@@ -160,7 +161,7 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
     rules: list[Rule] = []
     for index in view.off:
         facts = f"{view.fitting[index]:.0%} of its masks fit, epipolar lines miss by {view.offset_px[index]:.0f} px"
-        step = "it has the pose or the masks of another photo, or was moved; mend it or leave it out"
+        step = "it has the pose or the masks of another photo, or was moved; correct it or leave it out"
         rules.append((level, (index,), f"{{}} agrees with none of the others ({facts} or more): {step}"))
     missed = np.flatnonzero(view.offset_px >= OFFSET * pairs.unit_px).tolist() if len(names) >= FEW_VIEWS else []
     missing = [index for index in missed if index not in view.off]

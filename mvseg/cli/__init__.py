@@ -11,14 +11,14 @@ __all__ = ["main"]
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one verb, see `mvseg.cli.command.main`. Ctrl-C is one sentence from the first moment on.
+    """Run one verb, see `mvseg.cli.command.main`. Ctrl-C gives one sentence at any time, even during imports.
 
     Libraries that are being imported may swallow the exception of Ctrl-C, or turn it into another one.
     """
     try:
         import signal
 
-        for stream in (sys.stdout, sys.stderr):  # a character that the terminal does not have becomes a question mark
+        for stream in (sys.stdout, sys.stderr):  # a character that the terminal lacks becomes a question mark
             if isinstance(stream, TextIOWrapper):
                 stream.reconfigure(errors="replace")
         from mvseg.system.sigterm import held_back

@@ -21,7 +21,7 @@ def add(verbs: Any) -> None:
     help_scenes = "CSV table (columns scene, and if you like name, masks, plant, time, ...), or folder of scene folders"
     parser.add_argument("scenes", type=Path, help=help_scenes)
     add_run_options(parser)
-    help_resume = "go on with the batch in --out: what is done with the same inputs and options is kept"
+    help_resume = "continue the batch in --out: results of the same inputs and options are kept"
     parser.add_argument("--resume", type=bool, default=False, help=help_resume)
     help_workers = "scenes worked on at once, each in a process of its own on one thread (default: 1)"
     parser.add_argument("--num_workers", type=int | None, help=help_workers)

@@ -55,7 +55,7 @@ def run(args: Namespace) -> int:
                 regions = load_masks(
                     scene, find_masks(args.scene, args.masks), crowd=args.coco_crowd, categories=wanted
                 )
-            except InputError as error:  # what there is to say about the cameras and photos may explain it
+            except InputError as error:  # the findings about cameras and photos may explain it
                 unread = error
     check = check_scene(scene, regions, progress=not args.quiet)
     places = ["cameras" if index < num_of_cameras else "masks" for index in range(len(caught))]
@@ -67,7 +67,7 @@ def run(args: Namespace) -> int:
     for finding in sorted(found, key=lambda each: ("error", "warning", "note").index(each.level)):
         print(f"{finding.level:8} {finding.where:8} {finding.what}")
     if not found and unread is None:
-        print("nothing would go wrong")
+        print("no problems found")
     if args.out is not None:
         _write(args.out, check, found)
     if unread is not None:
@@ -102,7 +102,7 @@ def _print_table(check: Check) -> None:
 
 
 def _rows(check: Check) -> list[dict[str, Any]]:
-    """What the table and check.json say about each view; None where there is nothing to say."""
+    """The rows of the table and of check.json, one per view; None where a value is unknown."""
     from mvseg.checks.poses import view_agreement
     from mvseg.matching.tangency import touches_border
 

@@ -85,7 +85,7 @@ def _show_warning(
     file: TextIO | None = None,
     line: str | None = None,
 ) -> None:
-    """What is odd about the input, without the line of code that says it; other warnings are for developers."""
+    """Print input warnings without their line of code; other warnings are for developers."""
     text = f"mvseg: warning: {message}\n"
     if not issubclass(category, InputWarning):
         text = warnings.formatwarning(message, category, filename, lineno, line)

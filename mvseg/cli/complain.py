@@ -21,7 +21,7 @@ def complain(error: Exception, arguments: Sequence[str] = ()) -> int:
     """Print what is wrong with the input, on one line; returns the exit code.
 
     Args:
-        error: says it.
+        error: with the sentence.
         arguments: of the command line; an option among them is named as it stands there.
     """
     if isinstance(error, OSError) and error.filename:

@@ -1,4 +1,4 @@
-"""`mvseg correct`: a person corrects a result in the browser, and sees at once what comes of it."""
+"""`mvseg correct`: corrects a result in the browser, which shows the consequences at once."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ def run(args: Namespace) -> int:
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
     metrics |= dataclasses.asdict(leaf_metrics(regions, ids, truth))
     if metrics["no_instance"]:
-        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: no part of the scores of the ids"
+        message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: left out of the scores of the ids"
         print(f"mvseg: warning: {message}", file=sys.stderr)
     for name, value in metrics.items():
         print(f"{name:18} {value:.4f}" if isinstance(value, float) else f"{name:18} {value}")

@@ -1,4 +1,4 @@
-"""`mvseg export`: the traits of a batch in the forms that data bases and journals ask for."""
+"""`mvseg export`: the traits of a batch in the forms that databases and journals require."""
 
 from __future__ import annotations
 

@@ -63,7 +63,7 @@ def find_config(name: str) -> Path:
 
 
 def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
-    """The options of every verb that matches; `masks` is where they are when --masks does not say it."""
+    """The options of every verb that matches; `masks` is the default of --masks."""
     help_config = "YAML file with any of these options; paper.yaml ships"
     parser.add_argument("--config", action=CheckedConfig, help=help_config)
     parser.add_argument(
@@ -94,7 +94,7 @@ def add_overwrite(parser: ArgumentParser) -> None:
     """The options of the verbs that write the results of scenes one by one."""
     help_corrections = "file of a person's corrections, in the scene folder or anywhere; docs/corrections.md"
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)
-    help_overwrite = "replace the result in --out also where it is another scene's"
+    help_overwrite = "replace the result in --out even if it is another scene's"
     parser.add_argument("--overwrite", type=bool, default=False, help=help_overwrite)
 
 

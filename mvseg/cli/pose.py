@@ -27,21 +27,21 @@ def add(verbs: Any) -> None:
     parser.add_argument("--board", type=BoardConfig | None, help=help_board)
     help_marker = "scale from printed ArUco or AprilTag markers with sides (of the black squares) of this length"
     parser.add_argument("--marker", type=float | None, help=help_marker)
-    help_distance = "scale from how far apart two photos (by name), or two markers (as marker:7), are: A B LENGTH"
+    help_distance = "scale from the distance of two cameras (names of photos) or markers (as marker:7): A B LENGTH"
     parser.add_argument("--distance", nargs=3, type=str, metavar=("A", "B", "LENGTH"), help=help_distance)
-    help_positions = "scale and axes from where the camera stood: CSV with photo,x,y,z, or JSON"
+    help_positions = "scale and axes from camera positions: CSV with photo,x,y,z, or JSON"
     parser.add_argument("--positions", type=Path | None, help=help_positions)
     parser.add_argument("--unit", type=str | None, help="name of the unit of these lengths (mm, m, ...)")
     help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers)"
     parser.add_argument("--up", type=str | list[float] | None, help=help_up)
     help_turntable = (
-        "photos from a turntable, by cameras that stand still: 'board' calibrates it from photos of --board on the "
-        "table; a turntable.json made so gives the cameras of a plant on it"
+        "photos from a turntable with fixed cameras: 'board' calibrates it from photos of --board on the table; the "
+        "turntable.json that this writes gives the cameras for photos of a plant"
     )
     parser.add_argument("--turntable", type=str | None, help=help_turntable)
     help_angles = (
-        "with a turntable.json: the angles of the plant's photos, where they are not the calibration's: CSV with "
-        "photo,angle, or the degrees from one photo to the next"
+        "with a turntable.json: the angles of the plant's photos, if they differ from those of the calibration: CSV "
+        "with photo,angle, or the degrees from one photo to the next"
     )
     parser.add_argument("--angles", type=float | Path | None, help=help_angles)
     verbs.add_subcommand("pose", parser, help="a scene folder from photos alone")
@@ -58,7 +58,7 @@ def run(args: Namespace) -> int:
     )
     config = build_options(PoseConfig, args)
     if args.turntable in (None, "board") and args.angles is not None:
-        raise InputError("--angles: of no use without --turntable and a turntable.json")
+        raise InputError("--angles has no effect without --turntable and a turntable.json")
     if args.turntable is not None:
         _run_turntable(args, known, config)
         return 0
@@ -77,7 +77,7 @@ def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
     if config != PoseConfig():
         useless.append("the options of structure from motion")
     if useless:
-        raise InputError(f"{', '.join(useless)}: of no use with --turntable {args.turntable}, expected none of them")
+        raise InputError(f"{', '.join(useless)}: no effect with --turntable {args.turntable}, expected none of them")
     if not is_board:
         if isinstance(args.angles, float) and not math.isfinite(args.angles):
             raise InputError(f"angles is {args.angles}, expected degrees or a CSV file")
@@ -103,4 +103,4 @@ def _read_distance(words: list[str] | None) -> tuple[str, str, float] | None:
     try:
         return first, second, float(length)
     except ValueError:
-        raise InputError(f"distance: '{length}' is no length, expected --distance A B LENGTH") from None
+        raise InputError(f"distance: '{length}' is not a length, expected --distance A B LENGTH") from None

@@ -1,4 +1,4 @@
-"""`mvseg simulate`: render plants with known answers."""
+"""`mvseg simulate`: render plants with ground truth."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from mvseg.errors import InputError
 
 def add(verbs: Any) -> None:
     """Add the verb to the parser's sub-commands."""
-    parser = ArgumentParser(exit_on_error=False, description="Render plants with known answers.")
+    parser = ArgumentParser(exit_on_error=False, description="Render plants with ground truth.")
     presets = (
         "paper-eval (144 scenes of 3 to 20 photos), train (888 of 9 photos), wild (108 of 9 photos) or series "
         "(plants on 8 dates each)"
     )
     parser.add_argument("preset", help=presets)
     parser.add_argument("--out", type=Path, required=True, help="folder for the scenes; finished ones are kept")
-    parser.add_argument("--seed", type=int, default=0, help="for everything that is random")
+    parser.add_argument("--seed", type=int, default=0, help="random seed")
     parser.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")
-    parser.add_argument("--num_plants", type=int, default=6, help="of series: plants, of all families in turn")
-    verbs.add_subcommand("simulate", parser, help="render plants with known answers")
+    parser.add_argument("--num_plants", type=int, default=6, help="number of plants of the preset series")
+    verbs.add_subcommand("simulate", parser, help="render plants with ground truth")
 
 
 def run(args: Namespace) -> int:

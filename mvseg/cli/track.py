@@ -23,7 +23,7 @@ def add(verbs: Any) -> None:
     parser.add_argument("--times", type=str, nargs="+", help=help_times)
     parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: that of --out)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables and pages")
-    help_corrections = "what a person says: same_track and different_track, see docs/tracking.md"
+    help_corrections = "file of corrections with same_track and different_track, see docs/tracking.md"
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)
     parser.add_argument("--report", type=bool, default=True, help="write tracks.html and growth.png")
     parser.add_argument("--num_workers", type=int | None, help="plants tracked at once, each in a process of its own")

@@ -1,4 +1,4 @@
-"""A printed ChArUco board, as users describe it. Without torch: options are read before it is loaded."""
+"""A printed ChArUco board, as users describe it. Does not import torch: options are parsed before torch is loaded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mvseg.errors import InputError
 
 Floats = NDArray[np.float64]
 
-# Prints of markers, by OpenCV's names; the one with the most markers in the photos is taken.
+# Marker dictionaries, by OpenCV's names; the one with the most markers in the photos is used.
 Family = Literal["4X4_1000", "5X5_1000", "6X6_1000", "7X7_1000", "ARUCO_ORIGINAL", "APRILTAG_36H11"]
 FAMILIES: tuple[Family, ...] = get_args(Family)
 MAX_SQUARES = 200
@@ -21,14 +21,16 @@ MAX_SQUARES = 200
 
 @dataclass(frozen=True)
 class BoardConfig:
-    """A printed ChArUco board; its world has the origin in a corner, x and y in the board, z out of it, towards you.
+    """A printed ChArUco board; its frame has the origin in a corner, x and y in the board, z out of it, towards the
+    viewer.
 
     Attributes:
         columns: squares in a row.
         rows: squares in a column.
         square: side of a square.
         marker: side of a marker, in the unit of `square`.
-        family: OpenCV's name of the markers; a board of DICT_5X5_100 has family 5X5_1000, which begins with the same.
+        family: OpenCV's name of the marker dictionary; for DICT_5X5_100 use 5X5_1000, which begins with the same
+            markers.
         legacy: the pattern of boards from before OpenCV 4.6 (they differ if `rows` is even).
     """
 

@@ -1,6 +1,6 @@
-"""COCO instance JSON: masks in (polygons, run lengths, compressed run lengths), instances with their ids out.
+"""COCO instance JSON: reads masks (polygons, RLE, compressed RLE), and writes instances with their ids.
 
-The only codec of COCO's masks: whatever a file says, a mask of the image's size comes out, or one sentence.
+The only codec of COCO masks: any file gives a mask of the image's size, or an error of one sentence.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class CocoImage(BaseModel):
 
 
 class CocoAnnotation(BaseModel):
-    """An annotation as it stands in the file; `decode_segmentation` checks the mask, whoever needs it the category."""
+    """An annotation as it stands in the file; `decode_segmentation` checks the mask, and the caller the category."""
 
     id: Int64 | str | None = None
     image_id: int | str
@@ -78,21 +78,21 @@ _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(Items[Items[Fi
 def read_coco(
     path: Path, scene: Scene, *, parts: Sequence[Path] = (), crowd: Crowd = "mask", categories: Collection[str] = ()
 ) -> list[Iterator[tuple[int, np.ndarray]]]:
-    """The masks of a COCO file, view by view, as they stand there (in the frame of the photo).
+    """The masks of a COCO file, view by view, in the frame of the photo.
 
-    A mask is decoded when it is asked for: hundreds of them, of large photos, do not fit into memory together.
+    Masks are decoded lazily: hundreds of masks of large photos do not fit into memory together.
 
     Images are found by file name, see `find_views`; those that are not in the scene are left out. A list of results
     (annotations alone) is read, too: there the `image_id` is the name of a photo, or the number that it consists of.
-    Warns (InputWarning) of everything that is left out or taken loosely: crowds, boxes without a mask, views that the
+    Warns (InputWarning) of everything that is left out or ambiguous: crowds, boxes without a mask, views that the
     file does not list, annotations of images that it does not list, several categories.
 
     Args:
         path: the file; of several, their folder, which messages name.
         scene: gives the views and their sizes.
         parts: the files, where one was split by photos (Roboflow's train, valid and test).
-        crowd: what an annotation with `iscrowd` is: "mask", one like all others (supervision writes so for every mask
-            with holes or several parts, datumaro for all masks), or "ignore", left out as COCO's own evaluation does.
+        crowd: how annotations with `iscrowd` are treated: "mask": as all others (supervision sets it for every mask
+            with holes or several parts, datumaro for all masks); "ignore": left out, as in COCO's own evaluation.
         categories: names of the categories that are taken; all, if empty. A category without a name goes by its id.
 
     Returns:
@@ -169,7 +169,7 @@ def _read_file(path: Path, scene: Scene) -> _MaskFile:
 
 
 def _merge(parts: list[tuple[Path, _MaskFile]]) -> _MaskFile:
-    """One file of several, each with ids of its own: categories go by their names, annotations by their places."""
+    """Merge several files with independent ids: categories are identified by name, annotations by their place."""
     merged, part_of = _MaskFile(images=[], annotations=[]), dict[str, Path]()
     for number, (path, part) in enumerate(parts):
         names = {str(category.id): category.name for category in part.categories}
@@ -194,7 +194,7 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     if orphans:
         first = coco.annotations[orphans[0] - 1].id
         where = f"annotation {orphans[0] if first is None else first}"
-        message = f"{len(orphans)} annotations are of no image in the file, the first is {where}"
+        message = f"{len(orphans)} annotations refer to no image in the file, the first is {where}"
         warnings.warn(f"{path}: {message}", InputWarning, stacklevel=5)
     if len(image_ids) < len(coco.images):
         raise InputError(f"{path}: {len(coco.images)} images have {len(image_ids)} ids, expected one each")
@@ -256,13 +256,13 @@ def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarra
 
 
 def _decode_polygons(polygons: list[list[float]], width: int, height: int) -> np.ndarray:
-    """pycocotools walks along every edge in steps of a fifth of a pixel and keeps them all: far corners, or many long
-    edges, would ask for memory without end."""
+    """pycocotools walks along every edge in steps of a fifth of a pixel and keeps them all: distant corners, or many
+    long edges, would need unbounded memory."""
     if not polygons or any(len(polygon) < 6 or len(polygon) % 2 for polygon in polygons):
         raise InputError("its segmentation is not of the expected polygons x1, y1, x2, y2, x3, y3 and so on")
     outlines = [np.array(polygon).reshape(-1, 2) for polygon in polygons]
     if max(np.abs(corners).max() for corners in outlines) > 10 * max(width, height):
-        raise InputError("a polygon leads far out of the image")
+        raise InputError("a polygon reaches far out of the image")
     length = sum(np.abs(corners - np.roll(corners, 1, axis=0)).max(1).sum() for corners in outlines)
     if length > width * height + 100 * (width + height):  # the outline of every second pixel is as long as this
         raise InputError(f"its polygons are {length:.0f} pixels long, more than any outline in the image")

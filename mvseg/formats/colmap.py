@@ -51,7 +51,7 @@ def _by_number(path: Path) -> tuple[bool, int, str]:
 
 
 def _count_photos(model: Path) -> int:
-    """How many photos a model registers, without reading it; 0 where that cannot be told."""
+    """Number of photos that a model registers, without reading it; 0 if unknown."""
     try:
         if (model / "images.bin").is_file():
             with (model / "images.bin").open("rb") as file:
@@ -70,7 +70,7 @@ def read_colmap(model: Path, folder: Path) -> Scene:
         folder: the scene; photos are expected in its `images/`. Images that COLMAP did not register are left out.
 
     Raises:
-        InputError: the model cannot be read or is cut short, a camera has no pinhole (EQUIRECTANGULAR); see also
+        InputError: the model cannot be read or is truncated, a camera is not perspective (EQUIRECTANGULAR); see also
             `build_scene`.
     """
     _check_binary_model(model)
@@ -115,8 +115,8 @@ def _warn_of_photos_without_pose(model: Path, images: Path, registered: set[Path
 
 
 def _check_binary_model(model: Path) -> None:
-    """Walk through every binary file of a model, record by record: of files that were cut short, pycolmap 4.2 takes
-    half as whole, and reads others without end or asks for gigabytes. A model in text has none.
+    """Check every binary file of a model, record by record: of a truncated file pycolmap 4.2 may accept half, never
+    return, or allocate gigabytes. Text models need no check.
 
     Raises:
         InputError: a file cannot be read, does not end where its own counts say, or names an unknown camera model.

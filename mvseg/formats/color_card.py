@@ -1,12 +1,12 @@
 """Colour cards of 24 patches (ColorChecker Classic) in photos: where they are, and what a photo shows there.
 
-A card file says where a card is that cannot be found, or for which views a card stands:
+A card file gives the corners of a card that cannot be detected, or the views that a card is for:
 
     {"format": "mvseg-color-card/1",
      "cards": [{"photo": "left.jpg", "views": "left*"},
                {"photo": "right.jpg", "views": "right*", "corners": [[120, 80], [420, 90], [410, 280], [115, 270]]}]}
 
-`photo` lies beside the card file, `views` is a pattern of the names of views (all, if it is not there), and `corners`
+`photo` lies beside the card file, `views` is a pattern of view names (default: all), and `corners`
 are the pixels of the centres of the corner patches, clockwise from the brown one: brown, bluish green, black, white.
 """
 
@@ -33,10 +33,10 @@ ROWS, COLUMNS = 4, 6
 # centres of patches on the card, in patches: of all, row by row, and of those in the corners, clockwise
 CENTERS = np.stack(np.meshgrid(np.arange(COLUMNS), np.arange(ROWS)), -1).reshape(-1, 2).astype(float)
 CORNERS = (0, COLUMNS - 1, ROWS * COLUMNS - 1, (ROWS - 1) * COLUMNS)
-INSIDE = np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 9)] * 2), -1).reshape(-1, 2)  # of a patch: where it is looked at
+INSIDE = np.stack(np.meshgrid(*[np.linspace(-0.2, 0.2, 9)] * 2), -1).reshape(-1, 2)  # of a patch: sampled places
 LONGEST = 1600  # pixels; OpenCV looks for cards in photos no larger than this
 SCALES = (1.0, 0.8, 0.64, 1.25, 1.6)  # it finds a card at one scale that it misses at another
-STARTS = 5  # it groups colours from a random start, and not alike with one thread and with several
+STARTS = 5  # its clustering of colours starts at random, and depends on the number of threads
 
 
 class CardEntry(BaseModel):
@@ -55,11 +55,11 @@ class _CardFile(BaseModel):
 
 
 def read_card_file(path: Path) -> list[tuple[CardEntry, list[Floats]]]:
-    """The cards of a card file, or the one in a photo, each with the patches that may be its own.
+    """The cards of a card file, or the one in a photo, each with the candidates for its patches.
 
     Returns:
-        Per card (24, 3) sRGB values from 0 to 255, row by row from the brown patch; where it had to be looked for,
-        one for each place where there may be a card.
+        Per card (24, 3) sRGB values from 0 to 255, row by row from the brown patch; if the card had to be detected, one
+        array for each candidate.
 
     Raises:
         InputError: the file or a photo is missing or broken, the corners lie outside of the photo, or there is no card.
@@ -87,7 +87,7 @@ def read_card_file(path: Path) -> list[tuple[CardEntry, list[Floats]]]:
 
 
 def find_patches(photo: NDArray[np.uint8]) -> Iterator[Floats]:
-    """(24, 3) sRGB values, from 0 to 255, wherever OpenCV takes something for a card, at one scale after another.
+    """(24, 3) sRGB values, from 0 to 255, of every candidate for a card that OpenCV finds, scale by scale.
 
     Args:
         photo: (H, W, 3) uint8 RGB.

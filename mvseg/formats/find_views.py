@@ -1,4 +1,4 @@
-"""Which view a file name means: files of masks come from other machines and tools, which name photos in their ways."""
+"""Which view a file name refers to: mask files come from other machines and tools, with their own naming."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ ROBOFLOW = re.compile(r"_(jpe?g|png|tiff?|bmp|webp|heic)\.rf\.\w+$", re.IGNORECA
 
 
 def find_views(names: Sequence[str], scene: Scene, *, source: Path, warn_of_loose: bool = False) -> list[int | None]:
-    """The view that each file name means, None for a photo that is not in the scene.
+    """The view that each file name refers to, None for a photo that is not in the scene.
 
-    A name means a view if it is the path of the view's photo, its last part, or the view's name with or without suffix.
-    Views that nothing means so may be told by the base name alone (folders, suffix and Roboflow's ending left out,
-    capitals as small letters), where only one view and one of the names have it.
+    A name refers to a view if it is the path of the view's photo, the last part of that path, or the view's name with
+    or without suffix. Views without such a name may be matched by the base name alone (without folders, suffix and
+    Roboflow's ending; case is ignored), if only one view and one of the names have it.
 
     Args:
         names: paths with "/" or "\\" between folders, with or without suffix; of any machine.
         scene: gives the views.
         source: the file or folder that holds the names; messages name it.
-        warn_of_loose: say (InputWarning) which names were told by their base name alone.
+        warn_of_loose: warn (InputWarning) of names that were matched by their base name alone.
 
     Raises:
         InputError: a name fits several views, or several names that fit nothing else have the base name of one view.
@@ -70,7 +70,7 @@ def list_some(names: Sequence[str]) -> str:
 
 
 def _exact_views(names: Sequence[str], scene: Scene, source: Path) -> list[int | None]:
-    """The view of each name by its path or its name, None where that tells nothing."""
+    """The view of each name by its path or its name, None if neither matches."""
     by_name = {view.name: index for index, view in enumerate(scene.views)}
     by_path: dict[str, list[int]] = defaultdict(list)
     for index, view in enumerate(scene.views):

@@ -1,8 +1,8 @@
 """Image files: decoded whole or not at all, by Pillow.
 
-Pillow refuses files that are cut short. It does not see a bit that flipped in a PNG, so the checksums of PNG files are
-verified here. EXIF orientation is ignored: rows and columns are those that the file stores, to which cameras and masks
-refer. (The orientation tag of a TIFF file belongs to the format, and Pillow applies it.)
+Pillow refuses truncated files. It does not detect a flipped bit in a PNG, so the checksums of PNG files are verified
+here. EXIF orientation is ignored: rows and columns are those that the file stores, to which cameras and masks refer.
+(The orientation tag of a TIFF file belongs to the format, and Pillow applies it.)
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
 PHONE_SUFFIXES = (".heic", ".heif")  # known by name, to say what to do with them
 MAX_SIDE = 1 << 20  # pixels
 MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
-GREY = 2  # levels between the channels of a photo without colours
+GREY = 2  # largest difference between the channels of a grey photo
 ORIENTATION = 0x0112  # EXIF tag
 BITS_PER_SAMPLE = 0x0102  # TIFF tag
 LARGE = 1 << 26  # pixels; Pillow's own limit lies above
@@ -59,7 +59,7 @@ class WrongSize(InputError):
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
-    """Decode a JPEG, PNG, TIFF, BMP or WebP file, told apart by its content; the first image of several.
+    """Decode a JPEG, PNG, TIFF, BMP or WebP file, recognised by its content; the first image of several.
 
     Args:
         path: the file.
@@ -98,10 +98,10 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
 
 
 def read_image_size(path: Path) -> tuple[int, int]:
-    """Width and height in pixels, as stored; only the head of the file is read.
+    """Width and height in pixels, as stored; only the header of the file is read.
 
     Raises:
-        InputError: as `read_image`, as far as the head tells.
+        InputError: as `read_image`, as far as the header shows.
     """
     try:
         with path.open("rb") as file:
@@ -121,14 +121,14 @@ def read_image_size(path: Path) -> tuple[int, int]:
 
 
 def no_image_message(start: bytes) -> str:
-    """What a file is that is none of the images read here, by its first bytes."""
+    """Why a file is not a supported image, from its first bytes."""
     if start[4:8] == b"ftyp" and start[8:12] in (b"heic", b"heix", b"mif1", b"msf1", b"hevc", b"heim", b"avif"):
         return "it is a HEIC file, expected JPEG, PNG, TIFF, BMP or WebP: convert it without turning or scaling it"
     return "it is not a JPEG, PNG, TIFF, BMP or WebP file"
 
 
 def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) -> np.ndarray:
-    """(H, W, 3) uint8: an image in colour, without transparency, the upper 8 of 16 bits.
+    """(H, W, 3) uint8: the image as RGB, without transparency; of 16 bits, the upper 8.
 
     Files of 16 bits that hold smaller numbers only, as cameras of 10, 12 or 14 bits write them, give the upper 8 of
     those; see `sensor_bits`.
@@ -136,8 +136,8 @@ def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) 
     Args:
         path: the file.
         size: see `read_image`.
-        bits: that the numbers of a file of 16 bits have at least: what those of its neighbours have, so that a dark
-            photo stays darker than they.
+        bits: least number of bits that a 16-bit file is taken to use: that of the other photos, so that a dark photo
+            stays darker than they are.
 
     Raises:
         InputError: see `read_image`; or the pixels are signed, or have 32 bits.
@@ -161,7 +161,7 @@ def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) 
 def sensor_bits(path: Path, size: tuple[int, int] | None = None) -> int:
     """How many bits the numbers of an image use: 8, or 10, 12, 14 or 16 in a file of 16 bits.
 
-    Files of 8 bits are told by their heads; others are decoded. For `size` see `read_image`.
+    8-bit files are recognised by their headers; others are decoded. For `size` see `read_image`.
 
     Raises:
         InputError: see `read_image`.
@@ -179,7 +179,7 @@ def sensor_bits(path: Path, size: tuple[int, int] | None = None) -> int:
 
 
 def known_bits(path: Path, size: tuple[int, int] | None = None) -> int:
-    """As `sensor_bits`, remembered while the file stays as it is; 8 for one that cannot be read or has another size."""
+    """As `sensor_bits`, cached until the file changes; 8 for one that cannot be read or has another size."""
     try:
         facts = path.stat()
         return _bits_of_file(path, size, facts.st_mtime_ns, facts.st_size)
@@ -193,7 +193,7 @@ def _bits_of_file(path: Path, size: tuple[int, int] | None, modified_ns: int, nu
 
 
 def _tiff_bits(file: BinaryIO) -> int:
-    """Bits of a TIFF file's first channel, by its head; 8 where that cannot be told."""
+    """Bits of a TIFF file's first channel, from its header; 8 if unknown."""
     file.seek(0)
     try:
         return int(TiffImageFile(file).tag_v2.get(BITS_PER_SAMPLE, (8,))[0])
@@ -207,8 +207,8 @@ def _bits_of(deep: np.ndarray) -> int:
 
 
 def _read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
-    """(H, W) or (H, W, 3) uint16, RGB, of an image of 16 bits; None of others. Pillow cuts colours to 8 bits, so that
-    OpenCV reads them, after Pillow has found the file whole."""
+    """(H, W) or (H, W, 3) uint16, RGB, of an image of 16 bits; None of others. Pillow reduces colours to 8 bits, so
+    OpenCV reads them, after Pillow has verified the file."""
     if image.mode.startswith("I;16"):
         return np.asarray(image).astype(np.uint16)
     if image.mode not in ("RGB", "RGBA", "LA") or not isinstance(image, (PngImageFile, TiffImageFile)):
@@ -225,12 +225,12 @@ def _read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
 
 
 def is_grey(pixels: np.ndarray) -> bool:
-    """Whether a photo (H, W, 3) uint8 has no colours; a level or two, which a JPEG may make of them, are none."""
+    """Whether a photo (H, W, 3) uint8 is grey; differences of one or two levels, as JPEG makes, do not count."""
     return bool((np.ptp(pixels, axis=2) <= GREY).all())
 
 
 def is_turned(path: Path) -> bool:
-    """Whether EXIF asks viewers to turn or mirror a JPEG; other formats are rarely turned so, and not looked at."""
+    """Whether EXIF asks viewers to rotate or mirror a JPEG; other formats rarely do, and are not checked."""
     try:
         with path.open("rb") as file:
             return JpegImageFile(file).getexif().get(ORIENTATION, 1) != 1
@@ -239,7 +239,7 @@ def is_turned(path: Path) -> bool:
 
 
 def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | None:
-    """What is wrong with an image's path relative to its folder, as the end of a sentence; None for a sound one."""
+    """What is wrong with an image's path relative to its folder, as the end of a sentence; None if it is valid."""
     path = os.path.normpath(file)
     starts_elsewhere = os.path.isabs(path) or path.startswith(os.sep) or os.path.splitdrive(path)[0]  # on Windows, too
     if starts_elsewhere or path.split(os.sep)[0] == "..":
@@ -264,7 +264,7 @@ def _load(image: ImageFile) -> None:
 
 
 def _has_sound_chunks(data: bytes) -> bool:
-    """Whether a PNG file is there up to its end chunk, each chunk with the right checksum."""
+    """Whether a PNG file is complete up to its end chunk, each chunk with the right checksum."""
     at, kind = len(PNG_START), b""
     while kind != b"IEND":
         if at + 12 > len(data):

@@ -19,7 +19,7 @@ Item = TypeVar("Item")
 
 
 class _FirstFault(FailFast):
-    """The first item that is wrong is enough: pydantic would otherwise describe each of five million."""
+    """Stops at the first invalid item; pydantic would otherwise describe all of five million."""
 
     __hash__ = object.__hash__  # unions need one
 
@@ -35,7 +35,7 @@ def read_json(path: Path, model: type[Model]) -> Model:
         InputError: the file is missing, is not JSON, or does not fit the model; names the file and the key.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))  # Windows editors put a mark in front
+        content = json.loads(path.read_text(encoding="utf-8-sig"))  # Windows editors write a byte order mark
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, numbers of thousands of digits

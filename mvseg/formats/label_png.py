@@ -42,7 +42,7 @@ def open_labels(path: Path, size: tuple[int, int] | None) -> Image.Image:
 
     Args:
         path: the file.
-        size: width and height that its camera says; an image of another size is not decoded.
+        size: width and height that its camera states; an image of another size is not decoded.
 
     Raises:
         InputError: it is missing, cannot be decoded, is a JPEG, or is of another size.

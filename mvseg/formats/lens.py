@@ -2,8 +2,9 @@
 
 The undistorted image has the size and the K of the photo; only the distortion is removed. What the photo does not show
 is black (nothing, in masks). Every camera model of COLMAP works, through pycolmap; a rig file's OpenCV coefficients are
-COLMAP's FULL_OPENCV. Beyond some angle a lens polynomial turns back, so that a photo pixel appears twice, and a fisheye
-sees what no pinhole can: a position that does not come back to itself, there and back, counts as not shown.
+COLMAP's FULL_OPENCV. Beyond some angle a lens polynomial is not monotonic, so that a photo pixel would appear twice,
+and a fisheye sees more than a pinhole can: a position that does not return to itself under the mapping and its inverse
+counts as not visible.
 """
 
 from __future__ import annotations

@@ -28,19 +28,19 @@ def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
         family: of the markers.
 
     Returns:
-        {number of the marker: (4, 2) corners in pixels, clockwise from its top left}; a marker that is there twice
-        says nothing and is left out.
+        {number of the marker: (4, 2) corners in pixels, clockwise from its top left}; a marker that appears twice is
+        ambiguous and left out.
     """
     dictionary = cv2.aruco.getPredefinedDictionary(opencv_dictionary(family))
     if cv2.aruco.ArucoDetector(dictionary).detectMarkers(photo)[1] is None:  # quick, where there is none
         return {}
     parameters = cv2.aruco.DetectorParameters()
-    # Of the ways to refine corners the one without bias: the others find markers of 20 to 40 pixels 1 to 5 % too small.
+    # The corner refinement without bias: the others find markers of 20 to 40 pixels 1 to 5 % too small.
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
     detector = cv2.aruco.ArucoDetector(dictionary, parameters)
     quads, ids, _ = detector.detectMarkers(photo)
     numbers = [] if ids is None else [int(number) for number in ids.ravel()]
-    corners = [np.asarray(quad, float).reshape(4, 2) for quad in quads]  # this way counts from the corner of the photo
+    corners = [np.asarray(quad, float).reshape(4, 2) for quad in quads]  # (0, 0) is the photo's corner here
     return {number: quad for number, quad in zip(numbers, corners, strict=True) if numbers.count(number) == 1}
 
 

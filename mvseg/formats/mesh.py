@@ -1,4 +1,4 @@
-"""Meshes out: PLY per instance, one GLB with a node per instance, through trimesh."""
+"""Writes meshes through trimesh: a PLY per instance, and one GLB with a node per instance."""
 
 from __future__ import annotations
 
@@ -14,9 +14,10 @@ ROOT = "plant"  # the node above all others in a GLB
 
 
 def simplify_mesh(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
-    """A closed mesh with at most so many triangles, by quadric decimation; one that has no more is returned as it is.
+    """Simplify a closed mesh to at most `max_faces` triangles, by quadric decimation; smaller ones are returned as they
+    are.
 
-    The rim of an open mesh may suffer.
+    The boundary of an open mesh may be damaged.
     """
     return mesh if len(mesh.faces) <= max_faces else mesh.simplify_quadric_decimation(face_count=max_faces)
 
@@ -40,17 +41,17 @@ def write_glb(
     about: Mapping[str, Any] | None = None,
     extras: Mapping[str, Mapping[str, Any]] | None = None,
 ) -> None:
-    """Write meshes as one binary glTF, with normals. Their coordinates stay the world's: a node above them places them.
+    """Write meshes as one binary glTF, with normals, in world coordinates below a node that transforms them.
 
-    Each name gets a node and a material of its own, which is seen from both sides: a leaf may be an open surface.
+    Each name gets a node and a double-sided material of its own: a leaf may be an open surface.
 
     Args:
         path: the file.
         meshes: {name: mesh}.
-        colors: {name: RGB, 0 to 255}, of sRGB as in pictures; the file has them linear, as glTF wants them.
+        colors: {name: RGB, 0 to 255}, sRGB; the file has them linear, as glTF requires.
         matrix: (4, 4) gltf_from_world, of the node above all others; glTF is in metres, +y is up. None: the identity.
-        about: what that node says in its `extras`.
-        extras: {name: what its node says in its `extras`}.
+        about: the `extras` of that node.
+        extras: {name: the `extras` of its node}.
     """
     scene = trimesh.Scene()
     root = np.eye(4) if matrix is None else matrix
@@ -73,7 +74,7 @@ def write_glb(
 
 def _unit_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
     """(P, 3) normals of the vertices; those of a place without any (two sides that touch) point along +z, since glTF
-    allows no others than unit vectors."""
+    allows unit vectors only."""
     normals = np.array(mesh.vertex_normals)
     has_none = np.abs(np.linalg.norm(normals, axis=1) - 1) > 1e-3
     normals[has_none] = (0, 0, 1)
@@ -81,7 +82,7 @@ def _unit_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
 
 
 def _linear(color: tuple[int, int, int]) -> list[int]:
-    """The share of light that a colour of sRGB means, 0 to 255 (trimesh keeps no fractions)."""
+    """Linear light of an sRGB colour, 0 to 255 (trimesh keeps no fractions)."""
     share = np.array(color) / 255
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return [round(float(255 * value)) for value in light]

@@ -26,7 +26,7 @@ from mvseg.formats.text_file import read_bytes
 from mvseg.scene import Scene
 
 MAX_BYTES = 1 << 26
-GEOCENTRIC = 1e5  # metres: farther from the origin, float32 has no millimetres left
+GEOCENTRIC = 1e5  # metres from the origin, beyond which float32 does not resolve millimetres
 NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
 
 
@@ -46,12 +46,12 @@ def find_metashape(folder: Path) -> Path | None:
 def read_metashape(path: Path) -> Scene:
     """The scene of the cameras of a Metashape chunk, in the order of the file; photos are found by their labels.
 
-    The unit is "m" where the chunk has a transform (markers, scale bars or positions), else unknown. Of a geocentric
-    one, the translation is left out. A warning (InputWarning) says so, and how many cameras are not aligned.
+    The unit is "m" where the chunk has a transform (markers, scale bars or positions), else unknown. A geocentric
+    transform loses its translation. Warns (InputWarning) of that, and of cameras that are not aligned.
 
     Raises:
-        InputError: the file is no whole XML of Metashape's, holds several chunks or components, or a camera whose
-            sensor is unknown or not supported (fisheye, spherical, k4, p3, p4, b2 with distortion).
+        InputError: the file is not a complete XML file of Metashape, holds several chunks or components, or a camera
+            whose sensor is unknown or not supported (fisheye, spherical, k4, p3, p4, b2 with distortion).
     """
     chunk = _read_chunk(path)
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
@@ -76,7 +76,7 @@ def read_metashape(path: Path) -> Scene:
 
 def _read_chunk(path: Path) -> ElementTree.Element:
     data = read_bytes(path, "the cameras of Metashape alone", most=MAX_BYTES)
-    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # entities can ask for memory without end
+    if b"<!DOCTYPE" in data or b"<!ENTITY" in data:  # entities can expand without bound
         raise InputError(f"{path}: declares a document type, which Metashape does not")
     try:
         document = ElementTree.fromstring(data)
@@ -98,7 +98,7 @@ def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray,
     components = chunk.findall("components/component")
     used = {camera.get("component_id") for camera in _list_cameras(chunk) if camera.find("transform") is not None}
     if len(used) > 1:
-        raise InputError(f"the cameras are of {len(used)} components, expected one that holds all")
+        raise InputError(f"the cameras belong to {len(used)} components, expected one")
     owners = [each for each in components if each.get("id") in used] or [chunk]
     transform = owners[0].find("transform")
     if transform is None or transform.find("scale") is None:

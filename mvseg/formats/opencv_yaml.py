@@ -1,6 +1,6 @@
 """Calibrations in YAML, as OpenCV's `cv::FileStorage` and ROS's camera_calibration write them: K, distortion and size.
 
-OpenCV puts the centre of the top-left pixel at (0, 0), so that half a pixel is added to the principal point.
+OpenCV puts the centre of the top-left pixel at (0, 0), so half a pixel is added to the principal point.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ def _read_entries(path: Path) -> dict[str, Any]:
     """The top level of the file, keys in small letters and without "_"."""
     entries = read_yaml(path, EXPECTED, loader=_Loader)
     if not isinstance(entries, dict):
-        raise InputError(f"{path}: is no calibration, expected {EXPECTED}")
+        raise InputError(f"{path}: is not a calibration, expected {EXPECTED}")
     return {str(key).lower().replace("_", ""): value for key, value in entries.items()}
 
 

@@ -1,4 +1,4 @@
-"""From photos with cameras, as every reader of cameras gives them, to a scene; and the photos of a scene, read."""
+"""Builds the scene from photos with cameras, as every camera reader gives them, and reads the photos of a scene."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
             raise InputError(f"{source}: view {index} ({photo.file}): {problem}")
     moved = [(photo.file, file) for photo, file in zip(photos, files, strict=True) if is_elsewhere(photo.file, file)]
     if moved:
-        message = f"{len(moved)} photos are told by their names alone, the first is {moved[0][1]} for {moved[0][0]}"
+        message = f"{len(moved)} photos are matched by their names alone, the first is {moved[0][1]} for {moved[0][0]}"
         warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
     named = zip(view_names(files), files, photos, strict=True)
     views = tuple(View(name, folder / file, photo.lens) for name, file, photo in named)
@@ -99,11 +99,12 @@ def scene_name(folder: Path) -> str:
 
 
 def find_photo(folder: Path, file: str) -> str:
-    """The photo that a camera file means, as a path relative to the scene folder.
+    """The photo that a camera file refers to, as a path relative to the scene folder.
 
-    It is the file of this path; or the one there with the same name in other capitals, or with a suffix where the name
-    has none (nerfstudio, Blender); or, for a path of another machine or one that leads out of the scene folder
-    (colmap2nerf's start where it ran), the only photo of this name in the scene folder or below its `images/`.
+    It is the file of this path; or the one there whose name differs in case only, or has a suffix where the given name
+    has none (nerfstudio, Blender); or, for a path of another machine or one that leads out of the scene folder (those
+    of colmap2nerf start at its working directory), the only photo of this name in the scene folder or below its
+    `images/`.
 
     Returns:
         The path; `file` itself, if there is no such photo.
@@ -122,14 +123,14 @@ def find_photo(folder: Path, file: str) -> str:
 
 
 def size_of_photo(folder: Path, file: str) -> tuple[int, int]:
-    """Width and height of the photo that a camera file means, where the file does not say them.
+    """Width and height of the photo that a camera file refers to, if the file does not state them.
 
     Raises:
         InputError: the photo is missing, too, or cannot be read. The message is a reason, without the photo's name.
     """
     photo = folder / find_photo(folder, file)
     if file_name_problem(os.path.relpath(photo, folder)) or not photo.is_file():
-        raise InputError("width and height are missing, and so is the photo that could tell")
+        raise InputError("width and height are missing, and so is the photo")
     with faults_of("width and height are missing, and the photo cannot be read"):
         return read_image_size(photo)
 
@@ -158,7 +159,7 @@ def view_names(files: Sequence[str]) -> list[str]:
 
 
 def _problem(photo: Photo, file: str) -> str | None:
-    """What is wrong with a photo's camera or the path of its file, as the end of a sentence; None for a sound one."""
+    """What is wrong with a photo's camera or the path of its file, as the end of a sentence; None if it is valid."""
     problem = file_name_problem(file)
     if problem:
         return problem
@@ -171,11 +172,11 @@ def _problem(photo: Photo, file: str) -> str | None:
 
 
 def check_photos(scene: Scene) -> None:
-    """Are the photos of a scene there? None at all is fine: masks are enough for matching and for shapes.
+    """Check that the photos of a scene exist. All may be missing: masks are enough for matching and for shapes.
 
     Warns (InputWarning) of photos that EXIF asks viewers to turn: cameras and masks must refer to the stored pixels, as
-    those of COLMAP do; of photos of 16 bits that all use fewer; and of files in the place of the photos, if none is
-    there.
+    those of COLMAP do; of 16-bit photos that all use fewer bits; and of other files in their folder, if all photos are
+    missing.
 
     Raises:
         InputError: some photos are there and others are missing.
@@ -231,8 +232,8 @@ def require_photos(scene: Scene, folder: Path) -> None:
 
 
 def photo_bits(scene: Scene, view: int) -> int:
-    """How many bits the numbers in the photo of a view are taken to have: 8 or, for a file of 16 bits, as many as those
-    of any photo of the scene, so that one range brightens them all."""
+    """How many bits the photo of a view is taken to use: 8 or, for a 16-bit file, the most that any photo of the scene
+    uses, so that all are brightened by the same factor."""
     own = known_bits(scene.views[view].path, tuple(scene.cameras.sizes[view].tolist()))
     return own if own in (8, 16) else max(_bits_of_views(scene))
 
@@ -255,8 +256,8 @@ def load_photos(scene: Scene) -> list[torch.Tensor]:
 class Photos:
     """The photos of a scene: `photos(view)` is (H, W, 3) uint8 RGB with its lens distortion removed, see `read_photo`.
 
-    Those asked for last stay in memory, up to `CACHED_BYTES` in all, so that a scene that fits into that is decoded
-    once, however many stages look at it. What is returned is shared: it must not be written to.
+    The most recent ones are cached, up to `CACHED_BYTES` in all, so that a scene that fits is decoded once, however
+    many stages use it. What is returned is shared: it must not be written to.
 
     Attributes:
         scene: whose photos these are.
@@ -276,7 +277,7 @@ class Photos:
         if photo is None:
             photo = read_photo(self.scene, view)
             photo.flags.writeable = False
-        self._cached[view] = photo  # the last ones were asked for last
+        self._cached[view] = photo  # the most recent ones come last
         while len(self._cached) > 1 and sum(each.nbytes for each in self._cached.values()) > CACHED_BYTES:
             del self._cached[next(iter(self._cached))]
         return photo

@@ -1,11 +1,11 @@
-"""Where the camera stood at each photo, as carriages and robots log it, or how far a turntable had turned: CSV.
+"""Camera positions, as carriages and robots log them, or turntable angles, one per photo: CSV.
 
     photo,x,y,z          photo,angle
     000.jpg,75,375,80    000.jpg,7.5
 
-The first column may be called photo, image, file, filename or name; x, y and z perhaps have their unit, as in x_mm.
-Columns may be separated by commas, semicolons or tabs; others are left alone. Positions may also be JSON with a list of
-views: {"views": [{"file": "images/000.jpg", "x_mm": 75, "y_mm": 375, "z_mm": 80}, ...]}.
+The first column may be called photo, image, file, filename or name; x, y and z may have a unit, as in x_mm. Columns may
+be separated by commas, semicolons or tabs; other columns are ignored. Positions may also be JSON with a list of views:
+{"views": [{"file": "images/000.jpg", "x_mm": 75, "y_mm": 375, "z_mm": 80}, ...]}.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Positions:
     Attributes:
         names: of the photos, as in the file.
         xyz: (P, 3) float64.
-        unit: that the file says; "" if none.
+        unit: as the file states it; "" if it states none.
     """
 
     names: tuple[str, ...]
@@ -54,7 +54,7 @@ def read_positions(path: Path) -> Positions:
     """Read the camera positions of photos.
 
     Raises:
-        InputError: the file cannot be read, has no columns for photo, x, y and z, holds something else than numbers
+        InputError: the file cannot be read, has no columns for photo, x, y and z, holds other things than numbers
             there, names a photo twice or has columns in different units.
     """
     rows = read_json(path, _Positions).views if path.suffix.lower() == ".json" else _read_table(path, "positions")
@@ -74,8 +74,8 @@ def read_photo_angles(path: Path) -> dict[str, float]:
     """{name of the photo, as in the file: degrees}.
 
     Raises:
-        InputError: the file cannot be read, has no columns for photo and angle, holds something else than numbers
-            there, or names a photo twice.
+        InputError: the file cannot be read, has no columns for photo and angle, holds other things than numbers there,
+            or names a photo twice.
     """
     rows = _read_table(path, "angles")
     keys = _columns(rows)

@@ -58,8 +58,8 @@ class _Rig(BaseModel):
 
 
 def is_rig(path: Path) -> bool:
-    """Whether a cameras.json is meant as a rig file, sound or not; other programs (3D Gaussian splatting) have files of
-    this name, too."""
+    """Whether a cameras.json is meant as a rig file, valid or not; other programs (3D Gaussian splatting) use this
+    name, too."""
     try:
         content = json.loads(path.read_text(encoding="utf-8-sig"))
     except (OSError, ValueError, RecursionError):
@@ -102,7 +102,7 @@ def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
 
     Raises:
         InputError: there is not exactly one of K and a calibration, the calibration cannot be read or is of another
-            size, the size is not known, or the distortion is none that OpenCV has. The message is a reason.
+            size, the size is not known, or the distortion is not a model of OpenCV. The message is a reason.
     """
     if (camera.K is None) == (camera.calibration is None):
         raise InputError("expected either K or a calibration file")

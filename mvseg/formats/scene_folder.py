@@ -27,7 +27,7 @@ from mvseg.scene import Scene
 
 EXPECTED = "expected cameras.json, a COLMAP model in sparse/, transforms.json, or another kind of docs/formats.md"
 TRANSFORMS = ("transforms.json", "transforms_train.json")  # Blender's scenes of NeRF have train, val and test
-BINARY = 255  # what segmenters write that only tell leaf from background
+BINARY = 255  # written by segmenters that only separate leaf from background
 
 
 @np.errstate(over="ignore", invalid="ignore")  # absurd numbers become infinite: no camera has such, and it is named
@@ -51,7 +51,7 @@ def load_scene(folder: Path | str) -> Scene:
     scene = None if is_own else _read_others(folder)
     if scene is not None:
         if rig.is_file():
-            message = f"is no rig file, and not used; the cameras are those of {scene.source}"
+            message = f"is not a rig file, and not used; the cameras are those of {scene.source}"
             warnings.warn(f"{rig}: {message}", InputWarning, stacklevel=2)
         return scene
     if rig.is_file():
@@ -96,16 +96,16 @@ def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", catego
 
     Args:
         scene: gives the views and their sizes.
-        masks: a COCO JSON file, or a folder with files that are called as the photos: label images (PNG, TIFF), NumPy
+        masks: a COCO JSON file, or a folder with files that are named after the photos: label images (PNG, TIFF), NumPy
             or cellpose files, labelme or Segment Anything JSON, YOLO text, or one image per mask; see
             `recognise_masks`.
-        crowd: what COCO annotations with `iscrowd` are: masks like all others, or left out; see `read_coco`.
+        crowd: how COCO annotations with `iscrowd` are treated, see `read_coco`.
         categories: names of the categories that are taken, of COCO, labelme and YOLO files; all, if empty.
 
     Returns:
         Regions in the undistorted frame; `labels` holds the numbers of the masks in their files. Warns (InputWarning)
-        of everything that is left out or told by a loose rule, and of label images that hold 0 and 255 only, or a
-        number per class.
+        of everything that is left out or matched by its base name only, and of label images that hold 0 and 255 only,
+        or a number per class.
 
     Raises:
         InputError: a file is missing, broken, or does not fit its view, or a category is not there; see the readers.

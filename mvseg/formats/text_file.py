@@ -10,15 +10,15 @@ MAX_BYTES = 1 << 20
 
 
 def read_text(path: Path, expected: str, *, most: int = MAX_BYTES) -> str:
-    """The text of a file; the mark that Windows editors put in front is left out.
+    """The text of a file, without the byte order mark that Windows editors write.
 
     Raises:
-        InputError: it cannot be read, has more than `most` bytes, or is no UTF-8; names the path and what was expected.
+        InputError: it cannot be read, has more than `most` bytes, or is not UTF-8; names the path and what is expected.
     """
     try:
         return read_bytes(path, expected, most=most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is no UTF-8, expected {expected}") from None
+        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected {expected}") from None
 
 
 def read_bytes(path: Path, expected: str, *, most: int = MAX_BYTES) -> bytes:

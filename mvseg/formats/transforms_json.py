@@ -1,7 +1,8 @@
 """`transforms.json` of nerfstudio, instant-ngp and Blender: world_from_cam in OpenGL axes (+y up, -z forward).
 
 nerfstudio's `applied_transform` and `applied_scale` are undone: the world is that of the cameras before nerfstudio
-turned and scaled it (COLMAP's). Its `mask_path` says what to train on, not which leaf is where, and is not used.
+turned and scaled it (COLMAP's). Its `mask_path` marks what to train on and does not tell leaves apart, so it is not
+used.
 """
 
 from __future__ import annotations
@@ -69,7 +70,7 @@ def read_transforms(path: Path) -> Scene:
 
     Raises:
         InputError: the file is missing or broken, an intrinsic is missing, the camera model is not known, the applied
-            transform does not keep shapes, or a camera is unsound; see `build_scene`.
+            transform is not a similarity, or a camera is unsound; see `build_scene`.
     """
     transforms = read_json(path, _Transforms)
     shared = transforms.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)

@@ -1,4 +1,4 @@
-"""The turntable file `turntable.json`: one or more calibrated cameras that stand still, an axis, an angle per photo.
+"""The turntable file `turntable.json`: one or more fixed, calibrated cameras, an axis, and an angle per photo.
 
     {"format": "mvseg-turntable/1", "unit": "mm",
      "axis": {"point": [0, 0, 0], "direction": [0, 0, 1]},
@@ -7,9 +7,9 @@
      "views": [{"file": "images/top_000.jpg", "camera": "top", "angle": 0},
                {"file": "images/top_030.jpg", "camera": "top", "angle": 30}]}
 
-A camera is given as in a rig file; its R and t hold at the angle 0. The world stands on the table and turns with it.
+A camera is given as in a rig file; its R and t hold at the angle 0. The world is fixed to the table and turns with it.
 `angle` is in degrees and says how far the table has turned: anticlockwise, if the direction of the axis points towards
-who looks. Where the cameras go round a plant that stands still, the angles have the other sign.
+the viewer. If the cameras move around a plant that stands still, the angles have the opposite sign.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ def write_turntable(
 
 
 def turn_about(point: np.ndarray, direction: np.ndarray, degrees: float) -> tuple[np.ndarray, np.ndarray]:
-    """A turn about an axis: (3, 3) rotation and (3,) shift, so that X goes to rotation @ X + shift."""
+    """A turn about an axis: (3, 3) rotation and (3,) translation, so that X goes to rotation @ X + translation."""
     axis = direction / np.abs(direction).max()  # first, so that no length overflows
     axis /= np.linalg.norm(axis)
     turn = Rotation.from_rotvec(axis * np.radians(degrees % 360)).as_matrix()

@@ -1,7 +1,6 @@
-"""YAML files: what a parser may safely be given.
+"""YAML files: checks that make them safe to parse.
 
-PyYAML itself follows brackets as deep as Python's stack, and a file of 300 bytes whose aliases name each other unfolds
-into thousands of millions of values.
+PyYAML recurses as deep as Python's stack, and a file of 300 bytes with nested aliases expands into billions of values.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ def check_yaml(path: Path) -> None:
     """Check a file of options before it is parsed.
 
     Raises:
-        InputError: it cannot be read, is larger than 1 MB, no UTF-8 or no YAML, is nested more than 32 deep, uses
+        InputError: it cannot be read, is larger than 1 MB, not UTF-8 or not YAML, is nested more than 32 deep, uses
             aliases, or holds a number of more than 400 digits.
     """
     read_yaml(path, "a YAML file of options", loader=yaml.BaseLoader)
@@ -41,7 +40,7 @@ def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> An
     except InputError:
         raise
     except Exception as error:  # yaml raises its own kinds, and those of what it builds
-        raise InputError(f"{path}: is no YAML file ({' '.join(str(error).split())}), expected {expected}") from None
+        raise InputError(f"{path}: is not a YAML file ({' '.join(str(error).split())}), expected {expected}") from None
 
 
 def _check_events(path: Path, text: str) -> None:

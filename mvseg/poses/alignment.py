@@ -1,8 +1,9 @@
-"""Similarities: the scale, turn and shift that structure from motion leaves open, from points known in both worlds.
+"""Similarities: the scale, rotation and translation that structure from motion leaves undetermined, from points known
+in both frames.
 
 Closed form: Umeyama, Least-squares estimation of transformation parameters between two point patterns (PAMI 1991).
-`similarity * points` are (P, 3) points of the scene in the known world. pycolmap's own `estimate_sim3d` refuses points
-in one plane, as those of a board are, and its robust one finds fewer of these.
+`similarity * points` are (P, 3) points of the scene in the known world. pycolmap's own `estimate_sim3d` refuses
+coplanar points, such as those of a board, and its robust version finds fewer inliers among them.
 """
 
 from __future__ import annotations
@@ -18,11 +19,11 @@ from mvseg.errors import InputError
 
 Floats = NDArray[np.float64]
 
-FLAT = 0.02  # spread across over spread along, below which points count as one line (or one plane)
+FLAT = 0.02  # ratio of spreads, below which points count as collinear (or coplanar)
 MIRRORED = 0.5  # residual of the best reflection over that of the best similarity, below which axes are left-handed
 TRIALS = 300  # random triples of points
-OUTLIER = 3.0  # residuals that over half of the points keep to, times this, are still theirs
-ROUNDING = 1e-9  # of the spread of the points: residuals below it are none
+OUTLIER = 3.0  # inliers have residuals up to this times the one that half of the points do not exceed
+ROUNDING = 1e-9  # of the spread of the points: smaller residuals count as 0
 MIRROR = np.array([1.0, 1.0, -1.0])
 
 
@@ -57,7 +58,8 @@ def spreads(points: Floats) -> Floats:
 
 
 def is_one_line(points: Floats) -> bool:
-    """Whether points lie on one line (or at one place), so that the turn about it stays open; two always do."""
+    """Whether points are collinear (or coincide), so that the rotation about the line is undetermined; two always
+    are."""
     if len(points) < 3:
         return True
     along, across = spreads(points)[:2]
@@ -73,12 +75,12 @@ def fit_similarity(source: Floats, target: Floats) -> pycolmap.Sim3d:
 
     Raises:
         InputError: fewer than three points, points on one line, or targets that are the mirror image of the sources
-            (left-handed axes). Of points in one plane no one can tell.
+            (left-handed axes), which cannot be detected for coplanar points.
     """
     if len(source) < 3:
         raise InputError(f"{len(source)} known points, expected at least three that are not on one line")
     if is_one_line(source) or is_one_line(target):
-        raise InputError("the known points lie on one line, expected some beside it: the turn about it stays open")
+        raise InputError("the known points lie on one line, expected some off it: the rotation about it is free")
     fits = [(_fit(each, target), each) for each in (source, source * MIRROR)]
     misses = [float(np.linalg.norm(_residuals(fit, each, target))) / np.sqrt(len(source)) for fit, each in fits]
     _refuse_mirror(source, target, misses)
@@ -96,10 +98,10 @@ def _fit(source: Floats, target: Floats) -> pycolmap.Sim3d:
 
 def _refuse_mirror(source: Floats, target: Floats, misses: list[float]) -> None:
     """Raise InputError if the targets are fitted far better by the mirror image of the sources: `misses` are the
-    residuals of both. In one plane a mirror image is as good as a turn, and small misses differ by noise."""
+    residuals of both. In one plane a mirror image is as good as a rotation, and small residuals differ by noise."""
     is_flat = any(off <= FLAT * across for _, across, off in (spreads(source), spreads(target)))
     if not is_flat and misses[1] < MIRRORED * misses[0] and misses[0] > FLAT * spreads(target)[0]:
-        raise InputError("the known points fit as in a mirror only, expected right-handed axes: turn one round")
+        raise InputError("the known points are mirrored, expected right-handed axes: reverse one axis")
 
 
 def align(source: Floats, target: Floats) -> Alignment:

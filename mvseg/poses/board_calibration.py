@@ -1,7 +1,7 @@
-"""A turntable calibrated once: cameras that stand still, and photos of a board on the table at several angles.
+"""Calibrates a turntable once: fixed cameras, and photos of a board on the table at several angles.
 
-The unknowns are the cameras (OpenCV's calibration starts them), their poses, the board's pose on the table and the
-angles. All are refined together, so that all photos are turns about one axis; the reprojection error is least.
+The unknowns are the cameras (initialised by OpenCV's calibration), their poses, the board's pose on the table and the
+angles. All are refined together for the least reprojection error, with all photos being rotations about one axis.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ LEAST_PHOTOS = 4
 LEAST_CORNERS = 6  # of a photo
 LEAST_TURN = 10.0  # degrees, of all photos together
 FLAT = 0.7  # cosine between the axis and the normal of a board that lies, more or less, flat
-MOST_RESIDUAL = 0.005  # in widths of the photo, above which the table did not only turn
+MOST_RESIDUAL = 0.005  # in widths of the photo, above which the motion was not a pure rotation
 
 Poses = dict[int, tuple[Rotation, Floats]]  # {place of the angle: cam_from_board}
 
@@ -58,7 +58,7 @@ def calibrate_turntable(photos: Mapping[str, Sequence[Grey]], board: BoardConfig
     Raises:
         InputError: photos of one camera of different sizes, another number of photos than of the other cameras, too few
             that show the board, a table that hardly turned, a camera that sees the board at no angle at which others
-            do, or photos that no turn about one axis explains.
+            do, or photos that no rotation about one axis explains.
     """
     num_angles = len(next(iter(photos.values())))
     seen = {}
@@ -92,7 +92,7 @@ def calibrate_turntable(photos: Mapping[str, Sequence[Grey]], board: BoardConfig
     )
     residual = float(np.sqrt((fit.residuals**2).sum(1).mean()))
     if residual > MOST_RESIDUAL * max(each.size[0] for each in fit.cameras):
-        message = f"one turning axis explains the board to {residual:.1f} px only"
+        message = f"one axis of rotation explains the board to {residual:.1f} px only"
         raise InputError(f"{message}: did a camera move, or the board on the table?")
     all_angles = np.full(num_angles, np.nan)
     all_angles[used] = fit.angles
@@ -144,8 +144,8 @@ def _start(
 ) -> tuple[dict[str, TableCamera], dict[int, float], tuple[Rotation, Floats]]:
     """Cameras in one world, {place of the angle: degrees} and world_from_board, from the poses of the boards alone.
 
-    The camera that sees the board most often gives axis and world; the others join where they see it at an angle that
-    is known by then.
+    The camera that sees the board most often gives axis and world; each of the others joins through an angle that is
+    known by then.
     """
     first = max(poses, key=lambda name: len(poses[name]))
     cam_from_world, angles, world_from_board = _start_world(poses[first], middle)

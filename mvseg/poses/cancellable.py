@@ -1,4 +1,4 @@
-"""COLMAP's long calls, which Ctrl-C and SIGTERM must end: each runs in a thread of its own, and the main one waits."""
+"""COLMAP's long calls, which Ctrl-C and SIGTERM must end: each runs in its own thread while the main thread waits."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from typing import TypeVar
 import pycolmap
 
 Answer = TypeVar("Answer")
-WAIT = 0.1  # seconds after which a signal is noticed at the latest
+WAIT = 0.1  # seconds until a signal is handled, at the latest
 ERRORS_ONLY = 2  # of COLMAP's log
 
 
 def run_cancellable(call: Callable[[pycolmap.CancellationToken], Answer]) -> Answer:
-    """Run a call of pycolmap, which gets a token and gives up soon after it was cancelled.
+    """Run a call of pycolmap, which gets a token and returns soon after it was cancelled.
 
-    Python hears signals between its own steps only, and a call of pycolmap is one step of seconds to minutes.
+    Python handles signals between bytecodes only, and a call of pycolmap takes seconds to minutes.
 
     Raises:
-        BaseException: what the call raises; or what a signal raises meanwhile, once the call has given up.
+        BaseException: what the call raises; or what a signal raises meanwhile, once the call has returned.
     """
     token, done, answers, errors = pycolmap.CancellationToken(), Event(), [], []
 
@@ -50,7 +50,7 @@ def run_cancellable(call: Callable[[pycolmap.CancellationToken], Answer]) -> Ans
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """COLMAP's log, one line per step, is for its developers."""
+    """Suppress COLMAP's log, which is for its developers."""
     earlier = pycolmap.logging.minloglevel
     pycolmap.logging.minloglevel = max(earlier, ERRORS_ONLY)
     try:

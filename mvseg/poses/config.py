@@ -29,7 +29,7 @@ class PoseConfig:
         camera_model: COLMAP's name of the lens.
         shared_camera: true: one camera took all photos, with one zoom; false: every photo has a camera of its own. By
             default photos of one folder, size and (EXIF) focal length share one.
-        calibration: file of OpenCV or ROS with the camera matrix and distortion of all photos, which then are not
+        calibration: file of OpenCV or ROS with the camera matrix and distortion of all photos; they are then not
             estimated.
         min_registered: number of photos that must register; by default 60 %, and at least 3.
     """
@@ -55,7 +55,7 @@ class Known:
     """What is known of the world; at most one of the first four.
 
     Attributes:
-        board: a printed ChArUco board, in which the world then has its axes.
+        board: a printed ChArUco board, which then defines the axes of the world.
         marker: side of the printed markers (their black squares).
         distance: two photos, or markers as marker:7, and how far apart they are.
         positions: file of the camera positions, see `formats/positions.py`.

@@ -1,6 +1,6 @@
-"""SIFT in every photo, and which features of two photos are the same: COLMAP's, into its database.
+"""SIFT features of every photo and their matches, computed by COLMAP into its database.
 
-COLMAP's lists of pairs cannot hold names with spaces, so that it sees the photos under their numbers.
+COLMAP's lists of pairs cannot hold names with spaces, so it gets the photos under numbers.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from mvseg.poses.cancellable import run_cancellable
 from mvseg.poses.config import PoseConfig
 from mvseg.poses.photo_files import PhotoFile, group_by_camera
 
-PHOTOS_AT_ONCE = max(2, os.cpu_count() or 1)  # of one call, between which the bar moves
+PHOTOS_AT_ONCE = max(2, os.cpu_count() or 1)  # of one call, after which the progress bar advances
 PAIRS_AT_ONCE = 10
 SEED = 0
 
@@ -58,7 +58,7 @@ def extract_features(
         progress: show a progress bar.
 
     Raises:
-        InputError: COLMAP cannot read a photo, or photos that differ in size shall share a camera.
+        InputError: COLMAP cannot read a photo, or photos of different sizes are to share a camera.
     """
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=config.image_size)
     name_of = dict(zip(photos, names, strict=True))

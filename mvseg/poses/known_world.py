@@ -1,4 +1,4 @@
-"""Scale and axes of a scene whose cameras know neither: from markers, a known distance, or known positions."""
+"""Scale and axes of a scene whose cameras have neither: from markers, a known distance, or known positions."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ MISFIT = 0.05  # residual of positions over their spread, above which they hardl
 
 @dataclass(frozen=True, eq=False)
 class Placement:
-    """How a scene gets into its known world.
+    """The transform of a scene into its known world, and where it comes from.
 
     Attributes:
         similarity: world_from_scene.
         unit: of the world.
         source: where the scale comes from, as text; "" if nowhere.
-        residual: root mean square misfit, in units of the world; None if nothing tells.
+        residual: root mean square residual, in units of the world; None if unknown.
         left_out: names of photos whose positions contradict the others.
         up: direction that points up in the world, where the source says so (a board that lies flat).
     """
@@ -61,7 +61,7 @@ class Placement:
 
 
 def place(scene: Scene, known: Known, *, progress: bool = False) -> Placement:
-    """The similarity that brings a scene into the known world.
+    """The similarity that transforms a scene into the known world.
 
     Warns (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line.
 
@@ -159,7 +159,7 @@ def _point(scene: Scene, name: str, corners: dict[Corner, Floats]) -> Floats:
     if not name.startswith(MARKER):
         (view,) = find_views([name], scene, source=Path("--distance"))
         if view is None:
-            raise InputError(f"--distance: {name} is no registered photo and no marker, which is called as {MARKER}7")
+            raise InputError(f"--distance: {name} is neither a registered photo nor a marker (as in {MARKER}7)")
         return np.asarray(scene.cameras.centers[view].cpu().numpy())
     number = name.removeprefix(MARKER)
     keys = [(int(number), corner) for corner in range(4)] if number.isdecimal() else []
@@ -187,7 +187,7 @@ def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
     wrong = [positions.names[used[index]] for index in np.flatnonzero(~alignment.is_inlier)]
     if alignment.rms > MISFIT * spreads(target)[0]:
         share = alignment.rms / spreads(target)[0]
-        message = f"the positions hardly fit the photos (residual {share:.0%} of their spread): do the names belong?"
+        message = f"the positions hardly fit the photos (residual {share:.0%} of their spread): do the names match?"
         warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
     return Placement(
         similarity=alignment.similarity,
@@ -205,7 +205,7 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
     ratios = [np.linalg.norm(target[i] - target[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
     if not ratios:
         raise InputError(f"{path}: all positions are at one place, expected where the camera stood")
-    message = "the positions lie on one line, which gives a scale but no axes: they stay the scene's own"
+    message = "the positions lie on one line, which gives a scale but no axes: the scene keeps its own"
     warnings.warn(f"{path}: {message}", InputWarning, stacklevel=5)
     return Placement(
         similarity=scale_by(float(np.median(ratios))),

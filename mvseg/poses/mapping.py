@@ -34,7 +34,7 @@ class Structure:
         registered: names of the photos with a pose, in the order of all photos.
         left_out: names of the others.
         plain: of all photos, names of those with so few features that nothing could register them.
-        other_models: number of further photos in each of the other models, which share no world with this one.
+        other_models: number of further photos in each of the other models, which have frames of their own.
     """
 
     model: pycolmap.Reconstruction
@@ -58,10 +58,10 @@ def find_structure(
     work: Path | None = None,
     progress: bool = False,
 ) -> Structure:
-    """The cameras of photos and points of what they show, from the photos alone.
+    """Estimate the cameras of photos, and 3D points, from the photos alone.
 
     Equal photos give equal cameras, bit by bit, on one machine and with one version of pycolmap: random draws have
-    fixed seeds, and the mapping runs on one thread. Other processors round otherwise.
+    fixed seeds, and the mapping runs on one thread. Other processors round differently.
 
     Args:
         images: folder of the photos.
@@ -73,7 +73,7 @@ def find_structure(
 
     Raises:
         InputError: too few photos register (the message says how many, and what to do), COLMAP cannot read a photo, or
-            photos of different sizes shall share a camera.
+            photos of different sizes are to share a camera.
     """
     lens = None if calibration is None else _fixed_lens(calibration, photos)
     if lens is not None:
@@ -144,7 +144,7 @@ def _map(
     num_photos: int,
     progress: bool,
 ) -> list[pycolmap.Reconstruction]:
-    """All models, each with a world of its own."""
+    """All models, each in a frame of its own."""
     with tqdm(total=num_photos, desc="mapping", unit="photo", disable=not progress) as bar:
 
         def count(photos: int) -> None:  # attempts that fail count as well: at most to the end of the bar
@@ -175,7 +175,7 @@ def _too_few(found: int, num_photos: int, least: int, *, plain: Sequence[str], g
     """The sentence for too few registered photos."""
     poor = f"; {len(plain)} have hardly any texture, the first is {plain[0]}" if plain else ""
     asked = "--min_registered asks for" if given else "expected at least"
-    less = "" if given or found < LEAST else f", or --min_registered {found} for the scene of these"
+    less = "" if given or found < LEAST else f", or --min_registered {found} to accept these"
     text = f"{found} of {num_photos} photos could be registered, {asked} {least}{poor}"
     return f"{text}. Next: {NEXT_STEPS}{less}"
 

@@ -55,8 +55,7 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
     which stands for a camera.
 
     Returns:
-        The folder (or its `images/`), and the paths of the photos relative to it, in the order in which people number
-        them.
+        The folder (or its `images/`), and the paths of the photos relative to it, in natural order.
 
     Raises:
         InputError: there is no such folder, it holds fewer than three photos or HEIC files, or two photos differ in
@@ -95,7 +94,7 @@ def _are_photos(files: Sequence[Path]) -> bool:
 
 
 def natural_order(name: str) -> list[tuple[int, int | str]]:
-    """A key for sorting names as people count: 2.jpg before 10.jpg."""
+    """A key for natural sorting: 2.jpg before 10.jpg."""
     parts = re.split(r"(\d+)", name.lower())
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
 
@@ -104,7 +103,7 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: b
     """Copy photos into a scene's `images/`, as they are where that is possible.
 
     Photos that EXIF turns are written anew, upright; so are WebP files and those of 10, 12 or 14 bits in 16, which
-    COLMAP cannot read, as PNG of 8 bits; one range brightens them all.
+    COLMAP cannot read, as 8-bit PNG, all brightened by the same factor.
 
     Args:
         folder: of the photos.
@@ -113,7 +112,7 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: b
         progress: show a progress bar.
 
     Raises:
-        InputError: a photo is broken or cut short; it is named.
+        InputError: a photo is broken or truncated; it is named.
         OSError: a photo cannot be copied.
     """
     photos = []
@@ -128,7 +127,7 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: b
 
 def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
     turned = is_turned(source)
-    image = read_image(source)  # decoded: a file that is cut short is found now
+    image = read_image(source)  # decoded, so that a truncated file is found now
     optics = _describe_optics(image)
     if turned:
         exif = image.getexif()
@@ -163,7 +162,7 @@ def group_by_camera(photos: Sequence[PhotoFile], *, shared: bool | None = None) 
             focal length share one.
 
     Raises:
-        InputError: photos of different sizes shall share one camera.
+        InputError: photos of different sizes are to share one camera.
     """
     groups: dict[object, list[PhotoFile]] = defaultdict(list)
     for photo in photos:

@@ -1,4 +1,4 @@
-"""A posed scene on disk: photos, rig file and COLMAP model, which say the same."""
+"""A posed scene on disk: photos, and the cameras as rig file and as COLMAP model."""
 
 from __future__ import annotations
 

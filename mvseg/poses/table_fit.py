@@ -1,7 +1,8 @@
-"""Cameras that stand still beside a table that turns, fitted to what they see of a known shape on it.
+"""Fits fixed cameras beside a turntable to their sightings of a known shape on it.
 
-The world stands on the table and turns with it; its z axis is that of the table, upwards. Unknown are the cameras, the
-shape's pose on the table and the angles. All cameras share axis and angles, and every photo is a turn about that axis.
+The world is fixed to the table and turns with it; its z axis is that of the table, upwards. Unknown are the cameras,
+the shape's pose on the table and the angles. All cameras share axis and angles, and every photo is a turn about that
+axis.
 """
 
 from __future__ import annotations
@@ -83,12 +84,12 @@ def fit_table(
     """Least squares over poses and angles, and over lenses if these are free (k3 never is).
 
     Args:
-        cameras: C, a start; nearly right.
-        angles: (A,) degrees, a start.
-        shape_pose: world_from_shape, a start. Its height stays as it is: that and the fixed angle define the world.
+        cameras: C, initial values, nearly right.
+        angles: (A,) degrees, initial values.
+        shape_pose: world_from_shape, initial value. Its height is fixed: it and the fixed angle define the world.
         sightings: of the shape, with every camera and every angle in it.
         fixed_angle: which angle stays as it is.
-        has_free_lenses: false: lenses stay as they are, and a sighting that is far off counts less (soft L1, 1 pixel).
+        has_free_lenses: false: lenses are fixed, and outliers are weighted down (soft L1, 1 pixel).
     """
     turn, shift = shape_pose
     # The cameras one after another, the pose of the shape without its height, and all angles.
@@ -143,7 +144,7 @@ def _with_numbers(camera: TableCamera, numbers: Floats) -> TableCamera:
 
 
 def _residuals(numbers: Floats, sightings: Sightings, *, num_cameras: int, height: float) -> Floats:
-    """(P, 2) how far the shape is seen from where it should be, pixels."""
+    """(P, 2) reprojection errors, pixels."""
     cameras, rest = np.split(numbers, [NUM_CAMERA * num_cameras])
     shape = Rotation.from_rotvec(rest[:3]).apply(sightings.point) + [*rest[3:5], height]
     turned = Rotation.from_rotvec(rest[5:][sightings.angle][:, None] * [0, 0, 1.0]).apply(shape)

@@ -1,1 +1,1 @@
-"""The result folder: what a person looks at."""
+"""The result folder and the page in it."""

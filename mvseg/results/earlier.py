@@ -1,7 +1,7 @@
-"""Replacing an earlier result: only files that mvseg wrote, and nobody changed since, are replaced.
+"""Replacing an earlier result: only files that mvseg wrote, and that are unchanged since, are replaced.
 
 A result's run.json lists the files that were written with it and their SHA-256. Everything else in the folder belongs
-to the user (notes, the metrics.json of `mvseg eval`) and moves on into the new result.
+to the user (notes, the metrics.json of `mvseg eval`), and is copied into the new result.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def check_out(out: Path, run_file: str = RUN_FILE) -> None:
 
 
 def check_same_scene(out: Path, scene: Path) -> None:
-    """Check that `out` does not hold a result of another scene; one that does not say where its scene lay passes.
+    """Check that `out` does not hold a result of another scene; one that does not name its scene folder passes.
 
     Raises:
         InputError: it was made from another scene folder.

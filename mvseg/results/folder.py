@@ -97,7 +97,8 @@ def save_result(
 
 
 def _write_images(result: Result, folder: Path, progress: bool) -> list[Picture]:
-    """Labels, overlays and the contact sheet; what the report shows of the photos, which are read only once."""
+    """Write labels, overlays and the contact sheet; returns the report's pictures, so that photos are read only
+    once."""
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
     tiles, pictures = [], []
     views = list(enumerate(scene.views))
@@ -166,8 +167,8 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
 
 
 def write_refined(path: Path, scene: Scene) -> None:
-    """A rig file of refined cameras, to replace or to stand beside the file that the scene's cameras came from; nothing
-    where a lens is none that a rig file can hold."""
+    """Write a rig file of the refined cameras, to be used instead of the scene's camera file; nothing, if a rig file
+    cannot hold one of the lenses."""
     paths = [str(view.path) for view in scene.views]
     root = os.path.commonpath(paths if scene.source is None else [str(scene.source), *paths])
     distortion = [[] if view.lens is None else opencv_distortion(view.lens) for view in scene.views]
@@ -183,7 +184,7 @@ def _describe_poses(poses: RefinedPoses) -> dict[str, Any]:
 
 
 def _describe_traits(traits: Traits) -> dict[str, Any]:
-    """What run.json says of the traits: the world they are measured in, how their colours were corrected, and how many
-    instances are no leaves."""
+    """The traits entry of run.json: the world that they are measured in, how their colours were corrected, and how many
+    instances are not leaves."""
     colors = {"colors": [asdict(correction) for correction in traits.corrections]} if traits.corrections else {}
     return {"unit": traits.unit or None, "up": traits.up, **colors, "rejected": traits.rejected}

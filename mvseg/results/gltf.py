@@ -1,6 +1,6 @@
-"""What scene.glb says beside its meshes: how the world lies in glTF's, and what was measured of each leaf.
+"""What scene.glb holds beside its meshes: the transform of the world to glTF's, and the traits of each leaf.
 
-glTF is in metres, and +y is up. A scene whose cameras do not say its unit, or which way is up, keeps its own.
+glTF is in metres, and +y is up. A scene whose cameras do not state unit or up keeps its own.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ METRES = {
 
 
 def gltf_from_world(scene: Scene) -> NDArray[np.float64]:
-    """(4, 4) that turns up to +y and east to +x (`level_frame`) where up is known, and lengths to metres where the unit
-    is; what is not known is left as it is."""
+    """(4, 4) that rotates up to +y and east to +x (`level_frame`) if up is known, and scales lengths to metres if the
+    unit is known."""
     matrix = np.eye(4)
     if scene.up is not None:
         east, north, up = level_frame(scene.up)
@@ -47,7 +47,8 @@ def describe_world(scene: Scene) -> dict[str, Any]:
 
 
 def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
-    """{name of a leaf's node: its extras}: id, unit, method, quality, and the numbers there are, with deviations."""
+    """{name of a leaf's node: its extras}: id, unit, method, quality, and its existing numbers with standard
+    deviations."""
     found: dict[str, dict[str, Any]] = {}
     if traits is None:
         return found

@@ -168,7 +168,7 @@ def _write(canvas: np.ndarray, numbers: Sequence[_Number], *, scale: float) -> N
         (width, height), _ = cv2.getTextSize(number.text, cv2.FONT_HERSHEY_SIMPLEX, own, 1)
         corner = (number.center[0] - width // 2, number.center[1] + height // 2)
         cv2.putText(ink, number.text, corner, cv2.FONT_HERSHEY_SIMPLEX, own, 255, max(1, round(2 * own)), cv2.LINE_AA)
-    # A thicker stroke below would not do for an edge: what thickness means differs between versions of OpenCV.
+    # A thicker stroke underneath would not do as an edge: thickness differs between versions of OpenCV.
     edge = 2 * max(1, round(2 * scale)) + 1
     halo = cv2.dilate(ink, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge)))
     for layer, color in ((halo, 255.0), (ink, 0.0)):

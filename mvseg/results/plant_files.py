@@ -1,6 +1,6 @@
 """The files of a plant in 3D: a mesh for every leaf, the scene, the table of traits.
 
-In a file of its own: a run that only matches does without the libraries that this one loads.
+A separate file, because a run that only matches does not need the libraries that it imports.
 """
 
 from __future__ import annotations

@@ -29,17 +29,18 @@ class Result:
         scene: the scene, with refined cameras where `poses` has them.
         matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
         photos: of the scene; None: they are read when they are needed.
-        poses: what came of refining them; None where that was not asked for.
-        surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None when no surfaces were
-            asked for.
-        voxels: {instance id: voxels}: of all instances where voxels were asked for, otherwise of those without a
-            credible surface; None when only ids were asked for.
-        traits: of the plant and its leaves; None when only ids were asked for.
+        poses: outcome of their refinement; None if it was not requested.
+        surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None if no surfaces were
+            requested.
+        voxels: {instance id: voxels}: of all instances if voxels were requested, otherwise of those without a credible
+            surface; None for ids only.
+        traits: of the plant and its leaves; None for ids only.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
         corrections: of a person; None where there were none.
-        fates: what came of each of their edits.
-        num_moved: how many masks got another id from the surfaces, see `check_ids`; None where they were not asked.
+        fates: the outcome of each of their edits.
+        num_moved: number of masks that the surfaces moved to another instance, see `check_ids`; None without that
+            check.
     """
 
     scene: Scene

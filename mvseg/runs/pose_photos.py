@@ -126,7 +126,7 @@ def describe_result(out: Path, structure: Structure, *, placement: Placement, sc
         lines.append(f"  not registered: {list_some(structure.left_out)}")
     if structure.other_models:
         numbers = " and ".join(map(str, structure.other_models))
-        lines.append(f"  others fit among themselves only ({numbers} photos): photos in between would join them")
+        lines.append(f"  separate models: {numbers} photos fit only each other; photos in between would join them")
     lines.append(f"  {placement.describe()}")
     up = "unknown (--up X Y Z, rig or board)" if scene.up is None else " ".join(f"{x:.3f}" for x in scene.up)
     lines.append(f"  up is {up}")

@@ -1,1 +1,1 @@
-"""What runs and files need of the operating system: whole writes and locks, signals, worker processes."""
+"""Services of the operating system: atomic writes and locks, signals, worker processes."""

@@ -1,8 +1,8 @@
 """Replace on finish: a file or folder appears complete under its name, or not at all.
 
 What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile.
-Locks end with their process: what lies there without one was left by a process that was killed, and goes with the next
-write to NAME. On a disk without locks, two processes must not write to one NAME at the same time.
+Locks end with their process: files without one were left by a killed process, and are deleted by the next write to
+NAME. On a disk without locks, two processes must not write to one NAME at the same time.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from filelock import FileLock, Timeout
 from mvseg.errors import InputError
 
 PARTIAL, EARLIER, LOCK = ".partial", ".earlier", ".lock"
-NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)  # said by disks that have none
+NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)  # errors of disks without locks
 WAITS = (0.05, 0.2, 0.5)  # seconds between attempts to rename what another program has open
 
 
@@ -30,25 +30,25 @@ def resolve_place(place: Path) -> Path:
     """The absolute path of a place that need not exist, without links.
 
     Raises:
-        InputError: its links lead in a circle.
+        InputError: its links form a loop.
     """
     try:
         place.stat()
     except OSError as error:
         if error.errno == errno.ELOOP:
-            raise InputError(f"{place}: its links lead in a circle, expected a folder or a new name") from None
+            raise InputError(f"{place}: its links form a loop, expected a folder or a new name") from None
     return place.resolve()
 
 
 def is_partial(path: Path) -> bool:
-    """Whether a path is what a write has not finished, or never will, or its lock."""
+    """Whether a path is an unfinished or abandoned write, or its lock."""
     return path.name.startswith(".") and path.name.endswith((PARTIAL, EARLIER, LOCK))
 
 
 def sweep_abandoned(place: Path) -> None:
-    """Delete what killed runs left beside `place` while they were writing it, unless another one writes it now.
+    """Delete what killed runs left beside `place` while writing it, unless another run is writing it now.
 
-    One that was killed between its two renames left nothing at `place`: then the earlier folder comes back.
+    If a run was killed between its two renames, nothing is at `place`: the earlier folder is then restored.
 
     Raises:
         InputError: see `resolve_place`.
@@ -83,7 +83,7 @@ def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
 
 @contextmanager
 def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
-    """Lock a file that exists only as long as somebody has the lock, or was killed with it."""
+    """Lock a file that exists only while a process holds the lock, or after its holder was killed."""
     if not path.parent.is_dir():  # filelock would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
     lock = FileLock(path, timeout=-1 if wait else 0, fallback_to_soft=False)
@@ -100,11 +100,11 @@ def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
     finally:
         try:
             if sys.platform != "win32":
-                path.unlink(missing_ok=True)  # before it is free: who waits for it notices, and makes a new one
+                path.unlink(missing_ok=True)  # before the release: a waiting process notices, and makes a new one
         finally:
             lock.release()
         if sys.platform == "win32":
-            with suppress(OSError):  # there, nobody can delete what another process has opened
+            with suppress(OSError):  # where a file that another process has opened cannot be deleted
                 path.unlink()
 
 

@@ -1,4 +1,4 @@
-"""How a process ends: SIGTERM as an exception, so that what is half written is cleared away, as after Ctrl-C."""
+"""SIGTERM as an exception, so that unfinished files are deleted, as after Ctrl-C."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ class Terminated(BaseException):
 def stopped_by_sigterm() -> Iterator[None]:
     """SIGTERM raises `Terminated` in this block, which belongs to the main thread.
 
-    pycolmap brings a handler of its own, which prints a C++ trace and may hang: so pycolmap is imported here, with the
-    signal held back, before ours is set. Ctrl-C is held back, too: pycolmap would say that it is not installed.
+    pycolmap installs a handler of its own, which prints a C++ trace and may hang: so pycolmap is imported here, with
+    the signal blocked, before ours is set. Ctrl-C is blocked, too: pycolmap would report that it is not installed.
     """
     earlier_hook = sys.unraisablehook
     with held_back(signal.SIGTERM, signal.SIGINT):
@@ -30,7 +30,7 @@ def stopped_by_sigterm() -> Iterator[None]:
         sys.unraisablehook = _Insist(earlier_hook)
     try:
         if hasattr(signal, "pthread_sigmask"):
-            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # a worker is started with it held back
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # a worker is started with it blocked
         yield
     finally:
         sys.unraisablehook = earlier_hook
@@ -39,8 +39,8 @@ def stopped_by_sigterm() -> Iterator[None]:
 
 @contextmanager
 def held_back(*signals: signal.Signals) -> Iterator[None]:
-    """What comes of these signals in this block comes at its end, as long as no library has started threads before:
-    they would hear it. (Windows cannot hold signals back.)"""
+    """Delay these signals to the end of the block. This works as long as no library has started threads, which would
+    receive them. (Windows cannot block signals.)"""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
@@ -57,7 +57,7 @@ def _end(how: type[BaseException], *_: object) -> None:
 
 class _Insist:
     """Python swallows what is raised in a finaliser, or in the hooks around a fork (data loaders fork), and reports it
-    here: then the signal comes once more."""
+    here: the signal is then raised again."""
 
     def __init__(self, report: Callable[[sys.UnraisableHookArgs], object]) -> None:
         self.report = report

@@ -1,4 +1,4 @@
-"""Independent pieces of one job, spread over processes of this machine; the answers come in order.
+"""Spreads independent items of one job over processes of this machine; the answers come in order.
 
 (In a batch of scenes, one that dies must not stop the others: see `batch.local_workers`.)
 """
@@ -24,14 +24,14 @@ from mvseg.errors import InputError
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-AHEAD = 16  # items that wait for a worker: an early one that takes long stops nobody, and few lie in memory twice
+AHEAD = 16  # items queued for the workers: a slow one blocks no others, and few are in memory twice
 
 
 @contextmanager
 def start_workers(num_workers: int) -> Iterator[ProcessPoolExecutor | None]:
-    """Up to so many spawned processes, which start when there is work for them; None for one, the caller does it all.
+    """A pool of up to `num_workers` spawned processes, started on demand; None for one: the caller does the work.
 
-    They are gone afterwards, at once, whatever they are doing.
+    At the end of the block they are stopped at once, whatever they are doing.
 
     A script that asks for several needs `if __name__ == "__main__":`, as with all of Python's spawned processes.
 
@@ -49,7 +49,8 @@ def start_workers(num_workers: int) -> Iterator[ProcessPoolExecutor | None]:
 
 @contextmanager
 def start_pools() -> Iterator[Callable[[int], ProcessPoolExecutor]]:
-    """A function that gives a pool of so many processes, as often as it is asked; see `start_workers`."""
+    """A function that starts a pool of the given number of processes, see `start_workers`; it may be called
+    repeatedly."""
     context = multiprocessing.get_context("spawn")
     theirs, ours = context.Pipe(duplex=False)
     pools: list[ProcessPoolExecutor] = []
@@ -61,7 +62,7 @@ def start_pools() -> Iterator[Callable[[int], ProcessPoolExecutor]]:
     try:
         yield start_pool
     finally:
-        ours.close()  # taking all modules apart in an orderly way would take seconds
+        ours.close()  # an orderly shutdown of the interpreter would take seconds
         for pool in pools:
             pool.shutdown(cancel_futures=True)
 
@@ -113,11 +114,11 @@ def run_all(work: Callable[[Item], Answer], items: Iterable[Item], num_workers: 
 
 
 def _start_worker(parent: Connection) -> None:
-    """Prepare a process of the pool: OpenCV and torch on one thread, an end as soon as the parent closes its end of the
-    pipe or is gone, and one without a word on SIGTERM (pycolmap's handler would print a trace).
+    """Prepare a process of the pool: OpenCV and torch use one thread; it exits as soon as the parent closes its end of
+    the pipe or dies, and silently on SIGTERM (pycolmap's handler would print a trace).
 
-    Ctrl-C is for the parent to hear. A worker that outlives a killed parent would go on with the items in its queue and
-    get in the way of the next run.
+    Ctrl-C is left to the parent. A worker that outlives a killed parent would continue with its queue and interfere
+    with the next run.
     """
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
@@ -153,7 +154,7 @@ def _end_with(parent: Connection) -> None:
 
 
 def _answer(pickled: bytes) -> tuple[Any, list[Warning]]:
-    """In a worker: what `work` returns for the item, and what it warns of."""
+    """In a worker: what `work` returns for the item, and its warnings."""
     work, item = pickle.loads(pickled)
     with warnings.catch_warnings(record=True) as said:
         warnings.simplefilter("always")
@@ -162,7 +163,7 @@ def _answer(pickled: bytes) -> tuple[Any, list[Warning]]:
 
 
 def _receive(asked: Future[tuple[Answer, list[Warning]]]) -> Answer:
-    """The answer; what the worker warned of is warned of here."""
+    """The answer; the warnings of the worker are repeated here."""
     answer, said = asked.result()
     for each in said:
         warnings.warn(each, stacklevel=4)

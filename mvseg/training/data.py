@@ -3,7 +3,7 @@
 Two layouts: a folder of photos with a folder of label PNGs (same path and stem; 0 is background, 65535 is ignored; a
 scene's `images/` and `masks/` are such a pair), or a folder of photos with one COCO JSON file. A photo without any
 instance is a sample like any other, provided that its label PNG or its COCO entry exists.
-Broken samples are all reported, by name; nothing is dropped silently.
+All broken samples are reported by name; nothing is dropped silently.
 """
 
 from __future__ import annotations
@@ -155,7 +155,7 @@ def list_coco(photos: Path, labels: Path) -> SampleList:
 
 
 def read_sample(sample: Sample) -> LabelledPhoto:
-    """Read a photo and its instances. OpenCV has no part in it: its threads do not survive the fork of a data loader.
+    """Read a photo and its instances. Does not use OpenCV, whose threads do not survive the fork of a data loader.
 
     Raises:
         InputError: the photo or its label map is missing or cannot be read, sizes differ, or an annotation has an
@@ -211,7 +211,7 @@ def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
         category = annotation.category_id
         if annotation.iscrowd:
             ignore |= mask
-        elif category in list(sample.class_of):  # a list: the file may give anything, also what has no hash
+        elif category in list(sample.class_of):  # a list: the file may hold anything, unhashable values included
             masks.append(mask)
             classes.append(sample.class_of[category])
         else:
@@ -236,7 +236,7 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
     try:
         answers = list(tqdm(pool.map(inspect, samples), "checking samples", len(samples), disable=None, leave=False))
     finally:
-        pool.shutdown(cancel_futures=True)  # a run that is stopped does not first check the others
+        pool.shutdown(cancel_futures=True)  # an interrupted run does not check the others first
     broken = {index: answer for index, answer in enumerate(answers) if isinstance(answer, str)}
     return [answer if isinstance(answer, int) else 0 for answer in answers], broken
 

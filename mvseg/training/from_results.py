@@ -1,4 +1,4 @@
-"""Results as training samples: what `mvseg infer` found and the other views verified, or a person corrected.
+"""Results as training samples: masks that `mvseg infer` found and the other views verified, or that a person corrected.
 
 A mask is a label when it was matched with a score of at least 0.5 and its edges come from the photo, or when a person
 made or confirmed it. All others are ignored, not background: a mask that only the other views show, or one or two

@@ -9,7 +9,7 @@ the order in which the gradients of the chunks are added up differs.
 
 All randomness is a function of the seed and the step. A killed run therefore resumes with the same bits (on a CPU, with
 the same number of threads) without the state of any generator or scheduler in its checkpoint. Only `precision: auto`
-asks the clock, once; the checkpoint keeps the answer.
+measures time, once; the checkpoint keeps the decision.
 
 Files in `output`: config.yaml (resolved), log.jsonl (losses by step), metrics.json (by epoch), model.safetensors (the
 best epoch by mask AP; without validation samples the last), checkpoint.pt, tensorboard/ if tensorboard is installed,
@@ -68,7 +68,7 @@ class Run:
     """What stays the same during a run.
 
     Attributes:
-        config: everything that the user chose.
+        config: the user's options.
         processes: this process among those that train together.
         samples: the sound training samples.
         held_out: the sound validation samples, None without validation.
@@ -304,8 +304,8 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
 
 
 def _end_quietly(_: int) -> None:
-    """A worker that is stopped with its parent prints no trace of the connection that breaks. Errors of samples do not
-    pass here: they reach the parent."""
+    """A worker that is stopped with its parent prints no traceback of the broken connection. Errors of samples are not
+    affected: they reach the parent."""
     sys.excepthook = lambda *_: None
 
 

@@ -1,4 +1,4 @@
-"""Photos of plants that nobody has seen: rendered while a detector trains, each a pure function of its seed.
+"""Photos of new plants, rendered while a detector trains, each a pure function of its seed.
 
 Rays are cast at the size that the detector trains at, so that nothing is scaled afterwards: small leaves
 and leaves that fill the photo are equally sharp.
@@ -32,8 +32,8 @@ MOST_LEAVES = 60
 
 
 def render_new_plant(seed: int, size: int, backgrounds: tuple[Path, ...] = ()) -> LabelledPhoto:
-    """One photo of a plant of its own: any family, 2 to 60 leaves and one in four with 30 or more, three in five wild
-    (see `make_wild`), from any side, small in the photo or larger than it, some before a photograph.
+    """Render one photo of a new plant: any family, 2 to 60 leaves (30 or more in one of four plants), three in five
+    wild (see `make_wild`), from any side, from small in the photo to larger than it, some in front of a real photo.
 
     Args:
         seed: >= 0; the same arguments give the same photo, bit for bit, on one machine.
@@ -43,7 +43,7 @@ def render_new_plant(seed: int, size: int, backgrounds: tuple[Path, ...] = ()) -
     Raises:
         InputError: a background that cannot be read.
     """
-    # embree comes with `pip install mvseg[simulate]`; who trains on photos alone does without
+    # embree comes with `pip install mvseg[simulate]`; training on photos alone does not need it
     from mvseg.simulation.families import FAMILIES
     from mvseg.simulation.growth import grow_plant
     from mvseg.simulation.ray_cast import build_stage, render_stage
@@ -127,7 +127,7 @@ def _read_background(path: Path) -> NDArray[np.uint8]:
 
 
 def recolor(photo: Tensor, layers: Tensor, background: Tensor) -> Tensor:
-    """Leaves of a photo without colour, such as one of chlorophyll fluorescence, in one of their own, on a background.
+    """Colour the leaves of a grey photo, such as chlorophyll fluorescence, and put them on a background.
 
     Args:
         photo: (3, H, W) uint8; its brightness becomes that of the leaves.

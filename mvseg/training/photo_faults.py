@@ -1,5 +1,4 @@
-"""What real photos have and rendered ones lack: uneven light, the faults of cameras, things that are no leaves, leaves
-that are not green.
+"""What real photos have and rendered ones lack: uneven light, camera faults, clutter, and leaves that are not green.
 
 All of it is drawn from torch's global generator.
 """
@@ -21,7 +20,7 @@ LUMINANCE = torch.tensor([0.299, 0.587, 0.114])
 def light_unevenly(photo: Tensor) -> Tensor:
     """Put patches of shadow, or of glare up to overexposure, on a photo (3, H, W) uint8; their edges are sharp or soft.
 
-    Detectors that have not seen it break leaves in two where a shadow ends.
+    Detectors trained without it split leaves at the edge of a shadow.
     """
     cells, sharpness = int(torch.randint(2, 9, ())), 2 ** (6 * draw(0, 1))
     rough = torch.randn(1, 1, cells, cells)
@@ -48,14 +47,14 @@ def spoil(photo: Tensor) -> Tensor:
 
 
 def compress(photo: Tensor, *, quality: int) -> Tensor:
-    """What JPEG of a quality from 1 to 100 leaves of a photo (3, H, W) uint8, RGB."""
+    """Compress a photo (3, H, W) uint8, RGB, as JPEG of a quality from 1 to 100, and decode it."""
     _, coded = cv2.imencode(".jpg", photo.permute(1, 2, 0).numpy()[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, quality])
     decoded = np.asarray(cv2.imdecode(coded, cv2.IMREAD_COLOR))
     return torch.from_numpy(decoded[..., ::-1].copy()).permute(2, 0, 1)
 
 
 def blur_motion(photo: Tensor, *, length: float, angle: float) -> Tensor:
-    """A camera that moved along a line of so many pixels, in the direction of the angle (radians)."""
+    """Blur of a camera that moved along a line: length in pixels, direction in radians."""
     radius = math.ceil(length / 2)
     offsets = torch.arange(-radius, radius + 1, dtype=torch.float32)
     y, x = torch.meshgrid(offsets, offsets, indexing="ij")
@@ -67,8 +66,8 @@ def blur_motion(photo: Tensor, *, length: float, angle: float) -> Tensor:
 
 
 def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
-    """Put one to three things in front that are no leaves: tapes, labels, sticks, discs and hands. Of all but hands,
-    every other one has a colour of the photo itself, so that green alone makes no leaf.
+    """Put one to three objects in front that are not leaves: tapes, labels, sticks, discs and hands. All but hands take
+    a colour of the photo itself in half of the cases, so that green alone does not make a leaf.
 
     Args:
         photo: (3, H, W) uint8.
@@ -106,7 +105,8 @@ def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
 def tint_leaves(photo: Tensor, layers: Tensor) -> Tensor:
     """Give the leaves another colour, as those of coleus, beet, red lettuce or a silvery sage have; stems keep theirs.
 
-    Every leaf of a photo (3, H, W) uint8 gets the same hue, but more or less of it; brightness stays, times one factor.
+    All leaves of a photo (3, H, W) uint8 get the same hue, at different strengths; brightness is kept, up to one
+    factor.
 
     Args:
         photo: (3, H, W) uint8, RGB.
@@ -136,5 +136,5 @@ def hand_shape(along: Tensor, across: Tensor) -> Tensor:
 
 
 def draw(low: float, high: float) -> float:
-    """A number, evenly distributed."""
+    """A uniformly distributed random number."""
     return low + (high - low) * float(torch.rand(()))

@@ -18,7 +18,7 @@ from mvseg.training.config import TrainConfig
 
 logger = logging.getLogger(__name__)
 
-WORTHWHILE = 0.9  # of float32's time; for less, its precision is not given up
+WORTHWHILE = 0.9  # of float32's time: bfloat16 must be faster than that to be worth its precision
 
 
 def choose_bf16(
@@ -48,7 +48,7 @@ def choose_bf16(
 def time_passes(model: nn.Module, photos: list[Tensor], targets: list[Target], *, is_bf16: bool) -> float:
     """Seconds of CPU time for a forward and backward pass, the faster of two (the first one builds caches).
 
-    CPU time: on a machine that is shared, the clock on the wall tells more about the others.
+    CPU time: on a shared machine, wall time also measures other processes.
     """
     trial, seconds = copy.deepcopy(model), []
     for _ in range(2):

@@ -191,8 +191,8 @@ def follow(averaged: nn.Module, model: nn.Module, *, decay: float) -> None:
     """Move an average a share of 1 - `decay` towards the model: its parameters, and its buffers with them.
 
     The running statistics of a live BatchNorm belong to the weights that they were measured with. Those of the model
-    describe its present weights, so they are averaged as these are, over the same steps, and not copied. Whole numbers
-    (batches that were tracked) are copied.
+    describe its present weights, so they are averaged as these are, over the same steps, and not copied. Integers
+    (numbers of tracked batches) are copied.
     """
     here, there = (itertools.chain(each.parameters(), each.buffers()) for each in (averaged, model))
     for average, current in zip(here, there, strict=True):

@@ -1,4 +1,4 @@
-"""A detector run over samples: what average precision is computed from."""
+"""Runs a detector over samples, as input of average precision."""
 
 from __future__ import annotations
 

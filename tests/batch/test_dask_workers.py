@@ -78,8 +78,8 @@ def test_items_are_given_to_all_workers_at_once_and_taken_back(cluster: Any, tmp
     ("scheduler", "message"),
     [
         ("nowhere.json", "nowhere.json: cannot be read"),
-        ("broken.json", "broken.json: is no scheduler file of Dask"),
-        ("list.json", "list.json: is no scheduler file of Dask"),
+        ("broken.json", "broken.json: is not a scheduler file of Dask"),
+        ("list.json", "list.json: is not a scheduler file of Dask"),
         ("tcp://127.0.0.1:9", "no Dask scheduler answers at tcp://127.0.0.1:9"),
         ("127.0.0.1:9", "no Dask scheduler answers at 127.0.0.1:9"),
     ],

@@ -143,7 +143,7 @@ def test_what_the_batch_does_not_say_is_asked_for(tmp_path: Path, capsys: pytest
 @pytest.mark.parametrize(
     ("changes", "arguments", "message"),
     [
-        ({}, [], "nothing is asked for, expected --miappe, --brapi or both"),
+        ({}, [], "neither --miappe nor --brapi is given, expected one or both"),
         ({}, ["--miappe", "--factors", "light"], "the batch's table has no column 'light', found scene, plant"),
         ({}, ["--miappe", "--factors", "Organism"], "'Organism' is NCBI:39350 for all plants, expected two values"),
         ({"Organism": ""}, ["--miappe"], "filled in every row: Organism"),

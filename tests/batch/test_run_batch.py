@@ -200,7 +200,7 @@ def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
     assert main(arguments(plants, tmp_path / "out", "--quiet", "--num_workers", "3")) == 3
     assert rounds == [(3, ["basil", "cactus", "mint"]), (1, ["basil", "mint"])]
     said = capsys.readouterr().err
-    assert "mvseg: mint: the process was killed; it gets one more try\n" in said
+    assert "mvseg: mint: the process was killed; it is tried again\n" in said
     sentence = "the process that worked on this scene was killed, twice"
     assert f"mvseg: basil: {sentence}\n" in said
     failures = {row["scene"]: row["sentence"] for row in read_table(tmp_path / "out" / "tables" / "failures.csv")}

@@ -83,8 +83,8 @@ def test_every_sub_folder_is_a_scene(tmp_path: Path, monkeypatch: pytest.MonkeyP
         ("scene\na/b\na_b\n", "are both called 'a_b', expected different names (column name): each names a folder"),
         ("scene\nMint\nmint\n", "are both called 'mint', expected different names (column name): each names a folder"),
         ("scene\nTables\n", "a scene is called 'Tables', the name of a folder of the batch's own"),
-        (b"scene\nb\xfcsche\n", "byte 7 is no UTF-8, expected a CSV table"),
-        ('scene\n"' + "x" * 200_000 + '"\n', "line 2 is no CSV (field larger than field limit (131072))"),
+        (b"scene\nb\xfcsche\n", "byte 7 is not UTF-8, expected a CSV table"),
+        ('scene\n"' + "x" * 200_000 + '"\n', "line 2 is not CSV (field larger than field limit (131072))"),
     ],
 )
 def test_broken_tables_are_refused(text: str | bytes, message: str, tmp_path: Path) -> None:

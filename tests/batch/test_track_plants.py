@@ -104,7 +104,7 @@ def test_plants_are_tracked_on_a_dask_cluster(tmp_path: Path) -> None:
         (["a", "--times", "1", "2"], "1 results have 2 times"),
         (["a", "b", "--times", "1", "1"], "have the same time 1"),
         (["a", "b", "--times", "1", "soon"], "expected a number .days. or an ISO date"),
-        (["a"], "is no output of mvseg batch"),
+        (["a"], "is not an output of mvseg batch"),
         (["a", "ids", "--times", "1", "2"], "has ids but no surfaces, run mvseg infer"),
     ],
 )

@@ -78,7 +78,7 @@ def test_absurd_numbers_are_borne(demo_scene: Scene) -> None:
     same = replace(demo_scene.cameras, R=demo_scene.cameras.R[[0] * 6 + [1, 2, 3]],
                    t=demo_scene.cameras.t[[0] * 6 + [1, 2, 3]])  # fmt: skip
     found = findings_of(demo_scene, same)
-    assert [each.views for each in found if "stand where others stand" in each.what] == [(0, 1, 2, 3, 4, 5)]
+    assert [each.views for each in found if "the same position as other" in each.what] == [(0, 1, 2, 3, 4, 5)]
 
 
 def test_another_world_changes_nothing(demo_scene: Scene) -> None:
@@ -177,7 +177,7 @@ def test_views_from_one_side_only(demo_scene: Scene) -> None:
     cameras = cameras_at(arc_positions(9, span=1.0)[[0, 2, 4, 6, 8, 0, 2, 4, 6]])
     found = findings_of(demo_scene, cameras)
     assert any("depth is hardly seen" in each.what for each in found)
-    (same,) = [each for each in found if "stand where others stand" in each.what]
+    (same,) = [each for each in found if "the same position as other" in each.what]
     assert same.views == (0, 1, 2, 3, 5, 6, 7, 8)
 
 

@@ -207,7 +207,7 @@ BAD: list[tuple[Any, str]] = [
     ([[1.0, 2.0, 3.0, 4.0]], "expected polygons"),
     ([POLYGON, [1.0, 2.0, 3.0, 4.0]], "expected polygons"),
     ([[*POLYGON, 3.0]], "expected polygons"),
-    ([[1.0, 2.0, 1e12, 4.0, 5.0, 6.0]], "leads far out of the image"),
+    ([[1.0, 2.0, 1e12, 4.0, 5.0, 6.0]], "reaches far out of the image"),
     ([[-500.0, 0.0, 560.0, 40.0] * 3000], "polygons are 6[0-9]* pixels long, more than any outline in the image"),
     ({"size": [HEIGHT, WIDTH], "counts": "o" * 100_000 + "1"}, "are not a string that COCO writes"),
 ]
@@ -373,6 +373,6 @@ def test_written_file_reads_back_here_and_in_pycocotools(
 def test_annotations_of_no_image_are_counted(scene: Scene, tmp_path: Path) -> None:
     segmentation = uncompressed(random_mask(0))
     path = write(tmp_path, [{"segmentation": segmentation}, {"segmentation": segmentation, "image_id": 99}])
-    with pytest.warns(InputWarning, match="1 annotations are of no image in the file, the first is annotation 2"):
+    with pytest.warns(InputWarning, match="1 annotations refer to no image in the file, the first is annotation 2"):
         masks = read_all(path, scene)
     assert [len(view) for view in masks] == [1, 0]

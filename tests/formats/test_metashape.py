@@ -124,7 +124,7 @@ BAD = [
     (('sensor_id="0"', 'sensor_id="7"'), "camera IMG_0: its sensor is not in the file"),
     (("<scale>0.02</scale>", "<scale>-1</scale>"), "the scale of the chunk is -1, expected a positive number"),
     (("</chunk>", "</chunk><chunk/>"), "holds 2 chunks, expected the cameras of one chunk"),
-    (('id="0" sensor_id="0" component_id="0"', 'id="0" sensor_id="0" component_id="1"'), "the cameras are of 2 comp"),
+    (('id="0" sensor_id="0" component_id="0"', 'id="0" sensor_id="0" component_id="1"'), "the cameras belong to 2 comp"),
     (("<document", "<!DOCTYPE a [<!ENTITY b 'c'>]><document"), "declares a document type, which Metashape does not"),
     (("</document>", ""), "not a whole XML file"),
     (("IMG_1", "IMG_0"), "views 0 and 1 have the same name 'IMG_0'"),
@@ -172,7 +172,9 @@ FOREIGN = [
 def test_another_programs_cameras_json_hides_nothing(foreign: object, tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "cameras.json").write_text(json.dumps(foreign))
-    with pytest.warns(InputWarning, match=r"cameras.json: is no rig file, and not used; the cameras are .*cameras.xml"):
+    with pytest.warns(
+        InputWarning, match=r"cameras.json: is not a rig file, and not used; the cameras are .*cameras.xml"
+    ):
         assert load_scene(tmp_path).source == tmp_path / "cameras.xml"
     (tmp_path / "cameras.xml").unlink()
     with pytest.raises(InputError, match=r"cameras.json: (format: Field required|Input should be a valid dictionary$)"):

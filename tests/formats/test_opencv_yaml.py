@@ -89,9 +89,9 @@ def test_plain_lists(tmp_path: Path) -> None:
 
 
 BAD = [
-    ("", "is no calibration, expected camera_matrix"),
-    ("[1", r"is no YAML file"),
-    ("a: !!python/object/apply:os.getcwd []", r"is no YAML file"),
+    ("", "is not a calibration, expected camera_matrix"),
+    ("[1", r"is not a YAML file"),
+    ("a: !!python/object/apply:os.getcwd []", r"is not a YAML file"),
     (ROS.replace("camera_matrix", "camera_matirx"), "matrix: Field required, expected camera_matrix"),
     (ROS.replace("1234.5678901234567", ".nan"), "matrix.data.0: Input should be a finite number"),
     (ROS.replace("1234.5678901234567, ", ""), "the camera matrix has 8 numbers, expected 9"),
@@ -101,7 +101,7 @@ BAD = [
     (ROS.replace("plumb_bob", "equidistant"), "a fisheye with 5 coefficients, expected k1, k2, k3, k4"),
     (ROS.replace("1280", "-1"), "width: Input should be greater than or equal to 1"),
     ("#" * (1 << 20) + "\n", "is larger than 1048576 bytes"),
-    ("\0", r"is no YAML file"),
+    ("\0", r"is not a YAML file"),
 ]
 
 

@@ -62,7 +62,7 @@ def test_files_that_are_no_tables(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         read_positions(tmp_path / "nowhere.csv")
     (tmp_path / "log.csv").write_bytes(b"photo,x\xff,y,z\n")
-    with pytest.raises(InputError, match="is no UTF-8, expected a table of positions"):
+    with pytest.raises(InputError, match="is not UTF-8, expected a table of positions"):
         read_positions(tmp_path / "log.csv")
     (tmp_path / "log.json").write_text('{"views": [3]}')
     with pytest.raises(InputError, match="views"):

@@ -264,7 +264,7 @@ def test_paths_of_another_machine(tmp_path: Path) -> None:
     content = transforms()
     for name, frame in zip("abc", content["frames"], strict=True):
         frame["file_path"] = f"/home/me/plant/photos/{name.upper()}.png"
-    with pytest.warns(InputWarning, match=r"3 photos are told by their names alone, the first is images/a"):
+    with pytest.warns(InputWarning, match=r"3 photos are matched by their names alone, the first is images/a"):
         scene = read(tmp_path, content)
     assert [view.name for view in scene.views] == ["a", "b", "c"]
     assert all(view.path.is_file() for view in scene.views)
@@ -272,7 +272,7 @@ def test_paths_of_another_machine(tmp_path: Path) -> None:
         for name, frame in zip("abc", content["frames"], strict=True):
             frame["file_path"] = f"{place}{name}.png"
         del content["w"], content["h"]
-        with pytest.warns(InputWarning, match=r"3 photos are told by their names alone, the first is images/a"):
+        with pytest.warns(InputWarning, match=r"3 photos are matched by their names alone, the first is images/a"):
             scene = read(tmp_path, content)
         assert all(view.path.is_file() for view in scene.views)
         content |= {"w": 200, "h": 120}

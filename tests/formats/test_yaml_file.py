@@ -15,13 +15,13 @@ BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("a
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"masks: m # \xff\xfe", "byte 11 is no UTF-8"),
+        (b"masks: m # \xff\xfe", "byte 11 is not UTF-8"),
         (b"match: {seed: " + b"1" * 5000 + b"}", "line 1 holds a number of 5000 digits"),
         (b"\nmatch: " + b"[" * 20_000, "line 2 is nested more than 32 deep"),
         (b"match: " + b"{a: " * 2000 + b"1" + b"}" * 2000, "line 1 is nested more than 32 deep"),
         (BOMB.encode(), r"line 2 has the alias \*a"),
-        (b"\0", "is no YAML file"),
-        (b"match: {a: [3", "is no YAML file"),
+        (b"\0", "is not a YAML file"),
+        (b"match: {a: [3", "is not a YAML file"),
         (b"#" * (1 << 21), "is larger than 1048576 bytes"),
     ],
 )

@@ -74,7 +74,7 @@ def test_what_is_no_turntable() -> None:
     with pytest.raises(InputError, match=r"turned by 0.0 degrees"):
         calibrate_turntable({"camera": still}, BOARD)
     moved = [draw_board(angle, shift=(3 * angle % 70, 0, angle % 40)) for angle in ANGLES]
-    with pytest.raises(InputError, match=r"one turning axis explains the board to .* px only"):
+    with pytest.raises(InputError, match=r"one axis of rotation explains the board to .* px only"):
         calibrate_turntable({"camera": moved}, BOARD)
     with pytest.raises(InputError, match=r"^3 of 5 photos show 6 corners"):
         calibrate_turntable({"camera": [*still[:3], *[np.full((HEIGHT, WIDTH), 90, np.uint8)] * 2]}, BOARD)

@@ -105,7 +105,7 @@ def test_left_handed_positions_are_refused(room, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("known", "message"),
     [
-        ({"distance": ("0.png", "nowhere.png", 3.0)}, "nowhere.png is no registered photo"),
+        ({"distance": ("0.png", "nowhere.png", 3.0)}, "nowhere.png is neither a registered photo"),
         ({"distance": ("marker:0", "marker:99", 3.0)}, "marker:99 is not seen whole in two photos, found marker:0"),
         ({"distance": ("marker:x", "marker:0", 3.0)}, "marker:x is not seen whole"),
         ({"distance": ("1.png", "1.png", 3.0)}, "are at one place"),

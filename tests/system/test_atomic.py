@@ -182,7 +182,7 @@ def test_another_process_keeps_what_it_writes_until_it_dies(
 def test_links_that_lead_in_a_circle(tmp_path: Path) -> None:
     (tmp_path / "self").symlink_to("self")
     for place in (tmp_path / "self", tmp_path / "self" / "out"):
-        with pytest.raises(InputError, match="its links lead in a circle, expected a folder or a new name"):
+        with pytest.raises(InputError, match="its links form a loop, expected a folder or a new name"):
             folder_whole(place).__enter__()
 
 

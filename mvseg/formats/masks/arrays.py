@@ -1,4 +1,4 @@
-"""Masks in memory: what segmenters return in Python, to regions; and the ids back to where the masks came from."""
+"""Masks in memory: regions from what segmenters return in Python, and ids written back to the same objects."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""cellpose's `_seg.npy`: a pickled dict, of which only the array `masks` is read, without running anything.
+"""cellpose's `_seg.npy`: a pickled dict, of which only the array `masks` is read, without executing anything.
 
-Unpickling a file runs what its author wants. Here every name in the pickle stands for an inert record of its arguments;
-numpy itself never sees them. The array is then built from its recorded shape, type and bytes, after they are checked.
+Unpickling a file can execute any code. Here every name in the pickle becomes an inert record of its arguments; numpy
+never sees them. The array is then built from its recorded shape, type and bytes, after they are checked.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ class _Dtype(_Record):
 
 
 class _Reader(pickle._Unpickler):
-    """The unpickler in Python: that in C asks for as much memory as a file says. It knows what dicts of arrays need;
-    keys are text, since the hash of deeply nested ones would overflow the stack."""
+    """The unpickler written in Python: the one in C allocates as much memory as a file claims. It supports what dicts
+    of arrays need; keys are text, since the hash of deeply nested ones would overflow the stack."""
 
     stack: list[Any]
     pop_mark: Callable[[], list[Any]]

@@ -1,4 +1,5 @@
-"""Label images with a number per class, where one per leaf is expected, and photos: numbers with pieces far apart."""
+"""Recognises label images with a number per class instead of per leaf, and photos: their numbers have components far
+apart."""
 
 from __future__ import annotations
 
@@ -12,17 +13,17 @@ import numpy as np
 from mvseg.errors import InputError, InputWarning
 from mvseg.regions import Regions
 
-SIDE = 256  # pixels: larger masks are looked at so small
-COMPARABLE = 0.2  # of the largest piece's area: smaller ones are too small to tell
+SIDE = 256  # pixels: larger masks are scaled down to this
+COMPARABLE = 0.2  # of the largest component's area: smaller ones are ignored
 FAR = 0.5  # gap between pieces, in the square root of the smaller one's area
 MANY = 0.5  # share of the photos, or of the numbers of one
 PHOTO = 50  # numbers of a label image: with more, it may be a photo
 
 
 def check_numbers(regions: Regions, *, source: Path) -> None:
-    """Warn (InputWarning) if a number of label images has pieces far apart in most of the photos with masks.
+    """Warn (InputWarning) if a number of label images has components far apart in most of the photos with masks.
 
-    A leaf that others hide in part has pieces, too, but near each other or in few photos: on basil and maize with a
+    A partly occluded leaf has several components, too, but near each other or in few photos: on basil and maize with a
     number per leaf, in less than a third of the photos.
 
     Raises:

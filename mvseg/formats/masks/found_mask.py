@@ -1,4 +1,4 @@
-"""What every reader of masks gives, and which of it is wanted."""
+"""What every mask reader returns, and the selection by category."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FoundMask:
 def check_categories(
     counts: Mapping[str, int], wanted: Collection[str], *, known: Collection[str] = (), source: Path
 ) -> None:
-    """Warn (InputWarning) of masks of several categories that are taken alike, and where no mask is of a wanted one.
+    """Warn (InputWarning) if masks of several categories are treated alike, and if no mask is of a wanted one.
 
     Args:
         counts: how many masks each category has.

@@ -13,7 +13,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.find_views import base_name, find_views, list_some
 from mvseg.scene import Scene
 
-# Endings of files that are called as their photo; longer ones first, since `_seg.npy` ends on `.npy`.
+# Endings of files that are named after their photo; longer ones first, since `_seg.npy` ends on `.npy`.
 ENDINGS = {
     "_cp_masks.png": "cellpose's label images",
     "_cp_masks.tif": "cellpose's label images",
@@ -28,7 +28,7 @@ ENDINGS = {
 ONE_PER_MASK = "one image per mask"
 # The first of several that fit as many photos is taken: plain images come late, since they may be photos.
 KINDS = ("NumPy arrays", "cellpose", "cellpose's label images", "JSON", "YOLO", "label images", ONE_PER_MASK)
-# A photo without leaves has a file there, too.
+# In these kinds, a photo without leaves has a file, too.
 COMPLETE = ("NumPy arrays", "cellpose", "cellpose's label images", "label images")
 NUMBERED = re.compile(r"(?P<photo>.+?)[_-](?:mask[_-]?)?\d+$", re.IGNORECASE)
 EXPECTED = "expected a folder of label PNGs or a COCO .json file, or another kind of docs/formats.md"
@@ -63,7 +63,7 @@ def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
     if masks.is_file() and masks.suffix.lower() == ".json":
         return MaskFiles(masks, "COCO", ((masks,),) * len(scene.views))
     if not masks.is_dir():
-        what = "not a kind of masks that is known" if masks.is_file() else "no such masks"
+        what = "not a known kind of masks" if masks.is_file() else "no such masks"
         raise InputError(f"{masks}: {what}, {EXPECTED}")
     folder = masks / "SegmentationObject" if (masks / "SegmentationObject").is_dir() else masks  # VOC
     paths = _list_files(folder, scene)
@@ -102,7 +102,7 @@ def _list_files(folder: Path, scene: Scene) -> list[Path]:
 def _is_copy(path: Path, photo: Path) -> bool:
     try:
         return filecmp.cmp(path, photo, shallow=False)
-    except OSError:  # not readable: who reads it next will say so
+    except OSError:  # not readable: the reader will say so
         return False
 
 
@@ -129,8 +129,8 @@ def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str)
     """The files of each view.
 
     Raises:
-        InputError: several files fit one view, and none of them is called exactly so (a folder of photos beside one of
-            masks). The message is a reason.
+        InputError: several files fit one view, and none has exactly its name (a folder of photos beside one of masks).
+            The message is a reason.
     """
     files: list[list[Path]] = [[] for _ in scene.views]
     stems, problem = [f"{name}.png" for name in names], None
@@ -157,7 +157,8 @@ def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str)
 def _complete(
     scene: Scene, folder: Path, *, kind: str, files: tuple[tuple[Path, ...], ...]
 ) -> tuple[tuple[Path, ...], ...]:
-    """Photos without a file: the reader will miss it where each photo must have one; elsewhere they show nothing."""
+    """Complete photos without a file: where each photo must have one, the reader will report it; elsewhere they have no
+    masks."""
     missing = [view for view, paths in enumerate(files) if not paths]
     if missing and kind in COMPLETE:
         ending = next(ending for ending, each in ENDINGS.items() if each == kind)
@@ -170,7 +171,7 @@ def _complete(
 
 
 def _name_kind(kind: str, files: tuple[tuple[Path, ...], ...]) -> str:
-    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything have not."""
+    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not."""
     if kind != "JSON":
         return "label images" if kind == "cellpose's label images" else kind
     first = next(paths[0] for paths in files if paths)
@@ -190,11 +191,11 @@ def _lone_coco(scene: Scene, masks: Path, paths: list[Path], *, unclear: tuple[s
         raise InputError(f"{masks}: {unclear[0]}")
     if jsons:
         found = list_some([path.relative_to(masks).as_posix() for path in jsons])
-        message = f"holds {len(jsons)} JSON files ({found}), none of them called as a photo"
+        message = f"holds {len(jsons)} JSON files ({found}), none of them named after a photo"
         raise InputError(f"{masks}: {message}; expected the path of the COCO file")
     jpegs = [path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")]
     if jpegs:
         raise InputError(f"{jpegs[0]}: is a JPEG, which blurs the numbers of masks: export PNG instead")
     found = list_some([path.relative_to(masks).as_posix() for path in paths])
-    expected = f"masks called as {scene.views[0].name}.png or {scene.views[0].name}.json"
+    expected = f"masks named {scene.views[0].name}.png or {scene.views[0].name}.json"
     raise InputError(f"{masks}: fits no photo of the scene, expected {expected}, found {found}")

@@ -15,7 +15,7 @@ from mvseg.formats.masks.found_mask import FoundMask
 
 
 class _SamFile(RootModel[Any]):
-    """Of either form; `read_sam` checks it."""
+    """A file in either form; `read_sam` checks it."""
 
 
 def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:

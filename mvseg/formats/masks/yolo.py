@@ -46,7 +46,7 @@ def _read_line(line: str, number: int, size: tuple[int, int], *, names: dict[int
     try:
         kind, values = int(float(first)), [float(value) for value in rest]
     except (ValueError, OverflowError):
-        raise InputError("holds something that is no number, expected: class x1 y1 x2 y2 x3 y3 ...") from None
+        raise InputError("holds something that is not a number, expected: class x1 y1 x2 y2 x3 y3 ...") from None
     category = names.get(kind, str(kind))
     if len(values) in (4, 5):
         return FoundMask(number, None, category)

@@ -157,7 +157,7 @@ def test_labels_are_the_numbers_of_the_files(folder: Path) -> None:
 
 def test_photos_are_no_masks_where_both_lie_together(folder: Path) -> None:
     scene = load_scene(folder)
-    with pytest.raises(InputError, match=r"images: fits no photo of the scene, expected masks called as 000.png"):
+    with pytest.raises(InputError, match=r"images: fits no photo of the scene, expected masks named 000.png"):
         load_masks(scene, folder / "images")
     for view in range(4):
         labelme(folder / "images" / f"{view:03d}", read_label_png(folder / "masks" / f"{view:03d}.png", WIDTH, HEIGHT))
@@ -229,7 +229,7 @@ def test_what_is_there_is_said(folder: Path) -> None:
         (folder / "other" / name).touch()
     with pytest.raises(InputError, match=r"found a.png, b.png, c.xml and 1 more"):
         load_masks(scene, folder / "other")
-    with pytest.raises(InputError, match=r"000.png: not a kind of masks that is known, expected a folder"):
+    with pytest.raises(InputError, match=r"000.png: not a known kind of masks, expected a folder"):
         load_masks(scene, folder / "masks" / "000.png")
 
 

@@ -42,11 +42,11 @@ def test_a_rectangle_has_exact_pixels(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("line", "message"),
     [
-        ("leaf 0.1 0.1 0.2 0.2 0.3 0.3", "line 2: holds something that is no number, expected: class x1 y1"),
+        ("leaf 0.1 0.1 0.2 0.2 0.3 0.3", "line 2: holds something that is not a number, expected: class x1 y1"),
         ("0 0.1 0.1", "line 2: has 2 numbers after the class, expected three corners or more"),
         ("0 10 10 20 10 20 20", "line 2: its corners are not between 0 and 1"),
         ("0 nan 0.1 0.2 0.2 0.3 0.3", "line 2: its corners are not between 0 and 1"),
-        ("1e999 0.1 0.1 0.2 0.2 0.3 0.3", "line 2: holds something that is no number"),
+        ("1e999 0.1 0.1 0.2 0.2 0.3 0.3", "line 2: holds something that is not a number"),
     ],
 )
 def test_bad_lines_are_named(line: str, message: str, tmp_path: Path) -> None:
@@ -57,7 +57,7 @@ def test_bad_lines_are_named(line: str, message: str, tmp_path: Path) -> None:
 def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "000.txt").write_bytes(b"\xff\xfe\x00")
     for name in ("000.txt", "absent.txt"):
-        with pytest.raises(InputError, match=f"{name}: (cannot be read|byte 0 is no UTF-8)"):
+        with pytest.raises(InputError, match=f"{name}: (cannot be read|byte 0 is not UTF-8)"):
             read_yolo(tmp_path / name, 80, 60, names={})
 
 
