@@ -22,19 +22,18 @@ class RunConfig:
         match: how regions are matched across views.
         reconstruct: how instances become shapes; None for ids only.
         traits: which instances count as leaves in the tables of traits.
-        scale: the world's lengths are multiplied by this; None leaves them. Cameras that say their unit need `unit`
-            with it.
+        scale: factor of all lengths of the world; None for 1. Cameras that state their unit need `unit` with it.
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
             level, "board" from ArUco markers that lie flat; None for that of the scene.
-        refine_poses: refine poses that are a few pixels off, with the masks as the only evidence; kept only if leaves
-            that they were not fitted to agree clearly better.
-        color_card: how the colours of the photos are corrected before they are measured, see
-            `mvseg.traits.color_correction.read_color_card`; "find" looks for a card in them; None leaves them.
+        refine_poses: refine poses that are a few pixels off, with the masks as the only evidence; used only if held-out
+            leaves agree clearly better.
+        color_card: correction of the photos' colours before they are measured, see
+            `mvseg.traits.color_correction.read_color_card`; "find" detects a card in them; None for no correction.
         split_merged: cut a mask that seems to cover two instances in two.
         report: write report.html, the result as one page.
-        coco_crowd: what annotations with `iscrowd` are in a COCO file of masks: "mask", one like all others, or
-            "ignore", left out.
+        coco_crowd: how annotations with `iscrowd` in a COCO file are treated: "mask": as all others; "ignore": left
+            out.
         categories: names of the categories whose masks are taken, with commas between them ("leaf,petiole"), where the
             masks have categories; None for all.
     """

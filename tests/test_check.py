@@ -164,7 +164,7 @@ def test_real_plants_have_no_error(plant: str, masks: str | None, shared_data: P
     check = check_scene(scene, regions)
     assert not check.has_errors
     warned = [finding.what.split(" have ")[-1] for finding in check.findings if finding.level == "warning"]
-    expected = ["stray pixels far from the rest of them: remove the small pieces"] if plant == "maize-plant1" else []
+    expected = ["stray pixels far from the rest of them: remove small components"] if plant == "maize-plant1" else []
     assert warned == expected
 
 

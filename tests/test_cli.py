@@ -1127,5 +1127,5 @@ def test_infer_fits_in_so_many_processes(
 def test_infer_without_processes_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plant = write_scene(tmp_path / "plant", 2)
     assert main(["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--num_workers", "0"]) == 2
-    assert "0 workers asked for, expected at least 1" in capsys.readouterr().err
+    assert "num_workers is 0, expected at least 1" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()

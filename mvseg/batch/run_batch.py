@@ -69,7 +69,7 @@ def run_batch(
         OSError: the tables cannot be written.
     """
     if num_workers < 1:
-        raise InputError(f"{num_workers} workers asked for, expected at least 1")
+        raise InputError(f"num_workers is {num_workers}, expected at least 1")
     scenes = list_scenes(source, out, masks)
     if any(scene.masks is None for scene in scenes):
         config = _find_weights(config)

@@ -111,7 +111,7 @@ def track_plants(
         InputError: `out` cannot be written, the corrections are broken, or every plant failed.
     """
     if num_workers < 1:
-        raise InputError(f"{num_workers} workers asked for, expected at least 1")
+        raise InputError(f"num_workers is {num_workers}, expected at least 1")
     check_out(out)
     edits = [] if corrections is None else read_track_links(corrections)
     try:

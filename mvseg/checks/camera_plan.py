@@ -23,7 +23,7 @@ def draw_cameras(scene: Scene, coverage: Coverage, off: tuple[int, ...] = ()) ->
     Args:
         scene: of V cameras.
         coverage: of these.
-        off: views whose masks agree with none.
+        off: views whose masks agree with no other view.
     """
     cameras = scene.cameras
     axes = _plan_axes(scene)

@@ -15,13 +15,13 @@ from mvseg.scene import Cameras, Scene
 
 Floats = NDArray[np.float64]
 
-DEPTHS = np.geomspace(0.02, 500, 80)  # of points looked for, in the median distance of two cameras
-GRID = (0.25, 0.5, 0.75)  # of the photo's width and height: the rays along which they are looked for
-MOST_SOURCES, POINTS_AT_ONCE = 32, 4096  # cameras on whose rays points are looked for; bounds the memory
+DEPTHS = np.geomspace(0.02, 500, 80)  # of candidate points, in the median distance of two cameras
+GRID = (0.25, 0.5, 0.75)  # of the photo's width and height: the rays with the candidate points
+MOST_SOURCES, POINTS_AT_ONCE = 32, 4096  # cameras whose rays have candidate points; bounds the memory
 ALL, MOST = 0.9, 0.6  # share of the cameras that look at one point: with right poses; without doubt about them
-WIDER = 4  # times the angle between the cameras, from which another reading of the poses is the better one
+WIDER = 4  # times the angle between the cameras, from which another interpretation of the poses is better
 FIELD_OF_VIEW = (2.0, 140.0)  # degrees, of the photo's diagonal, that lenses without distortion have
-OFF_CENTER = 0.2  # of width and height; a principal point beyond is that of another photo
+OFF_CENTER = 0.2  # of width and height; a principal point farther off belongs to another photo
 SQUARE = 1.2  # quotient of the focal lengths
 FAR = 8.0  # distance of a camera from the middle of the others, in their median distance
 UNITS = {1000: "millimetres and metres", 100: "centimetres and metres", 10: "millimetres and centimetres"}
@@ -35,7 +35,8 @@ class Coverage:
     """A point that as many cameras as possible look at.
 
     Attributes:
-        point: (3,) world coordinates; where several are seen by as many, the one closest to the photos' middles.
+        point: (3,) world coordinates; of several that equally many cameras see, the one closest to the centres of the
+            photos.
         sees: (V,) bool, cameras that have it in their image and in front of them.
         angle: (V,) degrees between the rays of each camera and its neighbour at the point; nan for cameras that do not
             look at it, or are the only ones.
@@ -70,7 +71,7 @@ def find_coverage(cameras: Cameras) -> Coverage:
 
 
 def camera_findings(scene: Scene, coverage: Coverage) -> list[Finding]:
-    """What is odd about the cameras of a scene."""
+    """The findings about the cameras of a scene."""
     names = tuple(view.name for view in scene.views)
     return [
         *_place_findings(scene.cameras, coverage, names),
@@ -203,17 +204,17 @@ def _mixed_units(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -
 
 
 def _distance_ratio(cameras: Cameras, coverage: Coverage, is_short: Tensor) -> float:
-    """How many times as far from the point as one group of the cameras the other one is, in the median; at least 1."""
+    """Ratio of the median distances of two groups of cameras from the point; at least 1."""
     distance = torch.linalg.vector_norm(cameras.centers - torch.from_numpy(coverage.point), dim=1)
     short, long = (float(distance[group].median().clamp(min=1e-300)) for group in (is_short, ~is_short))
     return max(short / long, long / short)
 
 
 def _other_reading(cameras: Cameras, coverage: Coverage) -> str | None:
-    """What R and t seem to be instead, as a sentence; None where they seem right.
+    """What R and t seem to be instead, as a sentence; None if they seem right.
 
-    Poses that are the wrong way round may still look at one point: cameras around a plant then stand close together and
-    look the same way, each turned about its own axis.
+    Inverted poses may still look at one point: cameras around a plant then stand close together and look in one
+    direction, each rotated about its own axis.
     """
     R, t, flip = cameras.R, cameras.t, torch.from_numpy(FLIP)
     inverse = replace(cameras, R=R.mT, t=cameras.centers)

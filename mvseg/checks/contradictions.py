@@ -23,7 +23,7 @@ def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = Tru
     Args:
         scene: of V >= 2 views.
         regions: its masks.
-        photos: whether features of the photos are looked at, where there are any; it takes about 0.1 s per photo.
+        photos: compare features of the photos, if there are any, too; takes about 0.1 s per photo.
         progress: show progress bars.
     """
     cameras, names = scene.cameras.to("cpu"), tuple(view.name for view in scene.views)

@@ -64,10 +64,10 @@ def distance_findings(
 
 
 def focal_factor(matches: Sequence[PhotoMatches], cameras: Cameras) -> float:
-    """By what all focal lengths must be multiplied for the features to fit; 1 where that is not certain.
+    """The factor of all focal lengths with which the features fit; 1 if that is not certain.
 
     Another focal length is certain if it halves the median epipolar distance, brings it below what fits in 70 % of
-    the pairs, differs by 5 % or more, and is not at the end of what is tried (0.37 to 2.7).
+    the pairs, differs by 5 % or more, and is not at the end of the tested range (0.37 to 2.7).
     """
     if len(matches) < FEWEST_PAIRS:
         return 1.0
@@ -154,6 +154,6 @@ def _sides(
 
 
 def _fitting_share(pair: PhotoMatches, cameras: Cameras) -> float:
-    """How many features fit the cameras, of as many as fit one fundamental matrix."""
+    """Number of features that fit the cameras, over the number that fit one fundamental matrix."""
     fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < OFFSET * pair.unit_px
     return float(fits.sum() / pair.is_rigid.sum())

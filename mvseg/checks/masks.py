@@ -10,7 +10,7 @@ from mvseg.matching.tangency import touches_border, without_small_components
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-TINY_PX = 30  # pixels of a mask that says nothing
+TINY_PX = 30  # pixels; smaller masks carry no information
 MANY = 0.25  # share of the masks
 FEW = 0.34  # of the median number of masks per view
 COVERS = 0.8  # of the photo: the background
@@ -18,7 +18,7 @@ BEYOND = 0.1  # of the photo's longer side: how far small components reach beyon
 
 
 def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
-    """What is odd about the D masks of V views."""
+    """The findings about the D masks of V views."""
     if not len(regions):
         what = "the masks of all views are empty: there are no instances to match"
         return [Finding(where="masks", what=what, level="error")]
@@ -64,7 +64,7 @@ def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -
 
 
 def _small_component_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
-    """Masks with stray pixels: the shape of such a leaf is looked for in a space that is much too large."""
+    """Masks with stray pixels, which make the search volume for the leaf's shape much too large."""
     longest = cameras.sizes.amax(1).tolist()
     views: set[int] = set()
     for index in range(len(regions)):
@@ -73,5 +73,5 @@ def _small_component_findings(regions: Regions, cameras: Cameras, names: tuple[s
         reach = max(crop.shape[axis] - np.ptp(np.flatnonzero(kept.any(1 - axis))) - 1 for axis in (0, 1))
         if reach > BEYOND * longest[view]:
             views.add(view)
-    what = "masks of {} have stray pixels far from the rest of them: remove the small pieces"
+    what = "masks of {} have stray pixels far from the rest of them: remove small components"
     return list_findings("masks", [("warning", sorted(views), what)], names)

@@ -20,7 +20,7 @@ from mvseg.scene import Scene
 BLANK, BLANK_SHARE, ROUNDING = 4.0, 0.03, 1.0
 DARK = 30  # grey level that 99 % of the pixels stay below
 BRIGHT, BURNT = 250, 0.7  # grey level of all channels; share of the pixels from which a photo is overexposed
-STEP = 4  # every fourth row and column is looked at
+STEP = 4  # every fourth row and column is used
 
 
 @dataclass(frozen=True)

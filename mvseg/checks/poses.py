@@ -46,7 +46,7 @@ class PoseAgreement:
         fitting: (V, V) share of the masks of both views whose best partner in the other view fits better than under any
             move of the other view's masks; by chance it is about 0.06.
         num_masks: (V, V) int64, masks of both views that were compared.
-        offset: (V, V) units; distance by which the epipolar lines miss, told by the move at which most masks agree.
+        offset: (V, V) units; distance by which the epipolar lines miss: the shift at which most masks agree.
         unit_px: pixels per unit of `offset`; the offset is not known more exactly.
     """
 

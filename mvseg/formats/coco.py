@@ -293,7 +293,7 @@ def _decompress(counts: str) -> list[int]:
         bits = ord(character) - 48
         number |= (bits & 0x1F) << shift
         shift += 5
-        if shift > 60:  # nobody has so many pixels
+        if shift > 60:  # more pixels than any image has
             raise InputError("its run lengths are not a string that COCO writes")
         if not bits & 0x20:
             number -= (1 << shift) if bits & 0x10 else 0  # the sign

@@ -1,8 +1,7 @@
 """`transforms.json` of nerfstudio, instant-ngp and Blender: world_from_cam in OpenGL axes (+y up, -z forward).
 
 nerfstudio's `applied_transform` and `applied_scale` are undone: the world is that of the cameras before nerfstudio
-turned and scaled it (COLMAP's). Its `mask_path` marks what to train on and does not tell leaves apart, so it is not
-used.
+turned and scaled it (COLMAP's). Its `mask_path` marks what to train on and does not separate leaves, so it is not used.
 """
 
 from __future__ import annotations

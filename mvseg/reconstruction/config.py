@@ -20,13 +20,13 @@ class ReconstructConfig:
             paper: 0.5); in [0, 1).
         seen_share: keeps thin instances thin: of the instance's views with a clear line of sight to a voxel (its pixel
             shows this instance, or no instance at all), more than this share must show the instance. A view in which
-            another instance may hide the voxel does not count; what has no mask (stems, missed leaves) hides nothing.
-            In [0, 1); 0 is the paper's rule, which leaves thin instances thick.
+            another instance may hide the voxel does not count; unmasked objects (stems, missed leaves) hide nothing. In
+            [0, 1); 0 is the paper's rule, which leaves thin instances thick.
         voxel_size: edge of a voxel in the scene's unit; null to derive it from the budget.
         voxel_budget: number of voxels in an instance's bounding box when no size is given.
-        check_ids: masks that show another instance's surface than their own get its id, surfaces that lost or won masks
-            are fitted again, and masks that show two surfaces are listed, see docs/matching.md; not where masks
-            are verified (`detect.verify`), nor without surfaces.
+        check_ids: masks that fit the surface of another instance better get its id, surfaces whose masks changed are
+            fitted again, and masks that show two surfaces are listed, see docs/matching.md; not where masks are
+            verified (`detect.verify`), nor without surfaces.
     """
 
     shape: Literal["surface", "voxels", "both"] = "surface"

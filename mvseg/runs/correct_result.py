@@ -34,7 +34,7 @@ NOT_AGAIN = ("detect", "check", "measure", "reconstruct")  # stages whose outcom
 
 
 class Superseded(Exception):
-    """There are newer edits: nobody waits for these any more."""
+    """There are newer edits, so these results are not needed any more."""
 
 
 class OpenResult:

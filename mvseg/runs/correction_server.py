@@ -1,4 +1,4 @@
-"""The page "Correct" of one result at 127.0.0.1: saves each edit at once, and shows what comes of it.
+"""The page "Correct" of one result at 127.0.0.1: saves each edit at once, and shows the consequences.
 
 Only this machine reaches it, and only who knows the token in its address: requests that name another host or come from
 another page's origin are refused, which keeps out other users' browsers and pages that rebind their name.
@@ -42,7 +42,7 @@ class Refused(Exception):
 
 
 class Corrector:
-    """One open result, its newest edits, and a thread that computes what comes of them; the newest edits win."""
+    """One open result, its newest edits, and a thread that computes their consequences; the newest edits win."""
 
     def __init__(self, opened: OpenResult) -> None:
         """Raises InputError: the corrections saved in the folder, or a photo, cannot be read."""
@@ -232,7 +232,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._json({"problem": sentence}, HTTPStatus.INTERNAL_SERVER_ERROR)
 
     def _place(self) -> str:
-        """What is asked for, below the token.
+        """The requested path, below the token.
 
         Raises:
             Refused: by another name of this machine, from another page, or without the token.

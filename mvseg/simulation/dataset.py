@@ -137,7 +137,7 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
             raise InputError(f"unknown preset '{preset}', expected one of {', '.join(PRESETS)}")
         preset = PRESETS[preset]
     if num_workers < 1:
-        raise InputError(f"{num_workers} workers asked for, expected at least 1")
+        raise InputError(f"num_workers is {num_workers}, expected at least 1")
     if seed < 0:
         raise InputError(f"the seed is {seed}, expected 0 or more")
     folder = Path(folder)

@@ -55,7 +55,7 @@ def sweep_abandoned(place: Path) -> None:
     """
     place = resolve_place(place)
     if any(os.path.lexists(_beside(place, kind)) for kind in (PARTIAL, EARLIER, LOCK)):
-        with suppress(InputError, OSError), _locked(_beside(place, LOCK)):  # OSError: somebody else's
+        with suppress(InputError, OSError), _locked(_beside(place, LOCK)):  # OSError: of another user
             _clear(place)
 
 

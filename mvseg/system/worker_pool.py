@@ -39,7 +39,7 @@ def start_workers(num_workers: int) -> Iterator[ProcessPoolExecutor | None]:
         InputError: fewer than one.
     """
     if num_workers < 1:
-        raise InputError(f"{num_workers} workers asked for, expected at least 1")
+        raise InputError(f"num_workers is {num_workers}, expected at least 1")
     if num_workers == 1:
         yield None
         return

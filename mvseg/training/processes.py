@@ -73,7 +73,7 @@ def join_processes(device: str) -> Iterator[Processes]:
         device: "cpu", "cuda" or "auto" (a GPU when there is one); with GPUs, each process of a machine takes its own.
 
     Raises:
-        InputError: a device that is none of these, or that this machine does not have; or environment variables of
+        InputError: an unknown device, or one that this machine does not have; or environment variables of
             torchrun that are not numbers.
     """
     rank, count, local_rank = (_read_number(key) for key in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
@@ -92,7 +92,7 @@ def join_processes(device: str) -> Iterator[Processes]:
 
 
 def _read_number(key: str) -> int:
-    """One of the numbers that torchrun tells its processes; 0 without torchrun."""
+    """One of the numbers that torchrun gives its processes; 0 without torchrun."""
     value = os.environ.get(key, "0")
     if not (value.isascii() and value.isdigit() and len(value) < 10):
         raise InputError(f"the environment variable {key} is '{value[:20]}', expected a number as torchrun sets it")

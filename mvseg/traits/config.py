@@ -32,7 +32,7 @@ Up = tuple[float, float, float] | Literal["rig", "board"]  # the direction that 
 
 @dataclass(frozen=True)
 class TraitsConfig:
-    """Which instances count as leaves; of the others the table says why they do not, and their shapes and ids stay.
+    """Which instances count as leaves; the others keep shapes and ids, and the table gives the reason.
 
     Attributes:
         min_sure_views: views with a sure match (match score of 0.5 or more) that a leaf needs; it has no effect where
@@ -40,10 +40,10 @@ class TraitsConfig:
         min_quality: least median IoU of a leaf's surface with its masks; in [0, 1]. Leaves that have voxels only are
             not judged by it.
         min_visible_share: of the pixels that a leaf's surface covers in the photos, its masks must cover this share; in
-            [0, 1]. A surface that hardly any photo shows is not where the leaf is.
+            [0, 1]. A surface that is hardly visible in any photo is in the wrong place.
         leaves_only: leave out what looks like a stem (long and steep, and a surface explains its masks badly), the
-            floor (below everything else, and far larger) or something beside the plant (more than two leaf lengths
-            away from it). Stems and the floor are told only where it is known which way is up.
+            floor (below everything else, and far larger) or something beside the plant (more than two leaf lengths away
+            from it). Stems and the floor are recognised only if up is known.
     """
 
     min_sure_views: int = 2

@@ -267,7 +267,7 @@ def test_scenes_on_a_dask_cluster(plants: Path, tmp_path: Path, capsys: pytest.C
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["--num_workers", "0"], "0 workers asked for, expected at least 1"),
+        (["--num_workers", "0"], "num_workers is 0, expected at least 1"),
         (["--num_workers", "2", "--scheduler", "x"], "--num_workers has no effect with --scheduler"),
         (["--scheduler", "nowhere.json"], "nowhere.json: cannot be read"),
         (["--match.num_points", "0"], "num_points is 0"),

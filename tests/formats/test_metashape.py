@@ -124,7 +124,7 @@ BAD = [
     (('sensor_id="0"', 'sensor_id="7"'), "camera IMG_0: its sensor is not in the file"),
     (("<scale>0.02</scale>", "<scale>-1</scale>"), "the scale of the chunk is -1, expected a positive number"),
     (("</chunk>", "</chunk><chunk/>"), "holds 2 chunks, expected the cameras of one chunk"),
-    (('id="0" sensor_id="0" component_id="0"', 'id="0" sensor_id="0" component_id="1"'), "the cameras belong to 2 comp"),
+    (('id="0" sensor_id="0" component_id="0"', 'id="0" sensor_id="0" component_id="1"'), "the cameras belong to 2"),
     (("<document", "<!DOCTYPE a [<!ENTITY b 'c'>]><document"), "declares a document type, which Metashape does not"),
     (("</document>", ""), "not a whole XML file"),
     (("IMG_1", "IMG_0"), "views 0 and 1 have the same name 'IMG_0'"),

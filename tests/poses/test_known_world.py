@@ -98,7 +98,7 @@ def test_positions_on_a_line_give_the_scale_only(room, tmp_path: Path) -> None:
 
 def test_left_handed_positions_are_refused(room, tmp_path: Path) -> None:
     path = write_positions(tmp_path / "log.csv", room.truth.centers.numpy() * [1, -1, 1])
-    with pytest.raises(InputError, match="fit as in a mirror only"):
+    with pytest.raises(InputError, match="points are mirrored"):
         place(room.scene, Known(positions=path))
 
 

@@ -96,5 +96,5 @@ def test_how_many() -> None:
     assert 1 <= default_workers() <= 4
     with start_workers(1) as workers:
         assert workers is None
-    with pytest.raises(InputError, match=r"^0 workers asked for, expected at least 1$"), start_workers(0):
+    with pytest.raises(InputError, match=r"^num_workers is 0, expected at least 1$"), start_workers(0):
         pass

@@ -156,7 +156,7 @@ def _decode(segmentation: Any, size: tuple[int, ...] | None) -> np.ndarray:
         segmentation = {**segmentation, "counts": segmentation["counts"].decode("ascii", errors="replace")}
     if size is None:
         if not isinstance(segmentation, Mapping) or len(segmentation.get("size", ())) != 2:
-            raise InputError("a segmentation without a size, expected a scene that tells it")
+            raise InputError("a segmentation without a size, expected a scene that states it")
         size = (int(segmentation["size"][1]), int(segmentation["size"][0]))
     return decode_segmentation(segmentation, size[0], size[1])
 

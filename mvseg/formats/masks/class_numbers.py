@@ -15,7 +15,7 @@ from mvseg.regions import Regions
 
 SIDE = 256  # pixels: larger masks are scaled down to this
 COMPARABLE = 0.2  # of the largest component's area: smaller ones are ignored
-FAR = 0.5  # gap between pieces, in the square root of the smaller one's area
+FAR = 0.5  # gap between components, in the square root of the smaller one's area
 MANY = 0.5  # share of the photos, or of the numbers of one
 PHOTO = 50  # numbers of a label image: with more, it may be a photo
 
@@ -27,25 +27,25 @@ def check_numbers(regions: Regions, *, source: Path) -> None:
     number per leaf, in less than a third of the photos.
 
     Raises:
-        InputError: most of the many numbers of a view have pieces far apart, as the grey values of a photo have.
+        InputError: most of the many numbers of a view have components far apart, as the grey values of a photo do.
     """
     is_apart = [has_pieces_apart(regions.crop(index).numpy()) for index in range(len(regions))]
     in_view = Counter(view for view, apart in zip(regions.view_index.tolist(), is_apart, strict=True) if apart)
     for view, total in enumerate(regions.num_per_view.tolist()):
         if total > PHOTO and in_view[view] > MANY * total:
-            reason = f"holds {total} numbers whose pieces lie far apart: is it a photo? expected one number per leaf"
+            reason = f"holds {total} numbers with parts far apart: is it a photo? expected one number per leaf"
             raise InputError(f"{source}: the label image of view {view} {reason}")
     with_number = Counter(number for number, apart in zip(regions.labels.tolist(), is_apart, strict=True) if apart)
     num_photos = int((regions.num_per_view > 0).sum())
     number, count = with_number.most_common(1)[0] if with_number else (0, 0)
     if count > max(1, MANY * num_photos):
-        message = f"the number {number} has pieces far apart in {count} of {num_photos} photos, as one of a class has"
+        message = f"the number {number} has parts far apart in {count} of {num_photos} photos, as a class does"
         advice = "export a number per leaf (VOC's SegmentationObject, not SegmentationClass), or COCO"
         warnings.warn(f"{source}: {message}: {advice}", InputWarning, stacklevel=4)
 
 
 def has_pieces_apart(mask: np.ndarray) -> bool:
-    """Whether (h, w) bool holds two pieces of comparable size with a gap between them."""
+    """Whether (h, w) bool holds two components of comparable size with a gap between them."""
     scale = min(1.0, SIDE / max(mask.shape))
     size = (max(1, round(scale * mask.shape[1])), max(1, round(scale * mask.shape[0])))
     small = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)

@@ -36,7 +36,7 @@ def check_categories(
 
     Args:
         counts: how many masks each category has.
-        wanted: the categories that were asked for; empty for all.
+        wanted: the requested categories; empty for all.
         known: categories that the file lists, with or without masks.
         source: the file or folder; messages name it.
 

@@ -28,7 +28,7 @@ def stack_views(
             bool, which may overlap; in the frame of the photo.
         scene: gives the lenses; None for masks of undistorted photos.
         source: where the masks come from; the warning names it.
-        num_views: V, where no scene tells it.
+        num_views: V, if there is no scene.
 
     Returns:
         Regions ordered by view; `labels` holds the numbers. Warns (InputWarning) of masks without pixels, which are

@@ -59,7 +59,7 @@ def _read_line(line: str, number: int, size: tuple[int, int], *, names: dict[int
 
 
 def read_class_names(folder: Path) -> dict[int, str]:
-    """{class number: name}; empty where no file tells.
+    """{class number: name}; empty if there is no such file.
 
     Raises:
         InputError: a file of names cannot be read.

@@ -1,4 +1,4 @@
-"""What the page needs to correct a result: where its pictures lie in the user's photos, its name, and the doubts."""
+"""What the page needs to correct a result: where its pictures are in the user's photos, its name, and the doubts."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ COLUMNS = 33  # of the grid of a lens: between its points, straight lines are le
 
 
 def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
-    """All that the mode "Correct" reads: it begins with the edits of the result, and says what hindered each of them;
+    """The data of the mode "Correct": the edits of the result, and the problem of each, if any;
     `run` is what run.json says."""
     made = () if result.corrections is None else result.corrections.edits
     edits = dump_edits(made)
@@ -43,13 +43,13 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
 
 
 def describe_fate(fate: Fate) -> str:
-    """What hindered an edit; "" for nothing."""
+    """The problem of an edit; "" if it was applied."""
     return fate.problem if fate.fate in (APPLIED, PASSED) else f"{fate.fate} {fate.problem}".strip()
 
 
 def describe_lenses(scene: Scene) -> tuple[list[dict[str, Any]], list[int | None]]:
-    """Each lens once, as how far its photo moves the points of a grid over the undistorted one, and the lens of each
-    view; None for a pinhole.
+    """Each lens once, as the displacements of a grid of points between the undistorted image and the photo; and the
+    lens of each view, None for a pinhole.
 
     A grid has its numbers of columns and rows, from edge to edge of the photo, and x and y of the moves, pixels, row by
     row; 0 where the photo shows nothing.

@@ -1,4 +1,4 @@
-"""What the page says of the leaves and of the plant in numbers."""
+"""The numbers of the leaves and of the plant on the page."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from mvseg.traits.ontology import (
 from mvseg.traits.table import VOXEL_NAMES, format_number
 
 COLOURS = ("mean_red", "mean_green", "mean_blue")
-# The corners of boxes are in traits.csv; nobody compares them in a table.
+# The corners of boxes are in traits.csv; in a table they are of no interest.
 NO_COLUMNS = {*COLOURS, *(trait.name for trait in VOXEL_TRAITS if trait.name.endswith(("_min", "_max")))}
 SIGNS = {"^2": "²", "^3": "³"}
 
 
 def describe_leaves(result: Result) -> list[dict[str, Any]]:
-    """One entry per instance: id, colour, shape, doubts, and its traits, where these were asked for."""
+    """One entry per instance: id, colour, shape, doubts, and its traits, if they were measured."""
     measured = {} if result.traits is None else {leaf.leaf: leaf for leaf in result.traits.leaves}
     found = []
     for instance in range(1, result.matching.num_instances + 1):
@@ -42,7 +42,7 @@ def describe_leaves(result: Result) -> list[dict[str, Any]]:
 
 
 def _describe_leaf(leaf: LeafTraits) -> dict[str, Any]:
-    # as in traits.csv, what only voxels have is missing without a word where there are none
+    # as in traits.csv, traits of voxels are omitted if there are none
     shown = [trait for trait in LEAF_TRAITS if leaf.numbers[trait.name].exists or trait.name not in VOXEL_NAMES]
     return {
         "shape": leaf.method,
@@ -53,7 +53,7 @@ def _describe_leaf(leaf: LeafTraits) -> dict[str, Any]:
 
 
 def describe_plant(traits: Traits | None) -> dict[str, Any]:
-    """The plant's own numbers; none where no traits were asked for."""
+    """The plant's own numbers; none if no traits were measured."""
     return {} if traits is None else describe_numbers(traits.whole, PLANT_TRAITS)
 
 

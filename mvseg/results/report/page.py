@@ -47,7 +47,7 @@ def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str,
         result: what is shown; without shapes the leaves are missing in 3D.
         pictures: one per view.
         run: what run.json says.
-        is_served: `mvseg correct` serves it: it sends each edit there, and shows what comes of it. Otherwise it
+        is_served: `mvseg correct` serves it: it sends each edit there, and shows the consequences. Otherwise it
             connects to nothing.
     """
     data = describe_result(result, pictures, run=run)

@@ -1,4 +1,4 @@
-"""What the page shows of a photo: its part with the plant, a small one of the whole, and the outlines of the masks."""
+"""What the page shows of a photo: its part with the plant, a thumbnail of the whole, and the outlines of the masks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mvseg.results.report.outlines import Outline, outline_masks
 
 LARGEST_WIDTH, LEAST_WIDTH = 1600, 200  # pixels of a picture
 ALL_PIXELS = 24_000_000  # of all pictures together: 4 to 9 MB, large enough to correct masks in
-THUMBNAIL_WIDTH = 320  # also what a person sees of the photo around its picture
+THUMBNAIL_WIDTH = 320  # also shown around the picture of the plant
 QUALITY = 80  # of JPEGs
 
 
@@ -40,7 +40,7 @@ class Picture:
     outlines: list[Outline]
 
     def as_json(self) -> dict[str, Any]:
-        """What the page reads; but the masks; JPEGs in base64."""
+        """What the page reads, except for the masks; JPEGs in base64."""
         return {
             "jpeg": base64.b64encode(self.jpeg).decode("ascii"),
             "thumbnail": base64.b64encode(self.thumbnail).decode("ascii"),
@@ -76,7 +76,7 @@ def draw_picture(photo: np.ndarray, masks: Masks, *, view: int) -> Picture:
 
 
 def picture_width(num_views: int, proportion: float) -> int:
-    """Width in pixels at which so many pictures (height / width = proportion) have no more than `ALL_PIXELS`."""
+    """Width in pixels at which the pictures of all views (height / width = proportion) have at most `ALL_PIXELS`."""
     width = math.sqrt(ALL_PIXELS / num_views / proportion)
     return int(min(max(width, LEAST_WIDTH), LARGEST_WIDTH))
 

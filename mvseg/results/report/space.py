@@ -1,7 +1,7 @@
 """What the page shows in 3D: the leaves as small meshes, and the cameras.
 
-Everything is in the page's own frame: +y is up, the middle of the plant is at the origin, and no leaf lies farther from
-it than 1.
+Everything is in the page's own frame: +y is up, the middle of the plant is at the origin, and all leaves are within a
+radius of 1.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ Floats = NDArray[np.float64]
 MESH_SHAPE = (24, 9)  # grid of a surface: 352 triangles
 VOXEL_FACES = 700  # triangles of a leaf of voxels
 STEPS = 32767  # of a coordinate from 0 to 1: 16 bits
-PLANT_SHARE = 0.25  # radius of a plant without shapes, of the distance of its cameras
-LEVEL = 0.3  # length of the mean "up" of the cameras, from which it is taken for that of the plant
+PLANT_SHARE = 0.25  # radius of a plant without shapes, as a share of the distance of its cameras
+LEVEL = 0.3  # length of the mean up vector of the cameras, from which it is used as that of the plant
 GRID_STEPS = (1, 2, 5)
 
 
@@ -56,7 +56,7 @@ class Frame:
         return (points @ self.rotation.T - self.middle) / self.radius
 
     def turn(self, directions: Floats) -> Floats:
-        """World directions (P, 3) in the page's frame, as long as they are."""
+        """World directions (P, 3) in the page's frame, their lengths kept."""
         return directions @ self.rotation.T
 
 

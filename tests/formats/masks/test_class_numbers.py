@@ -26,7 +26,7 @@ def test_a_number_per_class_is_warned_of(kind: str, tmp_path: Path) -> None:
         if kind == "npy":
             np.save(path.with_suffix(".npy"), CLASSES)
             path.unlink()
-    with pytest.warns(InputWarning, match=r"masks: the number 15 has pieces far apart in 4 of 4 photos.*Segmentation"):
+    with pytest.warns(InputWarning, match=r"masks: the number 15 has parts far apart in 4 of 4 photos.*Segmentation"):
         assert len(load_masks(load_scene(folder), folder / "masks")) == 8
 
 

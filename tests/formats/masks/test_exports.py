@@ -169,6 +169,6 @@ def test_parts_that_overlap_or_are_of_other_names(folder: Path) -> None:
     with pytest.raises(InputError, match=r"train/_ann\S* and \S*valid/_ann\S* both list 002_png.rf.0f3a2.jpg, exp"):
         load_masks(scene, export)
     (export / "valid" / "_annotations.coco.json").rename(export / "valid" / "old.json")
-    message = r"export: holds 2 JSON files \(train/_annotations.coco.json, valid/old.json\), none .* named after a photo"
+    message = r"export: holds 2 JSON files \(train/_annotations.coco.json, valid/old.json\), none .* after a photo"
     with pytest.raises(InputError, match=message):
         load_masks(scene, export)
