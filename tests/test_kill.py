@@ -161,7 +161,7 @@ def test_a_batch_goes_on_where_it_was_killed(
     seconds = runs(run)["seconds"]
     old, new = ({name: read_result(of / name) for name in names} for of in (earlier, out))
     tables = {path.name: path.read_bytes() for path in (out / "tables").glob("traits*")}
-    assert len(tables) in (2, 4)  # without and with pyarrow
+    assert len(tables) == 2
     assert all(old[name] != new[name] for name in names)
     for number, (signal, delay) in enumerate(moments("batch", seconds)):
         shutil.rmtree(out)

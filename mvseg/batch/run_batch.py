@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
@@ -84,9 +83,7 @@ def run_batch(
             finished = _work_on_all(scenes, engine, place, quiet=quiet)
             rows = [(scene, finished[index].status) for index, scene in enumerate(scenes)]
             run = {**made_by(), "source": str(source), "masks": masks and str(masks)}
-            has_parquet = write_tables(tables_folder(place), place, rows, run={**run, "config": asdict(config)})
-    if not has_parquet:
-        print("mvseg: there are no Parquet tables without pyarrow: pip install 'mvseg[batch]'", file=sys.stderr)
+            write_tables(tables_folder(place), place, rows, run={**run, "config": asdict(config)})
     done = [status for _, status in rows if status.state == "done"]
     return BatchCounts(
         done=len(done),

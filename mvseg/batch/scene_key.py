@@ -11,7 +11,7 @@ from typing import Any
 
 from mvseg._version import code_hash
 from mvseg.config import RunConfig
-from mvseg.detectors.zoo import find_weights
+from mvseg.detectors.zoo import weights_path
 from mvseg.errors import InputError
 from mvseg.formats.masks.yolo import NAME_FILES
 from mvseg.scene import Scene
@@ -38,7 +38,7 @@ def scene_key(scene: Scene, masks: Path | None, config: RunConfig, *, correction
     try:
         if masks is None:
             options["detect"]["weights"] = None  # their hash counts, not their name
-            others: Any = hash_files(find_weights(config.detect.weights) or Path(config.detect.weights))
+            others: Any = hash_files(weights_path(config.detect.weights))
         else:
             del options["detect"]
             others = [_describe_file(path, masks) for path in _mask_files(masks)]

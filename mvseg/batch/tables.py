@@ -17,12 +17,10 @@ from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_fil
 from mvseg.system.atomic import folder_whole
 from mvseg.traits.table import escape_text, write_csv
 
-TEXT_COLUMNS = {"trait", "unit", "method", "ontology", "quality"}
-
 
 def write_tables(
     folder: Path, out: Path, scenes: Sequence[tuple[BatchScene, Status]], *, run: Mapping[str, Any]
-) -> bool:
+) -> None:
     """Write the folder of tables, whole or not at all; an earlier one is replaced, the user's files there stay.
 
     Args:
@@ -30,9 +28,6 @@ def write_tables(
         out: where the results of the scenes that are done lie.
         scenes: all scenes with their outcomes, in the order of the rows.
         run: what goes into run.json besides counts.
-
-    Returns:
-        Whether there are Parquet files, too: where pyarrow is installed.
 
     Raises:
         InputError: a result cannot be read, or `folder` cannot be replaced (see `check_out`).
@@ -51,12 +46,10 @@ def write_tables(
             if status.state == "failed"
         ]
         write_csv(partial / "failures.csv", ("scene", "folder", "sentence"), failures)
-        has_parquet = all([_write_parquet(path, carried) for path in sorted(partial.glob("traits*.csv"))])
         counts = {"scenes": len(scenes), "done": len(done), "failed": len(failures)}
         text = json.dumps({**run, "counts": counts, "files": list_files(partial)}, indent=1, default=str)
         (partial / RUN_FILE).write_text(text + "\n", encoding="utf-8")
         keep_user_files(folder, partial)
-    return has_parquet
 
 
 def _join(path: Path, scenes: Sequence[BatchScene], out: Path, *, carried: Sequence[str]) -> None:
@@ -96,23 +89,3 @@ def _cell(text: str) -> str:
         return text if math.isfinite(float(text)) else escape_text(text)
     except ValueError:
         return escape_text(text)
-
-
-def _write_parquet(path: Path, carried: Sequence[str]) -> bool:
-    """The same table as Parquet: what is measured as numbers, everything else as text. False without pyarrow."""
-    try:
-        from pyarrow import csv as arrow_csv
-        from pyarrow import float64, int64, parquet, string
-    except ModuleNotFoundError:
-        return False
-    with path.open(newline="", encoding="utf-8") as file:
-        columns = next(csv.reader(file))
-    types = {column: string() if column in TEXT_COLUMNS else float64() for column in columns}
-    types |= dict.fromkeys(("scene", *carried), string()) | {"leaf": int64()}
-    table = arrow_csv.read_csv(
-        path,
-        parse_options=arrow_csv.ParseOptions(newlines_in_values=True),
-        convert_options=arrow_csv.ConvertOptions(column_types={name: types[name] for name in columns}),
-    )
-    parquet.write_table(table, path.with_suffix(".parquet"))
-    return True

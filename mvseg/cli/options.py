@@ -70,7 +70,7 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
         "--masks",
         type=Path | None,
         default=masks,
-        help="masks (label images, COCO, labelme, YOLO, SAM, NumPy, cellpose; docs/formats.md), in the scene folder or "
+        help="masks (label images, COCO, labelme, YOLO, SAM, NumPy; docs/formats.md), in the scene folder or "
         "anywhere; without it, infer detects leaves",
     )
     parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")

@@ -17,7 +17,7 @@ from mvseg.detection.cached_detections import CachedDetections, delete_cached, r
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass, crop_cameras, place_crops
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
-from mvseg.detectors.zoo import find_weights, load_detector
+from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.formats.photos import Photos
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
@@ -105,8 +105,7 @@ def _detect_photos(
 
 def describe_detector(config: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
     """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
-    weights = find_weights(config.weights) or Path(config.weights)
-    options = asdict(config) | {"weights": hash_files(weights)}
+    options = asdict(config) | {"weights": hash_files(weights_path(config.weights))}
     options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
     return json.dumps(options | {"torch": torch.__version__, "device": device})

@@ -28,7 +28,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
     1. Each view's proposals pass the box and mask heads and NMS with a large threshold (`proposal_iou`, the paper:
        0.7): an excessive set of masks. Each mask is cut where its expected IoU is largest, and its score multiplied by
-       that (`mvseg.detectors.mask_cut`); what then scores less than the detector's `roi_heads.score_thresh` is
+       that (`detectors/mask_cut.py`); what then scores less than the detector's `roi_heads.score_thresh` is
        discarded.
     2. Match first: what plain NMS at `cluster_iou` keeps of it is matched across views. Objects of different
        classes are never matched.

@@ -43,7 +43,7 @@ def build_detector(
 
     Args:
         arch: one of `list_architectures()`; "resnet18_fpn" (14.7 M parameters), "mobilenet_v3_large_fpn" (6.6 M),
-            "efficientnet_lite0" (6.4 M) and "efficientnet_lite2" (7.8 M) are those of `mvseg.detectors.small`.
+            "efficientnet_lite0" (6.4 M) and "efficientnet_lite2" (7.8 M) are those of `small.py`.
         num_classes: classes with the background, >= 2. If the weights were made for another number, the box and mask
             predictors are replaced by fresh ones and everything else is kept.
         weights: None: random, drawn from torch's global generator. A name that torchvision has for this builder

@@ -94,6 +94,11 @@ def find_weights(name: str) -> Path | None:
     return entry.weights
 
 
+def weights_path(name: str | Path) -> Path:
+    """The weights file of a shipped detector, or else the path itself, which need not exist; see `find_weights`."""
+    return find_weights(str(name)) or Path(name)
+
+
 def load_detector(
     weights: str | Path, *, image_size: int | None = None, min_score: float | None = None
 ) -> MaskRCNN:
@@ -108,7 +113,7 @@ def load_detector(
     Raises:
         InputError: neither a name nor a readable file, a wrong hash, or a file that does not say what it holds.
     """
-    path = find_weights(str(weights)) or Path(weights)
+    path = weights_path(weights)
     if not path.is_file():
         names = ", ".join(sorted(_list_folders())) or "none"
         raise InputError(f"'{weights}' is neither a shipped detector ({names}) nor a file of weights")

@@ -17,7 +17,6 @@ from pycocotools.coco import COCO
 from pycocotools.cocoeval import COCOeval
 from torch import Tensor
 
-from mvseg.detectors.mask_cut import CUT
 from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.formats.coco import encode_mask
 
@@ -49,7 +48,7 @@ def annotate_detections(detections: dict[str, Tensor], masks: Iterable[Tensor], 
 
     Args:
         detections: "boxes" (D, 4) xyxy, "labels" (D,), "scores" (D,).
-        masks: D masks (H, W) of probabilities, cut at 0.5 here.
+        masks: D masks (H, W) of probabilities, cut at 0.5 here, as torchvision's are by convention.
         image_id: number of the photo, from 0 on.
     """
     annotations = []
@@ -57,7 +56,7 @@ def annotate_detections(detections: dict[str, Tensor], masks: Iterable[Tensor], 
         detections["boxes"].tolist(), detections["labels"].tolist(), detections["scores"].tolist(), masks, strict=True
     ):
         x1, y1, x2, y2 = box
-        described = describe_mask(mask > CUT, image_id)
+        described = describe_mask(mask > 0.5, image_id)
         annotations.append(
             {**described, "category_id": category, "iscrowd": 0, "score": score, "bbox": [x1, y1, x2 - x1, y2 - y1]}
         )

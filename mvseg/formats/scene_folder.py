@@ -97,7 +97,7 @@ def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", catego
     Args:
         scene: gives the views and their sizes.
         masks: a COCO JSON file, or a folder with files that are named after the photos: label images (PNG, TIFF), NumPy
-            or cellpose files, labelme or Segment Anything JSON, YOLO text, or one image per mask; see
+            files, labelme or Segment Anything JSON, YOLO text, or one image per mask; see
             `recognise_masks`.
         crowd: how COCO annotations with `iscrowd` are treated, see `read_coco`.
         categories: names of the categories that are taken, of COCO, labelme and YOLO files; all, if empty.

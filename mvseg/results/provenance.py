@@ -33,7 +33,10 @@ def describe_run(
     if config.reconstruct is None:
         for name in ("reconstruct", "traits", "scale", "unit", "up", "color_card"):
             del options[name]
-    sources = [result.scene.source, masks or _weights_of(config)]
+    if masks is None:
+        from mvseg.detectors.zoo import weights_path  # loads torchvision
+
+    sources = [result.scene.source, masks or weights_path(config.detect.weights)]
     corrections = None if result.corrections is None else result.corrections.source
     if corrections is not None:
         sources.append(corrections)
@@ -48,9 +51,3 @@ def describe_run(
         "mask_kind": result.mask_kind or None,
         "warnings": list(messages),
     }
-
-
-def _weights_of(config: RunConfig) -> Path:
-    from mvseg.detectors.zoo import find_weights  # loads torchvision
-
-    return find_weights(config.detect.weights) or Path(config.detect.weights)

@@ -7,7 +7,7 @@ number of workers or processes, and however often it is interrupted.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,48 +19,15 @@ from torchvision.transforms import v2
 
 from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.regions import masks_to_boxes
-from mvseg.training.config import Orientation
+from mvseg.training.config import Orientation, TrainConfig
 from mvseg.training.data import SampleList, read_sample
-from mvseg.training.new_plants import draw_background, recolor, render_new_plant
+from mvseg.training.new_plants import draw_background, list_backgrounds, recolor, render_new_plant
 from mvseg.training.photo_faults import add_clutter, light_unevenly, spoil, tint_leaves
 
 MEAN_COLOR = (124, 116, 104)  # RGB; what the detectors' normalisation maps to zero
 MIN_INSTANCE_PX = 16  # smaller remains of an instance at the edge of a crop are noise
 
 Target = dict[str, Tensor]
-
-
-@dataclass(frozen=True)
-class Augmentation:
-    """What happens to a training sample.
-
-    Attributes:
-        image_size: S; samples leave as S x S pixels.
-        orientation: "any" flips and rotates by right angles (photos from above), "upright" mirrors left and right only
-            (plants from the side), "fixed" does neither.
-        scale_range: the photo's longer side becomes a factor from this range (log-uniform) times S; then a random S x S
-            window is taken, or the photo is placed at random in an S x S frame of the mean colour.
-        color_jitter: strength of brightness, contrast and saturation changes, in [0, 1]; hue gets a tenth of it.
-        blur_probability: share of the samples that are blurred (Gaussian, sigma 0.1 to 2 px).
-        light_probability: share of the samples that are lit unevenly, see `light_unevenly`.
-        fault_probability: share of the samples with a camera fault, see `spoil`.
-        clutter_probability: share of the samples with objects in front that are not leaves, see `add_clutter`.
-        tint_probability: share of the samples whose leaves get another colour, see `tint_leaves`.
-        recolor: give leaves without colour one, see `mvseg.training.new_plants.recolor`.
-        backgrounds: photos without leaves, for `recolor` and for new plants.
-    """
-
-    image_size: int
-    orientation: Orientation = "any"
-    scale_range: tuple[float, float] = (0.6, 1.6)
-    color_jitter: float = 0.3
-    blur_probability: float = 0.2
-    light_probability: float = 0.0
-    fault_probability: float = 0.0
-    clutter_probability: float = 0.0
-    tint_probability: float = 0.0
-    recolor: bool = False
-    backgrounds: tuple[Path, ...] = ()
 
 
 class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
@@ -73,28 +40,29 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
         InputError: on access, when a sample broke since it was checked; see `read_sample`.
     """
 
-    def __init__(self, samples: SampleList, augmentation: Augmentation, *, seed: int, new_plants: int = 0) -> None:
+    def __init__(self, samples: SampleList, config: TrainConfig) -> None:
         self.samples = samples
-        self.augmentation = augmentation
-        self.seed = seed
-        self.new_plants = new_plants
+        self.config = config
+        self.backgrounds = list_backgrounds(config.backgrounds)
 
     def __len__(self) -> int:
-        return len(self.samples) + self.new_plants
+        return len(self.samples) + self.config.new_plants
 
     def __getitem__(self, key: tuple[int, int]) -> tuple[Tensor, Target, int]:
         epoch, index = key
-        seed, augmentation = mix_seed(self.seed, epoch, index), self.augmentation
+        seed, config = mix_seed(self.config.seed, epoch, index), self.config
         if index < len(self.samples):
             labelled = read_sample(self.samples.samples[index])
         else:
-            labelled = render_new_plant(seed, augmentation.image_size, augmentation.backgrounds)
-            augmentation = replace(augmentation, orientation="fixed", scale_range=(1.0, 1.0), recolor=False)
-        return *augment(labelled, augmentation, seed), index
+            labelled = render_new_plant(seed, config.image_size, self.backgrounds)
+            config = replace(config, orientation="fixed", scale_range=(1.0, 1.0), recolor=False)
+        return *augment(labelled, config, seed, backgrounds=self.backgrounds), index
 
 
-def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> tuple[Tensor, Target]:
-    """Augment one sample; torch's global generator is left as it was.
+def augment(
+    labelled: LabelledPhoto, config: TrainConfig, seed: int, *, backgrounds: tuple[Path, ...] = ()
+) -> tuple[Tensor, Target]:
+    """Augment one sample as the config says; torch's global generator is left as it was.
 
     Ignored pixels are painted over with the mean colour first: the network can then learn neither a leaf nor background
     from them.
@@ -106,18 +74,18 @@ def augment(labelled: LabelledPhoto, augmentation: Augmentation, seed: int) -> t
     photo[:, labelled.ignore] = mean_color(photo)[:, None]
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
-        if augmentation.recolor:
-            photo = recolor(photo, labelled.layers, draw_background(augmentation.backgrounds, photo))
-        photo, layers = orient(photo, labelled.layers, augmentation.orientation)
-        photo, layers = rescale(photo, layers, augmentation)
-        if happens(augmentation.tint_probability):
+        if config.recolor:
+            photo = recolor(photo, labelled.layers, draw_background(backgrounds, photo))
+        photo, layers = orient(photo, labelled.layers, config.orientation)
+        photo, layers = rescale(photo, layers, config)
+        if happens(config.tint_probability):
             photo = tint_leaves(photo, layers)
-        if happens(augmentation.clutter_probability):
+        if happens(config.clutter_probability):
             photo, layers = add_clutter(photo, layers)
-        if happens(augmentation.light_probability):
+        if happens(config.light_probability):
             photo = light_unevenly(photo)
-        photo = distort_color(augmentation)(tv_tensors.Image(photo)).as_subclass(Tensor)
-        if happens(augmentation.fault_probability):
+        photo = distort_color(config)(tv_tensors.Image(photo)).as_subclass(Tensor)
+        if happens(config.fault_probability):
             photo = spoil(photo)
     return photo.float() / 255, make_target(layers, labelled.classes)
 
@@ -138,14 +106,14 @@ def orient(photo: Tensor, layers: Tensor, orientation: Orientation) -> tuple[Ten
     return photo, layers
 
 
-def rescale(photo: Tensor, layers: Tensor, augmentation: Augmentation) -> tuple[Tensor, Tensor]:
+def rescale(photo: Tensor, layers: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor]:
     """Scale by a random factor and take, or fill, an S x S window at a random place.
 
     Layers are resized with nearest-exact: plain nearest, which torchvision's transforms use, shifts a mask against its
     photo by up to half a pixel.
     """
-    side = augmentation.image_size
-    low, high = (math.log(factor) for factor in augmentation.scale_range)
+    side = config.image_size
+    low, high = (math.log(factor) for factor in config.scale_range)
     factor = math.exp(low + (high - low) * float(torch.rand(()))) * side / max(photo.shape[1:])
     size = [max(1, round(factor * length)) for length in photo.shape[1:]]
     photo = v2.functional.resize(photo, size, antialias=True)
@@ -170,13 +138,13 @@ def mean_color(photo: Tensor) -> Tensor:
     return torch.tensor(MEAN_COLOR, dtype=photo.dtype)
 
 
-def distort_color(augmentation: Augmentation) -> v2.Transform:
+def distort_color(config: TrainConfig) -> v2.Transform:
     """Colour jitter and blur, for uint8 photos."""
-    strength = augmentation.color_jitter
+    strength = config.color_jitter
     return v2.Compose(
         [
             v2.ColorJitter(strength, strength, strength, strength / 10),
-            v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=augmentation.blur_probability),
+            v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=config.blur_probability),
         ]
     )
 

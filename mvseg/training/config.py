@@ -80,7 +80,7 @@ class TrainConfig:
         num_workers: processes that read and augment, per training process; 0 reads in the training process itself.
         seed: of the weights, the order, the augmentation and the samplers of the losses.
         checkpoint_every: steps between checkpoints; every epoch ends with one, too.
-        log_every: steps between records of the losses in log.jsonl and TensorBoard.
+        log_every: steps between records of the losses in log.jsonl.
         resume: continue from the checkpoint in output, if there is one.
     """
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +14,6 @@ from torch import nn
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
 from mvseg.system.atomic import write_text_whole, write_whole
-
-logger = logging.getLogger(__name__)
 
 
 def write_config(path: Path, config: Mapping[str, Any]) -> None:
@@ -73,13 +70,3 @@ def cut_log(path: Path, step: int) -> None:
         if record["step"] <= step:
             kept.append(line + "\n")
     write_text_whole(path, "".join(kept))
-
-
-def open_tensorboard(folder: Path, step: int) -> Any | None:
-    """A TensorBoard writer that continues after `step`, or None, with one line in the log, if it is not installed."""
-    try:
-        from torch.utils.tensorboard import SummaryWriter
-    except ImportError:
-        logger.info("tensorboard is not installed (pip install tensorboard): losses go to log.jsonl only")
-        return None
-    return SummaryWriter(str(folder), purge_step=step + 1)

@@ -3,7 +3,7 @@
 One optimisation step takes `batch_size` samples, in chunks of `images_per_forward`. torchrun's processes share the
 chunks of a step; a single process works through them one after another and adds up the gradients. Each chunk seeds the
 random samplers of torchvision's losses from (seed, step, chunk), and no norm looks at the batch
-(mvseg/detectors/mask_rcnn.py). So a run depends on `batch_size` and `images_per_forward` but not on the number of
+(`detectors/mask_rcnn.py`). So a run depends on `batch_size` and `images_per_forward` but not on the number of
 processes: torchvision normalises its losses over the images of one forward call, and these are the same images. Only
 the order in which the gradients of the chunks are added up differs.
 
@@ -12,8 +12,7 @@ the same number of threads) without the state of any generator or scheduler in i
 measures time, once; the checkpoint keeps the decision.
 
 Files in `output`: config.yaml (resolved), log.jsonl (losses by step), metrics.json (by epoch), model.safetensors (the
-best epoch by mask AP; without validation samples the last), checkpoint.pt, tensorboard/ if tensorboard is installed,
-broken_samples.txt if samples were skipped.
+best epoch by mask AP; without validation samples the last), checkpoint.pt, broken_samples.txt if samples were skipped.
 """
 
 from __future__ import annotations
@@ -39,20 +38,18 @@ from mvseg.detectors.weights_file import Description
 from mvseg.errors import InputError
 from mvseg.evaluation.average_precision import average_precision
 from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole
-from mvseg.training.augmentation import Augmentation, AugmentedSamples, Target, mix_seed, order_epoch
+from mvseg.training.augmentation import AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
 from mvseg.training.data import SampleList, keep_sound, list_samples
 from mvseg.training.files import (
     append_record,
     cut_log,
-    open_tensorboard,
     write_config,
     write_metrics,
     write_weights,
 )
 from mvseg.training.from_results import list_results
-from mvseg.training.new_plants import list_backgrounds
 from mvseg.training.precision import choose_bf16
 from mvseg.training.processes import Processes, join_processes
 from mvseg.training.schedule import learning_rate
@@ -163,14 +160,15 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
 
 def run_epochs(run: Run, state: TrainingState) -> None:
     """Train and evaluate until the last epoch; the first process writes the files."""
-    board = open_files(run, state) if run.processes.is_first else None
+    if run.processes.is_first:
+        open_files(run, state)
     network: nn.Module = state.model
     if run.processes.count > 1:
         network = DistributedDataParallel(state.model)
     chunks = load_chunks(run, state.step)
     for epoch in range(len(state.history), run.config.epochs):
         started = time.monotonic()
-        train_epoch(run, state, network=network, chunks=chunks, board=board)
+        train_epoch(run, state, network=network, chunks=chunks)
         losses = {name: total / run.steps_per_epoch for name, total in state.loss_sums.items()}
         scores = evaluate(run, state) if run.held_out is not None else {}
         record = {"epoch": epoch, "step": state.step, **losses, **scores}
@@ -179,15 +177,11 @@ def run_epochs(run: Run, state: TrainingState) -> None:
         state.history.append(record | {"seconds": round(time.monotonic() - started, 1)})
         state.loss_sums = {}
         if run.processes.is_first:
-            close_epoch(run, state, board)
-    if board is not None:
-        board.close()
+            close_epoch(run, state)
     logger.info("finished; %s holds epoch %d", run.config.output / "model.safetensors", best_epoch(state.history) + 1)
 
 
-def train_epoch(
-    run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk], board: Any | None
-) -> None:
+def train_epoch(run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk]) -> None:
     """Do the remaining steps of the current epoch, with checkpoints on the way and one at the end.
 
     Args:
@@ -195,7 +189,6 @@ def train_epoch(
         state: what changes.
         network: the state's model, wrapped if several processes train.
         chunks: this process's chunks from the state's step on.
-        board: TensorBoard's writer, or None.
 
     Raises:
         InputError: a loss or a gradient is not finite; the message names the photos.
@@ -213,7 +206,7 @@ def train_epoch(
             state.loss_sums[name] = state.loss_sums.get(name, 0.0) + value
         if run.processes.is_first:
             if state.step % config.log_every == 0:
-                log_losses(run, state, {"lr": rate, **losses}, board=board)
+                append_record(config.output / "log.jsonl", {"step": state.step, "lr": rate, **losses})
             if state.step % config.checkpoint_every == 0 or step == num_steps - 1:
                 save_state(state, config, run.samples)
 
@@ -259,27 +252,9 @@ def not_finite(what: str, run: Run, indices: list[int]) -> InputError:
 
 def try_precision(run: Run, state: TrainingState) -> bool:
     """Whether this run is to be in bfloat16, by a forward pass of its own."""
-    samples = augmented_samples(run)
+    samples = AugmentedSamples(run.samples, run.config)
     photos, targets, _ = collate([samples[0, index % len(samples)] for index in range(run.config.images_per_forward)])
     return choose_bf16(run.config, state.model, photos=photos, targets=targets)
-
-
-def augmented_samples(run: Run) -> AugmentedSamples:
-    config = run.config
-    augmentation = Augmentation(
-        image_size=config.image_size,
-        orientation=config.orientation,
-        scale_range=config.scale_range,
-        color_jitter=config.color_jitter,
-        blur_probability=config.blur_probability,
-        light_probability=config.light_probability,
-        fault_probability=config.fault_probability,
-        clutter_probability=config.clutter_probability,
-        tint_probability=config.tint_probability,
-        recolor=config.recolor,
-        backgrounds=list_backgrounds(config.backgrounds),
-    )
-    return AugmentedSamples(run.samples, augmentation, seed=config.seed, new_plants=config.new_plants)
 
 
 def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
@@ -293,7 +268,7 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
                 chunk = batch[number * config.images_per_forward : (number + 1) * config.images_per_forward]
                 keys.append([(epoch, index) for index in chunk])
     loader = DataLoader(
-        augmented_samples(run),
+        AugmentedSamples(run.samples, run.config),
         batch_sampler=keys,
         num_workers=config.num_workers,
         collate_fn=collate,
@@ -329,23 +304,15 @@ def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
 # --- files of the run
 
 
-def open_files(run: Run, state: TrainingState) -> Any | None:
-    """Write the config, cut the log to the state's step, and open TensorBoard's writer, if it is installed."""
+def open_files(run: Run, state: TrainingState) -> None:
+    """Write the config, and cut the log to the state's step."""
     output = run.config.output
     sweep_folder(output)
     write_config(output / "config.yaml", config_values(run.config))
     cut_log(output / "log.jsonl", state.step)
-    return open_tensorboard(output / "tensorboard", state.step)
 
 
-def log_losses(run: Run, state: TrainingState, values: dict[str, float], *, board: Any | None) -> None:
-    append_record(run.config.output / "log.jsonl", {"step": state.step, **values})
-    if board is not None:
-        for name, value in values.items():
-            board.add_scalar(f"train/{name}", value, state.step)
-
-
-def close_epoch(run: Run, state: TrainingState, board: Any | None) -> None:
+def close_epoch(run: Run, state: TrainingState) -> None:
     """Export the weights if the epoch is the best so far, then metrics and the checkpoint."""
     config, output, best = run.config, run.config.output, best_epoch(state.history)
     if best == len(state.history) - 1:
@@ -362,10 +329,6 @@ def close_epoch(run: Run, state: TrainingState, board: Any | None) -> None:
     }
     write_metrics(output / "metrics.json", metrics)
     save_state(state, config, run.samples)
-    if board is not None:
-        for name, value in state.history[-1].items():
-            if value is not None:
-                board.add_scalar(f"epoch/{name}", value, state.step)
 
 
 def best_epoch(history: list[dict[str, Any]]) -> int:

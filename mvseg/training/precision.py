@@ -21,9 +21,7 @@ logger = logging.getLogger(__name__)
 WORTHWHILE = 0.9  # of float32's time: bfloat16 must be faster than that to be worth its precision
 
 
-def choose_bf16(
-    config: TrainConfig, model: nn.Module, *, photos: list[Tensor], targets: list[Target]
-) -> bool:
+def choose_bf16(config: TrainConfig, model: nn.Module, *, photos: list[Tensor], targets: list[Target]) -> bool:
     """Whether the forward pass of a run is to be under bfloat16 autocast, see `TrainConfig.precision`.
 
     Args:

@@ -17,7 +17,7 @@ from torchvision.models.detection import MaskRCNN
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.run import leave_autocast
 from mvseg.detectors.weights_file import load_weights, read_weights
-from mvseg.detectors.zoo import find_weights
+from mvseg.detectors.zoo import find_weights, weights_path
 from mvseg.errors import InputError
 from mvseg.training.config import TrainConfig, config_difference, config_values
 from mvseg.training.data import SampleList
@@ -78,7 +78,7 @@ def start_state(
         weights = config.weights and str(find_weights(config.weights) or config.weights)
         model = build_detector(config.arch, len(samples.categories) + 1, weights)
         if config.heads:
-            take_heads(model, find_weights(config.heads) or Path(config.heads))
+            take_heads(model, weights_path(config.heads))
     model.transform.min_size, model.transform.max_size = (config.image_size,), config.image_size
     model.rpn.head.register_forward_hook(leave_autocast)
     model = model.to(device=device, memory_format=torch.channels_last).train()  # a third faster on CPUs

@@ -6,7 +6,6 @@ import csv
 import json
 import os
 import signal
-import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -125,39 +124,6 @@ def test_the_tables_of_a_batch(here: None, plants: Path, tmp_path: Path, capsys:
     assert run["counts"] == {"scenes": 3, "done": 2, "failed": 1}
     assert run["config"]["unit"] == "cm"
     assert run["files"].keys() == {path.name for path in (out / "tables").iterdir()} - {"run.json"}
-
-
-def test_the_same_tables_as_parquet(here: None, plants: Path, tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet")
-    (tmp_path / "night.csv").write_text("scene,plant,time\nplants/basil,007,1\nplants/mint,,\n")
-    main(arguments(tmp_path / "night.csv", tmp_path / "out", "--quiet"))
-    for name in ("traits", "traits_wide"):
-        rows = read_table(tmp_path / "out" / "tables" / f"{name}.csv")
-        table = parquet.read_table(tmp_path / "out" / "tables" / f"{name}.parquet")
-        assert table.column_names == list(rows[0])
-        found = table.to_pylist()
-        assert len(found) == len(rows) > 3
-        for row, cells in zip(rows, found, strict=True):
-            for column, text in row.items():
-                cell = cells[column]
-                if cell is None:
-                    assert text == ""
-                else:
-                    assert cell == (float(text) if isinstance(cell, float) else type(cell)(text))
-        assert found[0]["plant"] == "007"
-        assert {type(cells["leaf"]) for cells in found} <= {int, type(None)}
-        numbers = {"value", "sd"} if name == "traits" else {"area", "area_sd", "volume", "iou", "num_views"}
-        assert all(isinstance(cells[column], float | None) for cells in found for column in numbers)
-
-
-def test_without_pyarrow_there_are_csv_tables_and_a_sentence(
-    here: None, plants: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.setitem(sys.modules, "pyarrow", None)
-    main(arguments(plants, tmp_path / "out", "--quiet"))
-    assert "no Parquet tables without pyarrow: pip install 'mvseg[batch]'" in capsys.readouterr().err
-    assert not list((tmp_path / "out" / "tables").glob("*.parquet"))
-    assert (tmp_path / "out" / "tables" / "traits.csv").is_file()
 
 
 def test_a_batch_is_resumed(here: None, plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -357,7 +357,6 @@ def readers(folder: Path) -> dict[str, Reader]:
     per_mask = {f"masks/{name}/{number}.png": draw("L", "PNG") for name in NAMES for number in range(2)}
     labels_of = np.arange(WIDTH * HEIGHT, dtype=np.int32).reshape(HEIGHT, WIDTH) // 40
     arrays = {"masks/000.npy": npy(labels_of), "masks/001.npy": npy(np.stack([MASK, ~MASK]))}
-    seg = {f"masks/{name}_seg.npy": npy({"masks": labels_of, "filename": "a.png"}) for name in NAMES}  # type: ignore[arg-type]
     return {
         "rig": Reader(rig_file, read_cameras),
         "transforms": Reader({"transforms.json": TRANSFORMS}, read_cameras),
@@ -374,7 +373,6 @@ def readers(folder: Path) -> dict[str, Reader]:
         "label images in TIFF": Reader(tiffs, read_mask_folder, rig_file),
         "one image per mask": Reader(per_mask, read_mask_folder, rig_file),
         "arrays": Reader(arrays, read_mask_folder, rig_file),
-        "cellpose": Reader(seg, read_mask_folder, rig_file),
         "labelme": Reader({f"masks/{name}.json": LABELME for name in NAMES}, read_mask_folder, rig_file),
         "sam": Reader({f"masks/{name}.json": SAM for name in NAMES}, read_mask_folder, rig_file),
         "yolo": Reader(

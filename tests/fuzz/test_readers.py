@@ -47,7 +47,7 @@ EXAMPLES = int(os.environ.get("MVSEG_FUZZ_EXAMPLES", "20"))
 IS_LONG = "MVSEG_FUZZ_EXAMPLES" in os.environ
 NAMES = [
     "rig", "transforms", "turntable", "bop", "metashape", "calibration", "colmap text", "colmap binary", "label png",
-    "photos", "photos of a scene", "label images", "label images in TIFF", "one image per mask", "arrays", "cellpose",
+    "photos", "photos of a scene", "label images", "label images in TIFF", "one image per mask", "arrays",
     "labelme", "sam", "yolo", "coco results", "coco", "coco for training", "config", "training config", "safetensors",
     "checkpoint", "result", "run",
 ]  # fmt: skip

@@ -15,19 +15,18 @@ from torch import Tensor
 from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.training.augmentation import (
     MEAN_COLOR,
-    Augmentation,
     AugmentedSamples,
     augment,
     make_target,
     mix_seed,
     order_epoch,
 )
+from mvseg.training.config import TrainConfig
 from mvseg.training.data import list_samples
 from tiny_training import write_photos
 
-PLAIN = Augmentation(
-    image_size=64, orientation="fixed", scale_range=(1.0, 1.0), color_jitter=0.0, blur_probability=0.0
-)
+CONFIG = TrainConfig(output=Path("out"), from_results=Path("results"), image_size=64)
+PLAIN = replace(CONFIG, orientation="fixed", scale_range=(1.0, 1.0), color_jitter=0.0, blur_probability=0.0)
 
 
 def make_sample(height: int = 48, width: int = 64) -> LabelledPhoto:
@@ -57,8 +56,8 @@ def overlap(a: Tensor, b: Tensor) -> float:
 @pytest.mark.parametrize("scale_range", [(1.0, 1.0), (0.4, 0.9), (1.1, 2.0)])
 def test_masks_follow_the_photo(orientation: Any, scale_range: tuple[float, float]) -> None:
     for seed in range(8):
-        augmentation = replace(PLAIN, orientation=orientation, scale_range=scale_range)
-        photo, target = augment(make_sample(), augmentation, seed)
+        config = replace(PLAIN, orientation=orientation, scale_range=scale_range)
+        photo, target = augment(make_sample(), config, seed)
         assert photo.shape == (3, 64, 64)
         for label, mask in zip(target["labels"].tolist(), target["masks"].bool(), strict=True):
             assert overlap(mask_from_photo(photo, label - 1), mask) > 0.85
@@ -133,7 +132,7 @@ def test_empty_target() -> None:
 
 def test_samples_follow_from_seed_epoch_and_index(tmp_path: Path) -> None:
     samples = list_samples(*write_photos(tmp_path, 3))
-    ours, again, other = (AugmentedSamples(samples, Augmentation(64), seed=seed) for seed in (1, 1, 2))
+    ours, again, other = (AugmentedSamples(samples, replace(CONFIG, seed=seed)) for seed in (1, 1, 2))
     torch.manual_seed(0)
     expected = torch.rand(2)
     torch.manual_seed(0)

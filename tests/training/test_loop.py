@@ -281,21 +281,6 @@ def test_validation_set_of_other_categories(leaves: Path, tmp_path: Path) -> Non
 # --- files
 
 
-def test_tensorboard_is_optional(
-    leaves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with caplog.at_level(logging.INFO):
-        train(make_config(leaves, tmp_path, epochs=1, batch_size=24), build_tiny())
-    assert caplog.text.count("tensorboard is not installed") == 1
-    assert not (tmp_path / "tensorboard").exists()
-
-
-def test_tensorboard_log(finished: Path) -> None:
-    pytest.importorskip("tensorboard")
-    assert list((finished / "tensorboard").glob("events.*"))
-
-
 # --- real plants
 
 

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 from mvseg.errors import InputError
-from mvseg.training.augmentation import Augmentation, AugmentedSamples
+from mvseg.training.augmentation import AugmentedSamples
+from mvseg.training.config import TrainConfig
 from mvseg.training.data import SampleList
 from mvseg.training.new_plants import draw_background, list_backgrounds, recolor, render_new_plant
 
@@ -53,7 +54,8 @@ def test_backgrounds_are_seen_behind_some_plants_and_never_on_a_leaf(backgrounds
 
 
 def test_an_epoch_ends_with_new_plants_and_the_next_one_has_others() -> None:
-    samples = AugmentedSamples(SampleList((), ("leaf",)), Augmentation(64), seed=1, new_plants=2)
+    config = TrainConfig(output=Path("out"), from_results=Path("results"), image_size=64, seed=1, new_plants=2)
+    samples = AugmentedSamples(SampleList((), ("leaf",)), config)
     assert len(samples) == 2
     photo, target, index = samples[0, 1]
     assert photo.shape == (3, 64, 64)

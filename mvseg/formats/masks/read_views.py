@@ -9,7 +9,6 @@ from collections.abc import Collection, Iterator
 import numpy as np
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.masks.cellpose import read_cellpose
 from mvseg.formats.masks.found_mask import FoundMask, check_categories, select_masks
 from mvseg.formats.masks.label_image import read_label_image
 from mvseg.formats.masks.labelme import read_labelme
@@ -64,7 +63,8 @@ def _read_view(scene: Scene, view: int, found: MaskFiles) -> np.ndarray | list[F
         case "NumPy arrays":
             return read_npy(paths[0], width, height)
         case "cellpose":
-            return read_cellpose(paths[0], width, height)
+            advice = "in cellpose, save the masks as PNG or TIFF (File menu, or --save_png)"
+            raise InputError(f"{paths[0]}: is a pickle, which may run anything when it is read; {advice}")
         case "labelme":
             return read_labelme(paths[0], width, height)
         case "SAM":

@@ -27,7 +27,7 @@ ENDINGS = {
 }
 ONE_PER_MASK = "one image per mask"
 # The first of several that fit as many photos is taken: plain images come late, since they may be photos.
-KINDS = ("NumPy arrays", "cellpose", "cellpose's label images", "JSON", "YOLO", "label images", ONE_PER_MASK)
+KINDS = ("NumPy arrays", "cellpose's label images", "cellpose", "JSON", "YOLO", "label images", ONE_PER_MASK)
 # In these kinds, a photo without leaves has a file, too.
 COMPLETE = ("NumPy arrays", "cellpose", "cellpose's label images", "label images")
 NUMBERED = re.compile(r"(?P<photo>.+?)[_-](?:mask[_-]?)?\d+$", re.IGNORECASE)

@@ -37,12 +37,8 @@ def write_grey_photo(path: Path, view: int) -> None:
     write_image(path, ((noise - noise.min()) / np.ptp(noise) * 255).astype(np.uint8))
 
 
-def cellpose_4(path: Path, labels: np.ndarray) -> None:
-    normalize = {"lowhigh": None, "percentile": [1.0, 99.0], "normalize": True, "tile_norm_blocksize": 0}
-    content = {"outlines": labels * 0, "colors": np.zeros((3, 3), np.uint8), "masks": labels, "filename": "000.png"}
-    content |= {"flows": [np.zeros((2, 2), np.uint8), np.zeros((2, 2)), [], None], "ismanual": np.zeros(3, bool)}
-    content |= {"manual_changes": [], "normalize_params": normalize, "diameter": np.float64(30.0), "ratio": 1.0}
-    np.save(f"{path}_seg.npy", content)
+def cellpose(path: Path, labels: np.ndarray) -> None:
+    write_image(Path(f"{path}_cp_masks.png"), labels)
 
 
 def labelme(path: Path, labels: np.ndarray) -> None:
@@ -57,8 +53,7 @@ def yolo(path: Path, _: np.ndarray) -> None:
 
 
 SIDE_BY_SIDE: list[tuple[Write, str, int]] = [
-    (cellpose_4, "cellpose", 12),
-    (lambda path, labels: write_image(Path(f"{path}_cp_masks.png"), labels), "label images", 12),
+    (cellpose, "label images", 12),
     (labelme, "labelme", 4),
     (yolo, "YOLO", 4),
 ]
@@ -82,8 +77,8 @@ def test_copies_of_the_photos_are_not_looked_at(folder: Path) -> None:
     """Even where they are more than the masks, or lie where an export puts them."""
     shutil.copytree(folder / "images", folder / "work")
     for view in range(3):
-        cellpose_4(folder / "work" / f"{view:03d}", labels_of(folder, view))
-    assert recognise_masks(load_scene(folder), folder / "work").kind == "cellpose"
+        cellpose(folder / "work" / f"{view:03d}", labels_of(folder, view))
+    assert recognise_masks(load_scene(folder), folder / "work").kind == "label images"
     shutil.copytree(folder / "images", folder / "export" / "JPEGImages")
     shutil.copytree(folder / "masks", folder / "export" / "SegmentationClass")
     with pytest.warns(InputWarning, match=r"4 names .* the first is SegmentationClass/000.png for 000"):

@@ -48,11 +48,6 @@ def colour_png(path: Path, labels: np.ndarray) -> None:
     write_image(Path(f"{path}.png"), colours[labels])
 
 
-def cellpose(path: Path, labels: np.ndarray) -> None:
-    content = {"masks": labels, "outlines": labels * 0, "filename": "x.jpg", "flows": [np.zeros((2, 3)), [None, 1.5]]}
-    np.save(f"{path}_seg.npy", content)
-
-
 def labelme(path: Path, labels: np.ndarray) -> None:
     shapes = [
         {"label": "leaf", "points": np.reshape(outlines(mask)[0], (-1, 2)).tolist(), "shape_type": "polygon"}
@@ -101,7 +96,6 @@ KINDS: dict[str, tuple[Write, str]] = {
     "cellpose PNG": (lambda p, a: write_image(Path(f"{p}_cp_masks.png"), a), "label images"),
     "npy": (lambda p, a: np.save(f"{p}.npy", a.astype(np.int32)), "NumPy arrays"),
     "npy stack": (lambda p, a: np.save(f"{p}.npy", np.stack(masks_of(a))), "NumPy arrays"),
-    "cellpose": (cellpose, "cellpose"),
     "labelme": (labelme, "labelme"),
     "YOLO": (yolo, "YOLO"),
     "SAM": (sam, "SAM"),
