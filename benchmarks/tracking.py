@@ -250,7 +250,8 @@ def prepare(table: Path, results: Path, *, masks: str = "true") -> None:
 
 
 def true_ids(date: PlantOnDate, truth: Path) -> list[int]:
-    """The true id of each leaf: that of most pixels of its masks; 0 where most are unknown or of no leaf."""
+    """The true id of each leaf: that of most pixels of its masks; 0 where most are unknown or of no leaf, and for the
+    smaller ones of several that show one leaf."""
     assert date.folder is not None
     regions, labels = read_instances(date.folder, truth)
     votes: dict[int, Counter[int]] = {}
@@ -259,8 +260,12 @@ def true_ids(date: PlantOnDate, truth: Path) -> list[int]:
         height, width = labels[view].shape
         under = labels[view][regions.mask(index, width, height).numpy()]
         votes.setdefault(leaf, Counter()).update(under.tolist())
-    best = {leaf: count.most_common(1)[0][0] for leaf, count in votes.items()}
-    return [best.get(leaf.leaf, 0) % IGNORED for leaf in date.leaves]
+    best: dict[int, tuple[int, int]] = {}  # {true id: (pixels, leaf)}
+    for leaf in date.leaves:
+        true, count = votes.get(leaf.leaf, Counter({0: 0})).most_common(1)[0]
+        best[true] = max(best.get(true, (0, 0)), (count, leaf.leaf))
+    of = {leaf: true % IGNORED for true, (_, leaf) in best.items()}
+    return [of.get(leaf.leaf, 0) for leaf in date.leaves]
 
 
 def read_series(table: Path, results: Path) -> dict[str, tuple[list[PlantOnDate], Labels]]:

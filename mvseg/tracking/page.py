@@ -83,12 +83,12 @@ def write_index(path: Path, plants: Sequence[tuple[str, int, int]]) -> None:
 
 def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
     """All that the page shows, as its script reads it. Places are whole thousandths of the plant's size."""
-    scale, middle = _extent(tracks)
+    scale, middles = _extent(tracks)
     leaves: list[dict[str, Any]] = []
     for index, date in enumerate(tracks.dates):
         rows = {row.leaf: row for row in tracks.rows if row.date == index and row.leaf is not None}
         crops = _crops(date, {leaf: row.track for leaf, row in rows.items()})
-        pose = tracks.poses[index]
+        pose, middle = tracks.poses[index], middles.get(tracks.roots[index], np.zeros(3))
         for leaf in date.leaves:
             row, shape = rows[leaf.leaf], np.zeros((0, 3))
             if leaf.points is not None and leaf.midrib is not None:
@@ -137,21 +137,27 @@ def draw_growth(tracks: Tracks, growth: Growth) -> np.ndarray:
     trait = "area" if any(point.trait == "area" for point in growth.points) else "length"
     points = [point for point in growth.points if point.trait == trait]
     image = Image.new("RGB", CHART, "white")
-    draw, (width, height), (left, bottom) = ImageDraw.Draw(image), CHART, (130, 80)
+    draw, (width, height), (left, bottom) = ImageDraw.Draw(image), CHART, (130, 70)
     most = max((point.number.value for point in points), default=1.0) * 1.1
     times = [date.time for date in tracks.dates]
 
     def place(time: float, value: float) -> tuple[float, float]:
-        right = (time - times[0]) / (times[-1] - times[0]) * (width - left - 40)
+        right = (time - times[0]) / (times[-1] - times[0]) * (width - left - 90)
         return left + right, height - bottom - value / most * (height - bottom - 40)
 
-    for tick in np.linspace(0, most, 6)[:-1].tolist():
+    decade = 10 ** math.floor(math.log10(most / 4))
+    step = decade * next(factor for factor in (1, 2, 5, 10) if factor * decade >= most / 7)
+    for tick in np.arange(0, most, step).tolist():
         draw.line([place(times[0], tick), place(times[-1], tick)], fill=(225, 225, 225))
-        draw.text((10, place(0, tick)[1] - 10), f"{tick:.4g}", fill="black", font_size=20)
+        draw.text((left - 12, place(0, tick)[1]), f"{tick:g}", fill="black", font_size=22, anchor="rm")
+    free = -math.inf
     for date in tracks.dates:
-        draw.text((place(date.time, 0)[0] - 20, height - bottom + 10), date.written, fill="black", font_size=20)
+        middle, half = place(date.time, 0)[0], 7 * len(date.written)
+        if middle - half > free:
+            draw.text((middle, height - bottom + 12), date.written, fill="black", font_size=22, anchor="mt")
+            free = middle + half
     unit = points[0].number.unit if points else ""
-    draw.text((left, 8), f"{tracks.plant}: {trait} ({unit}) over time", fill="black", font_size=22)
+    draw.text((left, 8), f"{tracks.plant}: {trait} ({unit}) over time, with one sd", fill="black", font_size=24)
     curves = {curve.track: curve for curve in growth.curves if curve.trait == trait}
     for track, own in groupby(points, key=lambda point: point.track):
         color, sights = instance_color(track), [(times[point.date], point.number) for point in own]
@@ -159,23 +165,24 @@ def draw_growth(tracks: Tracks, growth: Growth) -> np.ndarray:
         if track in curves:
             steps = np.linspace(sights[0][0], sights[-1][0], CURVE_STEPS)
             line = list(zip(steps.tolist(), np.clip(curves[track].at(steps), 0, most).tolist(), strict=True))
-        draw.line([place(*point) for point in line], fill=color, width=3 if track in curves else 2)
+        draw.line([place(*point) for point in line], fill=color, width=4 if track in curves else 3)
         for time, number in sights:
             sd = number.sd if math.isfinite(number.sd) else 0.0
-            draw.line([place(time, number.value - sd), place(time, number.value + sd)], fill=color, width=1)
+            draw.line([place(time, number.value - sd), place(time, number.value + sd)], fill=color, width=2)
             x, y = place(time, number.value)
             draw.ellipse([x - 5, y - 5, x + 5, y + 5], fill=color)
     return np.asarray(image)
 
 
-def _extent(tracks: Tracks) -> tuple[float, np.ndarray]:
-    """Half the size of the largest plant, and the middle of the first one."""
-    clouds = [
-        np.concatenate([leaf.points for leaf in date.leaves if leaf.points is not None] or [np.zeros((1, 3))])
-        for date in tracks.dates
-    ]
-    middle = (clouds[0].min(0) + clouds[0].max(0)) / 2
-    return max(max(float(np.ptp(cloud, axis=0).max()) for cloud in clouds) / 2, 1e-9), middle
+def _extent(tracks: Tracks) -> tuple[float, dict[int, np.ndarray]]:
+    """Half the size of the largest plant, and {root: (3,) middle of the plant on all dates that stand in its frame}."""
+    clouds: dict[int, list[np.ndarray]] = {root: [np.zeros((0, 3))] for root in tracks.roots}
+    for date, root, pose in zip(tracks.dates, tracks.roots, tracks.poses, strict=True):
+        clouds[root] += [leaf.points @ pose[:3, :3].T + pose[:3, 3] for leaf in date.leaves if leaf.points is not None]
+    placed = {root: np.concatenate(points) for root, points in clouds.items()}
+    boxes = {root: (cloud.min(0), cloud.max(0)) for root, cloud in placed.items() if len(cloud)}
+    half = max((float((high - low).max()) / 2 for low, high in boxes.values()), default=0.0)
+    return max(half, 1e-9), {root: (low + high) / 2 for root, (low, high) in boxes.items()}
 
 
 def _crops(date: PlantOnDate, track_of: Mapping[int, int]) -> dict[int, str]:

@@ -61,6 +61,7 @@ class Tracks:
         rows: by date, then by track.
         poses: (T, 4, 4) first_from_date, where the frame of a date stands in that of the earliest date that it is
             surely aligned with, by way of others; the identity where there is none.
+        roots: (T,) index of that earliest date.
         warnings: dates that could not be aligned, and why.
     """
 
@@ -68,6 +69,7 @@ class Tracks:
     dates: tuple[PlantOnDate, ...]
     rows: tuple[TrackRow, ...]
     poses: Floats
+    roots: tuple[int, ...]
     warnings: tuple[str, ...]
 
     @property
@@ -114,7 +116,7 @@ def track_leaves(
     found = link_leaves([len(each) for each in leaves], compared.costs, same=same, different=different)
     return Tracks(
         plant=plant, dates=dates, rows=_rows(dates, found, compared.roots),
-        poses=compared.poses,
+        poses=compared.poses, roots=tuple(compared.roots.tolist()),
         warnings=tuple(_warnings(dates, compared)),
     )  # fmt: skip
 

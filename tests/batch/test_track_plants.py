@@ -5,14 +5,19 @@ from __future__ import annotations
 import csv
 import json
 import re
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.tracking import true_ids
+from mvseg import demo_scene
 from mvseg.batch.track_plants import list_plants, track_plants
 from mvseg.cli import main
 from mvseg.errors import InputError
+from mvseg.formats.label_png import read_labels, write_label_png
+from mvseg.tracking.dates import read_date
 from tests.plants_over_days import grow_blades, grown, write_result
 
 BLADES = grow_blades(7, 4)
@@ -95,6 +100,32 @@ def test_plants_are_tracked_on_a_dask_cluster(tmp_path: Path) -> None:
         arguments = ["track", str(batch), "--out", str(tmp_path / "out"), "--quiet", "--report", "false"]
         assert main([*arguments, "--scheduler", cluster.scheduler_address]) == 0
     assert {row["plant"] for row in read(tmp_path / "out" / "tracks.csv")} == {"a", "b"}
+
+
+@pytest.mark.slow
+def test_the_two_dates_that_ship(tmp_path: Path) -> None:
+    """The quick start, with half of the leaves: another pot, other cameras, one leaf gone, one new."""
+    dates = []
+    for name, place in (("day-0", demo_scene()), ("day-6", demo_scene().with_name("demo_plant_later"))):
+        shutil.copytree(place, tmp_path / name)
+        for path in (tmp_path / name / "truth").glob("*.png"):
+            labels = read_labels(path)
+            write_label_png(
+                tmp_path / name / "masks" / path.name,
+                np.where((labels % 2 == 1) | (labels == 2), labels, 0).astype(np.uint16),
+            )
+        out = str(tmp_path / "results" / name)
+        assert main(["infer", str(tmp_path / name), "--masks", "masks", "--out", out, "--report", "false"]) == 0
+        dates.append(out)
+    assert main(["track", *dates, "--times", "0", "6", "--out", str(tmp_path / "tracks"), "--quiet"]) == 0
+    truths = {
+        Path(date).name: true_ids(read_date(Path(date), 0), tmp_path / Path(date).name / "truth") for date in dates
+    }
+    tracks: dict[str, list[int]] = {}
+    for row in read(tmp_path / "tracks" / "tracks.csv"):
+        if row["leaf"]:
+            tracks.setdefault(row["track"], []).append(truths[row["scene"]][int(row["leaf"]) - 1])
+    assert sorted(tracks.values()) == [[1, 1], [2], [3, 3], [5, 5], [7, 7], [9, 9], [11, 11], [13]]
 
 
 @pytest.mark.parametrize(

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from benchmarks.tracking import see_series
+from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import align
 from mvseg.tracking.costs import leaves_of
 from tests.plants_over_days import grow_blades, grown, see
@@ -55,3 +57,23 @@ def test_a_plant_that_looks_the_same_from_two_sides_is_not_aligned() -> None:
     other = {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # the same, turned by half a turn
     first, second = leaves_of(see(half | other, 0)[0]), leaves_of(see(half | other, 1, turn=30)[0])
     assert align(first, second, days=1, knows_up=True).reason == "the pot could be turned in more than one way"
+
+
+@pytest.mark.parametrize("pair", [(0, 2), (1, 3)])
+def test_a_plant_is_not_aligned_with_its_own_older_leaves(pair: tuple[int, int]) -> None:
+    """A compound plant that doubles in days: its young leaves then look as the older ones did, a turn further."""
+    dates, truth = see_series(draw_specs(5, seed=3)[4])
+    (one, true), (other, later) = ((leaves_of(dates[n]), truth[n]) for n in pair)
+    days = dates[pair[1]].time - dates[pair[0]].time
+    alignment = align(one, other, days=days, knows_up=True)
+    right = [true[one.index[i]] == later[other.index[j]] for i, j in alignment.pairs]
+    assert not alignment.is_sure or np.mean(right) > 0.5
+
+
+def test_leaves_that_were_missed_before_do_no_harm() -> None:
+    plant = grow_blades(12, 3)
+    first, one = see({leaf: plant[leaf] for leaf in (2, 4, 5, 7, 9, 11)}, 0)
+    second, other = see(plant, 2, turn=75)
+    alignment = align(leaves_of(first), leaves_of(second), days=2, knows_up=True)
+    assert alignment.is_sure
+    assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]

@@ -25,7 +25,7 @@ def one_leaf(areas: list[float], times: list[float], *, sd: float = 0.02) -> Tra
 
     dates = tuple(on(time, area) for time, area in zip(times, areas, strict=True))
     rows = tuple(TrackRow(date=index, track=1, state="seen", leaf=1) for index in range(len(times)))
-    return Tracks("p", dates, rows, np.tile(np.eye(4), (len(times), 1, 1)), ())
+    return Tracks("p", dates, rows, np.tile(np.eye(4), (len(times), 1, 1)), (0,) * len(times), ())
 
 
 def test_slopes_and_their_deviations() -> None:

@@ -1,7 +1,8 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const find = (id) => document.getElementById(id);
-const WIDE = 190, HIGH = 210;
+const WIDE = Math.max(190, Math.min(420, Math.floor(1300 / data.dates.length))), HIGH = WIDE;
+const DOWN = 25 * Math.PI / 180; // how steeply the plants are looked at
 const tracks = Object.keys(data.colors).map(Number);
 let picked = 0;
 
@@ -14,10 +15,10 @@ function make(name, text, parent, kind) {
 }
 
 function project(shape, turn) {
-  const cos = Math.cos(turn), sin = Math.sin(turn), out = [];
+  const cos = Math.cos(turn), sin = Math.sin(turn), up = Math.cos(DOWN), near = Math.sin(DOWN), out = [];
   for (let at = 0; at < shape.length; at += 3) {
-    const [x, y, z] = shape.slice(at, at + 3);
-    out.push([WIDE / 2 + (x * cos - y * sin) * WIDE / 2400, HIGH / 2 - z * HIGH / 2400, x * sin + y * cos]);
+    const [x, y, z] = shape.slice(at, at + 3), back = x * sin + y * cos;
+    out.push([WIDE / 2 + (x * cos - y * sin) * WIDE / 2500, HIGH / 2 - (z * up + back * near) * HIGH / 2500, back * up - z * near]);
   }
   return out;
 }
@@ -102,19 +103,28 @@ function drawChart() {
   if (!values.length) { find("model").textContent = "not measured on any date"; return; }
   const low = Math.min(0, ...values), high = Math.max(...values, low + 1e-9), first = data.dates[0].time;
   const span = Math.max(data.dates.at(-1).time - first, 1e-9);
-  const x = (time) => 70 + (time - first) / span * 630, y = (value) => 300 - (value - low) / (high - low) * 280;
-  for (let tick = 0; tick <= 4; tick += 1) {
-    const value = low + (high - low) * tick / 4;
-    svg("line", { x1: 70, x2: 700, y1: y(value), y2: y(value), stroke: "#8884" });
-    svg("text", { x: 4, y: y(value) + 4 }, Number(value.toPrecision(3)));
+  const x = (time) => 70 + (time - first) / span * 610, y = (value) => 300 - (value - low) / (high - low) * 275;
+  const decade = 10 ** Math.floor(Math.log10((high - low) / 4));
+  const step = decade * [1, 2, 5, 10].find((factor) => factor * decade >= (high - low) / 6);
+  for (let tick = Math.ceil(low / step); tick * step <= high; tick += 1) {
+    svg("line", { x1: 70, x2: 680, y1: y(tick * step), y2: y(tick * step), stroke: "#8884" });
+    svg("text", { x: 62, y: y(tick * step) + 4, "text-anchor": "end" }, Number((tick * step).toPrecision(6)));
   }
-  data.dates.forEach((date) => svg("text", { x: x(date.time) - 12, y: 318 }, date.written));
-  svg("text", { x: 70, y: 12 }, `${trait.replaceAll("_", " ")} (${of.unit})`);
+  let free = -Infinity;
+  for (const date of data.dates) {
+    svg("line", { x1: x(date.time), x2: x(date.time), y1: 300, y2: 304, stroke: "#888" });
+    const half = 3.5 * date.written.length + 4;
+    if (x(date.time) - half < free) continue;
+    svg("text", { x: x(date.time), y: 318, "text-anchor": "middle" }, date.written);
+    free = x(date.time) + half;
+  }
+  const unit = of.unit.replace("^2", "\u00b2").replace("^3", "\u00b3");
+  svg("text", { x: 70, y: 12 }, trait.replaceAll("_", " ") + (unit ? ` (${unit})` : "") + " \u00b1 1 sd");
   for (const [track, points] of shown) {
     const at = points.map(([date, value, sd]) => [x(data.dates[date].time), y(value - sd), y(value + sd), y(value)]);
     const color = data.colors[track], curve = (data.curves[trait] || {})[track];
     const band = [...at.map((p) => `${p[0]},${p[1]}`), ...[...at].reverse().map((p) => `${p[0]},${p[2]}`)];
-    svg("polygon", { points: band.join(" "), fill: color, opacity: picked ? 0.25 : 0.08 });
+    svg("polygon", { points: band.join(" "), fill: color, opacity: picked ? 0.25 : 0.12 });
     const within = (point) => point[0] >= data.dates[points[0][0]].time && point[0] <= data.dates[points.at(-1)[0]].time;
     const line = curve ? curve.line.filter(within).map((p) => `${x(p[0])},${y(p[1])}`) : at.map((p) => `${p[0]},${p[3]}`);
     svg("polyline", { points: line.join(" "), fill: "none", stroke: color, "stroke-width": 2 });

@@ -1,0 +1,85 @@
+"""The page of a plant over days: small, and in a real browser what it says it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mvseg.tracking import page
+from mvseg.tracking.dates import PlantOnDate
+from mvseg.tracking.growth import measure_growth
+from mvseg.tracking.page import describe_tracks, write_page
+from mvseg.tracking.track import TrackRow, Tracks
+from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
+from tests.plants_over_days import grow_blades, grown, see
+
+
+def noisy_crops(date: PlantOnDate, track_of: Mapping[int, int]) -> dict[int, str]:
+    """Pictures that compress worst."""
+    rng = np.random.default_rng(int(date.time))
+    photo, mask = rng.integers(0, 256, (90, 90, 3), np.uint8), np.zeros((90, 90), bool)
+    mask[5:85, 5:85] = True
+    return {leaf: page._crop(photo, mask, (0, 255, 0)) for leaf in track_of}
+
+
+def many_dates(num_dates: int, num_leaves: int) -> Tracks:
+    seen = [see(grown(grow_blades(num_leaves, 1), 1 + 0.02 * day), day) for day in range(num_dates)]
+    rows = tuple(
+        TrackRow(date=day, track=leaf, state="seen", leaf=1 + truth.index(leaf), probability=0.99)
+        for day, (_, truth) in enumerate(seen)
+        for leaf in sorted(truth)
+    )
+    poses = np.tile(np.eye(4), (num_dates, 1, 1))
+    return Tracks("=<b>basil", tuple(date for date, _ in seen), rows, poses, (0,) * num_dates, ("a <warning>",))
+
+
+def test_forty_dates_stay_under_six_megabytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page, "_crops", noisy_crops)
+    tracks = many_dates(40, 17)
+    write_page(tmp_path, tracks, measure_growth(tracks))
+    size = (tmp_path / "tracks.html").stat().st_size
+    assert 1e6 < size < 6e6
+    assert "<b>basil" not in (tmp_path / "tracks.html").read_text(encoding="utf-8")
+
+
+def test_plants_are_shown_in_one_frame_where_they_are_aligned() -> None:
+    tracks = many_dates(3, 5)
+    moved = see(grow_blades(5, 1), 2, shift=(900, 0, 0))[0]  # not aligned: in a frame of its own
+    apart = Tracks("p", (*tracks.dates[:2], moved), tracks.rows, tracks.poses, (0, 0, 2), ())
+    shapes = [np.array(leaf["shape"]) for leaf in describe_tracks(apart, measure_growth(apart))["leaves"]]
+    assert max(np.abs(shape).max() for shape in shapes) <= 1000
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+def test_the_page_in_a_browser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(page, "_crops", noisy_crops)
+    tracks = many_dates(6, 4)
+    write_page(tmp_path, tracks, measure_growth(tracks))
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)
+        opened = Opened(browser, tmp_path / "tracks.html", (1300, 900), has_space=False)
+        shown = opened.page
+        assert shown.locator("#plant").inner_text() == "=<b>basil"
+        assert shown.locator("#warnings li").inner_text() == "a <warning>"
+        assert shown.locator("#dates canvas").count() == 6
+        assert shown.locator("#chart polyline").count() == 4
+        before = shown.evaluate("document.querySelector('canvas').toDataURL()")
+        for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
+            shown.keyboard.press(key)
+        assert shown.locator("#leaf").inner_text() == "Leaf 2"
+        assert shown.locator("#crops img").count() == 6
+        assert shown.locator("#chart polygon").count() == 1  # its band
+        assert shown.locator("#model").inner_text().startswith("curve: ")
+        assert shown.evaluate("document.querySelector('canvas').toDataURL()") != before
+        shown.keyboard.press("Escape")
+        assert shown.locator("#leaf").inner_text() == "All leaves"
+        data = json.loads(shown.locator("#data").text_content() or "")
+        leaf = data["leaves"][0]
+        shown.locator("tbody tr").nth(leaf["track"] - 1).click()
+        assert shown.locator("#leaf").inner_text() == f"Leaf {leaf['track']}"
+        opened.close()  # offline, and without a complaint
+        browser.close()
