@@ -1,4 +1,5 @@
-"""A result that a person corrects: what a run found is kept in memory, and each change runs only what it touches."""
+"""A result that a person corrects: the outcome of a run is kept in memory, and each edit reruns only what it
+affects."""
 
 from __future__ import annotations
 
@@ -95,7 +96,7 @@ class OpenResult:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
         and the other warnings on the way.
 
-        A surface is fitted anew only where its instance's masks are others than in all results before. (A run from
+        A surface is fitted anew only if its instance's masks differ from those in all results before. (A run from
         the command line fits all of them: each surface also depends a little on the masks that may hide it.)
 
         Args:
@@ -158,7 +159,7 @@ def name_masks(masks: Masks, instance: int) -> str:
 
 @contextmanager
 def open_alone(folder: Path) -> Iterator[None]:
-    """Keep a second process from correcting the same result; the system lets go when this one ends, however it does.
+    """Keep a second process from correcting the same result; the lock ends with this process, however it ends.
 
     Raises:
         InputError: another one has it open.

@@ -1,7 +1,7 @@
 """The page "Correct" of one result at 127.0.0.1: saves each edit at once, and shows the consequences.
 
-Only this machine reaches it, and only who knows the token in its address: requests that name another host or come from
-another page's origin are refused, which keeps out other users' browsers and pages that rebind their name.
+It can be reached from this machine only, and only with the token in its address: requests that name another host or
+come from another page's origin are refused, which keeps out other users' browsers and pages that rebind their name.
 """
 
 from __future__ import annotations

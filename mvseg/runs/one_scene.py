@@ -104,7 +104,8 @@ def save_scene(
     messages: Sequence[str],
     progress: bool,
 ) -> None:
-    """Write the result folder, run.json included; with the report, what the checks of the scene and its masks say."""
+    """Write the result folder, run.json included; with the report, the findings of the checks of the scene and its
+    masks."""
     from mvseg.checks.check_scene import check_scene
     from mvseg.results.folder import save_result
     from mvseg.results.provenance import describe_run

@@ -1,4 +1,4 @@
-"""The scene folder that photos become: what it may replace, and `pose.json`, which lists what mvseg wrote."""
+"""The scene folder that `mvseg pose` writes: what it may replace, and `pose.json`, which lists the files of mvseg."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ POSE_FILE = "pose.json"
 
 
 def check_folders(photos: Path, out: Path) -> tuple[Path, list[str]]:
-    """The folder of the photos and their names, as from `list_photos`, once nothing forbids to write `out`.
+    """The folder of the photos and their names, as from `list_photos`, after checking that `out` may be written.
 
     Raises:
-        InputError: no photos, photos inside of `out`, or something else there than an earlier scene of this kind.
+        InputError: no photos, photos inside `out`, or `out` holds something other than an earlier scene of this kind.
     """
     sweep_abandoned(out)
     check_out(out, POSE_FILE)
@@ -46,7 +46,7 @@ def new_scene_folder(out: Path) -> Iterator[Path]:
 
 
 def write_pose_file(folder: Path, out: Path, run: Mapping[str, Any]) -> None:
-    """Write pose.json into the new folder, last of mvseg's files, and take over the user's files from `out`."""
+    """Write pose.json into the new folder, last of mvseg's files, and copy the user's files from `out`."""
     content = {**made_by(), **run, "files": list_files(folder, POSE_FILE)}
     (folder / POSE_FILE).write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
     keep_user_files(out, folder, POSE_FILE)

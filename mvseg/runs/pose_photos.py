@@ -48,18 +48,18 @@ def pose_photos(
         out: the scene folder: images/ (upright copies), cameras.json, sparse/0 and pose.json.
         config: how cameras are estimated.
         known: where scale and axes come from.
-        up: the direction of up in the known world, or what shows it.
+        up: the direction of up in the known world, or how to find it.
         quiet: no progress bars and no line at the end.
 
     Raises:
         InputError: a photo is broken, too few photos register, what is known does not fit them, or `out` holds
-            something else than an earlier scene of this kind.
+            something other than an earlier scene of this kind.
     """
     source, names = check_folders(photos, out)
     file = config.calibration
     calibration = None if file is None else read_calibration(file.parent, file.name)
     if known.positions is not None:
-        read_positions(known.positions)  # a mistake in it must not cost the minutes that follow
+        read_positions(known.positions)  # to find mistakes in it before the minutes that follow
     start = time.perf_counter()
     with warnings.catch_warnings(record=True) as caught, new_scene_folder(out) as folder:
         warnings.simplefilter("always", InputWarning)
@@ -85,7 +85,7 @@ def pose_photos(
 
 
 def warn_of_upside_down(scene: Scene) -> None:
-    """Say (InputWarning) that the cameras hang upside down, which left-handed positions in one plane make of them."""
+    """Warn (InputWarning) if the cameras hang upside down, as a result of left-handed positions in one plane."""
     if scene.up is None:
         return
     own = -(scene.cameras.R[:, 1] @ torch.tensor(scene.up, dtype=torch.float64)).mean().item()

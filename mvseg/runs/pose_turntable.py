@@ -26,7 +26,7 @@ from mvseg.runs.pose_folder import check_folders, new_scene_folder, write_pose_f
 from mvseg.scene import Scene
 
 TURNTABLE_FILE = "turntable.json"
-ONLY_CAMERA = "camera"  # name of a camera whose photos lie in no folder of their own
+ONLY_CAMERA = "camera"  # name of a camera without a folder for its photos
 
 Angles = Path | float | None
 
