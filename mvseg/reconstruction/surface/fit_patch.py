@@ -12,10 +12,10 @@ from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
-FIT_GRID = (36, 9)
-NUM_STEPS, NUM_WARM_STEPS = 18, 7
-NUM_IMAGED = 8  # last steps, in which patches are drawn as the masks are
-FAR_REACH, NEAR_REACH, REACH_STEPS = 14.0, 6.0, 10  # pixels; the reach shrinks over so many steps
+FIT_GRID, FAR_GRID = (36, 9), (20, 5)  # rows and columns, of the second while the patch is far from its place
+FAR_STEPS, NUM_STEPS = range(10), 7  # from a rough start, and from one that is nearly right
+FAR_REACH, NEAR_REACH = 14.0, 6.0  # pixels
+FAR_STEP, NEAR_STEP = (0.05, 0.25), (0.005, 0.12)  # damping, and half-widths that no point moves farther than
 SAMPLE_WEIGHT = 0.35  # neighbouring samples are alike
 FAR_SCALE_PX, LEAST_SCALE_PX = 4.0, 0.7  # of the Cauchy weights, at first and in the end
 SCALE_FACTOR = 4.0  # or so many median distances, where masks contradict each other by more
@@ -53,59 +53,71 @@ class PatchFit:
         return float(np.nanmedian(self.residual_px)) if np.isfinite(self.residual_px).any() else float("nan")
 
 
-def fit_patch(
-    masks: MaskStack,
-    start: Floats,
-    *,
-    num_steps: int,
-    errors: MaskErrors | None = None,
-) -> PatchFit:
-    """Move a patch until its outlines are those of the masks: reweighted Gauss-Newton.
+def approach_patch(masks: MaskStack, start: Floats, *, steps: range = FAR_STEPS) -> Floats:
+    """A rough patch (26, 3), moved until its outlines are near those of the masks.
 
-    Works in a world moved and scaled to the start, so nothing depends on the scene's origin and unit.
+    Args:
+        steps: a part of FAR_STEPS; other parts may follow, from where this one ends.
+    """
+    moved, coefficients = _to_unit_world(masks, start)
+    for step in steps:
+        share = step / len(FAR_STEPS)
+        reach = FAR_REACH + (NEAR_REACH - FAR_REACH) * share
+        distances = outline_distances(moved, patch_grid(*FAR_GRID), coefficients, reach=reach, is_imaged=False)
+        offsets = np.zeros(len(masks))
+        if step >= OFFSET_FROM:
+            offsets = _believe(per_view(distances.px, distances.stack, len(masks)), None)
+        equations = _weigh(distances, offsets, scale_px=FAR_SCALE_PX + (LEAST_SCALE_PX - FAR_SCALE_PX) * share)
+        coefficients = _step(coefficients, equations, FAR_STEP)
+    return _from_unit_world(coefficients, start)
+
+
+def fit_patch(
+    masks: MaskStack, start: Floats, *, num_steps: int = NUM_STEPS, errors: MaskErrors | None = None
+) -> PatchFit:
+    """Move a patch that is nearly right until its outlines, drawn as the masks are, are theirs.
 
     Args:
         masks: of the leaf.
         start: (26, 3) coefficients.
-        num_steps: up to NUM_WARM_STEPS: from a start that is nearly right.
+        num_steps: 0 leaves the patch where it is.
         errors: how the masks of this segmenter err; None: they are right on average over the views.
     """
-    centre, scale = start[MIDRIB].mean(0), measure_patch(start).length
-    moved = masks.move_world(centre, scale)
-    coefficients = start.copy()
-    coefficients[MIDRIB] -= centre
-    coefficients /= scale
-    grid = patch_grid(*FIT_GRID)
-    is_warm = num_steps <= NUM_WARM_STEPS
-    offsets = np.zeros(len(masks))
-    for step in range(num_steps):
-        progress = 1.0 if is_warm else min(1.0, step / REACH_STEPS)
-        reach = masks.enlargement * (FAR_REACH + (NEAR_REACH - FAR_REACH) * progress)
-        is_near = is_warm or step >= NUM_STEPS - NUM_IMAGED
-        drawn = offsets if is_near and errors else np.zeros(len(masks))
-        distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=is_near, offsets=drawn)
-        if is_warm or step >= OFFSET_FROM:
-            offsets = _believe(drawn + _per_view(distances.px, distances.stack, len(masks)), errors)
-        scale_px = FAR_SCALE_PX + (LEAST_SCALE_PX - FAR_SCALE_PX) * progress
-        equations = _weigh(distances, offsets - drawn, scale_px=scale_px)
-        is_late = is_warm or step >= NUM_STEPS // 2
-        matrix, right = _normal_matrix(coefficients, equations)
-        damping, cap = (0.005, 0.12) if is_late else (0.05, 0.25)
-        coefficients = _step(coefficients, matrix, right, damping=damping, cap=cap)
-    drawn = offsets if errors else np.zeros(len(masks))
-    reach = NEAR_REACH * masks.enlargement
-    distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=True, offsets=drawn)
-    measured = drawn + _per_view(distances.px, distances.stack, len(masks))
-    equations = _weigh(distances, _believe(measured, errors) - drawn, scale_px=LEAST_SCALE_PX)
-    covariance = _covariance(coefficients, equations, distances.stack, centre_sd=_centre_sd(measured, errors))
-    coefficients = coefficients * scale
-    coefficients[MIDRIB] += centre
+    moved, coefficients = _to_unit_world(masks, start)
+    drawn, offsets = np.zeros(len(masks)), np.zeros(len(masks))
+    for step in range(num_steps + 1):
+        drawn = offsets if errors else drawn
+        distances = outline_distances(
+            moved, patch_grid(*FIT_GRID), coefficients, reach=NEAR_REACH, is_imaged=True, offsets=drawn
+        )
+        measured = drawn + per_view(distances.px, distances.stack, len(masks))
+        offsets = _believe(measured, errors)
+        equations = _weigh(distances, offsets - drawn, scale_px=LEAST_SCALE_PX)
+        if step < num_steps:
+            coefficients = _step(coefficients, equations, NEAR_STEP)
+    scale = measure_patch(start).length
+    centre_sd = _centre_sd(measured, errors)
     return PatchFit(
-        coefficients=coefficients,
-        covariance=covariance * scale**2,
+        coefficients=_from_unit_world(coefficients, start),
+        covariance=_covariance(coefficients, equations, distances.stack, centre_sd=centre_sd) * scale**2,
         residual_px=_rms_per_view(distances, equations, len(masks)),
         offsets_px=measured - _centre(measured, errors),
     )
+
+
+def _to_unit_world(masks: MaskStack, start: Floats) -> tuple[MaskStack, Floats]:
+    """Masks and coefficients in a world moved and scaled to a patch: nothing depends on the scene's origin and unit."""
+    centre, scale = start[MIDRIB].mean(0), measure_patch(start).length
+    coefficients = start.copy()
+    coefficients[MIDRIB] -= centre
+    return masks.move_world(centre, scale), coefficients / scale
+
+
+def _from_unit_world(coefficients: Floats, start: Floats) -> Floats:
+    """Coefficients in the world of the patch that the unit world was made for."""
+    coefficients = coefficients * measure_patch(start).length
+    coefficients[MIDRIB] += start[MIDRIB].mean(0)
+    return coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -189,15 +201,19 @@ def _centre_sd(measured: Floats, errors: MaskErrors | None) -> float:
 
 def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
     """(S,) 1, or less for views whose distances spread more than is usual in the others."""
-    spreads = np.nan_to_num(_per_view(np.abs(px), stack, num_views))
+    spreads = np.nan_to_num(per_view(np.abs(px), stack, num_views))
     usual = NOISY_VIEW * max(float(np.median(spreads)), 0.3)
     return np.minimum(1.0, (usual / np.maximum(spreads, 1e-9)) ** 2)
 
 
-def _per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
+def per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
     """(S,) medians; NaN for a view without samples."""
-    picks = [values[stack == index] for index in range(num_views)]
-    return np.array([np.median(pick) if len(pick) else np.nan for pick in picks])
+    ordered = np.append(values[np.lexsort((values, stack))], np.nan)
+    counts = np.bincount(stack, minlength=num_views)
+    first = np.cumsum(counts) - counts
+    low, high = (np.where(counts > 0, first + (counts + odd) // 2, len(values)) for odd in (-1, 0))
+    medians: Floats = (ordered[low] + ordered[high]) / 2
+    return medians
 
 
 def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats, Floats]:
@@ -208,8 +224,10 @@ def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats,
     return matrix, weighted.T @ equations.px + prior.T @ (target - prior @ coefficients.ravel())
 
 
-def _step(coefficients: Floats, matrix: Floats, right: Floats, *, damping: float, cap: float) -> Floats:
+def _step(coefficients: Floats, equations: _Equations, damping_and_cap: tuple[float, float]) -> Floats:
     """One damped Gauss-Newton step; no point of the patch moves by more than `cap` half-widths."""
+    damping, cap = damping_and_cap
+    matrix, right = _normal_matrix(coefficients, equations)
     matrix[np.diag_indices_from(matrix)] *= 1 + damping
     step = np.linalg.solve(matrix, right).reshape(-1, 3)
     longest = np.linalg.norm(patch_grid(*FIT_GRID).basis @ step, axis=1).max()
@@ -220,10 +238,7 @@ def _step(coefficients: Floats, matrix: Floats, right: Floats, *, damping: float
 
 def _rms_per_view(distances: Distances, equations: _Equations, num_views: int) -> Floats:
     """(S,) NaN for a view without samples."""
-    rms = np.full(num_views, np.nan)
-    for index in range(num_views):
-        here = distances.stack == index
-        if here.any():
-            weight = equations.weight[here]
-            rms[index] = np.sqrt((weight * distances.px[here] ** 2).sum() / weight.sum())
+    squares = np.bincount(distances.stack, equations.weight * distances.px**2, num_views)
+    with np.errstate(invalid="ignore"):
+        rms: Floats = np.sqrt(squares / np.bincount(distances.stack, equations.weight, num_views))
     return rms

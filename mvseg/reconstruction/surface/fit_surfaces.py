@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -15,28 +15,30 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.surface.fit_patch import FIT_GRID, NUM_STEPS, NUM_WARM_STEPS, PatchFit, fit_patch
+from mvseg.reconstruction.surface.fit_patch import FAR_GRID, FAR_STEPS, FIT_GRID, PatchFit, approach_patch, fit_patch
+from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
-from mvseg.reconstruction.surface.patch_image import hiding_pixels, project_points, view_ious
+from mvseg.reconstruction.surface.patch_image import cover_crops, crop_ious, hiding_pixels, project_points, view_ious
 from mvseg.reconstruction.surface.patch_start import start_patches
-from mvseg.reconstruction.voxels import VoxelGrid, back_project
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.worker_pool import spread
 
-HULL = ReconstructConfig(voxel_budget=25_000)
-HULL_BY_VOTE = ReconstructConfig(voxel_budget=25_000, seen_share=0.0)  # where faulty masks leave nothing of the first
-GOOD_IOU = 0.9  # of a fit after which no less likely start is tried
+NUM_FIRST_STEPS = 3  # of a fit that a second one follows
+GOOD_IOU = 0.85  # of a patch after which no less likely start is tried
 LEAST_GAIN = 0.03  # in IoU, for another start to be better
 AREA_COST = 0.1  # in IoU, of a surface e times as large: bulges can hide behind the outlines of a level leaf
 CLEAR_IOU = 0.75  # of a start that shows how the blade lies
-WIDE_COST = 0.1  # in IoU, of a start that is wider than long
-UNCLEAR, MOST_FITS = 0.05, 3  # starts that are worse by less than this are tried as well, and so many at most
+WIDE_COST = 0.1  # in IoU, of a patch that is wider than long
+UNCLEAR, MOST_STARTS = (
+    0.05,
+    3,
+)  # starts that are worse by less than this are as likely, and so many are tried of each hull
+HALF = 5  # steps, after which only the best of them go on
 WRONG_SHARE = 0.25  # of the median share of voxels in a mask: with less of them it is another leaf's
 MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
@@ -107,19 +109,15 @@ def fit_surfaces(
         start = starts.get(instance)
         unfitted[instance] = _Unfitted(
             masks=stacks[instance],
-            members=members,
             start=start.coefficients.numpy() if start is not None and start.exists else None,
-            good_iou=GOOD_IOU if len(kept) == len(views) else LEAST_IOU,
         )
-    asked = ((leaf, _pack_free(frames, leaf.members)) for leaf in unfitted.values())
-    answers = spread(partial(_fit_first, cameras), asked, workers)
+    answers = spread(_fit_first, unfitted.values(), workers)
     shown = tqdm(answers, "surfaces", len(unfitted), unit="instance", disable=not progress)
     for instance, (masks, fit) in zip(unfitted, shown, strict=True):
         stacks[instance] = masks
         if fit is None:
-            surfaces[instance] = LeafSurface.none(
-                unfitted[instance].members.view_index.unique(), "its masks agree on no point"
-            )
+            views = torch.from_numpy(unfitted[instance].masks.views)
+            surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
             fits[instance] = fit
     fits = {instance: fits[instance] for instance in stacks if instance in fits}
@@ -157,99 +155,87 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
 
 @dataclass(frozen=True, eq=False)
 class _Unfitted:
-    """An instance without a surface: its outlines, its masks, a start that is nearly right, and the IoU of a fit after
-    which no other start is tried."""
+    """An instance without a surface: its masks, a start that is nearly right, and the IoU of a fit after which no other
+    start is tried."""
 
     masks: MaskStack
-    members: Regions
     start: Floats | None
-    good_iou: float
 
 
-def _pack_free(frames: list[np.ndarray], members: Regions) -> dict[int, NDArray[np.uint8]]:
-    """Where the views of the members show no instance at all, eight pixels in a byte; row by row."""
-    return {view: np.packbits(frames[view] == 0, axis=1) for view in members.view_index.unique().tolist()}
-
-
-def _fit_first(
-    cameras: Cameras, asked: tuple[_Unfitted, Mapping[int, NDArray[np.uint8]]]
-) -> tuple[MaskStack, PatchFit | None]:
+def _fit_first(leaf: _Unfitted) -> tuple[MaskStack, PatchFit | None]:
     """The first fit of an instance, and the masks it is to."""
-    leaf, packed = asked
-    if leaf.start is not None:
-        return leaf.masks, fit_patch(leaf.masks, leaf.start, num_steps=NUM_WARM_STEPS)
-    widths = cameras.sizes[:, 0].tolist()
-    free = {
-        view: torch.from_numpy(np.unpackbits(bits, axis=1, count=widths[view])).bool() for view, bits in packed.items()
-    }
-    return _fit_from_hull(leaf.masks, leaf.members, cameras, free=free, good_iou=leaf.good_iou)
+    masks, start = leaf.masks, leaf.start
+    if start is None:
+        masks, start = _find_start(masks)
+    return masks, None if start is None else fit_patch(masks, start, num_steps=NUM_FIRST_STEPS)
 
 
-def _fit_from_hull(
-    masks: MaskStack, members: Regions, cameras: Cameras, *, free: Mapping[int, Tensor], good_iou: float
-) -> tuple[MaskStack, PatchFit | None]:
-    """The best of the fits from several starts, which are tried until one explains the masks; and the masks it is to.
+def _find_start(masks: MaskStack) -> tuple[MaskStack, Floats | None]:
+    """The best of several starts, which are moved to the masks until one explains them; and the masks that are right.
 
     The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
-    Very many views leave a hull that shows how the blade lies: there a lower IoU is good.
     """
-    best, best_score, is_good, is_checked = None, -np.inf, False, False
-    for config in (HULL, HULL_BY_VOTE):
-        hull = back_project(members, cameras, config=config, free=free)
-        if hull is None or not hull.occupied.any():
-            continue
-        if not is_checked:
-            is_checked, is_right = True, ~find_wrong_masks(masks, hull.points.numpy())
-            if not is_right.all():
-                masks = masks.select(is_right)
-                members = members.select(torch.isin(members.view_index, torch.from_numpy(masks.views)))
-                hull = back_project(members, cameras, config=HULL, free=free) or hull
-        starts, ranks = _likely_starts(masks, hull)
-        for start, rank in zip(starts, ranks, strict=True):
-            if is_good and rank < ranks[0] - UNCLEAR:
-                break
-            fit = fit_patch(masks, start, num_steps=NUM_STEPS)
-            iou = _median_iou(masks, fit.coefficients, offsets=np.nan_to_num(fit.offsets_px))
-            score = iou - AREA_COST * np.log(measure_sizes(fit.coefficients)[0])
+    hull = carve_hull(masks)
+    seen = hull.points[hull.is_seen] if hull.is_seen.any() else hull.points
+    if len(seen):
+        is_right = ~find_wrong_masks(masks, seen)
+        if not is_right.all():
+            masks = masks.select(is_right)
+            hull = carve_hull(masks)
+    best, best_score = None, -np.inf
+    for starts in _start_groups(masks, hull):
+        halfway = [approach_patch(masks, start, steps=FAR_STEPS[:HALF]) for start in starts]
+        scores = [_score(masks, patch) for patch in halfway]
+        for patch in (patch for patch, score in zip(halfway, scores, strict=True) if score > max(scores) - UNCLEAR):
+            moved = approach_patch(masks, patch, steps=FAR_STEPS[HALF:])
+            score = _score(masks, moved)
             if score > best_score + LEAST_GAIN:
-                best, best_score, is_good = fit, score, iou > good_iou
-        if is_good:
+                best, best_score = moved, score
+        if best is not None and _iou(masks, best) > GOOD_IOU:
             break
     return masks, best
 
 
-def _likely_starts(masks: MaskStack, hull: VoxelGrid) -> tuple[list[Floats], list[float]]:
-    """At most MOST_FITS starts from the voxels of the hull, the likeliest first, and how likely each is.
+def _score(masks: MaskStack, coefficients: Floats) -> float:
+    """How well a patch explains the masks, and how much like a leaf it is."""
+    return _rank(masks, coefficients) - AREA_COST * float(np.log(measure_sizes(coefficients)[0]))
 
-    They are told by how well they explain the masks as they are, before any fit.
+
+def _start_groups(masks: MaskStack, hull: Hull) -> Iterator[list[Floats]]:
+    """Starts to compare with each other, at most MOST_STARTS from each hull; later groups for where the earlier end badly.
+
+    How well a start explains the masks, before any fit, tells how likely it is.
     """
-    starts = start_in(hull)
-    ranks = [_rank(masks, start) for start in starts]
-    if ranks and max(ranks) < CLEAR_IOU:
-        starts = start_in(hull, is_clear=False)
+    for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
+        starts, others = start_in(replace(hull, voxels=hull.voxels[keep]))
         ranks = [_rank(masks, start) for start in starts]
-    order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_FITS]
-    return [starts[index] for index in order], [ranks[index] for index in order]
+        if ranks and max(ranks) < CLEAR_IOU:
+            starts += others
+            ranks += [_rank(masks, start) for start in others]
+        order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_STARTS]
+        likely = [index for index in order if ranks[index] > ranks[order[0]] - UNCLEAR]
+        yield from ([starts[index] for index in group] for group in (likely, order[len(likely) :]) if group)
 
 
-def start_in(hull: VoxelGrid, *, is_clear: bool = True) -> list[Floats]:
+def start_in(hull: Hull) -> tuple[list[Floats], list[Floats]]:
     """`start_patches` in whole numbers of voxels: many of these are equally far from each other, and in world units
     rounding, and with it the world's scale, would choose between them."""
-    corner = (hull.origin + 0.5 * hull.voxel_size).numpy()
-    starts = start_patches(hull.occupied.nonzero().double().numpy(), is_clear=is_clear)
-    starts = [hull.voxel_size * start for start in starts]
-    for start in starts:
-        start[MIDRIB] += corner
+    starts = start_patches(hull.voxels.astype(float))
+    for start in (*starts[0], *starts[1]):
+        start *= hull.size
+        start[MIDRIB] += hull.corner + 0.5 * hull.size
     return starts
 
 
-def _rank(masks: MaskStack, start: Floats) -> float:
-    size = measure_patch(start)
-    return _median_iou(masks, start) - (WIDE_COST if 2 * size.half_width > size.length else 0.0)
+def _rank(masks: MaskStack, coefficients: Floats) -> float:
+    size = measure_patch(coefficients)
+    return _iou(masks, coefficients) - (WIDE_COST if 2 * size.half_width > size.length else 0.0)
 
 
-def _median_iou(masks: MaskStack, coefficients: Floats, *, offsets: Floats | None = None) -> float:
-    return float(np.median(view_ious(masks, patch_grid(*FIT_GRID).points(coefficients), offsets=offsets)))
+def _iou(masks: MaskStack, coefficients: Floats) -> float:
+    """Median over the views, coarsely."""
+    covered = cover_crops(masks, project_points(masks.px_from_world, patch_grid(*FAR_GRID).points(coefficients))) > 0
+    return float(np.median(crop_ious(masks, covered)))
 
 
 def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
@@ -257,11 +243,8 @@ def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
 
     None where they are more than MOST_WRONG of all, or where fewer than three would be left.
     """
-    seen = project_points(masks.px_from_world, points[None]).px.reshape(-1, 2)
-    stack = np.repeat(np.arange(len(masks)), len(points))
-    inside = masks.look_up(masks.inside, stack, seen).reshape(len(masks), -1)
-    hidden = masks.look_up(masks.others, stack, seen).reshape(len(masks), -1) != 0
-    shares = inside.sum(1) / np.maximum((inside | ~hidden).sum(1), 1)
+    inside, free = look_at(masks, points)
+    shares = inside.sum(1) / np.maximum((inside | free).sum(1), 1)
     is_wrong = shares < WRONG_SHARE * np.median(shares)
     is_much = is_wrong.sum() > MOST_WRONG * len(masks) or (~is_wrong).sum() < 3
     return np.zeros(len(masks), bool) if is_much else is_wrong
@@ -290,10 +273,8 @@ def _fit_again(
     margin = BEHIND * measure_patch(fit.coefficients).length
     others = {other: grid for other, grid in points.items() if other != instance}
     hiding = hiding_pixels(masks, points[instance], others, margin=margin)
-    if errors or (hiding != masks.others).any():
-        masks = masks.with_others(hiding)
-        fit = fit_patch(masks, fit.coefficients, num_steps=NUM_WARM_STEPS, errors=errors)
-    return masks, fit
+    masks = masks.with_others(hiding)
+    return masks, fit_patch(masks, fit.coefficients, errors=errors)
 
 
 def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
@@ -305,7 +286,7 @@ def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
         coefficients=torch.from_numpy(fit.coefficients),
         covariance=torch.from_numpy(fit.covariance),
         views=torch.from_numpy(masks.views),
-        residual_px=torch.from_numpy(fit.residual_px),
+        residual_px=torch.from_numpy(fit.residual_px * masks.pixel_size),
         iou=torch.from_numpy(iou),
         is_oriented=False,
         quality=Quality(),

@@ -21,9 +21,7 @@ Ints = NDArray[np.int64]
 
 COUNTS = (7, 12, 4, 3)  # coefficients of m, Q, R, S; fewer for Q cannot follow lobes
 NUM_COEFFICIENTS = sum(COUNTS)
-MIDRIB, SIDE, FOLD, CURL = (
-    slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS))
-)
+MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
 
 # Standard deviations of the prior, in leaf lengths (SPEED, BEND) or half-widths.
 BEND_SD = 0.06  # third differences of m
@@ -139,49 +137,39 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
         A (E, 78) and b (E,): A @ coefficients.ravel() should be b with standard deviation 1.
     """
     length, half = size.length, size.half_width
-    equations: list[NDArray] = []
-    targets: list[NDArray] = []
-
-    def expect(rows: Floats, directions: Floats | None, sd: float, *, target: float = 0.0) -> None:
-        """Rows (E, 26) along directions (E, 3), or along all three axes."""
-        if directions is None:
-            equations.append(np.kron(rows, np.eye(3)) / sd)
-        else:
-            equations.append((rows[:, :, None] * directions[:, None, :]).reshape(len(rows), -1) / sd)
-        targets.append(np.broadcast_to(np.asarray(target) / sd, len(equations[-1])))
-
-    expect(_differences(MIDRIB, 3), None, BEND_SD * length)
-    expect(_differences(SIDE, 2), None, SIDE_SD * half)
-    frames = [_frames(coefficients, count) for count in COUNTS]
-    for part, place in ((1, SIDE), (2, FOLD), (3, CURL)):
-        along, _, _ = frames[part]
-        expect(_rows(place), along, SHEAR_SD * half / noise)
-    for part, place, sd in ((2, FOLD, FOLD_SD), (3, CURL, CURL_SD)):
-        _, across, normal = frames[part]
-        expect(_rows(place), across, SHEAR_SD * half / noise)
-        expect(_rows(place), normal, sd * half / noise)
-    expect(_differences(FOLD, 1), None, FOLD_STEP_SD * half / noise)
-    speed, tangents = _speed(coefficients)
-    expect(speed, tangents, SPEED_SD * length, target=length)
-    return np.concatenate(equations), np.concatenate(targets)
+    bend, side, fold = _difference_rows()
+    frames = [_frames(coefficients, count) for count in COUNTS[1:]]
+    tangents = _unit(_speed_rows() @ coefficients)
+    equations = [bend / (BEND_SD * length), side / (SIDE_SD * half), fold * (noise / (FOLD_STEP_SD * half))]
+    shear = noise / (SHEAR_SD * half)
+    rows = np.eye(NUM_COEFFICIENTS)
+    for place, (along, across, normal), sd in zip((SIDE, FOLD, CURL), frames, (None, FOLD_SD, CURL_SD), strict=True):
+        equations.append(_along(rows[place], along) * shear)
+        if sd is not None:
+            equations += [_along(rows[place], across) * shear, _along(rows[place], normal) * (noise / (sd * half))]
+    equations.append(_along(_speed_rows(), tangents) / (SPEED_SD * length))
+    target = np.zeros(sum(map(len, equations)))
+    target[-len(tangents) :] = 1 / SPEED_SD
+    return np.concatenate(equations), target
 
 
-def _rows(part: slice) -> Floats:
-    return np.eye(NUM_COEFFICIENTS)[part]
+def _along(rows: Floats, directions: Floats) -> Floats:
+    """(E, 78) rows (E, 26) along directions (E, 3)."""
+    return (rows[:, :, None] * directions[:, None, :]).reshape(len(rows), -1)
 
 
-def _differences(part: slice, order: int) -> Floats:
-    return np.diff(np.eye(NUM_COEFFICIENTS)[part], order, axis=0)
-
-
-def _speed(coefficients: Floats) -> tuple[Floats, Floats]:
-    """(10, 26) rows that give dm/du on ten pieces of the midrib, and the present directions (10, 3) of these."""
-    rows = _speed_rows()
-    return rows, _unit(rows @ coefficients)
+@cache
+def _difference_rows() -> tuple[Floats, Floats, Floats]:
+    """(E, 78) third differences of m, second ones of Q and first ones of R, along all three axes."""
+    rows = np.eye(NUM_COEFFICIENTS)
+    parts = ((MIDRIB, 3), (SIDE, 2), (FOLD, 1))
+    bend, side, fold = (np.kron(np.diff(rows[place], order, axis=0), np.eye(3)) for place, order in parts)
+    return bend, side, fold
 
 
 @cache
 def _speed_rows() -> Floats:
+    """(10, 26) rows that give dm/du on ten pieces of the midrib."""
     u = np.linspace(0, 1, 11)
     return np.diff(patch_basis(u, np.zeros_like(u)), axis=0) / 0.1
 

@@ -1,4 +1,8 @@
-"""The masks of one leaf, ready for its fit: blurred, with samples of their edges, and with what may hide the leaf."""
+"""The masks of one leaf, ready for its fit: blurred, with samples of their edges, and with what may hide the leaf.
+
+Large masks are made smaller first: outlines need no more than LARGE_PX pixels across a leaf, and photos of any
+size cost the same. Positions are in pixels of these crops, each from its own top-left corner.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,9 @@ from skimage.measure import find_contours
 from mvseg.reconstruction.surface.leaf_patch import Floats
 
 BLUR_PX = 0.8  # of the masks: makes their edges smooth functions of the position
-MARGIN = 24  # pixels around a mask that are kept; around a large one more
-LARGE_PX = 60.0  # side of a square mask from which distances grow with the masks
+MARGIN = 24  # pixels around a mask that are kept
+LARGE_PX = 60.0  # side of a square mask; those of half as much again are made smaller
+LONG_PX = 400  # of the longest side of a mask
 EDGE_SAMPLES = 40  # of each mask's edge
 FRAME = -1  # label of what lies outside the image
 Labels = NDArray[np.int32]
@@ -22,17 +27,15 @@ Labels = NDArray[np.int32]
 
 @dataclass(frozen=True, eq=False)
 class MaskStack:
-    """The masks of one leaf in its S views, as crops that stand one after another in flat arrays.
+    """The masks of one leaf in its S views, as crops (S, H, W) of one size.
 
     Attributes:
         views: (S,) view indices.
-        px_from_world: (S, 3, 4).
-        corners: (S, 2) x, y of the top-left pixel of each crop.
-        shapes: (S, 2) rows and columns of each crop.
-        starts: (S,) where each crop begins in the flat arrays.
-        blurred: (pixels,) float32, the mask, blurred; 0.5 is its edge.
-        inside: (pixels,) bool, the mask.
-        others: (pixels,) int32, instance that hides the leaf there, 0 for none, FRAME outside the image.
+        px_from_world: (S, 3, 4) to pixels of the crops.
+        pixel_size: side of a pixel of a crop, in pixels of the photo.
+        blurred: (S, H, W) float32, the mask, blurred; 0.5 is its edge.
+        inside: (S, H, W) bool, the mask.
+        others: (S, H, W) int32, instance that hides the leaf there, 0 for none, FRAME outside the image.
         edge_px: (E, 2) samples of the edges of the masks.
         edge_normals: (E, 2), outwards.
         edge_stack: (E,) place in `views` of each.
@@ -40,9 +43,7 @@ class MaskStack:
 
     views: NDArray[np.int64]
     px_from_world: Floats
-    corners: Floats
-    shapes: NDArray[np.int64]
-    starts: NDArray[np.int64]
+    pixel_size: int
     blurred: NDArray[np.float32]
     inside: NDArray[np.bool_]
     others: Labels
@@ -54,59 +55,46 @@ class MaskStack:
         return len(self.views)
 
     @property
-    def enlargement(self) -> float:
-        """By how much the masks are larger than small ones, at least 1: first errors in pixels grow with it."""
-        return mask_enlargement(np.add.reduceat(self.inside, self.starts))
-
-    def crop(self, values: NDArray, index: int) -> NDArray:
-        """(rows, columns) view into one of the flat arrays."""
-        rows, columns = self.shapes[index]
-        return values[self.starts[index] : self.starts[index] + rows * columns].reshape(rows, columns)
+    def size(self) -> tuple[int, int]:
+        """Rows and columns of a crop."""
+        return self.inside.shape[1], self.inside.shape[2]
 
     def look_up(self, values: NDArray, stack: NDArray, px: Floats) -> NDArray:
-        """Values of the pixels that the positions (P, 2) lie in; positions outside a crop get its border pixel."""
-        local = np.floor(px - self.corners[stack]).astype(np.int64)
-        rows, columns = self.shapes[stack].T
-        column, row = np.clip(local[:, 0], 0, columns - 1), np.clip(local[:, 1], 0, rows - 1)
-        return values[self.starts[stack] + row * columns + column]
+        """Values (S, H, W) of the pixels that the positions (P, 2) lie in; outside of a crop those of its border."""
+        rows, columns = self.size
+        column, row = np.floor(np.clip(px, 0, (columns - 1, rows - 1))).astype(np.int64).T
+        return values[stack, row, column]
 
     def interpolate(self, values: NDArray[np.float32], stack: NDArray, px: Floats) -> NDArray[np.float32]:
-        """(P, T) of one of the flat arrays at positions (P, T, 2), bilinear between pixel centres."""
-        local = (px - self.corners[stack][:, None] - 0.5).astype(np.float32)
-        rows, columns = (self.shapes[stack][:, None, axis] for axis in (0, 1))
-        x = np.clip(local[..., 0], 0, columns - 1.001)
-        y = np.clip(local[..., 1], 0, rows - 1.001)
+        """(P, T) of values (S, H, W) at positions (P, T, 2), bilinear between pixel centres."""
+        rows, columns = self.size
+        x = np.clip(px[..., 0] - 0.5, 0, columns - 1.001).astype(np.float32)
+        y = np.clip(px[..., 1] - 0.5, 0, rows - 1.001).astype(np.float32)
         column, row = x.astype(np.int64), y.astype(np.int64)
         x, y = x - column, y - row
-        first = self.starts[stack][:, None] + row * columns + column
-        below = first + columns
-        top = values[first] * (1 - x) + values[first + 1] * x
-        bottom = values[below] * (1 - x) + values[below + 1] * x
+        flat = values.ravel()
+        first = (stack[:, None] * rows + row) * columns + column
+        top = flat.take(first) * (1 - x) + flat.take(first + 1) * x
+        bottom = flat.take(first + columns) * (1 - x) + flat.take(first + columns + 1) * x
         return top * (1 - y) + bottom * y
 
     def select(self, keep: NDArray[np.bool_]) -> MaskStack:
         """Only the views (S,) that are to be kept."""
-        pick = np.flatnonzero(keep)
-        sizes = self.shapes.prod(1)
-        pixels = np.repeat(keep, sizes)
         edges = keep[self.edge_stack]
-        place = np.cumsum(keep) - 1
         return MaskStack(
-            views=self.views[pick],
-            px_from_world=self.px_from_world[pick],
-            corners=self.corners[pick],
-            shapes=self.shapes[pick],
-            starts=np.cumsum(sizes[pick]) - sizes[pick],
-            blurred=self.blurred[pixels],
-            inside=self.inside[pixels],
-            others=self.others[pixels],
+            views=self.views[keep],
+            px_from_world=self.px_from_world[keep],
+            pixel_size=self.pixel_size,
+            blurred=self.blurred[keep],
+            inside=self.inside[keep],
+            others=self.others[keep],
             edge_px=self.edge_px[edges],
             edge_normals=self.edge_normals[edges],
-            edge_stack=place[self.edge_stack[edges]],
+            edge_stack=(np.cumsum(keep) - 1)[self.edge_stack[edges]],
         )
 
     def with_others(self, others: Labels) -> MaskStack:
-        """The same masks, with what hides the leaf as (pixels,) int32."""
+        """The same masks, with what hides the leaf as (S, H, W) int32."""
         return replace(self, others=others)
 
     def move_world(self, centre: Floats, scale: float) -> MaskStack:
@@ -136,53 +124,53 @@ def stack_masks(
         own: the id of the leaf itself, which hides nothing, in `others`.
     """
     mask_corners = [(0, 0)] * len(masks) if mask_corners is None else mask_corners
-    margin = round(MARGIN * mask_enlargement(np.array([mask.sum() for mask in masks])))
-    corners, shapes, blurs, insides, hiding, edges = [], [], [], [], [], []
-    for mask, (left, top), other in zip(masks, mask_corners, others, strict=True):
-        rows, columns = np.flatnonzero(mask.any(1)), np.flatnonzero(mask.any(0))
-        crop = np.pad(mask[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1], margin)
-        x1, y1 = left + int(columns[0]) - margin, top + int(rows[0]) - margin
-        around = _cut(other, (x1, y1), (crop.shape[1], crop.shape[0]))
-        around[around == own] = 0
-        blurred = cv2.GaussianBlur(crop.astype(np.float32), (0, 0), BLUR_PX)
-        corner = np.array([x1, y1], float)
-        corners.append(corner)
-        shapes.append(crop.shape)
-        blurs.append(blurred.ravel())
-        insides.append(crop.ravel())
-        hiding.append(np.where(crop, 0, around).ravel())
-        edges.append(_edge_samples(blurred, corner))
-    sizes = np.array([len(blur) for blur in blurs])
+    places = [(np.flatnonzero(mask.any(0))[[0, -1]], np.flatnonzero(mask.any(1))[[0, -1]]) for mask in masks]
+    sides = np.array([(rows[1] - rows[0] + 1, columns[1] - columns[0] + 1) for columns, rows in places])
+    scale = choose_pixel_size([int(mask.sum()) for mask in masks], int(sides.max()))
+    rows, columns = (-(-side // scale) + 2 * MARGIN for side in sides.max(0).tolist())
+    shape = (len(masks), rows, columns)
+    blurred, inside, hiding = np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros(shape, np.int32)
+    px_from_world = np.array(px_from_world, dtype=float)
+    for index, (mask, (left, top), (across, down)) in enumerate(zip(masks, mask_corners, places, strict=True)):
+        x, y = int(across[0]) - scale * MARGIN, int(down[0]) - scale * MARGIN
+        around = _cut(others[index], (x + left, y + top), (columns * scale, rows * scale), beyond=FRAME)
+        around = around[scale // 2 :: scale, scale // 2 :: scale]
+        own_part = _cut(mask, (x, y), (columns * scale, rows * scale), beyond=0).astype(np.float32)
+        share = cv2.resize(own_part, (columns, rows), interpolation=cv2.INTER_AREA)
+        cv2.GaussianBlur(share, (0, 0), BLUR_PX, dst=blurred[index])
+        inside[index] = share >= 0.5
+        hiding[index] = np.where(inside[index] | (around == own), 0, around)
+        matrix = px_from_world[index]
+        matrix[:2] = (matrix[:2] - np.array([[x + left], [y + top]]) * matrix[2]) / scale
+    edges = [_edge_samples(image) for image in blurred]
     return MaskStack(
         views=np.asarray(views, dtype=np.int64),
-        px_from_world=np.asarray(px_from_world, dtype=float),
-        corners=np.stack(corners),
-        shapes=np.array(shapes, dtype=np.int64),
-        starts=np.cumsum(sizes) - sizes,
-        blurred=np.concatenate(blurs),
-        inside=np.concatenate(insides),
-        others=np.concatenate(hiding).astype(np.int32),
+        px_from_world=px_from_world,
+        pixel_size=scale,
+        blurred=blurred,
+        inside=inside,
+        others=hiding,
         edge_px=np.concatenate([px for px, _ in edges]),
         edge_normals=np.concatenate([normals for _, normals in edges]),
         edge_stack=np.repeat(np.arange(len(edges)), [len(px) for px, _ in edges]),
     )
 
 
-def mask_enlargement(num_pixels: NDArray) -> float:
-    """At least 1; of masks of (S,) pixels."""
-    return max(1.0, float(np.sqrt(np.median(num_pixels))) / LARGE_PX)
+def choose_pixel_size(num_pixels: Sequence[int], longest: int) -> int:
+    """At least 1, for masks of (S,) pixels the longest side of which is `longest`."""
+    return max(1, round(float(np.sqrt(np.median(num_pixels))) / LARGE_PX), -(-longest // LONG_PX))
 
 
-def _cut(frame: Labels, corner: tuple[int, int], size: tuple[int, int]) -> Labels:
-    """(rows, columns) of a frame from a corner on; FRAME outside of it."""
-    crop = np.full((size[1], size[0]), FRAME, np.int32)
+def _cut(frame: NDArray, corner: tuple[int, int], size: tuple[int, int], *, beyond: int) -> NDArray:
+    """(rows, columns) of a frame from a corner on; `beyond` outside of it."""
+    crop = np.full((size[1], size[0]), beyond, frame.dtype)
     x1, y1 = max(corner[0], 0), max(corner[1], 0)
     x2, y2 = min(corner[0] + size[0], frame.shape[1]), min(corner[1] + size[1], frame.shape[0])
     crop[y1 - corner[1] : y2 - corner[1], x1 - corner[0] : x2 - corner[0]] = frame[y1:y2, x1:x2]
     return crop
 
 
-def _edge_samples(blurred: NDArray, corner: Floats) -> tuple[Floats, Floats]:
+def _edge_samples(blurred: NDArray) -> tuple[Floats, Floats]:
     """Positions and outward normals (E, 2) along the level 0.5, evenly spread over its longer pieces."""
     lines = [line for line in find_contours(blurred, 0.5) if len(line) >= 12]
     total = sum(len(line) for line in lines)
@@ -196,5 +184,5 @@ def _edge_samples(blurred: NDArray, corner: Floats) -> tuple[Floats, Floats]:
         ahead, back = (blurred[tuple(np.round(line[pick] + side * across).astype(int).T)] for side in (1, -1))
         across = across if ahead.sum() < back.sum() else -across
         normals.append(across[:, ::-1])
-        px.append(line[pick][:, ::-1] + 0.5 + corner)
+        px.append(line[pick][:, ::-1] + 0.5)
     return np.concatenate(px), np.concatenate(normals)

@@ -19,8 +19,9 @@ from mvseg.reconstruction.surface.patch_image import (
     DRAWN_TOO_FAR,
     SUPERSAMPLED,
     Projection,
-    cover_crop,
+    cover_crops,
     draw_patch,
+    grid_orientations,
     project_points,
 )
 
@@ -65,11 +66,11 @@ def outline_samples(
 ) -> tuple[OutlineSamples, NDArray[np.uint8]]:
     """The visible outline of a patch in every view: its rim, and the folds that stand out against the background.
 
-    Also (pixels,) uint8, 1 where the patch covers a pixel, as a flat array of `masks`.
+    Also (S, H, W) uint8, above 0 where the patch covers a pixel of `masks`.
     """
     samples = _concatenate(_rim_samples(grid, projection), _fold_samples(grid, projection))
     outside = samples.px + OUTSIDE_PX * samples.normals
-    covered = np.concatenate([cover_crop(masks, projection, index).ravel() for index in range(len(masks))])
+    covered = cover_crops(masks, projection)
     return samples.select(masks.look_up(covered, samples.stack, outside) == 0), covered
 
 
@@ -108,8 +109,7 @@ def _rim_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
 def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     """Middles of the grid edges between quads that are seen from different sides."""
     px = projection.px
-    first, second = px[:, 1:, 1:] - px[:, :-1, :-1], px[:, 1:, :-1] - px[:, :-1, 1:]
-    is_front = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0] > 0
+    is_front = grid_orientations(px) > 0
     centres = (px[:, 1:, 1:] + px[:, :-1, :-1] + px[:, 1:, :-1] + px[:, :-1, 1:]) / 4
     columns = grid.shape[1]
     parts = []
@@ -191,7 +191,7 @@ def outline_distances(
         most = MOST_SHIFT_PX + float(np.abs(offsets).max(initial=0))
         shift = _search_edges(masks, samples, drawn, reach=most, offsets=offsets)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
     counts = np.isfinite(to_edge) & np.isfinite(shift) & ~(hidden & (to_edge < shift))
-    own, edge, toward = _nearest_samples(masks, samples, covered, reach=reach)
+    own, edge, toward = nearest_samples(masks, samples, covered, reach=reach)
     back = ((masks.edge_px[edge] - samples.px[own]) * toward).sum(1) - shift[own]
     stack = masks.edge_stack[edge]
     beyond = _is_hidden(masks, stack, masks.edge_px[edge], normals=masks.edge_normals[edge], offsets=offsets)
@@ -250,7 +250,7 @@ def _is_hidden(
     return hidden
 
 
-def _nearest_samples(
+def nearest_samples(
     masks: MaskStack, samples: OutlineSamples, covered: NDArray[np.uint8], *, reach: float
 ) -> tuple[NDArray, NDArray, Floats]:
     """Pairs of an outline sample and an edge sample, and the direction (M, 2) that their distance counts along.
@@ -259,22 +259,37 @@ def _nearest_samples(
     Where the patch stops short of a tip there is none ahead: samples outside the patch and far from its outline pull
     the nearest sample straight towards them.
     """
-    own, edge, toward = [np.zeros(0, int)], [np.zeros(0, int)], [np.zeros((0, 2))]
-    is_outside = masks.look_up(covered, masks.edge_stack, masks.edge_px) == 0
-    for index in range(len(masks)):
-        here, there = np.flatnonzero(samples.stack == index), np.flatnonzero(masks.edge_stack == index)
-        if not len(here) or not len(there):
-            continue
-        gap = masks.edge_px[there][:, None] - samples.px[here]
-        square = (gap**2).sum(2)
-        straight = square.argmin(1)
-        rows = np.arange(len(there))
-        pulls = is_outside[there] & (square[rows, straight] > PULL_FROM_PX**2)
-        square[masks.edge_normals[there] @ samples.normals[here].T < SIMILAR] = np.inf
-        nearest = np.where(pulls, straight, square.argmin(1))
-        found = pulls | (square[rows, nearest] < (2 * reach) ** 2)
-        ahead = gap[rows, straight] / np.maximum(np.linalg.norm(gap[rows, straight], axis=1, keepdims=True), 1e-9)
-        own.append(here[nearest[found]])
-        edge.append(there[found])
-        toward.append(np.where(pulls[:, None], ahead, masks.edge_normals[there])[found])
-    return np.concatenate(own), np.concatenate(edge), np.concatenate(toward)
+    edge, own = _places(masks.edge_stack, len(masks)), _places(samples.stack, len(masks))
+    there = _take(masks.edge_px, edge)
+    gap = there[:, :, None] - _take(samples.px, own)[:, None]
+    square = np.where((edge >= 0)[:, :, None] & (own >= 0)[:, None], (gap**2).sum(3), np.inf)
+    if not square.size:
+        return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
+    straight = square.argmin(2)
+    is_outside = _take(masks.look_up(covered, masks.edge_stack, masks.edge_px) == 0, edge)
+    normals = _take(masks.edge_normals, edge)
+    nearest_square = np.take_along_axis(square, straight[:, :, None], 2)[:, :, 0]
+    pulls = is_outside & (nearest_square > PULL_FROM_PX**2) & np.isfinite(nearest_square)
+    square[normals @ _take(samples.normals, own).transpose(0, 2, 1) < SIMILAR] = np.inf
+    nearest = np.where(pulls, straight, square.argmin(2))
+    found = pulls | (np.take_along_axis(square, nearest[:, :, None], 2)[:, :, 0] < (2 * reach) ** 2)
+    view, place = np.nonzero(found)
+    ahead = gap[view, place, straight[view, place]]
+    ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    toward = np.where(pulls[view, place][:, None], ahead, normals[view, place])
+    return own[view, nearest[view, place]], edge[view, place], toward
+
+
+def _places(stack: NDArray, num_views: int) -> NDArray:
+    """(S, most) the places in `stack` (N,) of the samples of each view, in order; -1 beyond the last one."""
+    order = np.argsort(stack, kind="stable")
+    counts = np.bincount(stack, minlength=num_views)
+    places = np.full((num_views, counts.max(initial=0)), -1)
+    ordered = stack[order]
+    places[ordered, np.arange(len(stack)) - (np.cumsum(counts) - counts)[ordered]] = order
+    return places
+
+
+def _take(values: NDArray, places: NDArray) -> NDArray:
+    """Values (N, ...) at places (S, most); those of -1 mean nothing."""
+    return values[places] if len(values) else np.zeros((*places.shape, *values.shape[1:]), values.dtype)

@@ -16,7 +16,8 @@ SUPERSAMPLED = 3  # side of the small pixels that patches are drawn in
 DRAWN_TOO_FAR = 0.48  # small pixels, measured
 SUB_PIXEL_BITS = 4  # of OpenCV's polygons
 LEAST_GROWTH_PX = 0.15  # offsets that are worth the time
-NEAR_PX = 4  # around a mask, where it matters what lies in front
+DRAWN_BESIDE = 4  # pixels around a patch that its blurred image reaches
+NEAR_PX = 6  # around a leaf, where it matters what lies in front
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,18 +37,14 @@ def project_points(px_from_world: Floats, points: Floats) -> Projection:
     return Projection(px=(cam[..., :2] / depth[..., None]).reshape(*shape, 2), depth=depth.reshape(shape))
 
 
-def cover_crop(masks: MaskStack, projection: Projection, index: int) -> NDArray[np.uint8]:
-    """(rows, columns) 1 where the quads of the projected grid cover a crop; every second row will do."""
-    shape = masks.shapes[index]
-    local = (projection.px[index] - masks.corners[index] - 0.5) * (1 << SUB_PIXEL_BITS)
-    limit = 1 << (SUB_PIXEL_BITS + 13)
-    corners = np.clip(np.round(local), -limit, limit).astype(np.int32)
-    pick = np.unique(np.r_[np.arange(0, len(corners), 2), len(corners) - 1])
-    corners = corners[pick][:, ::2]
-    canvas = np.zeros((int(shape[0]), int(shape[1])), np.uint8)
-    for quad in grid_quads(corners):
-        cv2.fillConvexPoly(canvas, quad, 1, shift=SUB_PIXEL_BITS)
-    return canvas
+def cover_crops(masks: MaskStack, projection: Projection) -> NDArray[np.uint8]:
+    """(S, H, W) above 0 where a projected grid covers the crops; of a fine one every second row and column will do."""
+    last = projection.px.shape[1] - 1
+    rows, every = (np.unique(np.r_[0:last:2, last]), 2) if last > 20 else (np.arange(last + 1), 1)
+    covered = np.zeros((len(masks), *masks.size), np.uint8)
+    for canvas, px in zip(covered, projection.px[:, rows, ::every], strict=True):
+        fill_grid(canvas, px)
+    return covered
 
 
 def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats | None = None) -> Floats:
@@ -56,30 +53,40 @@ def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats | None = None
     With `offsets` (S,), pixels, the patch is drawn as much too large or small as the mask of each view is.
     """
     shares = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, blur_px=0.0)
-    is_covered = (shares >= 0.5) & (masks.others == 0)
-    ious = []
-    for index in range(len(masks)):
-        covered, inside = masks.crop(is_covered, index), masks.crop(masks.inside, index)
-        ious.append((covered & inside).sum() / max(1, (covered | inside).sum()))
-    return np.array(ious)
+    return crop_ious(masks, shares >= 0.5)
+
+
+def crop_ious(masks: MaskStack, covered: NDArray[np.bool_]) -> Floats:
+    """(S,) IoU of covered pixels (S, H, W) and the mask in each view, where nothing else hides them."""
+    covered = covered & (masks.others == 0)
+    common, either = covered & masks.inside, covered | masks.inside
+    ious: Floats = common.sum((1, 2)) / np.maximum(either.sum((1, 2)), 1)
+    return ious
 
 
 def draw_patch(
     masks: MaskStack, projection: Projection, *, offsets: Floats | None = None, blur_px: float = BLUR_PX
 ) -> NDArray[np.float32]:
-    """(pixels,) the projected grid as a blurred mask, like `MaskStack.blurred`; sharp with a blur of 0.
+    """(S, H, W) the projected grid as a blurred mask, like `MaskStack.blurred`; sharp with a blur of 0.
 
     With `offsets` (S,), pixels, it is grown or shrunk as the mask of each view seems to be.
     """
-    drawn = []
-    for index in range(len(masks)):
-        height, width = masks.shapes[index].tolist()
-        canvas = _draw_small(grid_quads(projection.px[index]), (width, height), masks.corners[index])
+    drawn = np.zeros((len(masks), *masks.size), np.float32)
+    beside = DRAWN_BESIDE if offsets is None else DRAWN_BESIDE + int(np.ceil(np.abs(offsets).max(initial=0)))
+    for index, px in enumerate(projection.px):
+        low = np.clip(np.floor(px.min((0, 1))) - beside, 0, masks.size[::-1]).astype(int)
+        high = np.clip(np.ceil(px.max((0, 1))) + beside, 0, masks.size[::-1]).astype(int)
+        width, height = (high - low).tolist()
+        if not width or not height:
+            continue
+        canvas = np.zeros((height * SUPERSAMPLED, width * SUPERSAMPLED), np.uint8)
+        fill_grid(canvas, (px - low) * SUPERSAMPLED)
         if offsets is not None and abs(offsets[index]) > LEAST_GROWTH_PX:
             canvas = grow(canvas, SUPERSAMPLED * float(offsets[index]))
         share = _shares(canvas, (width, height))
-        drawn.append((cv2.GaussianBlur(share, (0, 0), blur_px) if blur_px else share).ravel())
-    return np.concatenate(drawn)
+        part = drawn[index, low[1] : high[1], low[0] : high[0]]
+        part[:] = cv2.GaussianBlur(share, (0, 0), blur_px) if blur_px else share
+    return drawn
 
 
 def grow(canvas: NDArray[np.uint8], px: float) -> NDArray[np.uint8]:
@@ -91,6 +98,33 @@ def grow(canvas: NDArray[np.uint8], px: float) -> NDArray[np.uint8]:
     return grown
 
 
+def fill_grid(canvas: NDArray[np.uint8], px: Floats) -> None:
+    """Set the pixels (H, W) that a projected grid (rows, columns, 2) covers to 255.
+
+    Its rim as one polygon has all pixels under an odd number of layers. Where there are two, one of them is seen from
+    the other side: the quads of the side that shows fewer of them do the rest.
+    """
+    cv2.fillPoly(canvas, [_fixed(np.concatenate([px[:, 0], px[-2:0:-1, -1]]))], 255, shift=SUB_PIXEL_BITS)
+    is_front = grid_orientations(px).ravel() > 0
+    is_rare = is_front if 2 * np.count_nonzero(is_front) < len(is_front) else ~is_front
+    if is_rare.any():
+        cv2.fillPoly(canvas, list(_fixed(grid_quads(px)[is_rare])), 255, shift=SUB_PIXEL_BITS)
+
+
+def _fixed(px: Floats) -> NDArray[np.int32]:
+    """Positions as OpenCV's polygons have them: whole numbers of small parts of a pixel, from its centre on."""
+    most = 1 << (SUB_PIXEL_BITS + 13)
+    return np.clip(np.round((px - 0.5) * (1 << SUB_PIXEL_BITS)), -most, most).astype(np.int32)
+
+
+def grid_orientations(px: Floats) -> Floats:
+    """(..., rows - 1, columns - 1) twice the signed areas of the cells of projected grids (..., rows, columns, 2)."""
+    first = px[..., 1:, 1:, :] - px[..., :-1, :-1, :]
+    second = px[..., 1:, :-1, :] - px[..., :-1, 1:, :]
+    areas: Floats = first[..., 0] * second[..., 1] - first[..., 1] * second[..., 0]
+    return areas
+
+
 def grid_quads(grid: Floats) -> Floats:
     """(quads, 4, n) corners in turn of the cells of a grid (rows, columns, n)."""
     quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], 2)
@@ -98,23 +132,18 @@ def grid_quads(grid: Floats) -> Floats:
 
 
 def draw_polygons(polygons: Floats, size: tuple[int, int], corner: Floats) -> NDArray[np.float32]:
-    """(height, width) share of each pixel that convex polygons (T, n, 2) cover.
+    """(height, width) share of each pixel that quads (T, 4, 2) cover.
 
     Drawn several times as large. OpenCV's polygons include their border: they are DRAWN_TOO_FAR small pixels too wide
     on every side.
     """
-    return _shares(_draw_small(polygons, size, corner), size)
-
-
-def _draw_small(polygons: Floats, size: tuple[int, int], corner: Floats) -> NDArray[np.uint8]:
-    width, height = size
-    scale = SUPERSAMPLED
-    local = ((polygons - corner) * scale - 0.5) * (1 << SUB_PIXEL_BITS)
-    local = np.clip(np.round(local), -(1 << 26), 1 << 26).astype(np.int32)
-    canvas = np.zeros((height * scale, width * scale), np.uint8)
-    for polygon in local:
-        cv2.fillConvexPoly(canvas, polygon, 255, shift=SUB_PIXEL_BITS)
-    return canvas
+    canvas = np.zeros((size[1] * SUPERSAMPLED, size[0] * SUPERSAMPLED), np.uint8)
+    first, second = polygons[:, 2] - polygons[:, 0], polygons[:, 3] - polygons[:, 1]
+    is_front = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > 0
+    local = _fixed((polygons - corner) * SUPERSAMPLED)
+    for side in (local[is_front], local[~is_front]):  # where two of one side meet, their edge counts twice: as inside
+        cv2.fillPoly(canvas, list(side), 255, shift=SUB_PIXEL_BITS)
+    return _shares(canvas, size)
 
 
 def _shares(canvas: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.float32]:
@@ -122,10 +151,8 @@ def _shares(canvas: NDArray[np.uint8], size: tuple[int, int]) -> NDArray[np.floa
     return share / np.float32(255)
 
 
-def hiding_pixels(
-    masks: MaskStack, points: Floats, others: dict[int, Floats], *, margin: float
-) -> NDArray[np.int32]:
-    """(pixels,) int32: which instance hides the leaf there, 0 for none, as the surfaces have it.
+def hiding_pixels(masks: MaskStack, points: Floats, others: dict[int, Floats], *, margin: float) -> NDArray[np.int32]:
+    """(S, H, W) int32: which instance hides the leaf there, 0 for none, as the surfaces have it.
 
     A pixel that shows another instance hides nothing where that one's surface lies behind the leaf. And a surface in
     front of the leaf hides it, whether that instance has a mask there or not.
@@ -139,23 +166,25 @@ def hiding_pixels(
     hiding = masks.others.copy()
     projection = project_points(masks.px_from_world, points)
     seen = {other: project_points(masks.px_from_world, grid) for other, grid in others.items()}
-    for index in range(len(masks)):
-        crop = masks.crop(hiding, index)
-        inside = masks.crop(masks.inside, index).astype(np.uint8)
-        near = cv2.dilate(inside, np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
+    leaves = (masks.inside | (cover_crops(masks, projection) > 0)).astype(np.uint8)
+    size = masks.size[::-1]
+    for index, crop in enumerate(hiding):
+        near = cv2.dilate(leaves[index], np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
+        near &= ~masks.inside[index]
         own = cKDTree(projection.px[index].reshape(-1, 2))
         own_depth = projection.depth[index].ravel()
-        corner, (rows, columns) = masks.corners[index], crop.shape
         for other, image in seen.items():
             px, depth = image.px[index].reshape(-1, 2), image.depth[index].ravel()
-            if (px.max(0) < corner).any() or (px.min(0) > corner + (columns, rows)).any():
+            if (px.max(0) < 0).any() or (px.min(0) > size).any():
                 continue
-            drawn = draw_polygons(grid_quads(image.px[index]), (columns, rows), corner) >= 0.5
+            canvas = np.zeros((size[1] * SUPERSAMPLED, size[0] * SUPERSAMPLED), np.uint8)
+            fill_grid(canvas, image.px[index] * SUPERSAMPLED)
+            drawn = _shares(canvas, size) >= 0.5
             shows = crop == other
-            row, column = np.nonzero(near & shows | drawn & (shows | (crop == 0)) & (inside == 0))
+            row, column = np.nonzero(near & (shows | drawn & (crop == 0)))
             if not len(row):
                 continue
-            place = np.stack([column, row], 1) + 0.5 + corner
+            place = np.stack([column, row], 1) + 0.5
             gap = depth[cKDTree(px).query(place)[1]] - own_depth[own.query(place)[1]]
             is_front = drawn[row, column] & (gap < -margin)
             crop[row, column] = np.where(gap > margin, 0, np.where(is_front, other, crop[row, column]))

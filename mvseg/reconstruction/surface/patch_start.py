@@ -18,19 +18,19 @@ from mvseg.reconstruction.surface.leaf_patch import (
     spline_basis,
 )
 
-MOST_POINTS = 1500  # of the voxels; enough for nine windows
+MOST_POINTS = 1000  # of the voxels; enough for nine windows
 NUM_WINDOWS = 9
 NEIGHBOURS = 8
 ELONGATED = 2.0  # ratio of the two largest spreads from which a leaf may be bent so far that its axis is a curve
 BENT = 1.35  # or from this ratio of the way along the leaf to the straight one; graphs make detours of a tenth
 ROUND = 1.6  # ratio below which the midrib may as well run along the shorter axis
-TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # of the side about the midrib, where it is not clear
+TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # of the side about the midrib
 LEAST_POINTS = 12
 TIE = 1e-6  # relative; distances on a lattice that differ by less are equal but for rounding
 
 
-def start_patches(points: Floats, *, is_clear: bool = True) -> list[Floats]:
-    """Rough patches through a cloud of points, the likeliest first.
+def start_patches(points: Floats) -> tuple[list[Floats], list[Floats]]:
+    """Rough patches through a cloud of points: the likely ones, and others.
 
     The long axis is straight (PCA), or a geodesic one for elongated clouds, so that strongly bent blades keep their
     two ends. Windowed centroids along it are the midrib, spreads across it the sides. Cameras that all look down at
@@ -38,37 +38,38 @@ def start_patches(points: Floats, *, is_clear: bool = True) -> list[Floats]:
 
     Args:
         points: (P, 3) float64, centres of occupied voxels.
-        is_clear: the spreads show how the blade lies.
 
     Returns:
-        (26, 3) coefficients each, fold and curl 0: along the longest axis, and for round leaves also across it; where
-        it is not clear along both axes and with sides in four directions. None with fewer than 12 points, or without
+        (26, 3) coefficients each, fold and curl 0. The likely ones run along the longest axis, and for round leaves
+        also across it; the others, too, and have sides in other directions. None with fewer than 12 points, or without
         any spread.
     """
     points = _thin(points)
     if len(points) < LEAST_POINTS:
-        return []
+        return [], []
     centred = points - points.mean(0)
     _, spreads, axes = np.linalg.svd(centred, full_matrices=False)
     if spreads[1] <= 1e-9 * spreads[0] or spreads[0] == 0:
-        return []
+        return [], []
     straight, along = centred @ axes[0], _geodesic_places(points)
     is_bent = spreads[0] > ELONGATED * spreads[1] or along.max() > BENT * np.ptp(straight)
-    places = [(along if is_bent else straight, axes[1])]
-    if not is_clear or (not is_bent and spreads[0] < ROUND * spreads[1]):
-        places.append((centred @ axes[1], axes[0]))
-    turns = (0.0,) if is_clear else TURNS_DEG
-    return [_patch_along(points, place, side, turn_deg=turn) for place, side in places for turn in turns]
+    first = _patches_along(points, along if is_bent else straight, axes[1])
+    second = _patches_along(points, centred @ axes[1], axes[0])
+    if is_bent or spreads[0] >= ROUND * spreads[1]:
+        return first[:1], first[1:] + second
+    return [first[0], second[0]], first[1:] + second[1:]
 
 
-def _patch_along(points: Floats, place: Floats, side: Floats, *, turn_deg: float) -> Floats:
-    """A patch whose u follows `place` (P,).
+def _patches_along(points: Floats, place: Floats, side: Floats) -> list[Floats]:
+    """Patches whose u follows `place` (P,).
 
-    `side` (3,) is roughly where v points to: along the largest spread across, turned about the midrib.
+    `side` (3,) is roughly where v of the first points to: along the largest spread across; the others are turned about
+    the midrib.
     """
     low, high = np.quantile(place, [0.005, 0.995])
     t = np.clip((place - low) / max(high - low, 1e-12), 0, 1)
-    return _coefficients(*_windows(points, t, side, turn_deg=turn_deg))
+    middles, sides = _windows(points, t, side)
+    return [_coefficients(middles, each) for each in sides]
 
 
 def _thin(points: Floats) -> Floats:
@@ -105,22 +106,19 @@ def _first_largest(values: Floats) -> int:
     return int((values >= values.max() * (1 - TIE)).argmax())
 
 
-def _windows(points: Floats, t: Floats, side: Floats, *, turn_deg: float) -> tuple[Floats, Floats]:
-    """Centroid and half-width vector, (9, 3) each, of overlapping windows along t in [0, 1]."""
+def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
+    """Centroids (9, 3) of overlapping windows along t in [0, 1], and half-width vectors (4, 9, 3) in all directions."""
     centres = (np.arange(NUM_WINDOWS) + 0.5) / NUM_WINDOWS
-    middles, sides = np.zeros((NUM_WINDOWS, 3)), np.zeros((NUM_WINDOWS, 3))
-    order = np.argsort(np.abs(centres - 0.5), kind="stable")
-    for index in order:
-        weight = np.clip(1 - np.abs(t - centres[index]) * NUM_WINDOWS, 0, None)
-        if (weight > 0).sum() < 4:  # a gap in the cloud: the nearest points
-            weight = np.zeros_like(t)
-            weight[np.argsort(np.abs(t - centres[index]), kind="stable")[:8]] = 1
-        middles[index] = weight @ points / weight.sum()
+    weights = np.clip(1 - np.abs(t - centres[:, None]) * NUM_WINDOWS, 0, None)
+    for index in np.flatnonzero((weights > 0).sum(1) < 4):  # a gap in the cloud: the nearest points
+        weights[index] = 0
+        weights[index, np.argsort(np.abs(t - centres[index]), kind="stable")[:8]] = 1
+    middles = weights @ points / weights.sum(1, keepdims=True)
     along = np.gradient(middles, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    turn = np.radians(turn_deg)
-    directions = np.zeros((NUM_WINDOWS, 3))
-    for index in order:
+    turns = np.radians(TURNS_DEG)[:, None]
+    directions, sides = np.zeros((NUM_WINDOWS, 3)), np.zeros((len(turns), NUM_WINDOWS, 3))
+    for index in np.argsort(np.abs(centres - 0.5), kind="stable"):
         near = np.abs(t - centres[index]) < 0.75 / NUM_WINDOWS
         flat = points[near] - middles[index] if near.sum() >= 4 else points - middles[index]
         flat = flat - (flat @ along[index])[:, None] * along[index]
@@ -129,8 +127,8 @@ def _windows(points: Floats, t: Floats, side: Floats, *, turn_deg: float) -> tup
         done = np.flatnonzero(directions.any(1))
         before = directions[done[np.abs(done - index).argmin()]] if len(done) else side
         directions[index] = widest * (1.0 if widest @ before >= 0 else -1.0)
-        turned = np.cos(turn) * directions[index] + np.sin(turn) * np.cross(along[index], directions[index])
-        sides[index] = np.quantile(np.abs(flat @ turned), 0.93) * turned
+        turned = np.cos(turns) * directions[index] + np.sin(turns) * np.cross(along[index], directions[index])
+        sides[:, index] = np.quantile(np.abs(flat @ turned.T), 0.93, axis=0)[:, None] * turned
     return middles, sides
 
 
