@@ -1,9 +1,10 @@
-"""What a detector learns from corrections: `python benchmarks/learned_corrections.py BASIL --out DIR --val DATA/val.json`
+"""What a detector learns from corrections: `python benchmarks/learned_corrections.py BASIL RESULT --out DIR`
 
-The simulated person of `corrections.py` corrects every third photo of a plant, and no others; `mvseg train
---from_results` learns from the result for a few minutes, simulated photos mixed in. Then the detector alone is judged,
-before and after: on the photos that nobody corrected (precision and recall of masks with scores from 0.3 on, and AP50),
-and, for what it forgot, on simulated photos (--val, every --every-th). Steps whose files are in the folder are not run again.
+RESULT is what `mvseg infer BASIL` found. The simulated person of `corrections.py` corrects the masks of every third
+photo, and no others; `mvseg train --from_results` learns from that for some minutes, simulated photos mixed in. Then
+the detector alone is judged, before and after: on the photos that nobody corrected (precision and recall of masks
+with scores from 0.3 on, and AP50), and, for what it forgot, on simulated photos (--val, every --every-th). What the
+views make of corrections in the other photos is left out here. Steps whose files are in the folder are not run again.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import json
 import sys
 import time
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,58 +23,59 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.corrections import Case, compute
 from benchmarks.mask_fates import true_maps
-from benchmarks.simulated_person import Labels, Look, count_worth, list_repairs
-from mvseg.config import RunConfig
-from mvseg.corrections.file import Corrections, Edit, Link, load_corrections, write_corrections
+from benchmarks.simulated_person import Labels, Look, change_masks_alone, count_worth, list_repairs
+from mvseg.corrections.file import Corrections, Edit, Outline, Reject, Split, load_corrections, write_corrections
 from mvseg.detection.config import DetectConfig
 from mvseg.detectors.zoo import load_detector
 from mvseg.errors import InputWarning
 from mvseg.evaluation.average_precision import average_precision
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
-from mvseg.pipeline import State, detect, load
+from mvseg.masks import Masks, Origin
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions, mask_box, stack_regions
 from mvseg.results.folder import save_result
 from mvseg.results.result import Result
+from mvseg.scene import Scene
 from mvseg.training.data import SampleList, list_samples
 from mvseg.training.loop import TrainConfig, train
 from mvseg.training.validation import detect_and_label
 
 EVERY = 3  # of the photos, one is corrected
-LOOKS = 1  # rounds of the person
 
 
-def correct_photos(case: Case, names: set[str]) -> tuple[Edit, ...]:
-    """What the person says of the masks in some photos, until they are right, and of the ids of these masks."""
+def read_masks(result: Path, scene: Scene) -> Masks:
+    """The table of a result, from its instances.json."""
+    content = json.loads((result / "instances.json").read_text(encoding="utf-8"))
+    rows = sorted(content["annotations"], key=lambda row: int(row["image_id"]))
+    regions = _as_regions([row | {"image_id": int(row["image_id"]) - 1} for row in rows], scene.cameras.sizes.tolist())
+    ids, scores = (torch.tensor([row[name] for row in rows]) for name in ("instance_id", "match_score"))
+    masks = Masks.of(regions, ids, scores, origin=Origin.DETECTED)
+    is_shown = torch.tensor([bool(row.get("from_other_views")) for row in rows])
+    return replace(masks, origin=torch.where(is_shown, int(Origin.OTHER_VIEWS), masks.origin))
+
+
+def correct_photos(masks: Masks, truth: list[Labels], *, scene: Scene, names: set[str]) -> tuple[Edit, ...]:
+    """What the person says of the masks in some photos: those that are no leaves, and outlines of what has none."""
     edits: tuple[Edit, ...] = ()
-    for _ in range(LOOKS):
-        state = compute(case, Corrections(edits))
-        done = {str(edit.by) for edit in edits}
-        for each in list_repairs(Look(state.matched.masks.to("cpu"), case.truth, state.scene, [])):
-            last = each.edits[-1]
-            places = {place[0] for place in last.at[1:]} if isinstance(last, Link) else {last.view}
-            if places <= names and each.name not in done:
-                edits += tuple(edit.model_copy(update={"by": each.name}) for edit in each.edits)
+    for each in list_repairs(Look(masks, truth, scene, [])):
+        edits += tuple(edit for edit in each.edits if isinstance(edit, Outline | Reject | Split) and edit.view in names)
     return edits
 
 
-def write_corrected(state: State, scene: Path, out: Path) -> None:
-    """A result folder as `mvseg infer --corrections` writes it, without shapes."""
-    result = Result(
-        scene=state.scene,
-        matching=state.matched,
-        photos=state.photos,
-        corrections=state.corrections,
-        fates=() if state.corrected is None else state.corrected.fates,
-    )
-    save_result(result, out, {"config": {"scene": str(scene)}}, report=False)
+def write_corrected(masks: Masks, corrections: Corrections, *, scene: Scene, folder: Path, out: Path) -> None:
+    """A result folder with these corrections, without shapes."""
+    changed = change_masks_alone(masks, corrections.edits, scene)
+    matching = Matching(changed, MatchReport("nview", has_probabilities=True))
+    result = Result(scene=scene, matching=matching, photos=Photos(scene), corrections=corrections)
+    save_result(result, out, {"config": {"scene": str(folder)}}, report=False)
 
 
 def learn(results: Path, out: Path, epochs: int) -> Path:
-    """The weights that a run from the shipped detector on these results ends with: a simulated photo for each real one."""
+    """The weights that a run from the shipped detector ends with; there is a simulated photo for each real one."""
     if not (out / "model.safetensors").exists():
         config = TrainConfig(
             output=out,
@@ -105,31 +108,31 @@ def judge_detector(weights: str, photos: SampleList, truth: list[Labels]) -> dic
     scores = average_precision(labelled, found, len(photos))
     answer: dict[str, float | None] = {"AP50": scores["mask_AP50"]}
     if truth:
-        regions = _as_regions([each for each in found if each["score"] >= DetectConfig.min_score], truth)
+        sure = [each for each in found if each["score"] >= DetectConfig.min_score and each["area"] > 0]
+        regions = _as_regions(sure, [[labels.shape[1], labels.shape[0]] for labels in truth])
         whole = leaf_metrics(regions, torch.full((len(regions),), -1), truth)
         answer |= {"precision": whole.mask_precision, "recall": whole.mask_recall}
     return answer
 
 
-def _as_regions(found: list[dict[str, Any]], truth: list[Labels]) -> Regions:
-    """Detections as regions; each is cut to its box."""
-    masks = []
+def _as_regions(found: list[dict[str, Any]], sizes: list[list[int]]) -> Regions:
+    """COCO annotations as regions, in their order; `sizes` are widths and heights."""
+    boxes, crops = [], []
     for each in found:
-        height, width = truth[each["image_id"]].shape
-        mask = torch.from_numpy(decode_segmentation(each["segmentation"], width, height))
-        if mask.any():
-            masks.append((each["image_id"], mask_box(mask), mask))
-    crops = [mask[y1:y2, x1:x2].flatten() for _, (x1, y1, x2, y2), mask in masks]
-    views, boxes = [view for view, _, _ in masks], [box for _, box, _ in masks]
-    return stack_regions(views, boxes, crops, labels=range(len(masks)), num_views=len(truth))
+        mask = torch.from_numpy(decode_segmentation(each["segmentation"], *sizes[each["image_id"]]))
+        x1, y1, x2, y2 = mask_box(mask)
+        boxes.append((x1, y1, x2, y2))
+        crops.append(mask[y1:y2, x1:x2].flatten())
+    views = [each["image_id"] for each in found]
+    return stack_regions(views, boxes, crops, labels=range(len(found)), num_views=len(sizes))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path, help="folder with photos and truth/")
+    parser.add_argument("result", type=Path, help="what mvseg infer made of it")
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--keep", type=Path, help="folder of detections, see run_scene")
-    parser.add_argument("--epochs", type=int, default=20)
+    parser.add_argument("--epochs", type=int, default=8)
     parser.add_argument("--val", type=Path, help="COCO file of simulated photos, beside their folders")
     parser.add_argument("--every", type=int, default=3)
     args = parser.parse_args()
@@ -139,14 +142,13 @@ def main() -> None:
     truth, names = true_maps(args.scene, scene), [view.name for view in scene.views]
     path = args.out / "corrections.json"
     if not (args.out / "corrected").exists():
+        masks = read_masks(args.result, scene)
+        corrections = Corrections(correct_photos(masks, truth, scene=scene, names=set(names[::EVERY])))
         args.out.mkdir(parents=True, exist_ok=True)
-        found = detect(load(args.scene, None, RunConfig(reconstruct=None), keep=args.keep))
-        case = Case(args.scene.name, found, truth, has_masks=False)
-        edits = load_corrections(path).edits if path.exists() else correct_photos(case, set(names[::EVERY]))
-        write_corrections(path, Corrections(edits))
-        write_corrected(compute(case, Corrections(edits)), args.scene, args.out / "corrected")
+        write_corrections(path, corrections)
+        write_corrected(masks, corrections, scene=scene, folder=args.scene, out=args.out / "corrected")
     edits = load_corrections(path).edits
-    print(f"{len(edits)} edits, worth {count_worth(edits)}, in photos {', '.join(names[::EVERY])}")
+    print(f"{len(edits)} edits, worth {count_worth(edits)}, in photos {', '.join(names[::EVERY])}", flush=True)
     weights = learn(args.out / "corrected", args.out / "run", args.epochs)
     every = list_samples(args.scene / "images", args.scene / "truth")
     others = [index for index in range(len(names)) if index % EVERY]

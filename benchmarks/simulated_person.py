@@ -31,6 +31,7 @@ Labels = NDArray[np.uint16]
 
 COSTS = {"outline": 3}  # of an edit; any other is 1
 LEAST_REPAIR = 0.03  # of a leaf's pixels, from which an edit is worth the while
+LOST = 0.25  # IoU below which a leaf is drawn anew, in two photos
 SHOWN = 0.5  # IoU from which a mask is left as it is; share of a leaf that a mask must cover to be worth a cut
 FALSE_LEAF, FALSE_MASK = 0.1, 0.06  # what it is worth to be rid of a leaf that is none, and of a lone mask; in leaves
 OUTLINE_PX = 1.5  # that a drawn outline is off
@@ -313,11 +314,10 @@ def _draw(look: Look) -> list[Repair]:
         gaps = [view for view in np.flatnonzero(look.visible[:, leaf]).tolist() if covered[view] < SHOWN]
         gaps.sort(key=lambda view: -look.visible[view, leaf])
         anchor = look.anchor(leaf)
-        if anchor < 0 and not (look.leaf == leaf).any():
-            views = _far_apart(look, gaps)
-            if views:
-                edits: tuple[Edit, ...] = tuple(look.outline(leaf, view) for view in views)
-                found.append(Repair(f"draw {leaf}", edits, look.worth(leaf, 1.0), 0.0, frozenset({leaf})))
+        iou, two = look.iou.get(leaf, 0.0), _far_apart(look, gaps)
+        if iou < LOST and two:
+            edits: tuple[Edit, ...] = tuple(look.outline(leaf, view) for view in two)
+            found.append(Repair(f"draw {leaf}", edits, look.worth(leaf, 1 - iou), 0.0, frozenset({leaf})))
             continue
         for view in gaps:
             drawn, name = look.outline(leaf, view), look.scene.views[view].name
@@ -369,4 +369,5 @@ def change_masks_alone(masks: Masks, edits: Sequence[Edit], scene: Scene) -> Mas
             is_cut = row[first] == row[second]
             leaves = second if is_cut and area[second] < area[first] else first
             ids[leaves] = new[leaves]
-    return apply_everywhere(changed, replace(changed.masks, instance_ids=ids))
+    scores = torch.where(row > 0, masks.match_scores[(row - 1).clamp(min=0)], 0.0)
+    return apply_everywhere(changed, replace(changed.masks, instance_ids=ids, match_scores=scores))

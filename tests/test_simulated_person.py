@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks.corrections import judge, print_table, read_records, write_records
+from benchmarks.learned_corrections import correct_photos
 from benchmarks.simulated_person import (
     Labels,
     Look,
@@ -117,6 +118,24 @@ def test_a_missed_mask_is_drawn_and_joins_its_leaf(truth: list[Labels], scene: S
     ops, after = mend(masks_of(found), truth, scene)
     assert ops == ["outline", "same"]
     assert judge(after, truth)["mv_pq"] > 0.99
+
+
+def test_a_leaf_that_is_nearly_lost_is_drawn_anew(truth: list[Labels], scene: Scene) -> None:
+    found = [labels.copy() for labels in truth]
+    for labels in found[1:]:
+        labels[labels == 1] = 0
+    ops, _ = mend(masks_of(found), truth, scene)
+    assert ops == ["outline", "outline"]
+
+
+def test_only_the_photos_that_are_named_are_corrected(truth: list[Labels], scene: Scene) -> None:
+    found = [labels.copy() for labels in truth]
+    for labels in found[:3]:
+        labels[60:80, 10:50] = 9
+        labels[labels == 3] = 0
+    edits = correct_photos(masks_of(found), truth, scene=scene, names={"v0", "v2"})
+    assert {edit.view for edit in edits} == {"v0", "v2"}
+    assert {edit.op for edit in edits} == {"outline", "reject"}
 
 
 def test_the_order_and_the_worth_of_repairs() -> None:

@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/corrections.md: `python benchmarks/figures/corrections.py --folder DIR`
+"""Draws the pictures of docs/correcting.md: `python benchmarks/figures/corrections.py --folder DIR`
 
 The shipped plant gets masks with a segmenter's faults; a person, driven by playwright, opens the page of the result in
 chromium. A result that is in DIR is not made again.
@@ -13,6 +13,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
@@ -26,6 +27,7 @@ from mvseg.formats.label_png import read_labels, write_label_png
 
 DOCS = Path(__file__).parents[2] / "docs"
 SEED = 5
+PAIR, LINKED = (2, 5), 6  # photos, and the leaf that is clicked at in both
 SIZE = {"width": 1180, "height": 700}
 OPTIONS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 
@@ -40,7 +42,7 @@ def write_faulty(folder: Path) -> None:
 def shoot(page: Page, name: str) -> None:
     """A picture of the page as a small JPEG."""
     picture = Image.open(io.BytesIO(page.screenshot()))
-    picture.convert("RGB").save(DOCS / f"corrections-{name}.jpg", quality=72, optimize=True)
+    picture.convert("RGB").save(DOCS / f"correcting-{name}.jpg", quality=72, optimize=True)
 
 
 class Person:
@@ -64,6 +66,19 @@ class Person:
     def mask(self, view: int, leaf: int) -> Any:
         find = "([view, leaf]) => data.views[view].masks.find((mask) => mask.leaf === leaf)"
         return self.page.evaluate(find, [view, leaf])
+
+    def missed_leaf(self, scene: Path, view: int) -> list[list[float]]:
+        """The outline of the largest leaf that no mask shows, as a hand draws it."""
+        truth = read_labels(scene / "truth" / f"{view:03d}.png")
+        masks = read_labels(scene / "masks" / f"{view:03d}.png")
+        missed = [leaf for leaf in np.unique(truth[truth > 0]) if (masks[truth == leaf] > 0).mean() < 0.3]
+        shown = truth == max(missed, key=lambda leaf: int((truth == leaf).sum()))
+        lines, _ = cv2.findContours(shown.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        outline = max(lines, key=len)[:, 0] + 0.5
+        x1, y1, x2, _ = self.page.evaluate("(view) => data.views[view].box", view)
+        corner, scale = np.array([x1 * shown.shape[1], y1 * shown.shape[0]]), 2000 / ((x2 - x1) * shown.shape[1])
+        drawn: list[list[float]] = ((outline[::4] - corner) * scale).tolist()
+        return [*drawn, drawn[0]]
 
     def draw(self, pane: int, line: list[list[float]]) -> None:
         self.page.mouse.move(*self.at(pane, line[0]))
@@ -89,8 +104,17 @@ def main() -> None:
         page.locator("#mode-correct").click()
         person = Person(page)
         page.keyboard.press("n")
-        page.wait_for_timeout(500)
         shoot(page, "ask")
+        page.keyboard.press("c")
+        for pane, view in enumerate(PAIR):
+            person.show(pane, view)
+            page.mouse.click(*person.at(pane, person.mask(view, LINKED)["at"]))
+        shoot(page, "pick")
+        page.keyboard.press("s")
+        person.show(1, PAIR[1])
+        page.keyboard.press("o")
+        person.draw(1, person.missed_leaf(scene, PAIR[1]))
+        shoot(page, "draw")
         browser.close()
 
 

@@ -192,7 +192,7 @@ def read_label_map(sample: Sample, path: Path, size: tuple[int, ...]) -> np.ndar
 
 
 def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
-    """A photo with its COCO annotations; crowds become ignored pixels."""
+    """A photo with its COCO annotations; crowds become ignored pixels, but for those of other annotations."""
     height, width = photo.shape[:2]
     if sample.size is not None and sample.size != (width, height):
         raise InputError(
@@ -216,6 +216,8 @@ def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
             classes.append(sample.class_of[category])
         else:
             raise InputError(f"{where}: its category {category} is not listed")
+    for mask in masks:
+        ignore &= ~mask  # a labelled instance is known, whatever covers part of it
     return mask_photo(photo, masks, classes=classes, ignore=ignore)
 
 

@@ -68,6 +68,15 @@ def test_sure_and_corrected_masks_are_labels_and_others_are_ignored(result: Path
     assert len(list_results(result.parent)) == 2  # of a folder that holds results
 
 
+def test_a_doubtful_mask_hides_no_part_of_a_sure_one(result: Path) -> None:
+    masks = json.loads((result / "instances.json").read_text())["annotations"]
+    masks[1]["segmentation"] = square(10)  # the first one ends at 20
+    change(result, annotations=masks)
+    labelled = read_sample(list_results(result).samples[0])
+    assert bool((labelled.layers[:, 20, :20] == 1).any(0).all())
+    assert labelled.ignore[20, :40].tolist() == [False] * 20 + [True] * 10 + [False] * 10
+
+
 def test_what_cannot_be_learned_from_is_named(result: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no result"):
