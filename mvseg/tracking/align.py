@@ -25,9 +25,9 @@ LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
 WORLD_PRIOR = 5.0  # log of how much likelier than any other pose it is that the world frames agree
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
-LARGE_NEW = 0.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
-MOST_LARGE_NEW = 0.21  # of all leaves, i.e. two in five of the larger half, where the pairs are
-NEARLY_ALL = 0.9  # of the leaves of the date with fewer; else leaves were missed there
+LARGE_NEW = 4.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
+MOST_LARGE_NEW = 0.21  # of all leaves, i.e. two in five of the larger half
+NEARLY_ALL = 0.9  # of the leaves of the date with fewer: where these are paired, large ones were missed there
 SURE_MARGIN = 7.0  # of the best hypothesis over others
 SURE_SUM, PER_LEAF = 23.5, 3.0  # of margin and PER_LEAF times the gain per leaf of the date with fewer leaves
 
@@ -77,14 +77,14 @@ def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Alig
         found.append(refine(first, second, poses[left[0]], days=days, knows_up=knows_up))
         left = left[pose_distances(poses[left[0]], poses[left], middle, scale=scale) > SAME]
     every = np.stack([each.pose for each in found])
-    scores = np.array([each.gain - LARGE_NEW * _num_large_new(second, each.pairs) for each in found])
+    scores = np.array([each.gain - LARGE_NEW * _num_large_new(first, second, each.pairs) for each in found])
     scores += WORLD_PRIOR * np.exp(-0.5 * pose_distances(np.eye(4), every, middle, scale=scale) ** 2)
     place = int(scores.argmax())
     best, others = found[place], scores[pose_distances(every[place], every, middle, scale=scale) >= 1]
     margin, reason = float(scores[place] - others.max(initial=0.0)), ""
     if len(best.pairs) < max(LEAST_PAIRS, 0.4 * fewer):
         reason = f"only {len(best.pairs)} of {fewer} leaves are alike, however the pot is turned"
-    elif len(best.pairs) < NEARLY_ALL * fewer and _num_large_new(second, best.pairs) > MOST_LARGE_NEW * len(second):
+    elif _num_large_new(first, second, best.pairs) > MOST_LARGE_NEW * len(second):
         reason = "leaves too large to be new would have appeared, however the pot is turned"
     elif margin < SURE_MARGIN:
         reason = "the pot could be turned in more than one way"
@@ -93,11 +93,15 @@ def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Alig
     return replace(best, margin=margin, reason=reason)
 
 
-def _num_large_new(second: Leaves, pairs: np.ndarray) -> int:
-    """How many leaves of the larger half are in no pair: a plant that is turned onto its own older leaves has many."""
+def _num_large_new(first: Leaves, second: Leaves, pairs: np.ndarray) -> int:
+    """How many leaves of the larger half are in no pair; 0 where nearly all leaves of the date with fewer are in one.
+
+    A plant that is turned onto its own older leaves has many.
+    """
     is_new = np.ones(len(second), bool)
     is_new[pairs[:, 1]] = False
-    return int((is_new & (second.lengths >= np.median(second.lengths))).sum())
+    is_large = second.lengths >= np.median(second.lengths)
+    return int((is_new & is_large).sum()) if len(pairs) < NEARLY_ALL * min(len(first), len(second)) else 0
 
 
 def pose_distances(pose: Floats, others: Floats, middle: Floats, *, scale: float) -> Floats:
