@@ -11,9 +11,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from mvseg.checks.contradictions import warn_of_contradictions
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere, fates_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
@@ -52,6 +55,7 @@ class State:
         corrected: what came of them.
         matching: the table of masks, and what matching says of the scene.
         poses: what came of refining them; None where that was not asked for.
+        colors: of leaves, see `leaf_colors`; None: those of the masks, wherever a stage asks.
         starts: {instance id: surface} that the masks were verified with; where the final ones start.
         surfaces, voxels, traits, mask_kind, num_moved: see `Result`; `surfaces` may hold only those that are known
             already until `reconstruct`.
@@ -69,6 +73,7 @@ class State:
     corrected: Corrected | None = None
     matching: Matching | None = None
     poses: RefinedPoses | None = None
+    colors: NDArray[np.bool_] | None = None
     starts: Mapping[int, LeafSurface] = field(default_factory=dict)
     surfaces: Mapping[int, LeafSurface] | None = None
     voxels: Mapping[int, VoxelGrid] | None = None
@@ -160,12 +165,12 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
         "correct": correct if has_edits else None,
         "match": match_refined if config.refine_poses else match,
         "correct_instances": correct_instances if has_edits else None,
+        "follow": follow if has_edits and (is_verified or shapes is not None) else None,
         "split": split if config.split_merged and not is_checked else None,
         "verify": verify if is_verified else None,
         "check": check_cameras,
         "check_ids": check_ids if is_checked else None,
         "split_checked": split if config.split_merged and is_checked else None,
-        "follow": follow if has_edits and has_masks and shapes is not None else None,
         "reconstruct": None if shapes is None else reconstruct,
         "measure": None if shapes is None else measure,
         "recut": recut if is_verified else None,
@@ -233,9 +238,18 @@ def match_refined(state: State) -> State:
 
 
 def correct_instances(state: State) -> State:
-    """Edits of a person about whole instances, see `apply_everywhere`."""
+    """Edits of a person about whole instances, see `apply_everywhere`.
+
+    Warns (InputWarning) of each earlier edit that one of them contradicts.
+    """
     assert state.corrected is not None
-    return state.with_masks(apply_everywhere(state.corrected, state.matched.masks.to("cpu")))
+    before = state.matched.masks.to("cpu")
+    corrected = replace(state.corrected, fates=fates_everywhere(state.corrected, before))
+    for message in corrected.messages:
+        if message not in state.corrected.messages:
+            warnings.warn(message, InputWarning, stacklevel=3)
+    masks = apply_everywhere(corrected, before)
+    return replace(state.with_masks(masks), corrected=corrected)
 
 
 def split(state: State) -> State:
@@ -273,11 +287,12 @@ def check_cameras(state: State) -> State:
 
 def check_ids(state: State) -> State:
     """Surfaces correct the ids, see `mvseg.verification.checked_ids`; those of the other instances are known then."""
-    from mvseg.corrections.follow import linked_masks
     from mvseg.verification import checked_ids
 
     before, surfaces = state.matched.masks, reconstruct(state, with_voxels=False).surfaces or {}
-    held = linked_masks(state.corrected)
+    held = None
+    if state.corrected is not None and not state.corrected.everywhere:  # these edits change the rows that links name
+        held = state.corrected.links.named(len(before))
     after = checked_ids.check_ids(before, surfaces, cameras=state.scene.cameras, held=held)
     known = after.renumber(checked_ids.unchanged_surfaces(before, after, surfaces))
     num_moved = int((before.instance_ids != after.instance_ids).sum())
@@ -285,12 +300,17 @@ def check_ids(state: State) -> State:
 
 
 def follow(state: State) -> State:
-    """Where masks are given, the other views of what a person drew get masks, too, see `add_other_views`."""
-    from mvseg.corrections.follow import add_other_views
+    """The other views of what a person drew get masks, see `follow_drawn`; all others stay as they are."""
+    from mvseg.verification.drawn_leaves import follow_drawn
 
-    before = state.matched.masks
-    after = add_other_views(before, state.scene.cameras, photos=state.photos, workers=state.workers)
-    return state if after is before else replace(state.with_masks(after), surfaces=None)
+    masks, starts = follow_drawn(
+        state.matched.masks,
+        cameras=state.scene.cameras,
+        photos=state.photos if state.photos.exist else None,
+        colors=state.colors,
+        workers=state.workers,
+    )
+    return replace(state.with_masks(masks), starts=starts)
 
 
 def reconstruct(state: State, *, with_voxels: bool = True) -> State:

@@ -17,6 +17,7 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 
+from mvseg.cli import main
 from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
@@ -232,6 +233,24 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text(json.dumps(run | {"code": "other", "mvseg": "0.0"}))
     assert OpenResult(tmp_path).notice == "mvseg 0.0 made this result; what you see is computed anew."
     assert OpenResult(folder).config.match == MatchConfig()
+
+
+def test_a_folder_that_cannot_be_written_to(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(os, "access", lambda *_: False)  # whoever runs the tests
+    assert main(["correct", str(folder), "--no_browser"]) == 2
+    said = capsys.readouterr().err
+    assert f"{folder}: cannot be written to, so corrections would be lost; expected a copy of your own" in said
+
+
+def test_saved_corrections_that_are_broken_are_not_written_over(folder: Path) -> None:
+    path = folder / "corrections.json"
+    path.write_text('{"format": "mvseg-corrections/1", "edits": [NaN]}', encoding="utf-8")
+    with pytest.raises(InputError, match="edit 1: is nan"):
+        Corrector(OpenResult(folder))
+    assert "NaN" in path.read_text(encoding="utf-8")
+    path.unlink()
 
 
 def test_photos_that_are_gone(tmp_path: Path) -> None:

@@ -10,25 +10,22 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.corrections.edited_mask import EditedMask, as_table, cut_out, hang_together, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.lens import pinhole_from_photo, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
-from mvseg.regions import mask_box, stack_regions
 from mvseg.scene import Scene
 
 APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
 COVERED = 0.5  # of a mask, from which an outline replaces it
-FINE = 4  # bits of a pixel's fraction, along a cut
-TOUCHES_PX = 2  # between pieces of one leaf in one photo
 
 
 @dataclass(frozen=True)
@@ -71,27 +68,15 @@ class Corrected:
 
 
 @dataclass(eq=False)
-class _Mask:
-    """One mask while edits are applied: the row of the table it began as (-1: none) and the edits that made it."""
-
-    view: int
-    box: tuple[int, int, int, int]
-    crop: Tensor
-    row: int
-    origin: int
-    edits: list[int] = field(default_factory=list)
-
-
-@dataclass(eq=False)
 class _Work:
     """All that edits change."""
 
     scene: Scene
-    masks: list[_Mask]
+    masks: list[EditedMask]
     fates: dict[int, Fate] = field(default_factory=dict)
-    links: list[tuple[int, bool, _Mask, _Mask]] = field(default_factory=list)  # edit, must, the two
-    everywhere: list[tuple[int, _Mask, bool]] = field(default_factory=list)
-    words: dict[str, list[tuple[int, _Mask]]] = field(default_factory=dict)
+    links: list[tuple[int, bool, EditedMask, EditedMask]] = field(default_factory=list)  # edit, must, the two
+    everywhere: list[tuple[int, EditedMask, bool]] = field(default_factory=list)
+    words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
 
 
 class _Lost(Exception):
@@ -114,7 +99,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     regions, origins = masks.regions, masks.origin.tolist()
     views, boxes = regions.view_index.tolist(), regions.boxes.tolist()
     rows = range(len(masks))
-    work = _Work(scene, [_Mask(views[n], tuple(boxes[n]), regions.crop(n), n, origins[n]) for n in rows])
+    work = _Work(scene, [EditedMask(views[n], tuple(boxes[n]), regions.crop(n), n, origins[n]) for n in rows])
     for number, edit in enumerate(corrections.edits, start=1):
         try:
             work.fates[number] = Fate(number, edit.op, PASSED if isinstance(edit, TrackLink) else APPLIED)
@@ -128,9 +113,10 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     place = {id(mask): n for n, mask in enumerate(order)}
     must, cannot = _agreeing_links(work, place)
     links = Links.of(must, cannot)
-    table = _as_table(masks, order)
+    table = as_table(masks, order)
     if must:
         component = torch.from_numpy(links.components(len(order)))
+        _tell_of_parts(work, order, component.tolist())
         first = torch.tensor([int((component == number).nonzero()[0, 0]) for number in component.tolist()])
         table = replace(table, classes=table.classes[first])  # masks of different classes are never matched
     everywhere = tuple((n, place[id(mask)], rejects) for n, mask, rejects in work.everywhere if id(mask) in place)
@@ -144,17 +130,37 @@ def apply_everywhere(corrected: Corrected, matched: Masks) -> Masks:
     `matched`: the corrected masks with ids, in their order. The masks of a rejected instance go, but for those that
     later edits drew, cut or confirmed; those of a confirmed one are confirmed. Ids are without gaps.
     """
-    ids, origin = matched.instance_ids, matched.origin.clone()
-    goes = torch.zeros(len(matched), dtype=torch.bool)
+    goes, confirmed, _ = _decide_everywhere(corrected, matched)
+    origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
+    return replace(matched, origin=origin).select(goes == 0).close_gaps()
+
+
+def fates_everywhere(corrected: Corrected, matched: Masks) -> tuple[Fate, ...]:
+    """The fates of all edits, once instances are known: an edit about a whole instance contradicts earlier ones that
+    drew, cut or confirmed its masks and now are rejected with it, or that rejected what it confirms."""
+    goes, _, undone = _decide_everywhere(corrected, matched)
+    rows = zip(corrected.last_edits.tolist(), goes.tolist(), strict=True)
+    undone |= {last: number for last, number in rows if 0 < last < number}
+    overridden = {edit: CONTRADICTED.format(number) for edit, number in undone.items()}
+    return tuple(replace(f, fate=overridden.get(f.edit, f.fate)) if f.fate == APPLIED else f for f in corrected.fates)
+
+
+def _decide_everywhere(corrected: Corrected, matched: Masks) -> tuple[Tensor, Tensor, dict[int, int]]:
+    """(D,) int64, the edit by which each mask goes, 0 for none; (D,) bool, those of confirmed instances; and {edit that
+    rejects an instance: the later one that confirms it}."""
+    ids, goes = matched.instance_ids, torch.zeros(len(matched), dtype=torch.int64)
+    confirmed = torch.zeros(len(matched), dtype=torch.bool)
+    undone: dict[int, int] = {}
     for number, row, rejects in corrected.everywhere:
-        own = (ids == ids[row]) if ids[row] > 0 else torch.zeros_like(goes)
+        own = (ids == ids[row]) if ids[row] > 0 else torch.zeros_like(confirmed)
         own[row] = True
         if rejects:
-            goes |= own & (corrected.last_edits < number)
+            goes[own & (corrected.last_edits < number)] = number
         else:
-            goes &= ~own
-            origin[own & (origin < Origin.CORRECTED)] = Origin.CONFIRMED
-    return replace(matched, origin=origin).select(~goes).close_gaps()
+            undone |= dict.fromkeys(goes[own & (goes > 0)].tolist(), number)
+            goes[own] = 0
+            confirmed |= own
+    return goes, confirmed, undone
 
 
 def _apply_one(work: _Work, number: int, edit: Edit) -> None:
@@ -192,7 +198,7 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
     frame = undistort(drawn, work.scene.views[view].lens, work.scene.cameras.K[view].cpu().numpy()) > 0
     if not frame.any():
         raise _Lost(f"its polygon covers no pixel of view {edit.view}")
-    box, crop = _cut_out(torch.from_numpy(frame), (0, 0))
+    box, crop = cut_out(torch.from_numpy(frame), (0, 0))
     covered = []
     for mask in [each for each in work.masks if each.view == view]:
         x1, y1, x2, y2 = mask.box
@@ -201,7 +207,7 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
     row = max(covered, key=lambda mask: int(mask.crop.sum())).row if covered else -1
     for mask in covered:
         _remove(work, number, mask)
-    made = _Mask(view, box, crop, row, int(Origin.CORRECTED), [number])
+    made = EditedMask(view, box, crop, row, int(Origin.CORRECTED), [number])
     work.masks.append(made)
     if edit.leaf is not None:
         work.words.setdefault(edit.leaf, []).append((number, made))
@@ -212,13 +218,13 @@ def _split(work: _Work, number: int, edit: Split) -> None:
     line = _to_pinhole(work.scene, mask.view, edit.line)
     if np.ptp(line, axis=0).max() < 1:
         raise _Lost("its line is a point")
-    is_left = _side_of(line, mask) & mask.crop
+    is_left = side_of(line, mask) & mask.crop
     if not is_left.any() or not (mask.crop & ~is_left).any():
         raise _Lost("its line does not cut the mask")
     parts = []
     for part in (is_left, mask.crop & ~is_left):
-        box, crop = _cut_out(part, mask.box[:2])
-        parts.append(_Mask(mask.view, box, crop, mask.row, int(Origin.CUT), [number]))
+        box, crop = cut_out(part, mask.box[:2])
+        parts.append(EditedMask(mask.view, box, crop, mask.row, int(Origin.CUT), [number]))
     _remove(work, number, mask)
     work.masks += parts
     work.links.append((number, False, parts[0], parts[1]))
@@ -228,16 +234,24 @@ def _link(work: _Work, number: int, edit: Link) -> None:
     found = [_mask_at(work, place) for place in edit.at]
     masks = list({id(mask): mask for mask in found}.values())
     if edit.op == "same":
-        for mask in masks[1:]:
-            others = [other for other in masks if other.view == mask.view and other is not mask]
-            if others and not any(_touch(mask, other) for other in others):
-                message = f"two of its masks in view {work.scene.views[mask.view].name} do not touch"
-                work.fates[number] = Fate(number, edit.op, APPLIED, message)
         work.links += [(number, True, masks[0], mask) for mask in masks[1:]]
     elif len(masks) < len(found):
         raise _Lost("two of its places show the same mask: split it")
     else:
         work.links += [(number, False, one, other) for n, one in enumerate(masks) for other in masks[:n]]
+
+
+def _tell_of_parts(work: _Work, order: Sequence[EditedMask], component: Sequence[int]) -> None:
+    """Masks of one photo that edits say are one leaf, but do not touch: the last of these edits says so."""
+    place = {id(mask): row for row, mask in enumerate(order)}
+    groups: dict[tuple[int, int], list[EditedMask]] = {}
+    for mask, number in zip(order, component, strict=True):
+        groups.setdefault((number, mask.view), []).append(mask)
+    for (group, view), masks in groups.items():
+        edits = [n for n, m, a, _ in work.links if m and id(a) in place and component[place[id(a)]] == group]
+        if edits and not hang_together(masks):
+            message = f"a contradiction: its masks in view {work.scene.views[view].name} do not touch"
+            work.fates[max(edits)] = replace(work.fates[max(edits)], problem=message)
 
 
 def _agreeing_links(work: _Work, place: dict[int, int]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
@@ -286,7 +300,7 @@ def _culprit(work: _Work, place: dict[int, int], number: int, held: Sequence[int
     return next((later for later in held if agree({number, *held} - {later})), max(held))
 
 
-def _remove(work: _Work, number: int, mask: _Mask) -> None:
+def _remove(work: _Work, number: int, mask: EditedMask) -> None:
     """Take a mask away; the edits that made it, or linked it, are contradicted."""
     work.masks = [other for other in work.masks if other is not mask]
     linked = [n for n, _, a, b in work.links if mask in (a, b)] + [n for n, m, _ in work.everywhere if m is mask]
@@ -298,7 +312,7 @@ def _contradict(work: _Work, number: int, edits: Sequence[int]) -> None:
         work.fates[earlier] = replace(work.fates[earlier], fate=CONTRADICTED.format(number))
 
 
-def _mask_at(work: _Work, place: Place) -> _Mask:
+def _mask_at(work: _Work, place: Place) -> EditedMask:
     """The smallest mask at a place, as it would be drawn on top."""
     name, x, y = place
     view = _view(work.scene, name)
@@ -334,62 +348,3 @@ def _to_pinhole(scene: Scene, view: int, points: Sequence[Point]) -> NDArray[np.
     if not np.isfinite(xy).all():
         raise _Lost("the lens shows nothing there")
     return xy.clip(-1e6, 1e6)
-
-
-def _side_of(line: NDArray[np.float64], mask: _Mask) -> Tensor:
-    """(h, w) bool: the pixels of a mask's box on one side of a line, which goes on straight at its ends."""
-    height, width = mask.crop.shape
-    line = line - mask.box[:2]
-    far = 4.0 * (width + height + np.abs(line).max())
-    steps = [line[0] - line[1], line[-1] - line[-2]]
-    ends = [step / max(float(np.hypot(*step)), 1e-9) * far for step in steps]
-    line = np.concatenate(([line[0] + ends[0]], line, [line[-1] + ends[1]]))
-    along = line[-1] - line[0]
-    aside = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9) * far
-    polygon = np.concatenate((line, [line[-1] + aside, line[0] + aside])) - 0.5  # from pixel corners to centres
-    side = np.zeros((height, width), np.uint8)
-    cv2.fillPoly(side, [np.round(polygon * 2**FINE).astype(np.int32)], 1, shift=FINE)
-    return torch.from_numpy(side > 0)
-
-
-def _touch(one: _Mask, other: _Mask) -> bool:
-    """Do two masks of one view touch, or nearly?"""
-    x1, y1 = (min(one.box[axis], other.box[axis]) - TOUCHES_PX for axis in (0, 1))
-    x2, y2 = (max(one.box[axis], other.box[axis]) + TOUCHES_PX for axis in (2, 3))
-    frames: list[NDArray[np.uint8]] = []
-    for mask in (one, other):
-        frame = np.zeros((y2 - y1, x2 - x1), np.uint8)
-        frame[mask.box[1] - y1 : mask.box[3] - y1, mask.box[0] - x1 : mask.box[2] - x1] = mask.crop.numpy()
-        frames.append(frame)
-    size = 2 * TOUCHES_PX + 1
-    return bool((np.asarray(cv2.dilate(frames[0], np.ones((size, size), np.uint8))) > 0)[frames[1] > 0].any())
-
-
-def _cut_out(part: Tensor, corner: Sequence[int]) -> tuple[tuple[int, int, int, int], Tensor]:
-    """The box and the crop of a mask in a frame whose top-left pixel is `corner`."""
-    x1, y1, x2, y2 = mask_box(part)
-    left, top = corner
-    return (left + x1, top + y1, left + x2, top + y2), part[y1:y2, x1:x2].clone()
-
-
-def _as_table(masks: Masks, made: Sequence[_Mask]) -> Masks:
-    """The table of the masks that are left. Those drawn where none was have the commonest class; what was drawn has no
-    score."""
-    if not made:
-        return Masks.of(masks.regions).select(torch.zeros(0, dtype=torch.int64))
-    rows = torch.tensor([mask.row for mask in made])
-    origin = torch.tensor([mask.origin for mask in made])
-    classes, scores, labels = torch.ones_like(rows), torch.full((len(made),), torch.nan), torch.zeros_like(rows)
-    if len(masks):
-        is_new, chosen = rows < 0, rows.clamp(min=0)
-        classes = torch.where(is_new, masks.classes.mode()[0], masks.classes[chosen])
-        scores = torch.where(origin == Origin.CORRECTED, torch.nan, masks.detection_scores[chosen])
-        labels = torch.where(is_new, 0, masks.regions.labels[chosen])
-    regions = stack_regions(
-        [mask.view for mask in made],
-        [mask.box for mask in made],
-        [mask.crop.flatten() for mask in made],
-        labels=labels.tolist(),
-        num_views=masks.regions.num_views,
-    )
-    return replace(Masks.of(regions, classes=classes, detection_scores=scores), origin=origin)

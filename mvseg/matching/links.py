@@ -1,29 +1,24 @@
 """What a person knows of masks: that they show one leaf, or different ones. Not in the paper.
 
-Masks that must be together are one node of the graph. Where the views have put them into several clusters, the node
-joins those clusters that it fits: a mask that was matched wrongly leaves its cluster, and halves of a leaf come
-together. A cluster with masks that cannot be together falls apart by average linkage.
+Masks that must be together are one node of the graph, and those that cannot never join one cluster: the search itself
+honours both (`ViewGraph`), so that a link pulls the rest of its leaf. Where what is found without links agrees with all
+of them, it stays: it is the best partition under them, too.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.matching.one_per_view import FORBIDDEN, STOP, TIE, ViewGraph
+from mvseg.matching.one_per_view import ViewGraph
 from mvseg.matching.partition import renumber
-
-HALF = 0.5  # share of a cluster's own mean weight, from which linked masks fit it
-SECOND_CHANCE = 0.4  # mean weight from which a mask that was taken out of a cluster joins another one
-MORE_FORBIDDEN = 1e6 * FORBIDDEN
 
 Ints = NDArray[np.int64]
 
@@ -56,6 +51,25 @@ class Links:
         must, cannot = place[self.must.cpu()], place[self.cannot.cpu()]
         return Links(must[(must >= 0).all(1)], cannot[(cannot >= 0).all(1)])
 
+    def named(self, num_regions: int) -> Tensor:
+        """(D,) bool, the regions that some link names."""
+        is_named = torch.zeros(num_regions, dtype=torch.bool)
+        is_named[torch.cat((self.must, self.cannot)).flatten()] = True
+        return is_named
+
+    def agree(self, clusters: Ints) -> bool:
+        """Whether clusters (D,), -1 for a region in none, say the same."""
+        must, cannot = clusters[self.must.cpu().numpy()], clusters[self.cannot.cpu().numpy()]
+        is_together = [(pairs[:, 0] == pairs[:, 1]) & (pairs[:, 0] >= 0) for pairs in (must, cannot)]
+        return bool(is_together[0].all() and not is_together[1].any())
+
+    def hold(self, graph: ViewGraph) -> ViewGraph:
+        """The graph in which they hold: regions that must be together are one node."""
+        node, pairs = self.components(len(graph.view_index)), self.cannot.cpu().numpy()
+        apart = np.zeros((int(node.max(initial=-1)) + 1,) * 2, bool)
+        apart[node[pairs[:, 0]], node[pairs[:, 1]]] = True
+        return replace(graph, node=node, apart=(apart | apart.T)[node][:, node])
+
     def components(self, num_regions: int) -> Ints:
         """(D,) number of the regions that must be together, transitively.
 
@@ -73,90 +87,3 @@ class Links:
             first, second = apart[both[0]].tolist()
             raise InputError(f"links say that regions {first} and {second} are the same and that they are different")
         return component
-
-
-def keep_links(clusters: Ints, graph: ViewGraph, links: Links) -> Ints:
-    """The partition, changed where it contradicts links; one that agrees with all of them stays as it is.
-
-    Args:
-        clusters: (D,) cluster of each region, from 0 on.
-        graph: their epipolar weights.
-        links: of the regions.
-
-    Returns:
-        (D,) clusters, numbered by their first region. The order of the links does not matter.
-
-    Raises:
-        InputError: links that contradict each other.
-    """
-    if not len(links):
-        return clusters
-    component = links.components(len(clusters))
-    joined = clusters.copy()
-    for number in np.flatnonzero(np.bincount(component) > 1).tolist():
-        node = component == number
-        if len(np.unique(joined[node])) > 1:
-            joined = _join_node(joined, graph, node)
-    pairs = np.unique(np.sort(links.cannot.cpu().numpy(), 1), axis=0)
-    apart = np.zeros((int(component.max(initial=-1)) + 1,) * 2, bool)
-    apart[component[pairs[:, 0]], component[pairs[:, 1]]] = True
-    is_apart = (apart | apart.T)[component][:, component]
-    divided = joined
-    for first, second in pairs.tolist():
-        if divided[first] == divided[second]:
-            divided = _divide(divided, graph, component, is_apart=is_apart, pair=(first, second))
-    torn = pairs[joined[pairs[:, 0]] == joined[pairs[:, 1]]]
-    for region in np.unique(torn).tolist():
-        if (divided == divided[region]).sum() == 1:
-            divided = _second_chance(divided, graph, region, forbidden=is_apart[region])
-    return renumber(divided)
-
-
-def _join_node(clusters: Ints, graph: ViewGraph, node: NDArray[np.bool_]) -> Ints:
-    """The regions of `node` (D,) bool leave their clusters, and join all of these that they fit as one region."""
-    joined = clusters.copy()
-    joined[node] = clusters.max() + 1
-    for number in np.unique(clusters[node]).tolist():
-        rest = np.flatnonzero((clusters == number) & ~node)
-        if not len(rest):
-            continue
-        views = graph.view_index[rest]
-        to_node = graph.weights[np.ix_(rest, node)].max(1)
-        is_elsewhere = (graph.view_index[node] != views[:, None]).any(1)
-        within, is_pair = graph.weights[np.ix_(rest, rest)], views[:, None] != views
-        own = within[is_pair].mean() if is_pair.any() else 0.0
-        if is_elsewhere.any() and to_node[is_elsewhere].mean() >= max(STOP, HALF * own):
-            joined[rest] = joined[node][0]
-    return joined
-
-
-def _divide(
-    clusters: Ints, graph: ViewGraph, component: Ints, *, is_apart: NDArray[np.bool_], pair: tuple[int, int]
-) -> Ints:
-    """The cluster of two regions in two: average linkage in which components are one, and `is_apart` (D, D) is never
-    joined before the last step."""
-    members = np.flatnonzero(clusters == clusters[pair[0]])
-    first, second = (members[index] for index in np.triu_indices(len(members), 1))
-    farthest = graph.weights.max(initial=1.0)
-    distance = 1 + farthest - graph.weights[first, second] + TIE * np.linspace(0, 1, len(first))
-    distance[component[first] == component[second]] = 0
-    distance[is_apart[first, second]] = FORBIDDEN
-    low, high = sorted(component[list(pair)].tolist())
-    ends = np.sort(component[np.stack((first, second))], 0)
-    distance[(ends[0] == low) & (ends[1] == high)] = MORE_FORBIDDEN  # any merge of these two is the last
-    side = fcluster(linkage(distance, "average"), 2, "maxclust")
-    divided = clusters.copy()
-    divided[members[side != side[members == pair[0]]]] = clusters.max() + 1
-    return divided
-
-
-def _second_chance(clusters: Ints, graph: ViewGraph, region: int, *, forbidden: NDArray[np.bool_]) -> Ints:
-    """A region that is alone joins the cluster of largest mean weight that has no region in its view and none that is
-    `forbidden` (D,)."""
-    clusters = renumber(clusters)
-    taken = np.unique(clusters[forbidden | (graph.view_index == graph.view_index[region])])
-    mean = np.bincount(clusters, graph.weights[region]) / np.bincount(clusters)
-    mean[taken] = -1
-    if mean.max() >= SECOND_CHANCE:
-        clusters[region] = mean.argmax()
-    return clusters

@@ -12,10 +12,9 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.links import Links, keep_links
+from mvseg.matching.links import Links
 from mvseg.matching.nview.match_nview import DILATIONS, match_nview
-from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
-from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
+from mvseg.matching.one_per_view import ViewGraph, cluster_graph, one_per_view_clusters
 from mvseg.matching.pencil import is_coincident
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.symnmf import cluster_affinity
@@ -79,20 +78,14 @@ def match_regions(
         return matching
     if method == "one-per-view":
         ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
-        return matching_of_ids(_keep_links(ids, regions, affinity, links), regions, affinity, method=method)
+        if not links.agree(ids.cpu().numpy()):
+            weights, views = affinity.to_dense().cpu().double().numpy(), regions.view_index.cpu().numpy()
+            ids = cluster_graph(links.hold(ViewGraph(weights, views, len(cameras)))).to(ids)
+        return matching_of_ids(ids, regions, affinity, method=method)
     matching = match_graph(affinity, regions, config, method=method, progress=progress)
-    ids = _keep_links(matching.instance_ids, regions, affinity, links)
-    return matching if ids is matching.instance_ids else matching_of_ids(ids, regions, affinity, method=method)
-
-
-def _keep_links(ids: Tensor, regions: Regions, affinity: Affinity, links: Links) -> Tensor:
-    """(D,) ids in [1, K] or -1 that agree with the links."""
-    if not len(links):
-        return ids
-    weights, views = affinity.to_dense().cpu().double().numpy(), regions.view_index.cpu().numpy()
-    clusters = separate_unmatched(renumber(ids.cpu().numpy()))
-    kept = keep_links(clusters, ViewGraph(weights, views, regions.num_views), links)
-    return number_instances(drop_singletons(kept)).to(ids.device)
+    if links.agree(matching.instance_ids.cpu().numpy()):
+        return matching
+    return match_graph(affinity, regions, config, method=method, links=links, progress=progress)
 
 
 def match_masks(
@@ -122,7 +115,13 @@ def match_masks(
 
 
 def match_graph(
-    graph: Affinity, regions: Regions, config: MatchConfig, *, method: str, progress: bool = False
+    graph: Affinity,
+    regions: Regions,
+    config: MatchConfig,
+    *,
+    method: str,
+    links: Links | None = None,
+    progress: bool = False,
 ) -> Matching:
     """Cluster any graph of the regions with SymNMF, |k| by Eq. 7.
 
@@ -131,6 +130,7 @@ def match_graph(
         regions: whose numbers per view set the default range for the number of instances.
         config: num_instances, search_range, num_restarts and seed are used; the rest concerns the epipolar weights.
         method: the `Matching.method` of the result.
+        links: of the regions, see `cluster_affinity`.
         progress: show a progress bar.
     """
     clustering = cluster_affinity(
@@ -140,6 +140,7 @@ def match_graph(
         search_range=config.search_range,
         num_restarts=config.num_restarts,
         seed=config.seed,
+        links=links,
         progress=progress,
     )
     return matching_of_ids(clustering.instance_ids, regions, graph, method=method)

@@ -36,15 +36,81 @@ class ViewGraph:
         weights: (D, D) symmetric, >= 0.
         view_index: (D,) int64 in [0, V).
         num_views: V.
+        node: (D,) int64: regions with one number stay together, as a person says; None: each is by itself.
+        apart: (D, D) bool, symmetric: regions that are never together; None: there are none.
     """
 
     weights: Floats
     view_index: Ints
     num_views: int
+    node: Ints | None = None
+    apart: NDArray[np.bool_] | None = None
 
     def select(self, index: Ints) -> ViewGraph:
         """The graph of some regions."""
-        return ViewGraph(self.weights[np.ix_(index, index)], self.view_index[index], self.num_views)
+        node = None if self.node is None else self.node[index]
+        apart = None if self.apart is None else self.apart[np.ix_(index, index)]
+        return ViewGraph(self.weights[np.ix_(index, index)], self.view_index[index], self.num_views, node, apart)
+
+    @property
+    def is_linked(self) -> NDArray[np.bool_]:
+        """(D,) whether a person says anything of a region."""
+        if self.node is None or self.apart is None:
+            return np.zeros(len(self.view_index), bool)
+        return (np.bincount(self.node)[self.node] > 1) | self.apart.any(1)
+
+    def movers(self, view: int) -> Movers:
+        """The nodes that a view shows."""
+        here = self.view_index == view
+        if self.node is None:
+            return Movers(np.flatnonzero(here), np.arange(int(here.sum())))
+        rows = np.flatnonzero(np.isin(self.node, self.node[here]))
+        _, first, owner = np.unique(self.node[rows], return_index=True, return_inverse=True)
+        return Movers(rows, np.argsort(np.argsort(first))[owner])
+
+    def forbidden(self, movers: Movers, clusters: Ints, numbers: Ints) -> NDArray[np.bool_]:
+        """(N, K) bool: the clusters `numbers` (K,) that each mover cannot join: the others hold a region that it is
+        apart from, or, but for the cluster (D,) that it is in, one in its view."""
+        is_forbidden = np.zeros((movers.num, len(numbers)), bool)
+        if self.node is None or self.apart is None:
+            return is_forbidden
+        stays = np.ones(len(clusters), bool)
+        stays[movers.rows] = False
+        members = (clusters[:, None] == numbers) & stays[:, None]
+        same_view = self.view_index[movers.rows][:, None] == self.view_index
+        is_elsewhere = clusters[movers.rows][:, None] != numbers
+        conflicts = (self.apart[movers.rows] @ members) | ((same_view @ members) & is_elsewhere)
+        np.logical_or.at(is_forbidden, movers.owner, conflicts)
+        return is_forbidden
+
+
+@dataclass(frozen=True, eq=False)
+class Movers:
+    """N nodes of regions, each of which moves as one.
+
+    Attributes:
+        rows: (R,) int64, their regions.
+        owner: (R,) int64 in [0, N), the node of each.
+    """
+
+    rows: Ints
+    owner: Ints
+
+    @property
+    def num(self) -> int:
+        """N."""
+        return int(self.owner.max(initial=-1)) + 1
+
+    @property
+    def sizes(self) -> Ints:
+        """(N,) regions of each."""
+        return np.bincount(self.owner, minlength=self.num)
+
+    def total(self, values: Floats) -> Floats:
+        """(N, K) sums over the regions of each node; `values` (R, K)."""
+        summed = np.zeros((self.num, values.shape[1]), values.dtype)
+        np.add.at(summed, self.owner, values)
+        return summed
 
 
 def one_per_view_clusters(affinity: Affinity, view_index: Tensor, num_views: int) -> Tensor:
@@ -62,15 +128,20 @@ def one_per_view_clusters(affinity: Affinity, view_index: Tensor, num_views: int
         its cluster. The partition does not depend on the order of views and regions unless weights tie.
     """
     weights = affinity.to_dense().cpu().double().numpy()
-    graph = ViewGraph(weights, view_index.cpu().numpy(), num_views)
-    clusters = power_iteration(graph, link_average(graph))
-    return number_instances(drop_singletons(clusters)).to(view_index.device)
+    return cluster_graph(ViewGraph(weights, view_index.cpu().numpy(), num_views)).to(view_index.device)
+
+
+def cluster_graph(graph: ViewGraph) -> Tensor:
+    """(D,) int64 instance ids on the CPU, see `one_per_view_clusters`; nodes of the graph are one region each."""
+    return number_instances(drop_singletons(power_iteration(graph, link_average(graph))))
 
 
 def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
-    """Average linkage in which clusters that share a view are never joined.
+    """Average linkage in which clusters that share a view are never joined, nor those that are apart.
 
-    Of equal weights, that of the regions that come first counts as larger, so that SciPy's order of ties does not show.
+    Nodes of several regions are joined first: from then on linkage is that of the contracted graph, whose weights are
+    means. Of equal weights, that of the regions that come first counts as larger, so that SciPy's order of ties does
+    not show.
 
     Args:
         graph: of D regions.
@@ -85,6 +156,9 @@ def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
     farthest = graph.weights.max(initial=1.0)  # the distance between two regions without an edge
     distance = farthest - graph.weights[first, second] + TIE * np.linspace(0, 1, len(first))
     distance[graph.view_index[first] == graph.view_index[second]] = FORBIDDEN
+    if graph.node is not None and graph.apart is not None:
+        distance[graph.apart[first, second]] = FORBIDDEN
+        distance[graph.node[first] == graph.node[second]] = 0
     cut = min(farthest - stop + TIE, np.nextafter(farthest, 0))
     return renumber(fcluster(linkage(distance, "average"), cut, "distance").astype(np.int64))
 
@@ -93,7 +167,8 @@ def power_iteration(graph: ViewGraph, clusters: Ints) -> Ints:
     """Re-assign the regions of one view after another to the clusters of the others, one to one.
 
     The gain of a region from a cluster is its summed weight to the members, divided by V - 1; a region may also stay
-    alone, for a gain of ALONE. The views with the largest total weight come first, whatever their numbers.
+    alone, for a gain of ALONE. A node of several regions moves as one, whenever a view of it is re-assigned; its gains
+    are their sums. The views with the largest total weight come first, whatever their numbers.
 
     Returns:
         (D,) cluster of each region in [0, K), regions that stay alone included.
@@ -102,13 +177,15 @@ def power_iteration(graph: ViewGraph, clusters: Ints) -> Ints:
     for _ in range(MAX_SWEEPS):
         before = clusters
         for view in order:
-            here = np.flatnonzero(graph.view_index == view)
-            rest = np.where(graph.view_index == view, -1, clusters)
+            movers = graph.movers(view)
+            rest = clusters.copy()
+            rest[movers.rows] = -1
             numbers, rest[rest >= 0] = np.unique(rest[rest >= 0], return_inverse=True)
             members = np.zeros((len(rest), len(numbers)))
             members[rest >= 0, rest[rest >= 0]] = 1
-            gain = graph.weights[here] @ members / max(graph.num_views - 1, 1)
-            rest[here] = assign_one_to_one(gain, ALONE)
+            gain = movers.total(graph.weights[movers.rows] @ members) / max(graph.num_views - 1, 1)
+            gain[graph.forbidden(movers, clusters, numbers)] = -np.inf
+            rest[movers.rows] = assign_one_to_one(gain, ALONE * movers.sizes)[movers.owner]
             clusters = rest
         clusters = renumber(clusters)
         if (clusters == before).all():
@@ -132,7 +209,8 @@ def join_alone(graph: ViewGraph, clusters: Ints, *, stop: float) -> Ints:
     for region in alone[np.argsort(-best_weight, kind="stable")].tolist():
         clusters = renumber(clusters)
         sizes = np.bincount(clusters)
-        taken = np.unique(clusters[graph.view_index == graph.view_index[region]])
+        is_apart = graph.view_index == graph.view_index[region]
+        taken = np.unique(clusters[is_apart if graph.apart is None else is_apart | graph.apart[region]])
         mean = np.bincount(clusters, graph.weights[region]) / sizes
         mean[taken] = -1
         if sizes[clusters[region]] == 1 and mean.max() >= stop:
@@ -140,18 +218,18 @@ def join_alone(graph: ViewGraph, clusters: Ints, *, stop: float) -> Ints:
     return renumber(clusters)
 
 
-def assign_one_to_one(gain: Floats, alone: float) -> Ints:
+def assign_one_to_one(gain: Floats, alone: float | Floats) -> Ints:
     """Best assignment of N regions to K clusters: a cluster takes at most one, and any region may stay alone.
 
     Args:
-        gain: (N, K).
-        alone: gain of a region in a cluster of its own.
+        gain: (N, K); -inf: never.
+        alone: gain of a region in a cluster of its own; of all, or of each (N,).
 
     Returns:
         (N,) cluster of each region; those alone get K, K + 1, ...
     """
     num_regions, num_clusters = gain.shape
-    padded = np.full((num_regions, num_clusters + num_regions), alone)
+    padded = np.full((num_regions, num_clusters + num_regions), np.reshape(alone, (-1, 1)))
     padded[:, :num_clusters] = gain
     region, cluster = linear_sum_assignment(padded, maximize=True)
     chosen = np.empty(num_regions, np.int64)

@@ -11,9 +11,12 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, fields, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import TypeAdapter, ValidationError
 
 from mvseg._version import code_hash
@@ -24,11 +27,13 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.pipeline import Stage, State, detect, list_stages, load, reconstruct
+from mvseg.reconstruction.shapes import Surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import RUN_FILE
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 from mvseg.system.atomic import lock_folder
+from mvseg.verification.other_views import colors_of_leaves, fit_roughly, verify_masks
 
 CORRECTIONS_FILE = "corrections.json"
 NOT_AGAIN = ("detect", "check", "measure", "reconstruct")  # stages whose outcome the page does not show, or that ran
@@ -66,6 +71,7 @@ class OpenResult:
             raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
         self._found = state if masks is not None else detect(state)
         self._fitted: dict[str, LeafSurface] = {}
+        self._rough: dict[str, LeafSurface] = {}  # that masks are verified with
         self.has_masks = masks is not None
 
     @property
@@ -107,7 +113,7 @@ class OpenResult:
             Superseded: `is_old` said so.
             InputError: see the stages.
         """
-        state = replace(self._found, corrections=corrections)
+        state = replace(self._found, corrections=corrections, colors=self._colors)
         messages: list[str] = []
         for stage in self._stages(has_edits=len(corrections.edits) > 0):
             if is_old():
@@ -123,6 +129,11 @@ class OpenResult:
         told = () if corrected is None else corrected.messages
         return _result_of(state), outcomes, [text for text in dict.fromkeys(messages) if text not in told]
 
+    @cached_property
+    def _colors(self) -> NDArray[np.bool_]:
+        """The colours of leaves before all edits: they stay, so that an edit changes no mask of other leaves."""
+        return colors_of_leaves(self.matched().masks.to("cpu"), self.photos)
+
     def _stages(self, *, has_edits: bool) -> list[Stage]:
         named = list_stages(self.config, has_masks=self.has_masks, has_edits=has_edits)
         stages: list[Stage] = []
@@ -130,21 +141,44 @@ class OpenResult:
             if name in ("check_ids", "reconstruct"):
                 stages.append(self._fit)
             if name not in NOT_AGAIN:
-                stages.append(stage)
+                stages.append(self._verify if name == "verify" else stage)
         return stages
 
     def _fit(self, state: State) -> State:
         """A surface for every instance; those whose masks had one before keep it."""
-        masks = state.matched.masks
-        ids = masks.instance_ids[masks.instance_ids > 0].unique().tolist()
-        names = {instance: name_masks(masks, instance) for instance in ids}
-        known = {instance: self._fitted[name] for instance, name in names.items() if name in self._fitted}
-        if known and len(known) == len(names):
-            return replace(state, surfaces=known)
-        surfaces = reconstruct(replace(state, surfaces=known), with_voxels=False).surfaces
-        for instance, surface in (surfaces or {}).items():
-            self._fitted[names[instance]] = surface
-        return replace(state, surfaces=surfaces)
+
+        def fit(known: dict[int, LeafSurface]) -> Surfaces | None:
+            return reconstruct(replace(state, surfaces=known), with_voxels=False).surfaces
+
+        return replace(state, surfaces=_fit_unknown(state.matched.masks, self._fitted, fit))
+
+    def _verify(self, state: State) -> State:
+        """As the stage of that name, with surfaces that are known."""
+        cameras = self.scene.cameras
+
+        def fit(masks: Masks) -> dict[int, LeafSurface]:
+            again = partial(fit_roughly, masks, cameras, workers=state.workers)
+            return dict(_fit_unknown(masks, self._rough, lambda known: again(known=known)) or {})
+
+        masks, starts = verify_masks(
+            state.matched.masks, cameras=cameras, photos=self.photos, colors=state.colors, fit=fit
+        )
+        return replace(state, matching=state.matched.with_masks(masks), starts=starts)
+
+
+def _fit_unknown(
+    masks: Masks, before: dict[str, LeafSurface], fit: Callable[[dict[int, LeafSurface]], Surfaces | None]
+) -> Surfaces | None:
+    """The surfaces of all instances: those of `before` by the names of their masks, and what `fit` makes of the others,
+    which is kept there."""
+    ids = masks.instance_ids[masks.instance_ids > 0].unique().tolist()
+    names = {instance: name_masks(masks, instance) for instance in ids}
+    known = {instance: before[name] for instance, name in names.items() if name in before}
+    if known and len(known) == len(names):
+        return known
+    surfaces = fit(known)
+    before.update({names[instance]: surface for instance, surface in (surfaces or {}).items()})
+    return surfaces
 
 
 def name_masks(masks: Masks, instance: int) -> str:

@@ -57,5 +57,6 @@ def has_leaf_color(photo: np.ndarray, colors: np.ndarray) -> np.ndarray:
 
 
 def _color_bins(photo: np.ndarray) -> np.ndarray:
-    red, green, blue = (photo[..., channel].astype(np.int64) * BINS // 256 for channel in range(3))
-    return (red * BINS + green) * BINS + blue
+    red, green, blue = ((photo[..., channel] // (256 // BINS)).astype(np.uint16) for channel in range(3))
+    bins: np.ndarray = (red * BINS + green) * BINS + blue
+    return bins

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Set
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import torch
@@ -29,6 +30,7 @@ from mvseg.verification.recut import AGREES, Box, Mask, agreement
 from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
 
 Photos = Callable[[int], NDArray[np.uint8]]
+Fit = Callable[[Masks], dict[int, LeafSurface]]
 
 LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for a view to show it openly
 LEAST_PIXELS = 64  # of that part
@@ -56,7 +58,8 @@ def verify_masks(
     *,
     cameras: Cameras,
     photos: Photos | None,
-    held: Tensor | None = None,
+    colors: NDArray[np.bool_] | None = None,
+    fit: Fit | None = None,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
@@ -65,7 +68,8 @@ def verify_masks(
     Args:
         masks: D detections, matched.
         cameras: V cameras.
-        photos, held: see `revise_masks`.
+        photos, colors: see `revise_masks`.
+        fit: from the masks to {instance id: surface}; None: `fit_roughly`.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         progress: show progress bars.
 
@@ -80,13 +84,32 @@ def verify_masks(
         message = f"the cameras see the leaves from one side only ({parallax:.0f} degrees apart, as a rule)"
         warnings.warn(f"{message}: the other views cannot verify their masks", InputWarning, stacklevel=2)
         return masks, {}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # what still holds after the correction is said then
-        surfaces = fit_surfaces(
-            masks.regions, masks.instance_ids, cameras, most_views=ROUGH_VIEWS, workers=workers, progress=progress
-        )
-    revised = revise_masks(masks, surfaces, cameras=cameras, photos=photos, held=held, progress=progress)
+    surfaces = fit_roughly(masks, cameras, workers=workers, progress=progress) if fit is None else fit(masks)
+    revised = revise_masks(masks, surfaces, cameras=cameras, photos=photos, colors=colors, progress=progress)
     return revised.close_gaps(), revised.renumber(surfaces)
+
+
+def fit_roughly(
+    masks: Masks,
+    cameras: Cameras,
+    *,
+    known: Mapping[int, LeafSurface] = MappingProxyType({}),
+    workers: ProcessPoolExecutor | None = None,
+    progress: bool = False,
+) -> dict[int, LeafSurface]:
+    """{instance id: surface} to verify masks with; for `known` see `fit_surfaces`. It does not warn: what still holds
+    after the correction is said then."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        return fit_surfaces(
+            masks.regions,
+            masks.instance_ids,
+            cameras,
+            known=known,
+            most_views=ROUGH_VIEWS,
+            workers=workers,
+            progress=progress,
+        )
 
 
 def median_parallax(masks: Masks, cameras: Cameras) -> float:
@@ -110,7 +133,7 @@ def revise_masks(
     *,
     cameras: Cameras,
     photos: Photos | None,
-    held: Tensor | None = None,
+    colors: NDArray[np.bool_] | None = None,
     progress: bool = False,
 ) -> Masks:
     """Keep, replace, add and drop masks as the surfaces of their instances say.
@@ -134,9 +157,10 @@ def revise_masks(
         cameras: V cameras.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted; asked twice for each view. None: there are none, and
             colour tells nothing.
-        held: (D,) bool, masks that are certain: they stay as they are, and so do their instances. By default those that
-            a person corrected (`Masks.is_corrected`).
+        colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
         progress: show a progress bar over the views.
+
+    Masks that a person corrected (`Masks.is_corrected`) are certain: they stay as they are, and so do their instances.
 
     Returns:
         The D' masks that are left, at most one for each instance and view, by view and instance; ids are as before,
@@ -144,9 +168,10 @@ def revise_masks(
         of theirs. One that only the other views show has `Origin.OTHER_VIEWS` and the mean scores of its instance.
     """
     regions, ids = masks.regions, masks.instance_ids
-    held = masks.is_corrected if held is None else held
+    held = masks.is_corrected
     certain = {*zip(regions.view_index[held].tolist(), ids[held].tolist(), strict=True)}
-    colors = None if photos is None else _colors_of_leaves(masks, photos)
+    if photos is not None and colors is None:
+        colors = colors_of_leaves(masks, photos)
     found: list[_Found] = []
     shown_openly: Counter[int] = Counter()
     for view in tqdm(range(regions.num_views), "verification", unit="view", disable=not progress):
@@ -231,7 +256,7 @@ def _first(masks: Masks, instance: int) -> int:
     return int((masks.instance_ids == instance).nonzero()[0, 0])
 
 
-def _colors_of_leaves(masks: Masks, photos: Photos) -> NDArray[np.bool_]:
+def colors_of_leaves(masks: Masks, photos: Photos) -> NDArray[np.bool_]:
     """The colours of masks that are surely matched, of instances that are so in `SURE_VIEWS` views, or in all where
     there are fewer; where there are no such masks, those of all that are matched."""
     enough = masks.count_sure_views() >= min(SURE_VIEWS, masks.regions.num_views)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import threading
@@ -9,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image, ImageOps
@@ -188,6 +190,22 @@ def test_a_scene_waits_until_an_earlier_worker_has_let_go_of_it(scene: BatchScen
 def test_masks_may_lie_beside_the_table(scene: BatchScene, tmp_path: Path) -> None:
     (scene.folder / "masks").rename(tmp_path / "masks")
     assert work_on_scene(tmp_path / "out", CONFIG, scene).status.masks == 9
+
+
+def test_corrections_of_a_scene(scene: BatchScene, tmp_path: Path) -> None:
+    """A row of the table names them; other edits make the scene anew, and a broken file is its failure alone."""
+    corrected, path = replace(scene, corrections=Path("mine.json")), scene.folder / "mine.json"
+    rows, columns = np.nonzero(np.array(Image.open(scene.folder / "masks" / "000.png")))
+    reject = {"op": "reject", "view": "000", "at": [float(columns[0]) + 0.5, float(rows[0]) + 0.5]}
+    for edits, num_masks in (([reject], 8), ([], 9)):
+        path.write_text(json.dumps({"format": "mvseg-corrections/1", "edits": edits}), encoding="utf-8")
+        finished = work_on_scene(tmp_path / "out", CONFIG, corrected)
+        assert (finished.is_kept, finished.status.masks) == (False, num_masks)
+        assert work_on_scene(tmp_path / "out", CONFIG, corrected).is_kept
+    path.write_text('{"format": "mvseg-corrections/1", "edits": [NaN]}', encoding="utf-8")
+    assert work_on_scene(tmp_path / "out", CONFIG, corrected).status.sentence.startswith(f"{path}: edit 1: is nan")
+    path.unlink()
+    assert "mine.json: no such corrections" in work_on_scene(tmp_path / "out", CONFIG, corrected).status.sentence
 
 
 def test_it_computes_on_one_thread(scene: BatchScene, tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere, fates_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
@@ -126,7 +126,12 @@ def test_a_later_edit_wins_and_the_earlier_one_says_so() -> None:
 
 def test_pieces_that_do_not_touch_are_named() -> None:
     corrected = correct(link("same", ("a", 15, 15), ("a", 35, 15)))
-    assert corrected.messages == ["correction 1 (same): applied: two of its masks in view a do not touch"]
+    said = "applied: a contradiction: its masks in view a do not touch"
+    assert corrected.messages == [f"correction 1 (same): {said}"]
+    chain = correct(link("same", ("a", 15, 15), ("b", 15, 15)), link("same", ("b", 15, 15), ("a", 35, 15)))
+    assert chain.messages == [f"correction 2 (same): {said}"]
+    bridged = [square(20, 10, 30, 20), link("same", ("a", 15, 15), ("a", 35, 15), ("a", 25, 15))]
+    assert correct(*bridged).messages == []
     assert correct(square(20, 10, 28, 20), link("same", ("a", 15, 15), ("a", 25, 15))).messages == []
 
 
@@ -146,6 +151,22 @@ def test_whole_instances_once_they_are_known() -> None:
     assert both.is_corrected.tolist() == [True, False, True, False]
     kept = after(at("reject", 15, 15, everywhere=True), at("confirm", 15, 15, "b"))
     assert kept.view_index.tolist() == [0, 1, 1]
+
+
+def test_an_edit_of_a_whole_instance_says_which_earlier_ones_it_overrides() -> None:
+    ids = torch.tensor([1, 2, 1, 2])
+
+    def told(*edits: dict[str, Any]) -> list[str]:
+        corrected = correct(*edits)
+        known = Masks.of(corrected.masks.regions, ids[: len(corrected.masks)], origin=Origin.DETECTED)
+        return [each.fate for each in fates_everywhere(corrected, known)]
+
+    everywhere = at("reject", 15, 15, everywhere=True)
+    assert told(at("confirm", 15, 15, "b"), everywhere) == ["contradicted by edit 2", "applied"]
+    assert told(everywhere, at("confirm", 15, 15, "b")) == ["applied", "applied"]
+    assert told(everywhere, at("confirm", 15, 15, "b", everywhere=True)) == ["contradicted by edit 2", "applied"]
+    assert told(at("confirm", 35, 15), everywhere) == ["applied", "applied"]
+    assert told(at("confirm", 15, 15, "b"), everywhere, at("confirm", 15, 15, "b")) == ["applied"] * 3
 
 
 def test_points_are_of_the_photo_with_its_distortion() -> None:

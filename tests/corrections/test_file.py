@@ -90,6 +90,26 @@ def test_broken_files_are_refused(tmp_path: Path, text: str) -> None:
         load_corrections(path)
 
 
+def test_hostile_texts_stay_in_their_sentence(tmp_path: Path) -> None:
+    """HTML, paths and line ends are texts: no file is opened by them, and a message is one short line."""
+    evil = "<img src=x onerror=alert(1)>\n\x1b[31m" + "../" * 100 + "etc/passwd"
+    named = parse_corrections(content(REJECT | {"view": evil, "by": evil, "when": evil})).edits[0]
+    assert isinstance(named, Reject)
+    assert named.view == evil
+    for edit in ({"op": evil}, REJECT | {evil: 1}, {"op": "same", "at": [[evil, 1]] * 2}, evil):
+        with pytest.raises(InputError) as caught:
+            parse_corrections(content(edit), tmp_path / "corrections.json")
+        assert not set("\n\x1b") & set(str(caught.value))
+        assert len(str(caught.value)) < 250 + len(str(tmp_path))
+
+
+def test_a_million_edits_are_refused_at_once(tmp_path: Path) -> None:
+    path = tmp_path / "corrections.json"
+    path.write_text('{"format": "mvseg-corrections/1", "edits": [' + "0," * 999_999 + "0]}", encoding="utf-8")
+    with pytest.raises(InputError, match="has 1000000 edits, expected at most 10000"):
+        load_corrections(path)
+
+
 def test_missing_and_huge_files_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         load_corrections(tmp_path / "none.json")

@@ -188,8 +188,7 @@ def test_two_outlines_of_one_leaf_show_it_in_all_views(tmp_path: Path) -> None:
         true = leafy.regions.label_map(view, leafy.regions.labels, (160, 160)) == 1
         ious[view] = float((shown & true).sum() / (shown | true).sum())
     assert min(ious[0], ious[3]) > 0.7
-    # two outlines leave a surface's tilt uncertain: view 2, from halfway between them, is shown a quarter of the leaf
-    assert max(ious[view] for view in views if view not in (0, 3)) > 0.4
+    assert min(ious.values()) > 0.75  # with the outlines alone: 0.24 to 0.62
     assert own.origin.tolist().count(Origin.OTHER_VIEWS) == len(views) - 2
 
 

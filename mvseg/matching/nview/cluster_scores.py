@@ -8,7 +8,7 @@ counts.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
 
@@ -71,6 +71,13 @@ class ClusterScores:
     _scores: dict[tuple[int, bytes], Floats] = field(default_factory=dict, init=False, repr=False)
     _coverages: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False)
     _own: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False)
+
+    def with_graph(self, graph: ViewGraph) -> ClusterScores:
+        """The same scores, with all that is cached, for a graph of other links."""
+        scores = replace(self, graph=graph)
+        for name in ("_scores", "_coverages", "_own"):
+            getattr(scores, name).update(getattr(self, name))
+        return scores
 
     @cached_property
     def evidence(self) -> Floats:
@@ -164,11 +171,11 @@ class ClusterScores:
 
         Args:
             view: the view.
-            clusters: (D,) cluster of each region in [0, K).
+            clusters: (D,) cluster of each region in [0, K), -1 for regions to leave out.
             coverages: `coverages` of an earlier partition; newer clusters, which it does not have, cover nothing.
         """
         here = self.sweep.bounds.regions(view)
-        is_other = self.sweep.view_index != view
+        is_other = (self.sweep.view_index != view) & (clusters >= 0)
         numbers, inverse = np.unique(clusters[is_other], return_inverse=True)
         compact = np.full(len(clusters), -1)
         compact[is_other] = inverse

@@ -6,7 +6,7 @@ estimates both. Average linkage of the affinity gives the clusters that the sear
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,26 +26,29 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-def initial_partitions(sweep: PlaneSweep) -> list[Ints]:
-    """One or, with few views, two partitions (D,) to start the search from; clusters in [0, K)."""
-    history = em_affinities(sweep)
+def initial_partitions(sweep: PlaneSweep, links: ViewGraph) -> list[Ints]:
+    """One or, with few views, two partitions (D,) to start the search from; clusters in [0, K). Of `links`, only what
+    must stay together and apart counts."""
+    history = em_affinities(sweep, links)
     partitions = []
     for iteration, stop in INITIALISATIONS[: 1 if sweep.num_views > MANY_VIEWS else None]:
-        graph = ViewGraph(history[iteration].astype(np.float64), sweep.view_index, sweep.num_views)
+        graph = replace(links, weights=history[iteration].astype(np.float64))
         partitions.append(link_average(graph, stop))
     return partitions
 
 
-def em_affinities(sweep: PlaneSweep) -> list[NDArray[np.floating]]:
+def em_affinities(sweep: PlaneSweep, links: ViewGraph | None = None) -> list[NDArray[np.floating]]:
     """How likely two regions are one instance, from the hypotheses alone, by expectation maximisation.
 
     E step: the hypotheses of a pixel share one unit of belief by a soft maximum of their mean affinity between all
     regions that they name (the pixel's own included), less EMPTY_COST for views that show nothing. With many views,
     EM_VIEWS of them are compared with each other. M step: the affinity of region n to m is the belief in hypotheses
-    with m, averaged over the pixels of n, and made symmetric.
+    with m, averaged over the pixels of n, and made symmetric. What a person knows of two regions is 1 or 0 after each
+    step: hypotheses that show linked regions are believed, and with them all else that these show.
 
     Args:
         sweep: hypotheses of D regions.
+        links: what must stay together and apart; its weights do not count. None: nothing.
 
     Returns:
         The affinity after each iteration: (D, D) float32 in [0, 1], symmetric, 0 within a view.
@@ -68,6 +71,9 @@ def em_affinities(sweep: PlaneSweep) -> list[NDArray[np.floating]]:
         belief /= np.repeat(np.add.reduceat(belief, start), run_lengths)
         is_believed = belief > NEGLIGIBLE
         affinity = _symmetric(_share_belief(sweep, hypotheses[is_believed], belief[is_believed]) / num_pixels)
+        if links is not None and links.node is not None and links.apart is not None:
+            affinity[links.apart] = 0
+            affinity[(links.node[:, None] == links.node) & (sweep.view_index[:, None] != sweep.view_index)] = 1
         history.append(affinity)
     return history
 

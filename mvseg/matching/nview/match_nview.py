@@ -16,14 +16,14 @@ from numpy.typing import NDArray
 
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.links import Links, keep_links
+from mvseg.matching.links import Links
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.plane_sweep import PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import search
-from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
+from mvseg.matching.one_per_view import ViewGraph, link_average, one_per_view_clusters, power_iteration
 from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions
@@ -54,7 +54,7 @@ def match_nview(
         affinity: the epipolar weights of the regions.
         config: costs, gains and thresholds.
         residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
-        links: of the regions, see `keep_links`.
+        links: of the regions. Where what is found without them contradicts one, all of them hold in a second search.
         progress: show progress bars.
 
     Returns:
@@ -73,8 +73,8 @@ def match_nview(
         ordered, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
     )
     scores, clusters = found.scores, found.clusters
-    if links is not None and len(links):
-        clusters = keep_links(clusters, graph, links.select(order))
+    if links is not None and not links.select(order).agree(clusters):
+        scores, clusters = search_again(found, graph, links.select(order), progress=progress)
     evidence = collect_evidence(scores, clusters, pairwise)
     report = MatchReport(
         method=found.method,
@@ -137,6 +137,22 @@ def find_clusters(
         if scores.explained(searched) >= UNEXPLAINED:
             clusters, method = searched, "nview"
     return FoundClusters(clusters=clusters, scores=scores, residual_px=residual_px, method=method)
+
+
+def search_again(
+    found: FoundClusters, graph: ViewGraph, links: Links, *, progress: bool = False
+) -> tuple[ClusterScores, Ints]:
+    """The clusters that explain all views best and agree with links; and their scores.
+
+    What was found without links is one more start; but each node that links name begins by itself.
+    """
+    linked = links.hold(graph)
+    scores, pairwise = found.scores.with_graph(linked), power_iteration(linked, link_average(linked))
+    if found.method != "nview":
+        return scores, pairwise
+    assert linked.node is not None
+    start = np.where(linked.is_linked, found.clusters.max() + 1 + linked.node, found.clusters)
+    return scores, search(scores, pairwise, more_starts=[start], progress=progress)
 
 
 def select_dilation(

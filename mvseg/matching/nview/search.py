@@ -7,6 +7,8 @@ cluster covers it too: fragments of an instance that the segmenter split, or tha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
@@ -14,7 +16,7 @@ from tqdm import tqdm
 from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.initialisation import initial_partitions
-from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_order
+from mvseg.matching.one_per_view import Movers, assign_one_to_one, join_alone, view_order
 from mvseg.matching.partition import renumber
 
 MAX_SWEEPS = 3
@@ -25,8 +27,10 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-def search(scores: ClusterScores, pairwise: Ints, *, progress: bool = False) -> Ints:
+def search(scores: ClusterScores, pairwise: Ints, *, more_starts: Sequence[Ints] = (), progress: bool = False) -> Ints:
     """The best partition that refinement finds from one start, or, with few views, two.
+
+    What the graph of the scores says must stay together, or apart, does so all the way.
 
     Clusters from the weights alone are kept when they are worth nearly as much: then the masks are sound, and the
     weights decide better about slivers that few views show.
@@ -34,13 +38,14 @@ def search(scores: ClusterScores, pairwise: Ints, *, progress: bool = False) -> 
     Args:
         scores: of D regions in three views or more.
         pairwise: (D,) int64, clusters from the weights alone, in [0, K).
+        more_starts: partitions to start from as well.
         progress: show a progress bar over the views of each sweep.
 
     Returns:
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
     refined = []
-    for start in initial_partitions(scores.sweep):
+    for start in (*initial_partitions(scores.sweep, scores.graph), *more_starts):
         refined.append(refine(scores, refine(scores, start, progress=progress), join_fragments=True, progress=progress))
     values = [scores.value(clusters) for clusters in (pairwise, *refined)]
     best = pairwise
@@ -62,21 +67,24 @@ def refine(scores: ClusterScores, clusters: Ints, *, join_fragments: bool = Fals
     Returns:
         (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
-    clusters, bounds = renumber(clusters), scores.sweep.bounds
+    clusters = renumber(clusters)
     order = view_order(scores.graph)
     for _ in range(MAX_SWEEPS):
         before, coverages = clusters, scores.coverages(clusters)
         clusters = before.copy()
         for view in tqdm(order.tolist(), desc="search", unit="view", leave=False, disable=not progress):
-            here = bounds.regions(view)
-            if here.start == here.stop:
+            movers = scores.graph.movers(view)
+            if not movers.num:
                 continue
-            gains = scores.gains(view, clusters, coverages)
-            chosen = assign_one_to_one(gains.total, scores.config.gains.alone)
+            gains = _gains(scores, movers, clusters, coverages)
+            chosen = assign_one_to_one(gains.total, scores.config.gains.alone * movers.sizes)
             if join_fragments:
-                chosen = _join_fragments(chosen, gains, scores.config)
+                is_free = np.ones(movers.num, bool)
+                if scores.graph.apart is not None:  # what a person keeps apart is no fragment
+                    is_free[movers.owner[scores.graph.apart[movers.rows].any(1)]] = False
+                chosen = _join_fragments(chosen, gains, scores.config, is_free=is_free)
             fresh = clusters.max() + 1 + np.arange(len(chosen))
-            clusters[here] = np.append(gains.clusters, fresh)[chosen]
+            clusters[movers.rows] = np.append(gains.clusters, fresh)[chosen][movers.owner]
         clusters = renumber(clusters)
         if (clusters == before).all():
             break
@@ -89,7 +97,7 @@ def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
     Fragments of over-segmented masks, and masks that are merged with something else, find each other across views and
     form spurious instances. A region of such a cluster joins the larger one that covers most of it and explains some of
     it, if there is one, whether or not that one has a region in the view already. With fewer than four views nothing is
-    dissolved.
+    dissolved, and never what a person has linked.
 
     Args:
         scores: of D regions.
@@ -104,26 +112,49 @@ def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
     is_few = is_shown.sum(1) <= max(1, thresholds.few * sweep.num_views)
     if sweep.num_views < 4 or not is_few.any():
         return clusters
-    coverages, joined = scores.coverages(clusters), clusters.copy()
+    coverages, joined, is_linked = scores.coverages(clusters), clusters.copy(), scores.graph.is_linked
     for view in np.unique(sweep.view_index[is_few[clusters]]).tolist():
         here = sweep.bounds.regions(view)
         gains = scores.gains(view, clusters, coverages)
         fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.few_coverage) & (gains.score > 0)
-        moves = is_few[clusters[here]] & fits.any(1)
+        moves = is_few[clusters[here]] & fits.any(1) & ~is_linked[here]
         if moves.any():
             joined[here][moves] = gains.clusters[np.where(fits, gains.coverage, -1)[moves].argmax(1)]
     return renumber(joined)
 
 
-def _join_fragments(chosen: Ints, gains: ViewGains, config: NViewConfig) -> Ints:
-    """Put left-over regions into taken clusters that cover them and explain them well."""
+def _gains(scores: ClusterScores, movers: Movers, clusters: Ints, coverages: Floats) -> ViewGains:
+    """What the movers would gain by joining the clusters of the other regions; -inf where they cannot. Of a node of
+    several regions, gains are summed up, scores and coverages are means."""
+    graph, rest = scores.graph, clusters.copy()
+    rest[movers.rows] = -1
+    views = np.unique(graph.view_index[movers.rows]).tolist()
+    if graph.node is None:
+        return scores.gains(views[0], rest, coverages)
+    numbers = np.unique(rest[rest >= 0])
+    shape = len(movers.rows), len(numbers)
+    score, coverage, total = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape)
+    for view in views:
+        gains = scores.gains(view, rest, coverages)
+        here, place = graph.view_index[movers.rows] == view, np.searchsorted(numbers, gains.clusters)
+        own = movers.rows[here] - scores.sweep.bounds.regions(view).start
+        for to, values in ((score, gains.score), (coverage, gains.coverage), (total, gains.total)):
+            to[np.ix_(here, place)] = values[own]
+    sums = movers.total(total)
+    sums[graph.forbidden(movers, clusters, numbers)] = -np.inf
+    sizes = movers.sizes[:, None].astype(np.float32)
+    return ViewGains(numbers, movers.total(score) / sizes, movers.total(coverage) / sizes, sums)
+
+
+def _join_fragments(chosen: Ints, gains: ViewGains, config: NViewConfig, *, is_free: NDArray[np.bool_]) -> Ints:
+    """Put left-over regions that are free (N,) to join into taken clusters that cover them and explain them well."""
     is_assigned = chosen < len(gains.clusters)
     holder_score = np.full(len(gains.clusters), np.inf)
     holder_score[chosen[is_assigned]] = gains.score[is_assigned, chosen[is_assigned]]
     fits = (gains.coverage >= config.thresholds.fragment_coverage) & (gains.score > 0)
     fits &= gains.score >= config.thresholds.fragment_score * holder_score
     value = np.where(fits, gains.score + config.gains.coverage * gains.coverage, -np.inf)
-    joins = ~is_assigned & fits.any(1)
+    joins = ~is_assigned & is_free & fits.any(1)
     chosen = chosen.copy()
     if joins.any():
         chosen[joins] = value[joins].argmax(1)

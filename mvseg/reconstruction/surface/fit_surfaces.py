@@ -202,7 +202,8 @@ def _score(masks: MaskStack, coefficients: Floats) -> float:
 
 
 def _start_groups(masks: MaskStack, hull: Hull) -> Iterator[list[Floats]]:
-    """Starts to compare with each other, at most MOST_STARTS from each hull; later groups for where the earlier end badly.
+    """Starts to compare with each other, at most MOST_STARTS from each hull; later groups for where earlier ones end
+    badly.
 
     How well a start explains the masks, before any fit, tells how likely it is.
     """

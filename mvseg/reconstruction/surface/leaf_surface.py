@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +22,8 @@ from mvseg.reconstruction.surface.leaf_patch import (
 )
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
+
+Part = tuple[tuple[int, int, int, int], NDArray[np.bool_]]  # a box, and the mask in it
 
 MESH_SHAPE = (64, 17)
 LEAST_CREDIBLE_IOU = 0.7
@@ -67,6 +69,7 @@ class LeafSurface:
     iou: Tensor
     is_oriented: bool
     quality: Quality
+    _drawn: dict[bytes, list[Part]] = field(default_factory=dict, init=False, repr=False)
 
     @staticmethod
     def none(views: Tensor, reason: str) -> LeafSurface:
@@ -192,8 +195,17 @@ class LeafSurface:
             masks.append(mask)
         return masks
 
-    def project_parts(self, cameras: Cameras) -> list[tuple[tuple[int, int, int, int], NDArray[np.bool_]]]:
-        """V boxes x1, y1, x2, y2 that hold what `project` shows, and these parts (y2 - y1, x2 - x1) of its masks."""
+    def project_parts(self, cameras: Cameras) -> list[Part]:
+        """V boxes x1, y1, x2, y2 that hold what `project` shows, and these parts (y2 - y1, x2 - x1) of its masks.
+
+        Drawn once for the same cameras: many stages ask, and so does each edit of a person.
+        """
+        key = cameras.px_from_world.cpu().numpy().tobytes() + cameras.sizes.cpu().numpy().tobytes()
+        if key not in self._drawn:
+            self._drawn[key] = self._draw_parts(cameras)
+        return self._drawn[key]
+
+    def _draw_parts(self, cameras: Cameras) -> list[Part]:
         sizes = cameras.sizes.tolist()
         nothing = (0, 0, 0, 0), np.zeros((0, 0), bool)
         if not self.exists:

@@ -1,0 +1,98 @@
+"""One mask while edits are applied to it: where a line cuts it, what it touches, and the table of those left."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mvseg.masks import Masks, Origin
+from mvseg.regions import mask_box, stack_regions
+
+FINE = 4  # bits of a pixel's fraction, along a cut
+TOUCHES_PX = 2  # between pieces of one leaf in one photo
+
+
+@dataclass(eq=False)
+class EditedMask:
+    """One mask while edits are applied: the row of the table it began as (-1: none) and the edits that made it."""
+
+    view: int
+    box: tuple[int, int, int, int]
+    crop: Tensor
+    row: int
+    origin: int
+    edits: list[int] = field(default_factory=list)
+
+
+def side_of(line: NDArray[np.float64], mask: EditedMask) -> Tensor:
+    """(h, w) bool: the pixels of a mask's box on one side of a line, which goes on straight at its ends."""
+    height, width = mask.crop.shape
+    line = line - mask.box[:2]
+    far = 4.0 * (width + height + np.abs(line).max())
+    steps = [line[0] - line[1], line[-1] - line[-2]]
+    ends = [step / max(float(np.hypot(*step)), 1e-9) * far for step in steps]
+    line = np.concatenate(([line[0] + ends[0]], line, [line[-1] + ends[1]]))
+    along = line[-1] - line[0]
+    aside = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9) * far
+    polygon = np.concatenate((line, [line[-1] + aside, line[0] + aside])) - 0.5  # from pixel corners to centres
+    side = np.zeros((height, width), np.uint8)
+    cv2.fillPoly(side, [np.round(polygon * 2**FINE).astype(np.int32)], 1, shift=FINE)
+    return torch.from_numpy(side > 0)
+
+
+def hang_together(masks: Sequence[EditedMask]) -> bool:
+    """Do masks of one view touch, or nearly, so that one can go from each to all others?"""
+    reached, left = list(masks[:1]), list(masks[1:])
+    for mask in reached:
+        reached += [other for other in left if touch(mask, other)]
+        left = [other for other in left if other not in reached]
+    return not left
+
+
+def touch(one: EditedMask, other: EditedMask) -> bool:
+    """Do two masks of one view touch, or nearly?"""
+    x1, y1 = (min(one.box[axis], other.box[axis]) - TOUCHES_PX for axis in (0, 1))
+    x2, y2 = (max(one.box[axis], other.box[axis]) + TOUCHES_PX for axis in (2, 3))
+    frames: list[NDArray[np.uint8]] = []
+    for mask in (one, other):
+        frame = np.zeros((y2 - y1, x2 - x1), np.uint8)
+        frame[mask.box[1] - y1 : mask.box[3] - y1, mask.box[0] - x1 : mask.box[2] - x1] = mask.crop.numpy()
+        frames.append(frame)
+    size = 2 * TOUCHES_PX + 1
+    return bool((np.asarray(cv2.dilate(frames[0], np.ones((size, size), np.uint8))) > 0)[frames[1] > 0].any())
+
+
+def cut_out(part: Tensor, corner: Sequence[int]) -> tuple[tuple[int, int, int, int], Tensor]:
+    """The box and the crop of a mask in a frame whose top-left pixel is `corner`."""
+    x1, y1, x2, y2 = mask_box(part)
+    left, top = corner
+    return (left + x1, top + y1, left + x2, top + y2), part[y1:y2, x1:x2].clone()
+
+
+def as_table(masks: Masks, made: Sequence[EditedMask]) -> Masks:
+    """The table of the masks that are left. Those drawn where none was have the commonest class; what was drawn has no
+    score."""
+    if not made:
+        return Masks.of(masks.regions).select(torch.zeros(0, dtype=torch.int64))
+    rows = torch.tensor([mask.row for mask in made])
+    origin = torch.tensor([mask.origin for mask in made])
+    classes, scores, labels = torch.ones_like(rows), torch.full((len(made),), torch.nan), torch.zeros_like(rows)
+    if len(masks):
+        is_new, chosen = rows < 0, rows.clamp(min=0)
+        classes = torch.where(is_new, masks.classes.mode()[0], masks.classes[chosen])
+        scores = torch.where(origin == Origin.CORRECTED, torch.nan, masks.detection_scores[chosen])
+        labels = torch.where(is_new, 0, masks.regions.labels[chosen])
+    regions = stack_regions(
+        [mask.view for mask in made],
+        [mask.box for mask in made],
+        [mask.crop.flatten() for mask in made],
+        labels=labels.tolist(),
+        num_views=masks.regions.num_views,
+    )
+    return replace(Masks.of(regions, classes=classes, detection_scores=scores), origin=origin)

@@ -1,0 +1,243 @@
+"""Masks, in all other views, of the leaves that a person drew in two or more.
+
+Two outlines leave a surface's tilt open. The other views close it: what has the colour of leaves there, and is in no
+mask of another leaf, is the leaf itself wherever the points that both outlines allow come to lie in it. The surface
+is fitted to those parts as well, and then says what each view shows of the leaf. Not in the paper.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mvseg.errors import InputWarning
+from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import back_project
+from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.scene import Cameras
+from mvseg.verification.leaf_color import has_leaf_color
+from mvseg.verification.other_views import (
+    LEAST_COLORED,
+    LEAST_PARALLAX,
+    LEAST_PIXELS,
+    LEAST_VISIBLE,
+    colors_of_leaves,
+    median_parallax,
+)
+from mvseg.verification.recut import AGREES, agreement
+from mvseg.verification.visible_leaves import VisibleLeaf
+
+Photos = Callable[[int], NDArray[np.uint8]]
+Frame = NDArray[np.bool_]
+
+HULL = ReconstructConfig(voxel_budget=25_000)
+ROUNDS = 2  # the second one looks only where the surface of the first one is
+BESIDE_PX = 2  # from leaf colour, that a point of a leaf may be shown
+MOST_AGAINST = 0.15  # of the views that look past a point: stakes and labels hide leaves, too
+COLUMNS = ("view_index", "boxes", "crops", "labels")
+AROUND = 0.1  # of the root of a surface's area in a view, that the leaf may reach beyond it
+
+
+def follow_drawn(
+    masks: Masks,
+    *,
+    cameras: Cameras,
+    photos: Photos | None,
+    colors: Frame | None = None,
+    workers: ProcessPoolExecutor | None = None,
+) -> tuple[Masks, dict[int, LeafSurface]]:
+    """Give the leaves that a person drew a mask in each other view that shows them openly.
+
+    That is where at least `LEAST_VISIBLE` of the leaf's surface, and `LEAST_PIXELS`, lie in no mask of another leaf,
+    and `LEAST_COLORED` of it have the colour of leaves. There, a mask that was matched to nothing and agrees with it
+    (`AGREES`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
+
+    Args:
+        masks: D masks, matched; those that a person drew have `Origin.CORRECTED`.
+        cameras: V cameras.
+        photos: view index -> (H, W, 3) uint8 RGB, undistorted. None: the outlines alone tell.
+        colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
+        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
+
+    Returns:
+        The D masks on the CPU in their order, and the new ones after them. And {instance id: surface} of the leaves
+        that were looked for; none of those that are not credible, which get no masks.
+    """
+    masks, cameras = masks.to("cpu"), cameras.to("cpu")
+    drawn = masks.instance_ids[(masks.origin == Origin.CORRECTED) & (masks.instance_ids > 0)].unique().tolist()
+    others = {leaf: _views_without(masks, leaf) for leaf in drawn}
+    if not any(others.values()) or median_parallax(masks, cameras) < LEAST_PARALLAX:
+        return masks, {}
+    colored = [np.ones((height, width), bool) for width, height in cameras.sizes.tolist()]
+    if photos is not None:
+        colors = colors_of_leaves(masks, photos) if colors is None else colors
+        colored = [has_leaf_color(photos(view), colors) for view in range(len(cameras))]
+    surfaces: dict[int, LeafSurface] = {}
+    for leaf in (leaf for leaf in drawn if others[leaf]):
+        surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras, workers=workers)
+        if surface.is_credible:
+            surfaces[leaf] = surface
+            masks = _show(masks, leaf, surface, cameras=cameras, colored=colored)
+    return masks, surfaces
+
+
+def _views_without(masks: Masks, leaf: int) -> list[int]:
+    shown = set(masks.view_index[masks.instance_ids == leaf].tolist())
+    return [view for view in range(masks.regions.num_views) if view not in shown] if len(shown) > 1 else []
+
+
+def _fit(
+    masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Cameras, workers: ProcessPoolExecutor | None
+) -> LeafSurface:
+    """The surface of a leaf from its masks and, where they and the colours agree, from what may be its parts in the
+    other views; all other masks may hide it."""
+    regions = masks.regions
+    alone = torch.where(masks.instance_ids == leaf, leaf, -1)
+    own = regions.select(alone == leaf)
+
+    def fit(parts: Mapping[int, Frame], start: LeafSurface | None) -> LeafSurface:
+        ids = torch.cat((alone, torch.full((len(parts),), leaf)))
+        more = _with_parts(regions, parts)
+        starts = {} if start is None else {leaf: start}
+        return fit_surfaces(more, ids, cameras, starts=starts, workers=workers)[leaf]
+
+    if colored is None:
+        return fit({}, None)
+    best = None
+    left = {view: colored[view] & ~_others(masks, leaf, view, cameras) for view in _views_without(masks, leaf)}
+    around = _shown_points(own, cameras, {view: colored[view] for view in left})
+    for _ in range(ROUNDS):
+        found = {view: _largest_part(left[view] & around[view]) for view in left if view in around}
+        parts = {view: part for view, part in found.items() if int(part.sum()) >= LEAST_PIXELS}
+        if not parts:
+            break
+        best = fit(parts, best)
+        if not best.exists:
+            break
+        around = _around(best, cameras, left)
+    is_own = None if best is None else torch.isin(best.views, own.view_index)
+    if best is None or is_own is None or float(best.iou[is_own].min()) < AGREES:  # the outlines are certain
+        return fit({}, None)
+    return best
+
+
+def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, colored: list[Frame]) -> Masks:
+    """The masks with those that the other views show of a leaf."""
+    places = surface.project_parts(cameras)
+    ids, parts = masks.instance_ids.clone(), {}
+    for view in _views_without(masks, leaf):
+        (x1, y1, x2, y2), covered = places[view]
+        visible = covered & ~_others(masks, leaf, view, cameras)[y1:y2, x1:x2]
+        leaf_colored, size = visible & colored[view][y1:y2, x1:x2], int(visible.sum())
+        is_open = size >= max(LEAST_PIXELS, LEAST_VISIBLE * int(covered.sum()))
+        if not is_open or int(leaf_colored.sum()) < LEAST_COLORED * size:
+            continue
+        shown = VisibleLeaf(instance=leaf, box=(x1, y1, x2, y2), mask=visible, share=1.0)
+        free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
+        fits = {
+            row: agreement(tuple(masks.regions.boxes[row].tolist()), masks.regions.crop(row).numpy(), shown)
+            for row in free
+        }
+        best = max(fits, key=lambda row: fits[row], default=-1)
+        if best >= 0 and fits[best] >= AGREES:
+            ids[best] = leaf
+        else:
+            parts[view] = np.zeros_like(colored[view])
+            parts[view][y1:y2, x1:x2] = leaf_colored
+    first = int((ids == leaf).nonzero()[0, 0])
+    rows = torch.cat((torch.arange(len(masks)), torch.full((len(parts),), first)))
+    more = replace(masks, instance_ids=ids).with_merged(masks.merged).select(rows)
+    is_new = torch.arange(len(rows)) >= len(masks)
+    return replace(
+        more,
+        regions=_with_parts(masks.regions, parts),
+        match_scores=torch.where(is_new, masks.match_scores[ids == leaf].mean(), more.match_scores),
+        detection_scores=torch.where(is_new, torch.nan, more.detection_scores),
+        origin=torch.where(is_new, int(Origin.OTHER_VIEWS), more.origin),
+    )
+
+
+def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Frame:
+    """(H, W) bool: what masks of other instances, or that a person drew, show."""
+    is_other = (masks.instance_ids != leaf) & ((masks.instance_ids > 0) | masks.is_corrected)
+    width, height = cameras.sizes[view].tolist()
+    return masks.regions.label_map(view, is_other.long(), (width, height)).numpy() > 0
+
+
+def _shown_points(own: Regions, cameras: Cameras, colored: Mapping[int, Frame]) -> dict[int, Frame]:
+    """{view: (H, W) bool} where the points come to lie that all masks of a leaf (`own`) allow, and nearly all other
+    views: these show leaf colour there."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # masks whose common part is unbounded are cut off
+        hull = back_project(own, cameras, config=HULL)
+    if hull is None or not len(hull.points):
+        return {}
+    px, depth = cameras.project(hull.points.double())
+    columns, rows = px.floor().long().clamp(-1, 2**30).numpy().transpose(2, 0, 1)
+    against = np.zeros(len(hull.points), np.int64)
+    places = {}
+    for view, frame in colored.items():
+        height, width = frame.shape
+        column, row = columns[view], rows[view]
+        is_inside = (column >= 0) & (row >= 0) & (column < width) & (row < height) & (depth[view].numpy() > 0)
+        place = np.where(is_inside, row * width + column, 0)
+        against += is_inside & ~_dilate(frame, BESIDE_PX).ravel()[place]
+        places[view] = place, is_inside
+    is_left = against <= max(1, MOST_AGAINST * len(colored))
+    around = {}
+    for view, (place, is_inside) in places.items():
+        points = np.zeros(colored[view].shape, bool)
+        points.ravel()[place[is_inside & is_left]] = True
+        gap = float(hull.voxel_size * cameras.K[view, 0, 0] / depth[view].median().clamp(min=1e-9))
+        around[view] = _dilate(points, int(np.ceil(gap)))
+    return around
+
+
+def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame]) -> dict[int, Frame]:
+    """{view: (H, W) bool} where a surface is, and around it."""
+    around = {}
+    for view, ((x1, y1, x2, y2), covered) in enumerate(surface.project_parts(cameras)):
+        if view in frames:
+            frame = np.zeros_like(frames[view])
+            frame[y1:y2, x1:x2] = covered
+            around[view] = _dilate(frame, max(BESIDE_PX, round(AROUND * float(covered.sum()) ** 0.5)))
+    return around
+
+
+def _largest_part(frame: Frame) -> Frame:
+    """The largest part of a mask that hangs together, without what is thinner than three pixels."""
+    opened = cv2.morphologyEx(frame.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+    if count < 2:
+        return np.zeros_like(frame)
+    largest: Frame = labels == 1 + int(stats[1:, cv2.CC_STAT_AREA].argmax())
+    return largest
+
+
+def _dilate(frame: Frame, radius: int) -> Frame:
+    kernel = np.ones((2 * radius + 1,) * 2, np.uint8)
+    dilated: Frame = np.asarray(cv2.dilate(frame.astype(np.uint8), kernel)) > 0
+    return dilated
+
+
+def _with_parts(regions: Regions, parts: Mapping[int, Frame]) -> Regions:
+    """The regions and, after them, one of each view."""
+    boxes = [mask_box(torch.from_numpy(part)) for part in parts.values()]
+    crops = [
+        torch.from_numpy(part[y1:y2, x1:x2].copy()).flatten()
+        for part, (x1, y1, x2, y2) in zip(parts.values(), boxes, strict=True)
+    ]
+    new = stack_regions(list(parts), boxes, crops, labels=[0] * len(boxes), num_views=regions.num_views)
+    columns: dict[str, Any] = {name: torch.cat((getattr(regions, name), getattr(new, name))) for name in COLUMNS}
+    return replace(regions, **columns)

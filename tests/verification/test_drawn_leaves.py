@@ -1,0 +1,100 @@
+"""A leaf that a person drew in two photos, in all the others: on the shipped plant, whose truth is known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from mvseg.demo import demo_scene
+from mvseg.formats.photos import Photos
+from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.masks import Masks, Origin
+from mvseg.regions import Regions
+from mvseg.scene import Scene
+from mvseg.verification.drawn_leaves import follow_drawn
+
+
+@pytest.fixture(scope="module")
+def plant() -> tuple[Scene, Regions]:
+    """The shipped plant and its true masks; their labels are the leaves."""
+    scene = load_scene(demo_scene())
+    return scene, load_masks(scene, demo_scene() / "truth")
+
+
+def drawn(truth: Regions, leaf: int, views: tuple[int, ...], *, missed: tuple[int, ...] = ()) -> Masks:
+    """All true masks but those of the leaves that were missed; of one leaf, only what a person drew in some views."""
+    is_drawn = (truth.labels == leaf) & torch.isin(truth.view_index, torch.tensor(views))
+    kept = is_drawn | ((truth.labels != leaf) & ~torch.isin(truth.labels, torch.tensor(missed, dtype=torch.int64)))
+    masks = Masks.of(truth.select(kept), truth.labels[kept], torch.full((int(kept.sum()),), 0.9))
+    return replace(masks, origin=torch.where(is_drawn[kept], int(Origin.CORRECTED), int(Origin.GIVEN)))
+
+
+def mask_of(regions: Regions, is_leaf: Tensor, view: int, size: tuple[int, int]) -> np.ndarray:
+    return regions.label_map(view, is_leaf.long(), size).numpy() > 0
+
+
+@pytest.mark.parametrize(
+    ("leaf", "views", "missed"),
+    [(8, (4, 7), ()), (10, (4, 8), (1, 5, 9, 12)), (3, (5, 8), ())],  # of the outlines alone: 0.21, 0.35, 0.34
+)
+def test_the_other_views_show_it(
+    plant: tuple[Scene, Regions], leaf: int, views: tuple[int, ...], missed: tuple[int, ...]
+) -> None:
+    scene, truth = plant
+    before = drawn(truth, leaf, views, missed=missed)
+    after, surfaces = follow_drawn(before, cameras=scene.cameras, photos=Photos(scene))
+    assert list(surfaces) == [leaf]
+    for name in ("instance_ids", "origin", "view_index"):
+        assert torch.equal(getattr(after, name)[: len(before)], getattr(before, name))
+    is_new = torch.arange(len(after)) >= len(before)
+    assert (after.instance_ids[is_new] == leaf).all()
+    assert (after.origin[is_new] == Origin.OTHER_VIEWS).all()
+    assert not {*after.view_index[is_new].tolist()} & {*views}
+    largest, ious = int(truth.areas[truth.labels == leaf].max()), []
+    for view, size in enumerate(scene.cameras.sizes.tolist()):
+        true = mask_of(truth, truth.labels == leaf, view, size)
+        if view not in views and true.sum() > 0.5 * largest:
+            shown = mask_of(after.regions, after.instance_ids == leaf, view, size)
+            ious.append(float((shown & true).sum() / (shown | true).sum()))
+    assert len(ious) >= 3
+    assert np.median(ious) > 0.85
+
+
+def test_a_mask_that_was_matched_to_nothing_becomes_the_leafs(plant: tuple[Scene, Regions]) -> None:
+    scene, truth = plant
+    masks = drawn(truth, 10, (4, 8))
+    lost = truth.select((truth.labels == 10) & (truth.view_index == 2))
+    both = Masks.concatenate((masks, Masks.of(lost)))
+    after, _ = follow_drawn(both, cameras=scene.cameras, photos=Photos(scene))
+    assert after.instance_ids[len(masks)] == 10
+    assert after.origin[len(masks)] == Origin.GIVEN
+    assert 2 not in after.view_index[len(both) :].tolist()
+
+
+def test_nothing_is_looked_for_without_need(plant: tuple[Scene, Regions]) -> None:
+    scene, truth = plant
+    for masks in (
+        drawn(truth, 10, (4,)),
+        drawn(truth, 10, tuple(range(9))),
+        drawn(truth, 10, (4, 8)).select(torch.zeros(0, dtype=torch.int64)),
+    ):
+        after, surfaces = follow_drawn(masks, cameras=scene.cameras, photos=Photos(scene))
+        assert len(after) == len(masks)
+        assert surfaces == {}
+
+
+def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions]) -> None:
+    """What contradicts itself has no credible surface, or shows nothing openly: no mask of others is touched."""
+    scene, truth = plant
+    masks = drawn(truth, 10, (4,))
+    other = truth.select((truth.labels == 3) & (truth.view_index == 8))
+    wrong = Masks.of(other, torch.tensor([10]), origin=Origin.CORRECTED)
+    both = Masks.concatenate((masks.select(~((masks.view_index == 8) & (masks.instance_ids == 3))), wrong))
+    both = replace(both, instance_ids=torch.where(torch.arange(len(both)) == len(both) - 1, 10, both.instance_ids))
+    after, _ = follow_drawn(both, cameras=scene.cameras, photos=Photos(scene))
+    for name in ("instance_ids", "origin", "match_scores"):
+        assert torch.equal(getattr(after, name)[: len(both)], getattr(both, name))
