@@ -12,8 +12,8 @@ from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
-FIT_GRID, FAR_GRID = (36, 9), (20, 5)  # rows and columns, of the second while the patch is far from its place
-FAR_STEPS, NUM_STEPS = range(10), 7  # from a rough start, and from one that is nearly right
+FIT_GRID, FAR_GRID = (36, 9), (20, 5)  # rows and columns, the second in the first half of the way
+FIRST_HALF, SECOND_HALF, NUM_STEPS = range(5), range(5, 10), 7  # from a rough start, and when it is nearly right
 FAR_REACH, NEAR_REACH = 14.0, 6.0  # pixels
 FAR_STEP, NEAR_STEP = (0.05, 0.25), (0.005, 0.12)  # damping, and half-widths that no point moves farther than
 SAMPLE_WEIGHT = 0.35  # neighbouring samples are alike
@@ -53,17 +53,18 @@ class PatchFit:
         return float(np.nanmedian(self.residual_px)) if np.isfinite(self.residual_px).any() else float("nan")
 
 
-def approach_patch(masks: MaskStack, start: Floats, *, steps: range = FAR_STEPS) -> Floats:
+def approach_patch(masks: MaskStack, start: Floats, *, steps: range) -> Floats:
     """A rough patch (26, 3), moved until its outlines are near those of the masks.
 
     Args:
-        steps: a part of FAR_STEPS; other parts may follow, from where this one ends.
+        steps: FIRST_HALF of the way, or the SECOND_HALF, from where the first one ends.
     """
     moved, coefficients = _to_unit_world(masks, start)
+    grid = patch_grid(*(FAR_GRID if steps == FIRST_HALF else FIT_GRID))
     for step in steps:
-        share = step / len(FAR_STEPS)
+        share = step / SECOND_HALF.stop
         reach = FAR_REACH + (NEAR_REACH - FAR_REACH) * share
-        distances = outline_distances(moved, patch_grid(*FAR_GRID), coefficients, reach=reach, is_imaged=False)
+        distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=False)
         offsets = np.zeros(len(masks))
         if step >= OFFSET_FROM:
             offsets = _believe(per_view(distances.px, distances.stack, len(masks)), None)

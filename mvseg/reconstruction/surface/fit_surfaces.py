@@ -15,7 +15,15 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.reconstruction.surface.fit_patch import FAR_GRID, FAR_STEPS, FIT_GRID, PatchFit, approach_patch, fit_patch
+from mvseg.reconstruction.surface.fit_patch import (
+    FAR_GRID,
+    FIRST_HALF,
+    FIT_GRID,
+    SECOND_HALF,
+    PatchFit,
+    approach_patch,
+    fit_patch,
+)
 from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, measure_sizes
@@ -29,16 +37,13 @@ from mvseg.scene import Cameras
 from mvseg.system.worker_pool import spread
 
 NUM_FIRST_STEPS = 3  # of a fit that a second one follows
-GOOD_IOU = 0.85  # of a patch after which no less likely start is tried
+GOOD_IOU = 0.93  # of a patch after which no less likely start is tried
 LEAST_GAIN = 0.03  # in IoU, for another start to be better
 AREA_COST = 0.1  # in IoU, of a surface e times as large: bulges can hide behind the outlines of a level leaf
 CLEAR_IOU = 0.75  # of a start that shows how the blade lies
 WIDE_COST = 0.1  # in IoU, of a patch that is wider than long
-UNCLEAR, MOST_STARTS = (
-    0.05,
-    3,
-)  # starts that are worse by less than this are as likely, and so many are tried of each hull
-HALF = 5  # steps, after which only the best of them go on
+UNCLEAR, MOST_STARTS = 0.05, 3  # starts worse by less than this are as likely, and so many are tried of each hull
+HOPELESS = 0.1  # half way, patches that are worse by more go no farther
 WRONG_SHARE = 0.25  # of the median share of voxels in a mask: with less of them it is another leaf's
 MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
@@ -184,10 +189,10 @@ def _find_start(masks: MaskStack) -> tuple[MaskStack, Floats | None]:
             hull = carve_hull(masks)
     best, best_score = None, -np.inf
     for starts in _start_groups(masks, hull):
-        halfway = [approach_patch(masks, start, steps=FAR_STEPS[:HALF]) for start in starts]
+        halfway = [approach_patch(masks, start, steps=FIRST_HALF) for start in starts]
         scores = [_score(masks, patch) for patch in halfway]
-        for patch in (patch for patch, score in zip(halfway, scores, strict=True) if score > max(scores) - UNCLEAR):
-            moved = approach_patch(masks, patch, steps=FAR_STEPS[HALF:])
+        for patch in (patch for patch, score in zip(halfway, scores, strict=True) if score > max(scores) - HOPELESS):
+            moved = approach_patch(masks, patch, steps=SECOND_HALF)
             score = _score(masks, moved)
             if score > best_score + LEAST_GAIN:
                 best, best_score = moved, score
@@ -202,8 +207,7 @@ def _score(masks: MaskStack, coefficients: Floats) -> float:
 
 
 def _start_groups(masks: MaskStack, hull: Hull) -> Iterator[list[Floats]]:
-    """Starts to compare with each other, at most MOST_STARTS from each hull; later groups for where earlier ones end
-    badly.
+    """Starts to compare with each other; later groups are for where the earlier ones end badly.
 
     How well a start explains the masks, before any fit, tells how likely it is.
     """
