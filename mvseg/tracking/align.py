@@ -30,6 +30,7 @@ MOST_LARGE_NEW = 0.21  # of all leaves, i.e. two in five of the larger half
 NEARLY_ALL = 0.9  # of the leaves of the date with fewer: where these are paired, large ones were missed there
 SURE_MARGIN = 7.0  # of the best hypothesis over others
 SURE_SUM, PER_LEAF = 23.5, 3.0  # of margin and PER_LEAF times the gain per leaf of the date with fewer leaves
+TWO_WAYS = "the pot could be turned in more than one way"
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +88,7 @@ def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Alig
     elif _num_large_new(first, second, best.pairs) > MOST_LARGE_NEW * len(second):
         reason = "leaves too large to be new would have appeared, however the pot is turned"
     elif margin < SURE_MARGIN:
-        reason = "the pot could be turned in more than one way"
+        reason = TWO_WAYS
     elif margin + PER_LEAF * best.gain / fewer < SURE_SUM:
         reason = "the leaves are not alike enough, however the pot is turned"
     return replace(best, margin=margin, reason=reason)

@@ -20,7 +20,7 @@ from mvseg.errors import InputError
 from mvseg.tracking.align import Alignment, align, refine
 from mvseg.tracking.costs import ACROSS, Leaves, cloud_costs, pair_costs, typical_length
 from mvseg.tracking.dates import Floats
-from mvseg.tracking.motions import Motion, find_motion
+from mvseg.tracking.motions import Motion, find_motion, settle
 
 Sight = tuple[int, int]  # index of the date, row of its `Leaves`
 MOST_GAP = 3  # dates from one sight to another that it is compared with, at most: two dates may hide a leaf
@@ -71,7 +71,10 @@ def compare_dates(dates: Sequence[Leaves], times: Sequence[float], *, knows_up: 
     """
     pairs = {(earlier, later): (dates[earlier], dates[later], times[later] - times[earlier])
              for later in range(len(dates)) for earlier in range(max(later - MOST_GAP, 0), later)}  # fmt: skip
-    alone = {pair: align(one, other, days=days, knows_up=knows_up) for pair, (one, other, days) in pairs.items()}
+    alone = {
+        pair: settle(one, other, align(one, other, days=days, knows_up=knows_up), days=days, knows_up=knows_up)
+        for pair, (one, other, days) in pairs.items()
+    }
     poses, roots = place_dates(len(dates), alone)
     costs: dict[tuple[int, int], Floats] = {}
     motions: dict[tuple[int, int], Motion] = {}

@@ -7,14 +7,18 @@ some leaves under which both together are far likelier.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from mvseg.tracking.align import (
     LEAST_PAIRS,
+    PER_LEAF,
     SAME,
     SURE_MARGIN,
+    SURE_SUM,
+    TWO_WAYS,
+    Alignment,
     alikeness,
     best_pairs,
     draw_poses,
@@ -48,6 +52,17 @@ class Motion:
     @property
     def is_sure(self) -> bool:
         return self.margin >= SURE_MARGIN
+
+
+def settle(first: Leaves, second: Leaves, alignment: Alignment, *, days: float, knows_up: bool) -> Alignment:
+    """The alignment, sure where it was not only because a second plant in the pot moved in the other way."""
+    if alignment.reason == TWO_WAYS:
+        motion = find_motion(first, second, alignment.pose, days=days, knows_up=knows_up)
+        if motion is not None and motion.is_sure:
+            per_leaf = (alignment.gain + motion.gain) / min(len(first), len(second))
+            if motion.margin + PER_LEAF * per_leaf >= SURE_SUM:
+                return replace(alignment, margin=SURE_MARGIN, reason="")
+    return alignment
 
 
 def find_motion(first: Leaves, second: Leaves, pose: Floats, *, days: float, knows_up: bool) -> Motion | None:

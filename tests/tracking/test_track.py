@@ -9,6 +9,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
+from mvseg.tracking.align import TWO_WAYS, align
+from mvseg.tracking.costs import leaves_of
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import LeafLink, track_leaves
 from tests.plants_over_days import Blades, grow_blades, grown, see, true_tracks
@@ -91,6 +93,15 @@ def test_two_plants_that_moved_against_each_other_are_linked_each_by_itself(turn
     assert sentence.startswith("day-0 and day-1: 8 leaves moved otherwise than the rest")
     assert tracks.num_tracks == 18
     assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
+
+
+def test_two_plants_of_one_size_are_aligned_although_each_moved_otherwise() -> None:
+    """Each of the two poses explains one of them: that is not one pot that could be turned in two ways."""
+    dates, truths = two_in_a_pot(60, grow_blades(10, 66))
+    one, other = (leaves_of(date) for date in dates)
+    assert align(one, other, days=1, knows_up=True).reason == TWO_WAYS
+    assert all(len(leaves) == 1 for leaves in true_tracks(track_leaves(dates), truths).values())
+    assert track_leaves(dates).num_tracks == 20
 
 
 def test_a_second_plant_that_could_have_been_turned_in_more_than_one_way_is_not_linked() -> None:
