@@ -105,9 +105,7 @@ def run_scene(spec: SceneSpec, *, cache: Path, num_draws: int, is_fit: bool) -> 
     return outcomes
 
 
-def judge(
-    regions: Regions, truth: Tensor, cameras: Cameras, *, kind: str, fault: str, is_fit: bool
-) -> Outcome:
+def judge(regions: Regions, truth: Tensor, cameras: Cameras, *, kind: str, fault: str, is_fit: bool) -> Outcome:
     """Match; `truth` (D,) is the leaf that each region shows, 0 = none."""
     found = None
     if is_fit:

@@ -28,6 +28,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
+from mvseg.verification.checked_ids import move_masks
 from mvseg.verification.other_views import ROUGH_VIEWS, revise_masks
 
 FATES = ("kept", "dropped: in no instance", "dropped: no credible surface", "dropped: found too rarely",
@@ -62,13 +63,14 @@ def count_fates(
         now[view, instance] = origin
     left = set(after.instance_ids.tolist())
     fates: Counter[tuple[str, bool | None]] = Counter()
+    seen = {instance for instance, surface in surfaces.items() if surface.is_credible}
     for row, (view, instance) in enumerate(zip(before.view_index.tolist(), before.instance_ids.tolist(), strict=True)):
         origin = now.get((view, instance))
         if instance < 1:
             fate = 1
         elif origin is not None:
             fate = 0 if origin != Origin.OTHER_VIEWS else 5
-        elif not surfaces[instance].is_credible:
+        elif instance not in seen:
             fate = 2
         else:
             fate = 4 if instance in left else 3
@@ -83,6 +85,7 @@ def judge(folder: Path, config: DetectConfig, keep: Path | None) -> Counter[tupl
     cache = None if keep is None else keep / folder.name
     before = detect_scene(photos, config, cache=cache)(scene.cameras).masks.to("cpu")
     surfaces = fit_surfaces(before.regions, before.instance_ids, scene.cameras, most_views=ROUGH_VIEWS)
+    before, surfaces = move_masks(before, surfaces, cameras=scene.cameras)
     after = revise_masks(before, surfaces, cameras=scene.cameras, photos=photos)
     fates = count_fates(before, after, surfaces, right=find_right(before, truth))
     for origin, is_right in zip(after.origin.tolist(), find_right(after, truth), strict=True):

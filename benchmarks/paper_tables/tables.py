@@ -197,7 +197,7 @@ def table_rules(plan: Plan) -> str:
 
 
 def split_cells(records: Sequence[Record], threshold: str, views: Sequence[int]) -> list[str]:
-    """"d (excess / gaps)" per number of cameras, and over all."""
+    """ "d (excess / gaps)" per number of cameras, and over all."""
     columns = [[r for r in records if r["views"] == number] for number in views] + [list(records)]
     cells = []
     for column in columns:

@@ -8,7 +8,7 @@ surface explains the masks of both. Where two surfaces explain one mask in disjo
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -35,6 +35,9 @@ FITS = 0.5  # IoU of a mask with what its view shows of a surface, from which it
 FEW_VIEWS = 0.75  # instances that at most this share of the views shows may be made of pieces
 INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
 MOST_PIECES = 0.5  # an instance is made of pieces when more than this share of its masks are pieces
+OFTEN_SPLIT = 0.05  # of all instances in all views: from here on, several masks of one leaf are nothing unusual
+MOST_SPLIT = 1  # photos that show both parts of a leaf as masks of their own, where masks are whole as a rule
+AS_NEAR = 1.1  # times as far from the masks' edges, as the outline of one surface in place of two may lie
 TOUCHES = 0.02  # of a surface's length, to the nearest point of one that may be the rest of its leaf
 EACH, BOTH = 0.2, 0.7  # of a merged mask, that shows either of its two surfaces, and both together
 MOST = 0.5  # of what its view shows of the second one, that lies in the mask
@@ -61,12 +64,44 @@ def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras, held: Tenso
     """
     on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
     old = masks.instance_ids.cpu().numpy()
-    is_held = (masks.is_corrected if held is None else masks.is_corrected | held).cpu().numpy()
-    ids = np.where(is_held, old, move_pieces(on_cpu, old, surfaces, cameras=cameras))
-    left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
-    ids = np.where(is_held, old, move_misfits(on_cpu, ids, left, cameras=cameras))
+    is_held = _is_held(masks, held)
+    ids, left = _move_to_surfaces(masks, surfaces, cameras=cameras, is_held=is_held)
     known = {*old[is_held].tolist()}
     ids = join_halves(on_cpu, ids, {k: each for k, each in left.items() if k not in known}, cameras=cameras)
+    checked = _with_ids(masks, ids)
+    merged = {each.region: each for each in checked.merged}
+    shared = find_shared(on_cpu, ids, left, cameras=cameras, named=list(merged.values()))
+    merged |= {each.region: each for each in shared}
+    return checked.with_merged(merged.values())
+
+
+def move_masks(
+    masks: Masks, surfaces: Surfaces, *, cameras: Cameras, held: Tensor | None = None
+) -> tuple[Masks, dict[int, LeafSurface]]:
+    """The first two steps of `check_ids`, which fit nothing, and the surfaces of the instances that still have masks.
+    What moves is forgotten to be merged."""
+    ids, left = _move_to_surfaces(masks, surfaces, cameras=cameras.to("cpu"), is_held=_is_held(masks, held))
+    return _with_ids(masks, ids), {instance: each for instance, each in left.items() if (ids == instance).any()}
+
+
+def _is_held(masks: Masks, held: Tensor | None) -> NDArray[np.bool_]:
+    is_held: NDArray[np.bool_] = (masks.is_corrected if held is None else masks.is_corrected | held).cpu().numpy()
+    return is_held
+
+
+def _move_to_surfaces(
+    masks: Masks, surfaces: Surfaces, *, cameras: Cameras, is_held: NDArray[np.bool_]
+) -> tuple[Ints, Surfaces]:
+    """(D,) ids after the pieces and the misfits moved, and the surfaces of the instances that had masks in between."""
+    regions, old = masks.regions.to("cpu"), masks.instance_ids.cpu().numpy()
+    ids = np.where(is_held, old, move_pieces(regions, old, surfaces, cameras=cameras))
+    left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
+    return np.where(is_held, old, move_misfits(regions, ids, left, cameras=cameras)), left
+
+
+def _with_ids(masks: Masks, ids: Ints) -> Masks:
+    """The masks with these ids (D,); what moved has the mean match score of those that had the id before."""
+    old = masks.instance_ids.cpu().numpy()
     is_moved = ids != old
     scores = masks.match_scores.clone()
     for instance in np.unique(ids[is_moved]).tolist():
@@ -74,11 +109,9 @@ def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras, held: Tenso
         others = others if others.any() else torch.from_numpy(old == instance)
         moved = torch.from_numpy(is_moved & (ids == instance))
         scores[moved.to(scores.device)] = masks.match_scores[others.to(scores.device)].mean()
-    merged = {each.region: each for each in masks.merged if not is_moved[each.region] and (ids == each.other).any()}
-    shared = find_shared(on_cpu, ids, left, cameras=cameras, named=list(merged.values()))
-    merged |= {each.region: each for each in shared}
-    checked = replace(masks, instance_ids=torch.from_numpy(ids).to(masks.instance_ids), match_scores=scores)
-    return checked.with_merged(merged.values())
+    merged = [each for each in masks.merged if not is_moved[each.region] and (ids == each.other).any()]
+    with_ids = replace(masks, instance_ids=torch.from_numpy(ids).to(masks.instance_ids), match_scores=scores)
+    return with_ids.with_merged(merged)
 
 
 def unchanged_surfaces(before: Masks, after: Masks, surfaces: Surfaces) -> dict[int, LeafSurface]:
@@ -154,25 +187,42 @@ def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     """Instances that are parts of one leaf become one; for the arguments see `move_pieces`.
 
     Where something crosses a leaf, masks on either side may form an instance each, and neither lies in the other's
-    surface. So a credible surface of an instance that few views show is doubted where it touches another one. If one
-    surface that is fitted to the masks of both fits no worse than each alone, in the views of each, they are the same
-    leaf. All join the one of them that has most masks.
+    surface. So a credible surface of an instance that few views show is doubted where it touches another one. Two masks
+    in one photo speak for two leaves: one photo may split a leaf by accident, several do so only where masks are often
+    in pieces (`OFTEN_SPLIT`). If no more than that speaks against it, and one surface that is fitted to the masks of
+    both fits them as well as two do (`fits_as_well`), they are the same leaf. All join the one of them that has most
+    masks.
     """
     shown = {instance: each for instance, each in surfaces.items() if each.exists and (ids == instance).any()}
-    pairs = set()
-    for part in _seen_rarely(regions, ids):
-        if part in shown and shown[part].is_credible:
-            whole = touched_surface(part, shown)
-            if whole and _is_one_leaf(regions, ids, (part, whole), surfaces=shown, cameras=cameras):
-                pairs.add((part, whole))
+    few = [part for part in _seen_rarely(regions, ids) if part in shown and shown[part].is_credible]
+    touching = {(part, whole) for part in few if (whole := touched_surface(part, shown))}
+    most = regions.num_views if _share_split(regions, ids) >= OFTEN_SPLIT else MOST_SPLIT
+    pairs = [
+        pair for pair in sorted({(min(pair), max(pair)) for pair in touching})
+        if _num_shared_views(regions, ids, pair) <= most
+        and _is_one_leaf(regions, ids, pair, surfaces=shown, cameras=cameras)
+    ]  # fmt: skip
     if not pairs:
         return ids
-    part, whole = np.array(sorted(pairs)).T
+    part, whole = np.array(pairs).T
     size = int(ids.max()) + 1
     _, leaf = connected_components(coo_array((np.ones(len(part)), (part, whole)), shape=(size, size)), directed=False)
     num_masks = np.bincount(ids[ids > 0], minlength=size)
     largest = np.array([np.where(leaf == number, num_masks, -1).argmax() for number in range(leaf.max() + 1)])
     return np.where(ids > 0, largest[leaf[ids]], ids)
+
+
+def _share_split(regions: Regions, ids: Ints) -> float:
+    """Of all instances in all views that show them, how many have several masks there."""
+    is_matched = ids > 0
+    places = np.stack((ids[is_matched], regions.view_index.numpy()[is_matched]))
+    _, counts = np.unique(places, axis=1, return_counts=True)
+    return float((counts > 1).mean()) if len(counts) else 0.0
+
+
+def _num_shared_views(regions: Regions, ids: Ints, pair: tuple[int, int]) -> int:
+    one, other = (regions.view_index.numpy()[ids == instance] for instance in pair)
+    return len(np.intersect1d(one, other))
 
 
 def _seen_rarely(regions: Regions, ids: Ints) -> list[int]:
@@ -191,14 +241,25 @@ def touched_surface(part: int, surfaces: Surfaces) -> int | None:
 
 
 def _is_one_leaf(regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras) -> bool:
-    """Does one surface fit the masks of two instances no worse than their own surfaces do, in the views of each?"""
+    """Does one surface fit the masks of two instances as well as their own surfaces do?"""
     joint = fit_surfaces(regions, torch.from_numpy(np.where(np.isin(ids, pair), 1, -1)), cameras)[1]
-    for instance in pair:
-        is_seen = torch.isin(joint.views, regions.view_index[torch.from_numpy(ids == instance)])
-        fits_alone = surfaces[instance].iou.median()
-        if not is_seen.any() or not joint.iou[is_seen].median() >= fits_alone:
-            return False
-    return True
+    return fits_as_well(joint, [surfaces[instance] for instance in pair])
+
+
+def fits_as_well(joint: LeafSurface, parts: Sequence[LeafSurface]) -> bool:
+    """Whether it is credible, its median IoU that of the worst of the parts or more, and its outline as near to those
+    of the masks.
+
+    The IoU alone would forgive a larger surface: outlines that are as uncertain take a smaller share of it.
+    """
+    worst = min(float(part.iou.median()) for part in parts)
+    farthest = max(_outline_px(part) for part in parts)
+    return joint.is_credible and float(joint.iou.median()) >= worst and _outline_px(joint) <= AS_NEAR * farthest
+
+
+def _outline_px(surface: LeafSurface) -> float:
+    """Root mean square distance between its outline and those of its masks, over the views."""
+    return float(surface.residual_px.square().mean().sqrt())
 
 
 def find_shared(

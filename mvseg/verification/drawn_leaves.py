@@ -143,7 +143,7 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         is_open = size >= max(LEAST_PIXELS, LEAST_VISIBLE * int(covered.sum()))
         if not is_open or int(leaf_colored.sum()) < LEAST_COLORED * size:
             continue
-        shown = VisibleLeaf(instance=leaf, box=(x1, y1, x2, y2), mask=visible, share=1.0)
+        shown = VisibleLeaf(instance=leaf, box=(x1, y1, x2, y2), mask=visible, covered=covered, share=1.0)
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
         fits = {
             row: agreement(tuple(masks.regions.boxes[row].tolist()), masks.regions.crop(row).numpy(), shown)

@@ -25,8 +25,9 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import mask_box
 from mvseg.scene import Cameras
+from mvseg.verification.checked_ids import move_masks
 from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
-from mvseg.verification.recut import AGREES, Box, Mask, agreement
+from mvseg.verification.recut import AGREES, Box, Mask, agreement, inside
 from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
 
 Photos = Callable[[int], NDArray[np.uint8]]
@@ -36,6 +37,11 @@ LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for a view to show
 LEAST_PIXELS = 64  # of that part
 LEAST_COLORED = 0.8  # of it, that have the colour of leaves, for it to become a mask
 LEAST_FOUND = 0.3  # of the views that show an instance openly, where its surface agrees with what the detector found
+MOST_FOUND = 0.5  # of them, beyond which the surface may show it where the detector did not find it
+MOST_UNCERTAIN = 0.2  # standard deviation of the area, as a share of it, of a surface that does so
+UNSURE = 0.2  # of the masks that agree: no lower are the detection scores of masks that stay although they disagree
+PIECE = 0.8  # of a mask, that lies in what the surface shows
+ENOUGH, SHARE_SURE = 3, 0.5  # masks that the detector is sure of, for an instance without a credible surface to stay
 ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
 SURE_VIEWS = 4  # of an instance whose masks tell that colour
 LEAST_PARALLAX = 30.0  # degrees between the views of an instance, from which its surface tells what they show
@@ -53,6 +59,27 @@ class _Found:
     crop: Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """What is known of one instance in one view.
+
+    Attributes:
+        own: what the detector found; None: nothing.
+        shown: what the surface shows, where the photo can show a leaf there; None: it cannot.
+        agrees: the two show the same leaf.
+        is_open: the view shows enough of the surface to tell.
+        is_sure: the detector and the matcher are as sure of `own` as of most masks that agree.
+        is_piece: `own` lies within what the surface shows.
+    """
+
+    own: _Found | None
+    shown: _Found | None = None
+    agrees: bool = False
+    is_open: bool = False
+    is_sure: bool = False
+    is_piece: bool = False
+
+
 def verify_masks(
     masks: Masks,
     *,
@@ -64,6 +91,8 @@ def verify_masks(
     progress: bool = False,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
     """Detections as the other views correct them: surfaces are fitted to them, and they are revised as these say.
+
+    First, masks that show another instance's surface than their own get its id (`move_masks`).
 
     Args:
         masks: D detections, matched.
@@ -85,6 +114,7 @@ def verify_masks(
         warnings.warn(f"{message}: the other views cannot verify their masks", InputWarning, stacklevel=2)
         return masks, {}
     surfaces = fit_roughly(masks, cameras, workers=workers, progress=progress) if fit is None else fit(masks)
+    masks, surfaces = move_masks(masks, surfaces, cameras=cameras)
     revised = revise_masks(masks, surfaces, cameras=cameras, photos=photos, colors=colors, progress=progress)
     return revised.close_gaps(), revised.renumber(surfaces)
 
@@ -140,16 +170,22 @@ def revise_masks(
 
     For every instance and view:
 
-    - its masks there stay, as one, when their IoU with the visible part of the surface is at least `AGREES`;
-    - otherwise, and where it has none, that part becomes its mask, as far as it has the colour of leaves
+    - its masks there stay, as one, when their IoU with the visible part of the surface is at least `AGREES`. Of what
+      nearer surfaces hide, that part counts as visible which these masks show, where the view shows the surface openly:
+      photos know better what lies in front;
+    - masks that disagree stay as well where the detector was sure of them, unless they are pieces: `PIECE` of them lies
+      in what the surface shows. It was sure where it scores them no lower than the lowest `UNSURE` of those that agree;
+    - otherwise, and where it has none, the visible part becomes its mask, as far as it has the colour of leaves
       (`leaf_color`). It must be `LEAST_VISIBLE` of the surface, so that the view shows it openly, and `LEAST_COLORED`
-      of it must have that colour: what a stem or a pot hides, or a wrong surface shows, is no mask;
-    - otherwise it has none.
+      of it must have that colour: what a stem or a pot hides, or a wrong surface shows, is no mask. The surface must be
+      sure (`MOST_UNCERTAIN`), and found in most of the views that show it;
+    - otherwise it has none, or the piece that the detector was sure of.
 
-    Instances without a credible surface go, and those with masks in one view only; so do masks that are matched to
-    nothing. A leaf that only one photo shows is lost with the false ones. And those go whose masks stayed in fewer than
-    `LEAST_FOUND` of the views that show them openly: what is seen from all sides, and taken for a leaf from a few, is a
-    stem or the like.
+    Of instances without a credible surface those masks stay that the detector was sure of, if these are `ENOUGH`, and
+    half of all (`SHARE_SURE`). All others of them go, and so do instances with masks in one view only, and masks that
+    are matched to nothing. A leaf that only one photo shows is lost with the false ones. And those go whose masks
+    agreed in fewer than `LEAST_FOUND` of the views that show them openly: what is seen from all sides, and taken for a
+    leaf from a few, is a stem or the like.
 
     Args:
         masks: D masks on the CPU, as a detector found them, matched.
@@ -167,33 +203,102 @@ def revise_masks(
         with gaps where instances went. A mask made of several takes the columns of the largest and the best match score
         of theirs. One that only the other views show has `Origin.OTHER_VIEWS` and the mean scores of its instance.
     """
-    regions, ids = masks.regions, masks.instance_ids
-    held = masks.is_corrected
-    certain = {*zip(regions.view_index[held].tolist(), ids[held].tolist(), strict=True)}
+    ids, held = masks.instance_ids, masks.is_corrected
+    certain = {*zip(masks.view_index[held].tolist(), ids[held].tolist(), strict=True)}
     if photos is not None and colors is None:
         colors = colors_of_leaves(masks, photos)
-    found: list[_Found] = []
-    shown_openly: Counter[int] = Counter()
-    for view in tqdm(range(regions.num_views), "verification", unit="view", disable=not progress):
+    places: dict[tuple[int, int], _Place] = {}
+    for view in tqdm(range(len(cameras)), "verification", unit="view", disable=not progress):
         width, height = cameras.sizes[view].tolist()
         colored = np.ones((height, width), bool)
         if photos is not None and colors is not None:
             colored = has_leaf_color(photos(view), colors)
-        for leaf in visible_leaves(surfaces, cameras, view):
-            if (view, leaf.instance) in certain:
-                continue
-            members = ((regions.view_index == view) & (ids == leaf.instance)).nonzero()[:, 0].tolist()
-            x1, y1, x2, y2 = leaf.box
-            colored_here = colored[y1:y2, x1:x2]
-            box, own = regions.union(members) if members else (leaf.box, torch.zeros(leaf.mask.shape, dtype=torch.bool))
-            is_own = agreement(box, own.numpy(), leaf) >= AGREES
-            shown_openly[leaf.instance] += is_own or _is_open(leaf)
-            if is_own:
-                found.append(_found(view, leaf, members, (box, own.numpy()), is_own=True))
-            elif _is_leaf(leaf, colored_here):
-                found.append(_found(view, leaf, members, (leaf.box, leaf.mask & colored_here), is_own=False))
+        places |= _look_at(masks, surfaces, cameras, view=view, colored=colored)
+    places = {key: place for key, place in _with_sure(masks, places).items() if key not in certain}
     instances = {instance for _, instance in certain}
-    return _with_held(_as_masks(masks, _borne_out(found, shown_openly, instances)), masks.select(held))
+    return _with_held(_as_masks(masks, _decide(places, surfaces, certain=instances)), masks.select(held))
+
+
+def _look_at(
+    masks: Masks, surfaces: Mapping[int, LeafSurface], cameras: Cameras, *, view: int, colored: Mask
+) -> dict[tuple[int, int], _Place]:
+    """What one view shows of every instance; `colored` (H, W) has the colour of leaves."""
+    here = masks.view_index == view
+    ids = masks.instance_ids
+    places, frame = {}, masks.regions.label_map(view, ids.clamp(min=0), cameras.sizes[view].tolist()).numpy()
+    own: dict[int, _Found] = {}
+    for instance in ids[here & (ids > 0)].unique().tolist():
+        members = (here & (ids == instance)).nonzero()[:, 0].tolist()
+        box, crop = masks.regions.union(members)
+        own[instance] = _found((view, instance), members, (box, crop.numpy()), is_own=True)
+        places[view, instance] = _Place(own=own[instance])
+    for leaf in visible_leaves(surfaces, cameras, view):
+        x1, y1, x2, y2 = leaf.box
+        in_box = frame[y1:y2, x1:x2]
+        found = own.get(leaf.instance)
+        agrees = is_piece = False
+        if found is not None:
+            mask = found.crop.numpy()
+            claimed = leaf.covered & (in_box == leaf.instance) & (leaf.share >= LEAST_VISIBLE)
+            seen = replace(leaf, mask=leaf.mask | claimed)
+            agrees = agreement(found.box, mask, seen) >= AGREES
+            is_piece = inside(found.box, mask, seen) >= PIECE
+        colored_here = colored[y1:y2, x1:x2]
+        members = [] if found is None else found.members
+        shown = None
+        if _is_leaf(leaf, colored_here):
+            shown = _found((view, leaf.instance), members, (leaf.box, leaf.mask & colored_here), is_own=False)
+        places[view, leaf.instance] = _Place(
+            own=found, shown=shown, agrees=agrees, is_open=agrees or _is_open(leaf), is_piece=is_piece
+        )
+    return places
+
+
+def _with_sure(masks: Masks, places: dict[tuple[int, int], _Place]) -> dict[tuple[int, int], _Place]:
+    """The same places, which know of what the detector was sure."""
+    scores = {key: float(masks.detection_scores[place.own.members].max()) for key, place in places.items() if place.own}
+    agreed = [score for key, score in scores.items() if places[key].agrees and not np.isnan(score)]
+    least = float(np.quantile(agreed, UNSURE)) if agreed else np.inf
+    return {
+        key: replace(
+            place,
+            is_sure=place.own is not None
+            and scores[key] >= least
+            and float(masks.match_scores[place.own.members].max()) >= SURE,
+        )
+        for key, place in places.items()
+    }
+
+
+def _decide(
+    places: Mapping[tuple[int, int], _Place], surfaces: Mapping[int, LeafSurface], *, certain: Set[int]
+) -> list[_Found]:
+    """The masks that stay and those that are added, by view; `certain` instances stay."""
+    num_agreeing = Counter(instance for (_, instance), place in places.items() if place.agrees)
+    num_open = Counter(instance for (_, instance), place in places.items() if place.is_open)
+    num_sure = Counter(instance for (_, instance), place in places.items() if place.is_sure)
+    num_found = Counter(instance for (_, instance), place in places.items() if place.own is not None)
+    credible = {instance for instance, surface in surfaces.items() if surface.is_credible}
+    explains = {  # instances whose surfaces tell where there are masks that the detector did not find
+        instance for instance in credible
+        if instance in certain
+        or (num_agreeing[instance] > MOST_FOUND * num_open[instance]
+            and surfaces[instance].deviations[0] <= MOST_UNCERTAIN * surfaces[instance].area)
+    }  # fmt: skip
+    found = []
+    for (_, instance), place in sorted(places.items()):
+        stays = place.agrees or (place.is_sure and not place.is_piece)
+        if not stays and place.shown is not None and instance in explains:
+            found.append(place.shown)
+        elif (stays or place.is_sure) and place.own is not None:
+            found.append(place.own)
+    num_masks = Counter(each.instance for each in found)
+    borne_out = certain | {
+        instance for instance in num_masks
+        if (num_masks[instance] > 1 and num_agreeing[instance] >= LEAST_FOUND * num_open[instance]
+            if instance in credible else num_sure[instance] >= max(ENOUGH, SHARE_SURE * num_found[instance]))
+    }  # fmt: skip
+    return [each for each in found if each.instance in borne_out]
 
 
 def _with_held(revised: Masks, held: Masks) -> Masks:
@@ -281,21 +386,10 @@ def _is_leaf(leaf: VisibleLeaf, colored: Mask) -> bool:
     return _is_open(leaf) and int((leaf.mask & colored).sum()) >= LEAST_COLORED * int(leaf.mask.sum())
 
 
-def _found(view: int, leaf: VisibleLeaf, members: list[int], placed: tuple[Box, Mask], *, is_own: bool) -> _Found:
+def _found(where: tuple[int, int], members: list[int], placed: tuple[Box, Mask], *, is_own: bool) -> _Found:
+    """`where`: view and instance."""
     (left, top, _, _), mask = placed
     x1, y1, x2, y2 = mask_box(torch.from_numpy(mask))
     crop = torch.from_numpy(mask[y1:y2, x1:x2].copy())
     box = (left + x1, top + y1, left + x2, top + y2)
-    return _Found(view=view, instance=leaf.instance, members=members, is_own=is_own, box=box, crop=crop)
-
-
-def _borne_out(found: list[_Found], shown_openly: Mapping[int, int], certain: Set[int]) -> list[_Found]:
-    """Those of `certain` instances; of the others not those that have a mask in one view only, or that the detector
-    found in too few of the views that show them openly (`shown_openly`: how many these are)."""
-    masks = Counter(each.instance for each in found)
-    seen = Counter(each.instance for each in found if each.is_own)
-    return [
-        each for each in found
-        if each.instance in certain
-        or (masks[each.instance] > 1 and seen[each.instance] >= LEAST_FOUND * shown_openly[each.instance])
-    ]  # fmt: skip
+    return _Found(view=where[0], instance=where[1], members=members, is_own=is_own, box=box, crop=crop)

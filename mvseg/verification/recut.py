@@ -95,13 +95,23 @@ def blur_px(mask: Mask) -> float:
 
 def agreement(box: Box, mask: Mask, leaf: VisibleLeaf) -> float:
     """IoU of a mask in its box (x1, y1, x2, y2) with the visible part of a surface."""
+    both = _common(box, mask, leaf)
+    return both / max(int(mask.sum()) + int(leaf.mask.sum()) - both, 1)
+
+
+def inside(box: Box, mask: Mask, leaf: VisibleLeaf) -> float:
+    """The share of a mask in its box (x1, y1, x2, y2) that lies in the visible part of a surface."""
+    return _common(box, mask, leaf) / max(int(mask.sum()), 1)
+
+
+def _common(box: Box, mask: Mask, leaf: VisibleLeaf) -> int:
+    """Pixels that both have."""
     x1, y1 = max(box[0], leaf.box[0]), max(box[1], leaf.box[1])
     x2, y2 = min(box[2], leaf.box[2]), min(box[3], leaf.box[3])
     if x1 >= x2 or y1 >= y2:
-        return 0.0
+        return 0
     common = (x1, y1, x2, y2)
-    both = int((_cut(box, mask, common) & _cut(leaf.box, leaf.mask, common)).sum())
-    return float(both / max(int(mask.sum()) + int(leaf.mask.sum()) - both, 1))
+    return int((_cut(box, mask, common) & _cut(leaf.box, leaf.mask, common)).sum())
 
 
 def _cut(box: Box, mask: Mask, inner: Box) -> Mask:

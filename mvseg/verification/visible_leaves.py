@@ -21,12 +21,14 @@ class VisibleLeaf:
         instance: its id.
         box: x1, y1, x2, y2 of the part of the frame that holds it.
         mask: (y2 - y1, x2 - x1) bool, pixels that it covers and no nearer surface does.
-        share: of all the pixels that it covers.
+        covered: (y2 - y1, x2 - x1) bool, all pixels that it covers.
+        share: of these, that no nearer surface covers.
     """
 
     instance: int
     box: tuple[int, int, int, int]
     mask: NDArray[np.bool_]
+    covered: NDArray[np.bool_]
     share: float
 
 
@@ -57,5 +59,5 @@ def visible_leaves(surfaces: Mapping[int, LeafSurface], cameras: Cameras, view: 
         mask = covered & ~taken_here
         if mask.any():
             share = float(mask.sum() / covered.sum())
-            yield VisibleLeaf(instance=instance, box=(x1, y1, x2, y2), mask=mask, share=share)
+            yield VisibleLeaf(instance=instance, box=(x1, y1, x2, y2), mask=mask, covered=covered, share=share)
         taken_here |= covered

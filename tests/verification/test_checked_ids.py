@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -15,7 +17,13 @@ from mvseg.masks import Masks, MergedMask
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
-from mvseg.verification.checked_ids import check_ids, match_surfaces, touched_surface, unchanged_surfaces
+from mvseg.verification.checked_ids import (
+    check_ids,
+    fits_as_well,
+    match_surfaces,
+    touched_surface,
+    unchanged_surfaces,
+)
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 
@@ -212,15 +220,47 @@ def halved_maps(views: tuple[int, ...]) -> list[np.ndarray]:
     return maps
 
 
+def pieces_of_others(maps: list[np.ndarray]) -> list[np.ndarray]:
+    """The same, with the masks of leaf 2 in two pieces, 2 and 12, in every view."""
+    for labels in maps:
+        is_right = np.indices((SIZE, SIZE))[1] > np.median(np.nonzero(labels == 2)[1])
+        labels[(labels == 2) & is_right] = 12
+    return maps
+
+
 @pytest.mark.slow
-def test_halves_of_a_leaf_become_one() -> None:
-    regions, numbers = as_regions(halved_maps((0, 1, 2, 3)))
-    ids = torch.where(numbers == 11, 4, numbers)
+@pytest.mark.parametrize(
+    ("views", "are_others_in_pieces", "is_joined"),
+    [((0, 1, 2, 3), True, True), ((0, 1, 2, 3), False, False), ((0,), False, True)],
+)
+def test_halves_of_a_leaf_become_one(views: tuple[int, ...], are_others_in_pieces: bool, is_joined: bool) -> None:
+    """Two masks in each of four photos are two leaves, unless masks are in pieces all over; in one, an accident."""
+    maps = halved_maps(views)
+    if len(views) == 1:  # and the whole leaf in three more
+        for view in (1, 2, 3):
+            maps[view][true_maps()[view] == 1] = 11
+    regions, numbers = as_regions(pieces_of_others(maps) if are_others_in_pieces else maps)
+    right = numbers % 10
+    ids = torch.where(numbers == 11, 4, right)
     surfaces = fit_surfaces(regions, ids, CAMERAS)
     checked = check(regions, ids, surfaces)
-    assert torch.equal(checked.instance_ids, numbers % 10)
-    assert is_moved(ids, checked).tolist() == (numbers == 11).tolist()
-    assert list(unchanged_surfaces(matched(regions, ids).masks, checked, surfaces)) == [2, 3]
+    assert torch.equal(checked.instance_ids, right if is_joined else ids)
+    known = unchanged_surfaces(matched(regions, ids).masks, checked, surfaces)
+    assert list(known) == ([2, 3] if is_joined else [1, 2, 3, 4])
+
+
+@pytest.mark.parametrize(
+    ("iou", "residual_px", "expected"), [(0.8, 1.5, True), (0.78, 1.5, False), (0.9, 1.7, False), (0.9, 1.6, True)]
+)
+def test_a_larger_surface_must_lie_as_near_to_the_outlines(iou: float, residual_px: float, expected: bool) -> None:
+    """Two leaves of IoU 0.8 and 0.85 whose outlines are 1.5 and 1 px off."""
+
+    def fitted(iou: float, residual_px: float) -> LeafSurface:
+        numbers = (torch.full((6,), number, dtype=torch.float64) for number in (iou, residual_px))
+        return replace(LEAVES[1], **dict(zip(("iou", "residual_px"), numbers, strict=True)))
+
+    assert fits_as_well(fitted(iou, residual_px), [fitted(0.8, 1.5), fitted(0.85, 1.0)]) == expected
+    assert not fits_as_well(fitted(0.65, 1.0), [fitted(0.6, 1.5), fitted(0.85, 1.0)])  # no blade
 
 
 @pytest.mark.slow

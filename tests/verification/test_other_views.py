@@ -11,8 +11,11 @@ import torch
 from blade_scene import SIZE, as_regions
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
+from mvseg.verification.checked_ids import move_masks
 from mvseg.verification.other_views import median_parallax, revise_masks, verify_masks
+from mvseg.verification.visible_leaves import visible_leaves
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 GREEN, BROWN = (70, 150, 50), (120, 90, 60)
@@ -28,8 +31,8 @@ def photo(view: int) -> np.ndarray:
     return np.array([BROWN, GREEN], np.uint8)[(TRUE[view] > 0).astype(int)]
 
 
-def detected(regions: Regions, ids: torch.Tensor) -> Masks:
-    return Masks.of(regions, ids, torch.where(ids > 0, 0.9, 0.0), origin=Origin.DETECTED)
+def detected(regions: Regions, ids: torch.Tensor, scores: torch.Tensor | None = None) -> Masks:
+    return Masks.of(regions, ids, torch.where(ids > 0, 0.9, 0.0), detection_scores=scores, origin=Origin.DETECTED)
 
 
 def revise(maps: list[np.ndarray], **changes: object) -> Masks:
@@ -131,6 +134,90 @@ def test_views_that_show_no_leaf_where_it_lies_open_count_against_it() -> None:
 
     revised = revise(maps, photos=brown_from_view_2)
     assert revised.instance_ids.unique().tolist() == [1, 2]  # found in one of six, green in two
+
+
+def doubted(instance: int, **changes: torch.Tensor) -> dict[int, LeafSurface]:
+    return LEAVES | {instance: replace(LEAVES[instance], **changes)}
+
+
+@pytest.mark.parametrize(("score", "num_left"), [(0.8, 6), (0.2, 0)])
+def test_masks_that_the_detector_is_sure_of_need_no_credible_surface(score: float, num_left: int) -> None:
+    regions, ids = as_regions(TRUE)
+    masks = detected(regions, ids, torch.where(ids == 3, score, 0.7))
+    surfaces = doubted(3, iou=torch.full((6,), 0.5, dtype=torch.float64))
+    revised = revise_masks(masks, surfaces, cameras=CAMERAS, photos=photo)
+    assert int((revised.instance_ids == 3).sum()) == num_left
+    assert not is_new(revised).any()
+
+
+def test_without_a_credible_surface_most_masks_must_be_sure() -> None:
+    regions, ids = as_regions(TRUE)
+    is_unsure = (ids == 3) & (regions.view_index > 1)
+    masks = detected(regions, ids, torch.where(is_unsure, 0.2, 0.7))
+    surfaces = doubted(3, iou=torch.full((6,), 0.5, dtype=torch.float64))
+    assert revise_masks(masks, surfaces, cameras=CAMERAS, photos=photo).instance_ids.unique().tolist() == [1, 2]
+
+
+@pytest.mark.parametrize(("score", "is_kept"), [(0.9, True), (0.1, False)])
+def test_a_sure_mask_that_disagrees_stays_and_an_unsure_one_is_replaced(score: float, is_kept: bool) -> None:
+    """The mask of leaf 3 lies half beside it in view 4."""
+    maps = [labels.copy() for labels in TRUE]
+    rows, columns = np.nonzero(TRUE[4] == 3)
+    width = int(np.ptp(columns))
+    maps[4][TRUE[4] == 3] = 0
+    maps[4][rows, np.clip(columns - width // 2, 0, SIZE - 1)] = 3
+    regions, ids = as_regions(maps)
+    here = (regions.view_index == 4) & (ids == 3)
+    revised = revise_masks(detected(regions, ids, torch.where(here, score, 0.7)), LEAVES, cameras=CAMERAS, photos=photo)
+    assert bool(is_new(revised).any()) != is_kept
+    assert np.array_equal(label_maps(revised)[4] == 3, (maps if is_kept else TRUE)[4] == 3)
+
+
+def test_an_uncertain_surface_adds_nothing_and_drops_nothing() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    maps[2][maps[2] == 1] = 0
+    spread = torch.eye(len(LEAVES[1].covariance), dtype=torch.float64)
+    revised = revise(maps, surfaces=doubted(1, covariance=spread))
+    assert not is_new(revised).any()
+    assert len(revised) == num_masks(maps)
+
+
+def test_what_is_found_in_few_views_is_not_added_to_others() -> None:
+    maps = [labels.copy() for labels in TRUE]
+    for labels in maps[3:]:
+        labels[labels == 3] = 0
+    revised = revise(maps)
+    assert int((revised.instance_ids == 3).sum()) == 3  # of six
+
+
+def test_photos_know_better_what_lies_in_front() -> None:
+    """Leaf 2 is drawn behind leaf 1; the photos show it before that one."""
+    maps = [labels.copy() for labels in TRUE]
+    hidden = 0
+    for view, labels in enumerate(maps):
+        for leaf in visible_leaves(LEAVES, CAMERAS, view):
+            if leaf.instance == 2:
+                x1, y1, x2, y2 = leaf.box
+                hidden += int((leaf.covered & ~leaf.mask).sum())
+                labels[y1:y2, x1:x2][leaf.covered] = 2
+    assert hidden > 0
+    revised = revise(maps)
+    shown = label_maps(revised)
+    assert all(np.array_equal(one == 2, other == 2) for one, other in zip(shown, maps, strict=True))
+    assert not is_new(revised)[revised.instance_ids == 2].any()
+
+
+def test_masks_with_each_others_ids_are_swapped_before_they_are_judged() -> None:
+    regions, ids = as_regions(TRUE)
+    wrong = ids.clone()
+    in_view = regions.view_index == 2
+    wrong[in_view & (ids == 1)], wrong[in_view & (ids == 2)] = 2, 1
+    moved, left = move_masks(detected(regions, wrong), LEAVES, cameras=CAMERAS)
+    assert torch.equal(moved.instance_ids, ids)
+    assert left == LEAVES
+    revised = revise_masks(moved, left, cameras=CAMERAS, photos=photo)
+    assert not is_new(revised).any()
+    assert len(revised) == num_masks(TRUE)
 
 
 def test_the_order_of_masks_does_not_matter() -> None:
