@@ -48,7 +48,8 @@ def carve_hull(masks: MaskStack) -> Hull:
     that no point of half of the masks can lie in are left out. Cells are judged by the balls around them, so nothing
     is lost, however thin. Masks of nearly parallel views may share an unbounded space: it ends at the cube.
     """
-    centres = -np.linalg.solve(masks.px_from_world[:, :, :3], masks.px_from_world[:, :, 3:])[..., 0]
+    matrices = masks.px_from_world
+    centres = np.asarray(-np.linalg.solve(matrices[:, :, :3], matrices[:, :, 3:])[..., 0], dtype=float)
     middle = _nearest_point(masks, centres)
     size = 4 * float(np.linalg.norm(centres - middle, axis=1).max())
     corner = middle - size / 2

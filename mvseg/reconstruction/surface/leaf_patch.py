@@ -161,10 +161,11 @@ def _along(rows: Floats, directions: Floats) -> Floats:
 @cache
 def _difference_rows() -> tuple[Floats, Floats, Floats]:
     """(E, 78) third differences of m, second ones of Q and first ones of R, along all three axes."""
-    rows = np.eye(NUM_COEFFICIENTS)
-    parts = ((MIDRIB, 3), (SIDE, 2), (FOLD, 1))
-    bend, side, fold = (np.kron(np.diff(rows[place], order, axis=0), np.eye(3)) for place, order in parts)
-    return bend, side, fold
+    return _differences(MIDRIB, 3), _differences(SIDE, 2), _differences(FOLD, 1)
+
+
+def _differences(part: slice, order: int) -> Floats:
+    return np.asarray(np.kron(np.diff(np.eye(NUM_COEFFICIENTS)[part], order, axis=0), np.eye(3)), dtype=float)
 
 
 @cache

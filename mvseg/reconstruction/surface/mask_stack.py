@@ -65,7 +65,7 @@ class MaskStack:
         column, row = np.floor(np.clip(px, 0, (columns - 1, rows - 1))).astype(np.int64).T
         return values[stack, row, column]
 
-    def interpolate(self, values: NDArray[np.float32], stack: NDArray, px: Floats) -> NDArray[np.float32]:
+    def interpolate(self, values: NDArray[np.float32], stack: NDArray, px: Floats) -> NDArray[np.floating]:
         """(P, T) of values (S, H, W) at positions (P, T, 2), bilinear between pixel centres."""
         rows, columns = self.size
         x = np.clip(px[..., 0] - 0.5, 0, columns - 1.001).astype(np.float32)
