@@ -82,6 +82,7 @@ def test_edit_reload_edit(browser: sync_api.Browser, served: CorrectionServer, f
     tab.wait_for("What you see follows from all edits.")
     tab.press_on(0, 1, "r")
     tab.wait_for("What you see follows from all edits.")
+    assert "11 masks" in tab.page.locator("#summary").inner_text()
     tab.page.reload()
     tab.wait_for("What you see follows from all edits.")
     assert [row.startswith("no leaf") for row in tab.rows()] == [True]
@@ -110,7 +111,7 @@ def test_two_tabs_never_save_over_each_other(browser: sync_api.Browser, served: 
     other.wait_for("What you see follows from all edits.")
     assert len(other.rows()) == 1
     other.press_on(0, 2, "c")
-    one.wait_for("Another page has changed the edits. This one saves nothing any more")
+    one.wait_for("This one saves nothing any more")
     assert ops(folder) == ["reject", "confirm"]
     one.press_on(0, 2, "r")
     assert ops(folder) == ["reject", "confirm"]

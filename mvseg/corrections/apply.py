@@ -78,6 +78,10 @@ class _Work:
     everywhere: list[tuple[int, EditedMask, bool]] = field(default_factory=list)
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
 
+    def is_rejected(self, mask: EditedMask) -> bool:
+        """Whether it only stays to tell which instance is rejected."""
+        return any(rejects and other is mask for _, other, rejects in self.everywhere)
+
 
 class _Lost(Exception):
     """An edit points at nothing; the message says where."""
@@ -200,7 +204,7 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
         raise _Lost(f"its polygon covers no pixel of view {edit.view}")
     box, crop = cut_out(torch.from_numpy(frame), (0, 0))
     covered = []
-    for mask in [each for each in work.masks if each.view == view]:
+    for mask in [each for each in work.masks if each.view == view and not work.is_rejected(each)]:
         x1, y1, x2, y2 = mask.box
         if int((mask.crop & torch.from_numpy(frame[y1:y2, x1:x2])).sum()) > COVERED * int(mask.crop.sum()):
             covered.append(mask)
@@ -285,12 +289,10 @@ def _culprit(work: _Work, place: dict[int, int], number: int, held: Sequence[int
     links contradict each other."""
 
     def agree(edits: Collection[int]) -> bool:
-        pairs = [(m, place.get(id(a), -1), place.get(id(b), -1)) for n, m, a, b in work.links if n in edits]
+        rows = [(m, place.get(id(a), -1), place.get(id(b), -1)) for n, m, a, b in work.links if n in edits]
+        must, cannot = ([(a, b) for m, a, b in rows if m == kind and min(a, b) >= 0] for kind in (True, False))
         try:
-            Links.of(
-                [(a, b) for is_must, a, b in pairs if is_must and min(a, b) >= 0],
-                [(a, b) for is_must, a, b in pairs if not is_must and min(a, b) >= 0],
-            ).components(len(place))
+            Links.of(must, cannot).components(len(place))
         except InputError:
             return False
         return True
@@ -317,14 +319,10 @@ def _mask_at(work: _Work, place: Place) -> EditedMask:
     name, x, y = place
     view = _view(work.scene, name)
     column, row = np.floor(_to_pinhole(work.scene, view, [(x, y)])[0]).astype(int).tolist()
-    here = []
-    for mask in work.masks:
-        x1, y1, x2, y2 = mask.box
-        if mask.view == view and x1 <= column < x2 and y1 <= row < y2 and mask.crop[row - y1, column - x1]:
-            here.append(mask)
+    here = [mask for mask in work.masks if mask.view == view and mask.holds(column, row)]
     if not here:
         raise _Lost(f"there is no mask at ({x:g}, {y:g}) in view {name}")
-    return min(here, key=lambda mask: int(mask.crop.sum()))
+    return min(here, key=lambda mask: (work.is_rejected(mask), int(mask.crop.sum())))
 
 
 def _view(scene: Scene, name: str) -> int:

@@ -29,6 +29,11 @@ class EditedMask:
     origin: int
     edits: list[int] = field(default_factory=list)
 
+    def holds(self, column: int, row: int) -> bool:
+        """Whether a pixel of its view is in it."""
+        x1, y1, x2, y2 = self.box
+        return x1 <= column < x2 and y1 <= row < y2 and bool(self.crop[row - y1, column - x1])
+
 
 def side_of(line: NDArray[np.float64], mask: EditedMask) -> Tensor:
     """(h, w) bool: the pixels of a mask's box on one side of a line, which goes on straight at its ends."""

@@ -116,7 +116,7 @@ def _fit(
         return fit({}, None)
     best = None
     left = {view: colored[view] & ~_others(masks, leaf, view, cameras) for view in _views_without(masks, leaf)}
-    around = _shown_points(own, cameras, {view: colored[view] for view in left})
+    around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in left})
     for _ in range(ROUNDS):
         found = {view: _largest_part(left[view] & around[view]) for view in left if view in around}
         parts = {view: part for view, part in found.items() if int(part.sum()) >= LEAST_PIXELS}
@@ -175,12 +175,29 @@ def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Frame:
     return masks.regions.label_map(view, is_other.long(), (width, height)).numpy() > 0
 
 
-def _shown_points(own: Regions, cameras: Cameras, colored: Mapping[int, Frame]) -> dict[int, Frame]:
-    """{view: (H, W) bool} where the points come to lie that all masks of a leaf (`own`) allow, and nearly all other
-    views: these show leaf colour there."""
+def _with_hiding(masks: Masks, leaf: int, cameras: Cameras) -> Regions:
+    """One region for each view that has masks of a leaf: these, and those of others that touch them and may hide more
+    of it."""
+    frames, regions = {}, masks.regions
+    for view in masks.view_index[masks.instance_ids == leaf].unique().tolist():
+        here = (masks.view_index == view).nonzero()[:, 0].tolist()
+        size, is_leaf = tuple(cameras.sizes[view].tolist()), masks.instance_ids == leaf
+        frames[view] = regions.label_map(view, is_leaf.long(), size).numpy() > 0
+        near = _dilate(frames[view], BESIDE_PX)
+        for row in (row for row in here if not is_leaf[row]):
+            x1, y1, x2, y2 = regions.boxes[row].tolist()
+            crop = regions.crop(row).numpy()
+            if (near[y1:y2, x1:x2] & crop).any():
+                frames[view][y1:y2, x1:x2] |= crop
+    return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), frames)
+
+
+def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Frame]) -> dict[int, Frame]:
+    """{view: (H, W) bool} where the points come to lie that all regions `allowed` hold, and nearly all other views:
+    these show leaf colour there."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # masks whose common part is unbounded are cut off
-        hull = back_project(own, cameras, config=HULL)
+        hull = back_project(allowed, cameras, config=HULL)
     if hull is None or not len(hull.points):
         return {}
     px, depth = cameras.project(hull.points.double())

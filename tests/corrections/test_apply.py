@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -167,6 +168,17 @@ def test_an_edit_of_a_whole_instance_says_which_earlier_ones_it_overrides() -> N
     assert told(everywhere, at("confirm", 15, 15, "b", everywhere=True)) == ["contradicted by edit 2", "applied"]
     assert told(at("confirm", 35, 15), everywhere) == ["applied", "applied"]
     assert told(at("confirm", 15, 15, "b"), everywhere, at("confirm", 15, 15, "b")) == ["applied"] * 3
+
+
+def test_a_rejected_instance_may_be_drawn_anew() -> None:
+    """The outline is another leaf: it does not bring the rejected one back."""
+    drawn = square(*LEFT)
+    corrected = correct(at("reject", 15, 15, everywhere=True), drawn, at("confirm", 15, 15))
+    assert fates(corrected) == ["applied"] * 3
+    known = Masks.of(corrected.masks.regions, torch.tensor([1, 2, 1, 1, 2]), origin=Origin.DETECTED)
+    left = apply_everywhere(corrected, replace(known, origin=corrected.masks.origin))
+    assert left.view_index.tolist() == [0, 0, 1]
+    assert left.origin.tolist() == [Origin.DETECTED, Origin.CORRECTED, Origin.DETECTED]
 
 
 def test_points_are_of_the_photo_with_its_distortion() -> None:

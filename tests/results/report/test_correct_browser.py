@@ -173,6 +173,12 @@ def test_an_outline_is_drawn_in_one_go_or_by_its_corners(opened: Person, tmp_pat
     assert opened.page.locator("#correct-list li").last.inner_text().startswith("outline drawn in")
 
 
+def test_a_small_outline_that_ends_where_it_began_is_whole(opened: Person) -> None:
+    opened.page.keyboard.press("o")
+    opened.drag(0, [[1000, 300], [1030, 300], [1015, 325], [1001, 301]])
+    assert opened.page.evaluate("modes.work.draft.isClosed")
+
+
 def test_an_outline_shows_the_leaf_that_is_picked_elsewhere(opened: Person, tmp_path: Path) -> None:
     opened.click_mask(1, 2)
     opened.page.keyboard.press("o")

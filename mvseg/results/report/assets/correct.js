@@ -47,6 +47,7 @@ class Work {
   update({ views, leaves, doubts, numMasks }) {
     views.forEach(({ masks }, index) => { this.data.views[index].masks = masks; });
     Object.assign(this.data, { leaves, numMasks });
+    summarise(this.data);
     this.data.correct.doubts = doubts;
     this.read();
     this.picks = this.picks.flatMap((pick) => this.pickAgain(pick));

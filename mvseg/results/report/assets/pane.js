@@ -229,7 +229,8 @@ class Pane {
     if (!pointer) return;
     const { tool, draft } = this.work;
     if (tool && draft?.pane === this) {
-      const inOneGo = pointer.moved && draft.points.length > 7;
+      const isBack = draft.points.length > 3 && this.screenDistance(draft.points.at(-1), draft.points[0]) < NEAR;
+      const inOneGo = pointer.moved && (draft.points.length > 7 || isBack);
       const isCut = tool === "split" && pointer.moved && draft.points.length > 1;
       if (!draft.isClosed && (inOneGo || isCut)) this.work.finish();
     } else if (!tool && !pointer.moved) {

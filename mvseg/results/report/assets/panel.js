@@ -50,7 +50,8 @@ class Panel {
     parts.tools.replaceChildren(...this.tools());
     parts.list.replaceChildren(...this.list());
     const notes = [work.note, work.edits.problem, work.server?.problem];
-    parts.note.replaceChildren(notes.filter(Boolean).join(" "), ...(work.server?.isStale ? this.reload() : []));
+    parts.note.replaceChildren(...notes.filter(Boolean).map((note) => element("span", {}, note)),
+      ...(work.server?.isStale ? this.reload() : []));
     parts.state.textContent = work.server?.state ?? "";
     if (focused === this.word) this.word.focus();
     else if (!focused.isConnected) {
@@ -61,7 +62,7 @@ class Panel {
 
   reload() {
     const text = "This one saves nothing any more: reload it, and go on from what is saved.";
-    return [element("span", {}, ` ${text}`), this.button("Reload", null, () => window.location.reload())];
+    return [element("span", {}, text), this.button("Reload", null, () => window.location.reload())];
   }
 
   question() {

@@ -1,12 +1,16 @@
 // The head of the page, and what is known of the run: warnings, versions, options.
 
+function summarise(data) {
+  const leaves = count(data.leaves.length, "leaf", "leaves");
+  document.getElementById("summary").textContent =
+    `${leaves}, ${count(data.views.length, "photo")}, ${count(data.numMasks, "mask")}; lengths in ${data.unit}`;
+}
+
 function buildRun(data) {
   const { run } = data;
   const warnings = run.warnings ?? [];
   document.getElementById("plant").textContent = data.plant;
-  const leaves = count(data.leaves.length, "leaf", "leaves");
-  document.getElementById("summary").textContent =
-    `${leaves}, ${count(data.views.length, "photo")}, ${count(data.numMasks, "mask")}; lengths in ${data.unit}`;
+  summarise(data);
   const link = document.getElementById("warnings-link");
   link.textContent = count(warnings.length, "warning");
   link.hidden = warnings.length === 0;
