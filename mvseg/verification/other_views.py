@@ -238,11 +238,11 @@ def _look_at(
         found = own.get(leaf.instance)
         agrees = is_piece = False
         if found is not None:
-            mask = found.crop.numpy()
+            detected = found.crop.numpy()
             claimed = leaf.covered & (in_box == leaf.instance) & (leaf.share >= LEAST_VISIBLE)
             seen = replace(leaf, mask=leaf.mask | claimed)
-            agrees = agreement(found.box, mask, seen) >= AGREES
-            is_piece = inside(found.box, mask, seen) >= PIECE
+            agrees = agreement(found.box, detected, seen) >= AGREES
+            is_piece = inside(found.box, detected, seen) >= PIECE
         colored_here = colored[y1:y2, x1:x2]
         members = [] if found is None else found.members
         shown = None
