@@ -13,6 +13,7 @@ import argparse
 import csv
 import io
 import itertools
+import math
 import sys
 import time
 import warnings
@@ -29,11 +30,11 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.label_maps import add_scene_options, chosen_scenes, load_maps
 from benchmarks.mask_fates import true_maps
+from benchmarks.masks_alone import change_masks_alone
 from benchmarks.simulated_person import (
     Labels,
     Look,
     Order,
-    change_masks_alone,
     choose_repairs,
     count_worth,
     list_repairs,
@@ -60,11 +61,16 @@ from mvseg.system.atomic import write_text_whole
 Record = dict[str, Any]
 
 NOT_AGAIN = ("detect", "check", "measure")  # done once, or not shown
-ROUNDS = 7  # until there is an edit's worth for each leaf
+MOST, ROUNDS = 2.0, 8  # edits' worth per leaf, and in how many rounds, as a rule
 CURVES = (
     ("corrected, what repairs most first", "repair", "", "C2-"),
     ("corrected, in the page's order", "doubt", "", "C0-"),
     ("the same edits, masks alone", "repair", "alone_", "C7--"),
+)
+PANELS = (
+    ("degraded", "ari", "ARI of the ids"),
+    ("detected", "right", "leaves right"),
+    ("detected", "mv_pq", "MV-PQ of whole leaves"),
 )
 MEASURES = ("ari", "pair_f1", "mv_pq", "right")
 NEARLY_ALL = 0.95  # of the leaves right: the aim, with an edit's worth for two leaves
@@ -151,7 +157,7 @@ def judge(masks: Masks, truth: Sequence[Labels]) -> dict[str, float]:
 
 
 def correct(case: Case, order: Order, out: Path) -> list[Record]:
-    """The records of all rounds, until edits are worth one for each leaf; those in the folder are read."""
+    """The records of all rounds, until edits are worth `MOST` for each leaf; those in the folder are read."""
     path = out / f"{case.name}_{order}.csv"
     records, edits = read_records(path), tuple[Edit, ...]()
     if records and records[-1]["is_last"]:
@@ -168,8 +174,9 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
         doubts = list_doubts(masks, state.surfaces, cameras=state.scene.cameras)
         look = Look(masks, case.truth, state.scene, doubts, ids_only=case.has_masks)
         done = {str(edit.by) for edit in edits}
-        left = case.num_leaves - count_worth(edits)
-        step = min(left, -(-case.num_leaves // ROUNDS))
+        most = math.ceil(MOST * case.num_leaves)
+        left = most - count_worth(edits)
+        step = min(left, math.ceil(most / ROUNDS))
         chosen = choose_repairs(list_repairs(look), order=order, worth=(step, left), done=done)
         about = {"scene": case.name, "order": order, "leaves": case.num_leaves}
         alone = judge(change_masks_alone(first, edits, state.scene), case.truth)
@@ -219,9 +226,14 @@ def at_rate(records: Sequence[Record], name: str, rate: float) -> float:
     return float(within[-1][name])
 
 
+def along(records: Sequence[Record], name: str, rates: np.ndarray) -> np.ndarray:
+    """A measure at all these rates, on straight lines from round to round."""
+    return np.interp(rates, [each["worth"] / each["leaves"] for each in records], [each[name] for each in records])
+
+
 def print_table(runs: Sequence[Sequence[Record]]) -> None:
     """For each scene, what is reached with none, a quarter, half and one edit's worth for each leaf; and the means."""
-    rates = (0.0, 0.25, 0.5, 1.0)
+    rates = (0.0, 0.25, 0.5, 1.0, MOST)
     print(f"{'edits worth, per leaf (masks alone)':63}" + "".join(f"{rate:8.2f}{'':8}" for rate in rates))
     orders = sorted({str(run[0]["order"]) for run in runs})
     kinds = sorted({str(run[0]["scene"]).split("_")[0] for run in runs})
@@ -248,38 +260,30 @@ def print_table(runs: Sequence[Sequence[Record]]) -> None:
 
 
 def plot(runs: Sequence[Sequence[Record]], path: Path) -> None:
-    """A column for each kind of scene, a row for each measure: means over its scenes, over edits' worth per leaf."""
+    """Means over the scenes of each kind, over edits' worth per leaf."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    kinds = sorted({str(run[0]["scene"]).split("_")[0] for run in runs})
-    figure, axes = pyplot.subplots(
-        2, len(kinds), figsize=(3.4 * len(kinds), 4.8), sharex=True, sharey=True, squeeze=False
-    )
-    rates = np.linspace(0, 1, 41)
-    for column, kind in enumerate(kinds):
+    panels = [each for each in PANELS if any(str(run[0]["scene"]).startswith(each[0]) for run in runs)]
+    figure, axes = pyplot.subplots(1, len(panels), figsize=(3.3 * len(panels), 3), sharey=True, squeeze=False)
+    rates = np.linspace(0, max(run[-1]["worth"] / run[0]["leaves"] for run in runs), 61)
+    for axis, (kind, measure, title) in zip(axes[0], panels, strict=True):
         of_kind = [run for run in runs if str(run[0]["scene"]).startswith(kind)]
-        for row, measure in enumerate(("right", "mv_pq")):
-            axis = axes[row][column]
-            for name, order, prefix, style in CURVES:
-                chosen = [run for run in of_kind if run[0]["order"] == order]
-                if chosen:
-                    mean = [np.mean([at_rate(run, prefix + measure, rate) for run in chosen]) for rate in rates]
-                    axis.step(rates, mean, style, where="post", label=name, lw=1.6)
-            axis.set_ylim(0, 1.02)
-            axis.grid(alpha=0.3)
-            if row == 0:
-                scenes = len({run[0]["scene"] for run in of_kind})
-                axis.set_title(f"{kind}, {scenes} plant{'s' if scenes > 1 else ''}", fontsize=10)
-                axis.axhline(NEARLY_ALL, color="0.5", lw=0.8, ls=":")
-            if column == 0:
-                axis.set_ylabel({"right": "leaves right", "mv_pq": "MV-PQ"}[measure])
-        axes[1][column].set_xlabel("edits' worth per leaf")
+        for name, order, prefix, style in CURVES:
+            chosen = [run for run in of_kind if run[0]["order"] == order]
+            if chosen:
+                mean = np.mean([along(run, prefix + measure, rates) for run in chosen], 0)
+                axis.plot(rates, mean, style, label=name, lw=1.6)
+        axis.set_ylim(0.4, 1.01)
+        axis.grid(alpha=0.3)
+        scenes = len({run[0]["scene"] for run in of_kind})
+        axis.set_title(f"{title}\n{kind} masks, {scenes} scene{'s' if scenes > 1 else ''}", fontsize=9)
+        axis.set_xlabel("edits' worth per leaf", fontsize=9)
     axes[0][0].legend(fontsize=7, loc="lower right")
     figure.tight_layout()
-    figure.savefig(path, dpi=100)
+    figure.savefig(path, dpi=90)
 
 
 def main() -> None:

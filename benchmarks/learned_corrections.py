@@ -24,7 +24,8 @@ from tqdm import tqdm
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.mask_fates import true_maps
-from benchmarks.simulated_person import Labels, Look, change_masks_alone, count_worth, list_repairs
+from benchmarks.masks_alone import change_masks_alone
+from benchmarks.simulated_person import Labels, Look, count_worth, list_repairs
 from mvseg.corrections.file import Corrections, Edit, Outline, Reject, Split, load_corrections, write_corrections
 from mvseg.detection.config import DetectConfig
 from mvseg.detectors.zoo import load_detector
@@ -45,6 +46,7 @@ from mvseg.training.loop import TrainConfig, train
 from mvseg.training.validation import detect_and_label
 
 EVERY = 3  # of the photos, one is corrected
+SIZE = 800  # longer side at which photos are looked at, whatever size the weights were trained at
 
 
 def read_masks(result: Path, scene: Scene) -> Masks:
@@ -103,7 +105,7 @@ def learn(results: Path, out: Path, epochs: int) -> Path:
 
 def judge_detector(weights: str, photos: SampleList, truth: list[Labels]) -> dict[str, float | None]:
     """AP50 on these photos and, of what scores enough, precision and recall of masks."""
-    detector = load_detector(weights)
+    detector = load_detector(weights, image_size=SIZE)
     labelled, found = detect_and_label(detector, photos, tqdm(range(len(photos)), "photos"))
     scores = average_precision(labelled, found, len(photos))
     answer: dict[str, float | None] = {"AP50": scores["mask_AP50"]}

@@ -7,22 +7,19 @@ together, and a leaf that is outlined in two photos is found in all others.
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Literal
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from mvseg.corrections.apply import apply, apply_everywhere
 from mvseg.corrections.doubtful import Doubt
-from mvseg.corrections.file import Corrections, Edit, Link, Outline, Reject, Split
+from mvseg.corrections.file import Edit, Link, Outline, Reject, Split
 from mvseg.evaluation.panoptic import RIGHT_IOU
 from mvseg.evaluation.truth import region_crops, shown_instances
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.masks import Masks, Origin
-from mvseg.matching.partition import separate_unmatched
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
 
@@ -348,26 +345,3 @@ def _far_apart(look: Look, views: Sequence[int]) -> list[int]:
     cosines = ahead @ ahead[views[0]]
     far = [view for view in views[1:] if cosines[view] <= np.cos(np.radians(30))]
     return [views[0], *(far or views[1:])[:1]]
-
-
-def change_masks_alone(masks: Masks, edits: Sequence[Edit], scene: Scene) -> Masks:
-    """The same edits in a tool that knows no cameras: each changes the masks that it names, and nothing follows.
-
-    An outline has the leaf of the mask that it replaces; `same` gives all of its masks the leaf of the first one,
-    `different` takes the later ones out of their leaf, and the smaller part of a cut mask is another leaf.
-    """
-    numbered = replace(masks, regions=replace(masks.regions, labels=torch.arange(1, len(masks) + 1)))
-    changed = apply(Corrections(tuple(edits)), numbered, scene)
-    before = torch.from_numpy(separate_unmatched(masks.instance_ids.numpy())) + 1
-    row, area = changed.masks.regions.labels, changed.masks.regions.areas  # label 0: a mask where none was
-    new = int(before.max()) + 1 + torch.arange(len(row))
-    ids = torch.where(row > 0, before[(row - 1).clamp(min=0)], new)
-    for first, second in changed.links.must.tolist():
-        ids[second] = ids[first]
-    for first, second in changed.links.cannot.tolist():
-        if ids[first] == ids[second]:
-            is_cut = row[first] == row[second]
-            leaves = second if is_cut and area[second] < area[first] else first
-            ids[leaves] = new[leaves]
-    scores = torch.where(row > 0, masks.match_scores[(row - 1).clamp(min=0)], 0.0)
-    return apply_everywhere(changed, replace(changed.masks, instance_ids=ids, match_scores=scores))

@@ -11,11 +11,11 @@ import torch
 
 from benchmarks.corrections import judge, print_table, read_records, write_records
 from benchmarks.learned_corrections import correct_photos
+from benchmarks.masks_alone import change_masks_alone
 from benchmarks.simulated_person import (
     Labels,
     Look,
     Repair,
-    change_masks_alone,
     choose_repairs,
     count_worth,
     cut_line,
