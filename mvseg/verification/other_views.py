@@ -37,8 +37,6 @@ LEAST_VISIBLE = 0.3  # of a surface that no nearer one hides, for a view to show
 LEAST_PIXELS = 64  # of that part
 LEAST_COLORED = 0.8  # of it, that have the colour of leaves, for it to become a mask
 LEAST_FOUND = 0.3  # of the views that show an instance openly, where its surface agrees with what the detector found
-MOST_FOUND = 0.5  # of them, beyond which the surface may show it where the detector did not find it
-MOST_UNCERTAIN = 0.2  # standard deviation of the area, as a share of it, of a surface that does so
 UNSURE = 0.2  # of the masks that agree: no lower are the detection scores of masks that stay although they disagree
 PIECE = 0.8  # of a mask, that lies in what the surface shows
 ENOUGH, SHARE_SURE = 3, 0.5  # masks that the detector is sure of, for an instance without a credible surface to stay
@@ -177,8 +175,7 @@ def revise_masks(
       in what the surface shows. It was sure where it scores them no lower than the lowest `UNSURE` of those that agree;
     - otherwise, and where it has none, the visible part becomes its mask, as far as it has the colour of leaves
       (`leaf_color`). It must be `LEAST_VISIBLE` of the surface, so that the view shows it openly, and `LEAST_COLORED`
-      of it must have that colour: what a stem or a pot hides, or a wrong surface shows, is no mask. The surface must be
-      sure (`MOST_UNCERTAIN`), and found in most of the views that show it;
+      of it must have that colour: what a stem or a pot hides, or a wrong surface shows, is no mask;
     - otherwise it has none, or the piece that the detector was sure of.
 
     Of instances without a credible surface those masks stay that the detector was sure of, if these are `ENOUGH`, and
@@ -279,16 +276,10 @@ def _decide(
     num_sure = Counter(instance for (_, instance), place in places.items() if place.is_sure)
     num_found = Counter(instance for (_, instance), place in places.items() if place.own is not None)
     credible = {instance for instance, surface in surfaces.items() if surface.is_credible}
-    explains = {  # instances whose surfaces tell where there are masks that the detector did not find
-        instance for instance in credible
-        if instance in certain
-        or (num_agreeing[instance] > MOST_FOUND * num_open[instance]
-            and surfaces[instance].deviations[0] <= MOST_UNCERTAIN * surfaces[instance].area)
-    }  # fmt: skip
     found = []
-    for (_, instance), place in sorted(places.items()):
+    for _, place in sorted(places.items()):
         stays = place.agrees or (place.is_sure and not place.is_piece)
-        if not stays and place.shown is not None and instance in explains:
+        if not stays and place.shown is not None:
             found.append(place.shown)
         elif (stays or place.is_sure) and place.own is not None:
             found.append(place.own)
