@@ -102,7 +102,7 @@ def list_cases(args: argparse.Namespace) -> Iterator[Case]:
         yield degraded_case(spec, args.cache)
     folders = [render(spec, args.cache) for spec in chosen_scenes(args)] if "detected" in args.masks else []
     for folder in [*folders, *args.scenes]:
-        state = detect(load(folder, None, RunConfig(), keep=args.cache / "kept" / folder.name))
+        state = detect(load(folder, None, RunConfig(), cache=args.cache / "kept" / folder.name))
         yield Case(f"detected_{folder.name}", state, true_maps(folder, state.scene), has_masks=False)
 
 
