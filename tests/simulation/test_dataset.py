@@ -170,7 +170,7 @@ def test_wild_scenes_show_wild_plants(tmp_path: Path) -> None:
     ("changes", "message"),
     [
         ({"preset": "huge"}, "unknown preset 'huge'"),
-        ({"num_workers": 0}, "0 workers"),
+        ({"num_workers": 0}, "num_workers is 0"),
         ({"seed": -1}, "seed is -1"),
     ],
 )
