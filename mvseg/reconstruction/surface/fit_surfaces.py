@@ -37,7 +37,7 @@ from mvseg.scene import Cameras
 from mvseg.system.worker_pool import spread
 
 NUM_FIRST_STEPS = 3  # of a fit that a second one follows
-GOOD_IOU = 0.93  # of a patch after which no less likely start is tried
+GOOD_IOU = 0.93  # of a patch, longer than wide, after which no less likely start is tried
 LEAST_GAIN = 0.03  # in IoU, for another start to be better
 AREA_COST = 0.1  # in IoU, of a surface e times as large: bulges can hide behind the outlines of a level leaf
 CLEAR_IOU = 0.75  # of a start that shows how the blade lies
@@ -196,7 +196,7 @@ def _find_start(masks: MaskStack) -> tuple[MaskStack, Floats | None]:
             score = _score(masks, moved)
             if score > best_score + LEAST_GAIN:
                 best, best_score = moved, score
-        if best is not None and _iou(masks, best) > GOOD_IOU:
+        if best is not None and _rank(masks, best) > GOOD_IOU:
             break
     return masks, best
 
