@@ -1,6 +1,6 @@
 """One set of weights on all real plants at hand: `python benchmarks/board.py DATA --weights leaf-lite leaf-slim`
 
-DATA holds the scenes of `/shared/data` (docs/benchmarks.md); those that are missing are left out. One table, a row for
+DATA holds the real scenes, each in its folder; those that are missing are left out. One table, a row for
 each scene and a column for each set of weights:
 
 - basil-0729, whole job from photos to ids, against true masks: at default options, and mean and spread (standard
