@@ -9,6 +9,7 @@ from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -91,6 +92,23 @@ class State:
         """The same with another state of the table of masks."""
         return replace(self, matching=self.matched.with_masks(masks))
 
+    def result(self, seconds: Mapping[str, float] = MappingProxyType({})) -> Result:
+        """What the run gives back; `seconds`: {stage: wall time}."""
+        return Result(
+            scene=self.scene,
+            matching=self.matched,
+            photos=self.photos,
+            poses=self.poses,
+            surfaces=self.surfaces,
+            voxels=self.voxels,
+            traits=self.traits,
+            seconds=dict(seconds),
+            mask_kind=self.mask_kind,
+            num_moved=self.num_moved,
+            corrections=self.corrections,
+            fates=() if self.corrected is None else self.corrected.fates,
+        )
+
 
 Stage = Callable[[State], State]
 
@@ -135,20 +153,7 @@ def run_scene(
         begun = time.perf_counter()
         state = stage(state)
         seconds[name] = time.perf_counter() - begun
-    return Result(
-        scene=state.scene,
-        matching=state.matched,
-        photos=state.photos,
-        poses=state.poses,
-        surfaces=state.surfaces,
-        voxels=state.voxels,
-        traits=state.traits,
-        seconds=seconds,
-        mask_kind=state.mask_kind,
-        num_moved=state.num_moved,
-        corrections=corrections,
-        fates=() if state.corrected is None else state.corrected.fates,
-    )
+    return state.result(seconds)
 
 
 def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) -> dict[str, Stage]:

@@ -96,7 +96,7 @@ class OpenResult:
 
     def matched(self) -> Result:
         """The masks with the ids that matching alone gives them, within a moment: for the page to begin with."""
-        return _result_of(list_stages(self.config, has_masks=self.has_masks)["match"](self._found))
+        return list_stages(self.config, has_masks=self.has_masks)["match"](self._found).result()
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
@@ -127,7 +127,7 @@ class OpenResult:
         fine = (APPLIED, PASSED)
         outcomes = [fate.problem if fate.fate in fine else f"{fate.fate} {fate.problem}".strip() for fate in fates]
         told = () if corrected is None else corrected.messages
-        return _result_of(state), outcomes, [text for text in dict.fromkeys(messages) if text not in told]
+        return state.result(), outcomes, [text for text in dict.fromkeys(messages) if text not in told]
 
     @cached_property
     def _colors(self) -> NDArray[np.bool_]:
@@ -219,17 +219,6 @@ def say_how_to_run(result: OpenResult) -> str:
     verb = "match" if result.config.reconstruct is None else "infer"
     corrections = result.folder / CORRECTIONS_FILE
     return f"mvseg {verb} {config['scene']}{masks} --out {result.folder} --corrections {corrections}"
-
-
-def _result_of(state: State) -> Result:
-    return Result(
-        scene=state.scene,
-        matching=state.matched,
-        photos=state.photos,
-        poses=state.poses,
-        surfaces=state.surfaces,
-        mask_kind=state.mask_kind,
-    )
 
 
 def _read_run(folder: Path) -> dict[str, Any]:
