@@ -24,7 +24,7 @@ from mvseg.system.worker_pool import run_all
 
 Photo = tuple[dict[str, Any], list[dict[str, Any]]]  # COCO image and its annotations, still without ids
 
-# Without "leggy", which is there for training only: published figures stay comparable.
+# Without "leggy" and "fern", which are there for training only: published figures stay comparable.
 EVALUATED_FAMILIES = ("ovate", "lanceolate", "rosette", "strap", "lobed", "compound")
 
 

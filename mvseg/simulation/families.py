@@ -77,6 +77,11 @@ FAMILIES: dict[str, Family] = {
         petiole=(0.15, 0.5), elevation=(60, -10), droop=(20, 80),
         internode=(60, 140), divergence=90.0, per_node=2, per_shoot=4, tillers=0.8, lean=(0, 40),
     ),
+    "fern": Family(
+        outline=(0.35, 0.55), length=(180, 360), aspect=(0.2, 0.38), curl=(-25, 5), lobes=(18, 0.85), twist=25,
+        petiole=(0.03, 0.3), elevation=(84, 15), droop=(20, 110), fold=(0, 20), rows=100,
+        internode=(0.3, 1.2), per_shoot=48, stem_radius=6.0, pot_radius=70.0,
+    ),
 }  # fmt: skip
 
 
