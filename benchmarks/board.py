@@ -80,8 +80,8 @@ def find_leaves(scene: Scene, options: DetectConfig, cache: Path | None) -> tupl
     """Masks as they are found and matched, and as they leave the whole job."""
     state = State(config=RunConfig(reconstruct=None, detect=options), scene=scene, photos=Photos(scene), cache=cache)
     state = match(detect(state))
-    found = state.matched.masks
-    return found, (recut(verify(state)) if options.verify else state).matched.masks
+    found = state.masks
+    return found, (recut(verify(state)) if options.verify else state).masks
 
 
 def judge(masks: Masks, truth: list[np.ndarray]) -> Figures:

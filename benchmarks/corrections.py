@@ -50,6 +50,7 @@ from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.matching.match import match_regions
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import State, detect, list_stages, load
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene, View
@@ -117,7 +118,8 @@ def degraded_case(spec: SceneSpec, cache: Path) -> Case:
         scene=scene,
         photos=Photos(scene),
         match=partial(match_regions, regions, config=config.match),
-        find=lambda _: Masks.of(regions),
+        matching=Matching(Masks.of(regions), MatchReport("none")),
+        mask_kind="label images",
     )
     return Case(f"degraded_{name}", state, list(maps.true), has_masks=True)
 
@@ -164,12 +166,12 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
         return records
     if records:
         edits = load_corrections(path.with_suffix(".json")).edits
-    first = compute(case, Corrections()).matched.masks.to("cpu") if edits else None
+    first = compute(case, Corrections()).masks.to("cpu") if edits else None
     while True:
         begun = time.process_time()
         state = compute(case, Corrections(edits))
         seconds = time.process_time() - begun
-        masks = state.matched.masks.to("cpu")
+        masks = state.masks.to("cpu")
         first = masks if first is None else first
         doubts = list_doubts(masks, state.surfaces, cameras=state.scene.cameras)
         look = Look(masks, case.truth, state.scene, doubts, ids_only=case.has_masks)
@@ -180,10 +182,9 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
         chosen = choose_repairs(list_repairs(look), order=order, worth=(step, left), done=done)
         about = {"scene": case.name, "order": order, "leaves": case.num_leaves}
         alone = judge(change_masks_alone(first, edits, state.scene), case.truth)
-        fates = () if state.corrected is None else state.corrected.fates
         record = about | {"edits": len(edits), "worth": count_worth(edits)} | judge(masks, case.truth)
         record |= {f"alone_{name}": value for name, value in alone.items()}
-        record |= {"idle": sum(fate.fate != APPLIED for fate in fates), "seconds": round(seconds, 1)}
+        record |= {"idle": sum(fate.fate != APPLIED for fate in state.fates), "seconds": round(seconds, 1)}
         records.append(record | {"is_last": int(not chosen)})
         for each in chosen:
             edits += tuple(edit.model_copy(update={"by": each.name}) for edit in each.edits)

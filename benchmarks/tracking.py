@@ -40,7 +40,7 @@ from mvseg.reconstruction.shapes import reconstruct_shapes
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import save_result
 from mvseg.results.read import read_instances
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from mvseg.simulation.blades import BLADE_COLUMNS
 from mvseg.simulation.growth import Plant
 from mvseg.simulation.series import (
@@ -267,7 +267,8 @@ def prepare(table: Path, results: Path, *, masks: str = "true") -> None:
         ids = matching.instance_ids
         surfaces, voxels = reconstruct_shapes(regions, ids, scene.cameras, config=ReconstructConfig())
         traits = measure_plant(scene, matching, surfaces=surfaces, voxels=voxels)
-        result = Result(scene=scene, matching=matching, surfaces=surfaces, voxels=voxels, traits=traits)
+        instances = Instances(surfaces=surfaces, voxels=voxels, traits=traits)
+        result = Result(scene=scene, matching=matching, instances=instances)
         save_result(result, place, {"scene": scene.name}, report=False)
         print(place, flush=True)
 

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.checks.contradictions import warn_of_contradictions
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere, fates_everywhere
+from mvseg.corrections.apply import apply, apply_everywhere, fates_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
@@ -25,89 +24,57 @@ from mvseg.formats.photos import Photos, check_photos, require_photos
 from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.masks import Masks
 from mvseg.matching.match import check_baselines, match_masks, match_regions
-from mvseg.matching.result import Matching
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.split import split_merged
-from mvseg.poses.refine_poses import RefinedPoses, refine_scene
-from mvseg.results.result import Result
-from mvseg.scene import Cameras, Scene
+from mvseg.poses.refine_poses import refine_scene
+from mvseg.regions import stack_regions
+from mvseg.results.result import Instances, Result
+from mvseg.scene import Cameras
 from mvseg.traits.world_frame import place_scene
-
-if TYPE_CHECKING:
-    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-    from mvseg.reconstruction.voxels import VoxelGrid
-    from mvseg.traits.measure import Traits
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
 
 
-@dataclass(frozen=True, eq=False)
-class State:
-    """What is known of a scene between two stages, and how the run works.
+NOTHING_FOUND = Matching(Masks.of(stack_regions([], [], [], labels=[], num_views=0)), MatchReport("none"))
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class State(Result):
+    """A result in the making, between two stages, and how the run works.
 
     Attributes:
         config: the options of all stages.
-        scene: cameras and views.
         photos: of the scene.
+        matching: the masks as they were given, until they are matched.
+        match: from cameras to the masks, matched; what `load`, `detect` or `correct` leaves.
         cache, workers, progress: see `run_scene`.
-        find: from cameras to the masks of the scene; what `load` or `detect` leaves.
-        match: from cameras to the same masks, matched; what `load`, `detect` or `correct` leaves.
-        corrections: of a person; None: there are none.
-        corrected: what came of them.
-        matching: the table of masks, and what matching says of the scene.
-        poses: what came of refining them; None where that was not asked for.
         colors: of leaves, see `leaf_colors`; None: those of the masks, wherever a stage asks.
-        starts: {instance id: surface} that the masks were verified with; where the final ones start.
-        surfaces, voxels, traits, mask_kind, num_moved: see `Result`; `surfaces` may hold only those that are known
-            already until `reconstruct`.
     """
 
     config: RunConfig
-    scene: Scene
     photos: Photos
+    matching: Matching = NOTHING_FOUND
+    match: Callable[[Cameras], Matching] | None = None
     cache: Path | None = None
     workers: ProcessPoolExecutor | None = None
     progress: bool = False
-    find: Callable[[Cameras], Masks] | None = None
-    match: Callable[[Cameras], Matching] | None = None
-    corrections: Corrections | None = None
-    corrected: Corrected | None = None
-    matching: Matching | None = None
-    poses: RefinedPoses | None = None
     colors: NDArray[np.bool_] | None = None
-    starts: Mapping[int, LeafSurface] = field(default_factory=dict)
-    surfaces: Mapping[int, LeafSurface] | None = None
-    voxels: Mapping[int, VoxelGrid] | None = None
-    traits: Traits | None = None
-    mask_kind: str = ""
-    num_moved: int | None = None
-
-    @property
-    def matched(self) -> Matching:
-        """The matching, for the stages after it."""
-        assert self.matching is not None
-        return self.matching
 
     def with_masks(self, masks: Masks) -> State:
-        """The same with another state of the table of masks."""
-        return replace(self, matching=self.matched.with_masks(masks))
+        """The same with other masks. Gaps between their ids close; what is known of the instances follows, but for the
+        surfaces of those whose masks changed."""
+        instances = self.instances
+        if instances.surfaces is not None:
+            from mvseg.verification.checked_ids import unchanged_surfaces
 
-    def result(self, seconds: Mapping[str, float] = MappingProxyType({})) -> Result:
-        """What the run gives back; `seconds`: {stage: wall time}."""
-        return Result(
-            scene=self.scene,
-            matching=self.matched,
-            photos=self.photos,
-            poses=self.poses,
-            surfaces=self.surfaces,
-            voxels=self.voxels,
-            traits=self.traits,
-            seconds=dict(seconds),
-            mask_kind=self.mask_kind,
-            num_moved=self.num_moved,
-            corrections=self.corrections,
-            fates=() if self.corrected is None else self.corrected.fates,
-        )
+            instances = replace(instances, surfaces=unchanged_surfaces(self.masks, masks, instances.surfaces))
+        matching = self.matching.with_masks(masks.close_gaps())
+        return replace(self, matching=matching, instances=instances.close_gaps(masks))
+
+    def result(self) -> Result:
+        """What the run gives back."""
+        return Result(**{each.name: getattr(self, each.name) for each in fields(Result)})
 
 
 Stage = Callable[[State], State]
@@ -153,7 +120,7 @@ def run_scene(
         begun = time.perf_counter()
         state = stage(state)
         seconds[name] = time.perf_counter() - begun
-    return state.result(seconds)
+    return replace(state, seconds=seconds).result()
 
 
 def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) -> dict[str, Stage]:
@@ -198,7 +165,8 @@ def load(folder: Path, masks: Path | None, config: RunConfig, **how: Any) -> Sta
     found = recognise_masks(scene, masks)
     regions = read_masks(scene, found, crowd=config.coco_crowd, categories=config.category_names)
     matcher = partial(match_regions, regions, config=config.match, progress=state.progress)
-    return replace(state, match=matcher, find=lambda _: Masks.of(regions), mask_kind=found.kind)
+    given = Matching(Masks.of(regions), MatchReport("none"))
+    return replace(state, matching=given, match=matcher, mask_kind=found.kind)
 
 
 def detect(state: State) -> State:
@@ -207,7 +175,7 @@ def detect(state: State) -> State:
 
     config = state.config
     matcher = detect_scene(state.photos, config.detect, match=config.match, cache=state.cache, progress=state.progress)
-    return replace(state, match=matcher, find=lambda cameras: matcher(cameras).masks)
+    return replace(state, match=matcher)
 
 
 def correct(state: State) -> State:
@@ -215,9 +183,10 @@ def correct(state: State) -> State:
 
     Warns (InputWarning) of each edit that points at nothing, or that a later one contradicts.
     """
-    assert state.find is not None
+    assert state.match is not None
     assert state.corrections is not None
-    corrected = apply(state.corrections, state.find(state.scene.cameras), state.scene)
+    masks = state.masks if state.mask_kind else state.match(state.scene.cameras).masks
+    corrected = apply(state.corrections, masks, state.scene)
     for message in corrected.messages:
         warnings.warn(message, InputWarning, stacklevel=3)
     options = state.config.match
@@ -248,22 +217,17 @@ def correct_instances(state: State) -> State:
     Warns (InputWarning) of each earlier edit that one of them contradicts.
     """
     assert state.corrected is not None
-    before = state.matched.masks.to("cpu")
+    before = state.masks.to("cpu")
     corrected = replace(state.corrected, fates=fates_everywhere(state.corrected, before))
     for message in corrected.messages:
         if message not in state.corrected.messages:
             warnings.warn(message, InputWarning, stacklevel=3)
-    masks = apply_everywhere(corrected, before)
-    return replace(state.with_masks(masks), corrected=corrected)
+    return replace(state.with_masks(apply_everywhere(corrected, before)), corrected=corrected)
 
 
 def split(state: State) -> State:
-    """Cut masks that show two instances; surfaces of these are not known any more."""
-    from mvseg.verification.checked_ids import unchanged_surfaces
-
-    before, after = state.matched.masks, split_merged(state.matched.masks)
-    surfaces = None if state.surfaces is None else unchanged_surfaces(before, after, state.surfaces)
-    return replace(state.with_masks(after), surfaces=surfaces)
+    """Cut masks that show two instances, see `split_merged`."""
+    return state.with_masks(split_merged(state.masks))
 
 
 def verify(state: State) -> State:
@@ -272,21 +236,17 @@ def verify(state: State) -> State:
     from mvseg.verification.other_views import verify_masks
 
     masks, starts = verify_masks(
-        state.matched.masks,
-        cameras=state.scene.cameras,
-        photos=state.photos,
-        workers=state.workers,
-        progress=state.progress,
+        state.masks, cameras=state.scene.cameras, photos=state.photos, workers=state.workers, progress=state.progress
     )
-    masks = select_by_views(masks, state.matched.masks, min_views=state.config.detect.min_views)
-    return replace(state.with_masks(masks.close_gaps()), starts=masks.renumber(starts))
+    masks = select_by_views(masks, state.masks, min_views=state.config.detect.min_views)
+    return replace(state, instances=Instances(starts=starts)).with_masks(masks)
 
 
 def check_cameras(state: State) -> State:
     """Warns where masks or photos contradict the cameras, see `warn_of_contradictions`; photos are not asked where ids
     alone are wanted."""
     has_photos = state.config.reconstruct is not None and state.photos.exist
-    warn_of_contradictions(state.scene, state.matched.masks.regions, photos=has_photos, progress=state.progress)
+    warn_of_contradictions(state.scene, state.regions, photos=has_photos, progress=state.progress)
     return state
 
 
@@ -294,14 +254,13 @@ def check_ids(state: State) -> State:
     """Surfaces correct the ids, see `mvseg.verification.checked_ids`; those of the other instances are known then."""
     from mvseg.verification import checked_ids
 
-    before, surfaces = state.matched.masks, reconstruct(state, with_voxels=False).surfaces or {}
+    state = reconstruct(state, with_voxels=False)
     held = None
     if state.corrected is not None and not state.corrected.everywhere:  # these edits change the rows that links name
-        held = state.corrected.links.named(len(before))
-    after = checked_ids.check_ids(before, surfaces, cameras=state.scene.cameras, held=held)
-    known = after.renumber(checked_ids.unchanged_surfaces(before, after, surfaces))
-    num_moved = int((before.instance_ids != after.instance_ids).sum())
-    return replace(state.with_masks(after.close_gaps()), surfaces=known, num_moved=num_moved)
+        held = state.corrected.links.named(len(state.masks))
+    checked = checked_ids.check_ids(state.masks, state.surfaces or {}, cameras=state.scene.cameras, held=held)
+    num_moved = int((state.masks.instance_ids != checked.instance_ids).sum())
+    return replace(state.with_masks(checked), num_moved=num_moved)
 
 
 def follow(state: State) -> State:
@@ -309,13 +268,13 @@ def follow(state: State) -> State:
     from mvseg.verification.drawn_leaves import follow_drawn
 
     masks, starts = follow_drawn(
-        state.matched.masks,
+        state.masks,
         cameras=state.scene.cameras,
         photos=state.photos if state.photos.exist else None,
         colors=state.colors,
         workers=state.workers,
     )
-    return replace(state.with_masks(masks), starts=starts)
+    return replace(state, instances=Instances(starts=starts)).with_masks(masks)
 
 
 def reconstruct(state: State, *, with_voxels: bool = True) -> State:
@@ -323,19 +282,18 @@ def reconstruct(state: State, *, with_voxels: bool = True) -> State:
     from mvseg.reconstruction.shapes import reconstruct_shapes
 
     assert state.config.reconstruct is not None
-    masks = state.matched.masks
     surfaces, voxels = reconstruct_shapes(
-        masks.regions,
-        masks.instance_ids,
+        state.regions,
+        state.masks.instance_ids,
         state.scene.cameras,
         config=state.config.reconstruct,
-        starts=state.starts,
+        starts=state.instances.starts,
         known=state.surfaces or {},
         with_voxels=with_voxels,
         workers=state.workers,
         progress=state.progress,
     )
-    return replace(state, surfaces=surfaces, voxels=voxels)
+    return replace(state, instances=replace(state.instances, surfaces=surfaces, voxels=voxels))
 
 
 def measure(state: State) -> State:
@@ -345,19 +303,20 @@ def measure(state: State) -> State:
 
     traits = measure_plant(
         state.scene,
-        state.matched,
+        state.matching,
         surfaces=state.surfaces,
         voxels=state.voxels or {},
         photos=state.photos,
         config=state.config.traits,
         corrections=correct_views(state.scene, state.config.color_card),
     )
-    return replace(state, traits=traits)
+    return replace(state, instances=replace(state.instances, traits=traits))
 
 
 def recut(state: State) -> State:
     """Cut the detector's masks anew by their surfaces, see `recut_masks`."""
     from mvseg.verification.recut import recut_masks
 
-    surfaces = state.surfaces or state.starts
-    return state.with_masks(recut_masks(state.matched.masks, surfaces, cameras=state.scene.cameras))
+    surfaces = state.surfaces or state.instances.starts
+    masks = recut_masks(state.masks, surfaces, cameras=state.scene.cameras)
+    return replace(state, matching=state.matching.with_masks(masks))

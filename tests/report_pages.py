@@ -29,7 +29,7 @@ def rename_hostile(result: Result) -> Result:
     scene = replace(result.scene, name=f"plant {HOSTILE}", unit=f"mm {HOSTILE}", views=views)
     leaves = tuple(replace(leaf, reasons=(f"doubt {HOSTILE}",)) for leaf in result.traits.leaves)
     traits = replace(result.traits, plant=scene.name, unit=scene.unit, leaves=leaves)
-    return replace(result, scene=scene, traits=traits, mask_kind=HOSTILE)
+    return replace(result, scene=scene, instances=replace(result.instances, traits=traits), mask_kind=HOSTILE)
 
 
 def draw_pictures(result: Result) -> list[Picture]:

@@ -43,8 +43,8 @@ from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
-from mvseg.results.provenance import describe_run
 from mvseg.results.result import Result
+from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Cameras, Scene, View
 from mvseg.verification.other_views import verify_masks
 from scene_folders import write_scene

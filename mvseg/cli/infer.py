@@ -10,7 +10,6 @@ from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import DEFAULT_OUT, add_overwrite, add_run_options, build_run
 from mvseg.demo import demo_scene
-from mvseg.runs.one_scene import run_one_scene
 
 
 def add(verbs: Any) -> None:
@@ -32,6 +31,7 @@ def run(args: Namespace) -> int:
         print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
     scene = args.scene or demo_scene()
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
+    from mvseg.runs.one_scene import run_one_scene
     from mvseg.system.worker_pool import default_workers
 
     out = args.out or DEFAULT_OUT / scene_name(scene)

@@ -12,7 +12,6 @@ from mvseg.cli.options import DEFAULT_OUT, add_matching_options, add_overwrite, 
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
-from mvseg.runs.one_scene import run_one_scene
 
 
 def add(verbs: Any) -> None:
@@ -27,6 +26,7 @@ def add(verbs: Any) -> None:
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
+    from mvseg.runs.one_scene import run_one_scene
 
     names = [scene_name(scene) for scene in args.scenes]
     for name in names:

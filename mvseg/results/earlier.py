@@ -9,13 +9,37 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from mvseg.errors import InputError
-from mvseg.system.atomic import resolve_place
+from mvseg.system.atomic import folder_whole, resolve_place
 from mvseg.system.file_hash import hash_files
 
 RUN_FILE = "run.json"
+
+
+@contextmanager
+def replace_result(out: Path, run: dict[str, Any], run_file: str = RUN_FILE) -> Iterator[Path]:
+    """A new folder that becomes `out` when the block ends, see `folder_whole`; until then an earlier result stays.
+
+    At the end, `run`, as the block left it, is written to `run_file` with a list of the files, and the user's files in
+    the earlier result are copied.
+
+    Raises:
+        InputError: `out` cannot be written or holds something else, see `check_out`.
+    """
+    check_out(out, run_file)
+    try:
+        with folder_whole(out) as folder:
+            yield folder
+            text = json.dumps(run | {"files": list_files(folder, run_file)}, indent=1, default=str)
+            (folder / run_file).write_text(text + "\n", encoding="utf-8")
+            keep_user_files(out, folder, run_file)
+    except OSError as error:
+        raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
 
 
 def check_out(out: Path, run_file: str = RUN_FILE) -> None:
@@ -30,7 +54,10 @@ def check_out(out: Path, run_file: str = RUN_FILE) -> None:
         if not os.access(resolved, os.R_OK):
             raise InputError(f"{out}: cannot be read, expected a new or empty folder, or an earlier result")
         if any(resolved.iterdir()):
-            _check_unchanged(out, _read_listed(out, run_file))
+            for name, sha256 in _read_listed(out, run_file).items():
+                if (out / name).is_file() and hash_files(out / name) != sha256:
+                    message = "was changed after mvseg wrote it, move it away, or choose another --out"
+                    raise InputError(f"{out / name}: {message}")
     elif out.exists() or any(parent.is_file() for parent in resolved.parents):
         raise InputError(f"{out}: the output folder is not writable (a file is in the way)")
     nearest = next((parent for parent in resolved.parents if parent.exists()), resolved)
@@ -87,10 +114,3 @@ def _read_listed(out: Path, run_file: str) -> dict[str, str]:
     except (OSError, ValueError, KeyError, TypeError, AttributeError):  # no run.json, or another program's
         message = "holds files that are not an earlier result, expected a new or empty folder"
         raise InputError(f"{out}: {message}") from None
-
-
-def _check_unchanged(out: Path, listed: dict[str, str]) -> None:
-    for name, sha256 in listed.items():
-        path = out / name
-        if path.is_file() and hash_files(path) != sha256:
-            raise InputError(f"{path}: was changed after mvseg wrote it, move it away, or choose another --out")

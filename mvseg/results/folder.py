@@ -6,17 +6,15 @@ Numbers in files are instance ids: label 3, `leaf_003.ply`, leaf 3 in `traits.cs
 
 from __future__ import annotations
 
-import json
 import math
 import os
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from mvseg.errors import InputError
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
@@ -24,16 +22,11 @@ from mvseg.formats.lens import distort, opencv_distortion
 from mvseg.formats.photos import Photos
 from mvseg.formats.rig import write_rig
 from mvseg.masks import Origin
-from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
+from mvseg.results.earlier import replace_result
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.scene import Scene
-from mvseg.system.atomic import folder_whole
-
-if TYPE_CHECKING:
-    from mvseg.poses.refine_poses import RefinedPoses
-    from mvseg.traits.measure import Traits
 
 REPORT_FILE = "report.html"
 CAMERAS_FILE = "cameras.json"
@@ -50,8 +43,7 @@ def save_result(
 ) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
-    The folder appears complete or not at all: it is written next to `out` and moved there at the end; until then an
-    earlier result stays. The overlays are drawn on the photos, or on grey when the scene has none.
+    The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.
 
     Args:
         result: the result.
@@ -64,36 +56,37 @@ def save_result(
         InputError: `out` cannot be written or holds something that is not a result (see `check_out`), or a photo is
             broken, or missing while others exist.
     """
-    check_out(out)
-    try:
-        with folder_whole(out) as folder:
-            pictures = _write_images(result, folder, progress)
-            _write_instances(result, folder, progress)
-            if result.surfaces is not None or result.voxels is not None:
-                from mvseg.results.plant_files import write_plant  # loads trimesh and scikit-image
+    run = run | describe_result(result)
+    with replace_result(out, run) as folder:
+        pictures = _write_images(result, folder, progress)
+        _write_instances(result, folder, progress)
+        if result.surfaces is not None or result.voxels is not None:
+            from mvseg.results.plant_files import write_plant  # loads trimesh and scikit-image
 
-                write_plant(result, folder)
-            counts = {"regions": len(result.regions), "instances": result.matching.num_instances}
-            counts |= {} if result.num_moved is None else {"moved": result.num_moved}
-            seconds = {stage: round(wall, 3) for stage, wall in result.seconds.items()}
-            matched: dict[str, Any] = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
-            poses = result.poses
-            if poses is not None:
-                matched["poses"] = _describe_poses(poses)
-                if poses.is_refined:
-                    write_refined(folder / CAMERAS_FILE, result.scene)
-            measured = {} if result.traits is None else {"traits": _describe_traits(result.traits)}
-            corrected = {"corrections": [asdict(each) for each in result.fates]} if result.fates else {}
-            said = run | matched | measured | corrected | {"counts": counts, "seconds": seconds}
-            if report:
-                from mvseg.results.report.page import write_report  # loads trimesh
+            write_plant(result, folder)
+        if result.poses is not None and result.poses.is_refined:
+            write_refined(folder / CAMERAS_FILE, result.scene)
+        if report:
+            from mvseg.results.report.page import write_report  # loads trimesh
 
-                write_report(folder / REPORT_FILE, result, pictures, run=said)
-            text = json.dumps(said | {"files": list_files(folder)}, indent=1, default=str)
-            (folder / RUN_FILE).write_text(text + "\n", encoding="utf-8")
-            keep_user_files(out, folder)
-    except OSError as error:
-        raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
+            write_report(folder / REPORT_FILE, result, pictures, run=run)
+
+
+def describe_result(result: Result) -> dict[str, Any]:
+    """What run.json says of the outcome of a run: of matching, poses, traits and corrections; counts and timings."""
+    said: dict[str, Any] = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
+    if (poses := result.poses) is not None:
+        residuals = [None if math.isnan(residual) else round(residual, 3) for residual in poses.residual_px]
+        said["poses"] = {"refined": poses.is_refined, "residual_px": residuals}
+    if (traits := result.traits) is not None:
+        colors = {"colors": [asdict(correction) for correction in traits.corrections]} if traits.corrections else {}
+        said["traits"] = {"unit": traits.unit or None, "up": traits.up, **colors, "rejected": traits.rejected}
+    if result.fates:
+        said["corrections"] = [asdict(each) for each in result.fates]
+    said["counts"] = {"regions": len(result.regions), "instances": result.matching.num_instances}
+    if result.num_moved is not None:
+        said["counts"]["moved"] = result.num_moved
+    return said | {"seconds": {stage: round(wall, 3) for stage, wall in result.seconds.items()}}
 
 
 def _write_images(result: Result, folder: Path, progress: bool) -> list[Picture]:
@@ -125,28 +118,22 @@ def _write_instances(result: Result, folder: Path, progress: bool) -> None:
         width, height = scene.cameras.sizes[index].tolist()
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
         images.append({"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height})
-    others = result.masks.second_ids.tolist()
-    annotations = []
-    for region in tqdm(range(len(result.regions)), desc="masks", unit="mask", disable=not progress):
-        annotation = _annotate(result, region)
-        if others[region] > 0:
-            annotation["other_instance_id"] = others[region]
-        annotations.append(annotation)
-    write_coco(folder / "instances.json", images, annotations)
+    shown = tqdm(range(len(result.regions)), desc="masks", unit="mask", disable=not progress)
+    write_coco(folder / "instances.json", images, [_annotate(result, region) for region in shown])
 
 
 def _annotate(result: Result, region: int) -> dict[str, Any]:
     """The entry of one region in instances.json, without what COCO itself requires."""
-    view = int(result.regions.view_index[region])
+    masks, view = result.masks, int(result.masks.view_index[region])
     width, height = result.scene.cameras.sizes[view].tolist()
-    mask = result.regions.mask(region, width, height).cpu().numpy().astype(np.uint8)
+    mask = masks.regions.mask(region, width, height).cpu().numpy().astype(np.uint8)
     K = result.scene.cameras.K[view].cpu().numpy()
-    instance = int(result.matching.instance_ids[region])
+    instance, other = int(masks.instance_ids[region]), int(masks.second_ids[region])
     track = {"track_id": instance} if instance > 0 else {}
-    origin, score = Origin(int(result.masks.origin[region])), float(result.masks.detection_scores[region])
+    origin, score = Origin(int(masks.origin[region])), float(masks.detection_scores[region])
     source: dict[str, Any] = {}
     if origin == Origin.GIVEN:
-        source["source_label"] = int(result.regions.labels[region])
+        source["source_label"] = int(masks.regions.labels[region])
     elif math.isfinite(score):
         source["score"] = round(score, 4)
     if origin in (Origin.DETECTED, Origin.OTHER_VIEWS):
@@ -160,9 +147,10 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         "instance_id": instance,
         **track,
         "attributes": {"instance_id": instance} | track,  # what datumaro and CVAT keep
-        "match_score": round(float(result.matching.match_scores[region]), 4),
+        "match_score": round(float(masks.match_scores[region]), 4),
         **source,
         "segmentation": encode_mask(distort(mask, result.scene.views[view].lens, K)),
+        **({"other_instance_id": other} if other > 0 else {}),
     }
 
 
@@ -175,16 +163,3 @@ def write_refined(path: Path, scene: Scene) -> None:
     if None not in distortion:
         files = [Path(os.path.relpath(photo, root)).as_posix() for photo in paths]
         write_rig(path, scene, files, distortion=distortion)
-
-
-def _describe_poses(poses: RefinedPoses) -> dict[str, Any]:
-    """What run.json says of the poses: whether they were refined, and the residuals before and after."""
-    residuals = [None if math.isnan(residual) else round(residual, 3) for residual in poses.residual_px]
-    return {"refined": poses.is_refined, "residual_px": residuals}
-
-
-def _describe_traits(traits: Traits) -> dict[str, Any]:
-    """The traits entry of run.json: the world that they are measured in, how their colours were corrected, and how many
-    instances are not leaves."""
-    colors = {"colors": [asdict(correction) for correction in traits.corrections]} if traits.corrections else {}
-    return {"unit": traits.unit or None, "up": traits.up, **colors, "rejected": traits.rejected}

@@ -14,11 +14,36 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 if TYPE_CHECKING:  # loads trimesh and scikit-image
-    from mvseg.corrections.apply import Fate
+    from mvseg.corrections.apply import Corrected, Fate
     from mvseg.corrections.file import Corrections
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.reconstruction.voxels import VoxelGrid
     from mvseg.traits.measure import Traits
+
+
+@dataclass(frozen=True, eq=False)
+class Instances:
+    """The other table: what is known of the instances that `Masks` names. (Their support follows from the masks, see
+    `Matching.support`.)
+
+    Attributes:
+        starts: {instance id: surface} that masks were verified with, and the final ones are fitted from.
+        surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None if no surfaces were
+            requested.
+        voxels: {instance id: voxels}: of all instances if voxels were requested, otherwise of those without a credible
+            surface; None for ids only.
+        traits: of the plant and its leaves, once ids are final; None for ids only.
+    """
+
+    starts: Mapping[int, LeafSurface] = field(default_factory=dict)
+    surfaces: Mapping[int, LeafSurface] | None = None
+    voxels: Mapping[int, VoxelGrid] | None = None
+    traits: Traits | None = None
+
+    def close_gaps(self, masks: Masks) -> Instances:
+        """The shapes of the instances that have masks, by the ids that `masks.close_gaps()` gives them."""
+        surfaces, voxels = (each and masks.renumber(each) for each in (self.surfaces, self.voxels))
+        return Instances(starts=masks.renumber(self.starts), surfaces=surfaces, voxels=voxels)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,40 +53,54 @@ class Result:
     Attributes:
         scene: the scene, with refined cameras where `poses` has them.
         matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
+        instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
         poses: outcome of their refinement; None if it was not requested.
-        surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None if no surfaces were
-            requested.
-        voxels: {instance id: voxels}: of all instances if voxels were requested, otherwise of those without a credible
-            surface; None for ids only.
-        traits: of the plant and its leaves; None for ids only.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
-        corrections: of a person; None where there were none.
-        fates: the outcome of each of their edits.
         num_moved: number of masks that the surfaces moved to another instance, see `check_ids`; None without that
             check.
+        corrections: of a person; None where there were none.
+        corrected: what came of them; None without any edits.
     """
 
     scene: Scene
     matching: Matching
+    instances: Instances = Instances()
     photos: Photos | None = None
     poses: RefinedPoses | None = None
-    surfaces: Mapping[int, LeafSurface] | None = None
-    voxels: Mapping[int, VoxelGrid] | None = None
-    traits: Traits | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
+    seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""
     num_moved: int | None = None
     corrections: Corrections | None = None
-    fates: tuple[Fate, ...] = ()
+    corrected: Corrected | None = None
 
     @property
     def masks(self) -> Masks:
-        """The table."""
+        """The table of masks."""
         return self.matching.masks
 
     @property
     def regions(self) -> Regions:
         """D masks, undistorted."""
-        return self.matching.masks.regions
+        return self.masks.regions
+
+    @property
+    def surfaces(self) -> Mapping[int, LeafSurface] | None:
+        """See `Instances`."""
+        return self.instances.surfaces
+
+    @property
+    def voxels(self) -> Mapping[int, VoxelGrid] | None:
+        """See `Instances`."""
+        return self.instances.voxels
+
+    @property
+    def traits(self) -> Traits | None:
+        """See `Instances`."""
+        return self.instances.traits
+
+    @property
+    def fates(self) -> tuple[Fate, ...]:
+        """The outcome of each of the corrections."""
+        return () if self.corrected is None else self.corrected.fates

@@ -30,7 +30,7 @@ from mvseg.pipeline import Stage, State, detect, list_stages, load, reconstruct
 from mvseg.reconstruction.shapes import Surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import RUN_FILE
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from mvseg.scene import Scene
 from mvseg.system.atomic import lock_folder
 from mvseg.verification.other_views import colors_of_leaves, fit_roughly, verify_masks
@@ -148,9 +148,11 @@ class OpenResult:
         """A surface for every instance; those whose masks had one before keep it."""
 
         def fit(known: dict[int, LeafSurface]) -> Surfaces | None:
-            return reconstruct(replace(state, surfaces=known), with_voxels=False).surfaces
+            instances = replace(state.instances, surfaces=known)
+            return reconstruct(replace(state, instances=instances), with_voxels=False).surfaces
 
-        return replace(state, surfaces=_fit_unknown(state.matched.masks, self._fitted, fit))
+        surfaces = _fit_unknown(state.masks, self._fitted, fit)
+        return replace(state, instances=replace(state.instances, surfaces=surfaces))
 
     def _verify(self, state: State) -> State:
         """As the stage of that name, with surfaces that are known."""
@@ -160,10 +162,8 @@ class OpenResult:
             again = partial(fit_roughly, masks, cameras, workers=state.workers)
             return dict(_fit_unknown(masks, self._rough, lambda known: again(known=known)) or {})
 
-        masks, starts = verify_masks(
-            state.matched.masks, cameras=cameras, photos=self.photos, colors=state.colors, fit=fit
-        )
-        return replace(state, matching=state.matched.with_masks(masks), starts=starts)
+        masks, starts = verify_masks(state.masks, cameras=cameras, photos=self.photos, colors=state.colors, fit=fit)
+        return replace(state, instances=Instances(starts=starts)).with_masks(masks)
 
 
 def _fit_unknown(

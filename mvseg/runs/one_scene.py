@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import platform
 import sys
 import warnings
 from collections.abc import Sequence
@@ -9,14 +10,24 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
+import torch
+
+from mvseg._version import made_by
+from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
+from mvseg.detection.cached_detections import claim_cache, delete_cached
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError, InputWarning
-
-if TYPE_CHECKING:
-    from mvseg.results.result import Result
+from mvseg.formats.find_views import list_some
+from mvseg.pipeline import run_scene
+from mvseg.results.earlier import check_out, check_same_scene
+from mvseg.results.folder import save_result
+from mvseg.results.result import Result
+from mvseg.system.atomic import resolve_place, sweep_abandoned
+from mvseg.system.file_hash import hash_files
+from mvseg.system.worker_pool import start_workers
 
 
 def run_one_scene(
@@ -36,11 +47,6 @@ def run_one_scene(
         InputError: bad input; `out` holds a result of another scene, or what a run found in its photos, and `overwrite`
             is not set; or another run detects for `out` now.
     """
-    from mvseg.detection.cached_detections import claim_cache, delete_cached
-    from mvseg.results.earlier import check_out, check_same_scene
-    from mvseg.system.atomic import resolve_place, sweep_abandoned
-    from mvseg.system.worker_pool import start_workers
-
     sweep_abandoned(out)
     check_out(out)
     if not overwrite:
@@ -78,8 +84,6 @@ def solve_scene(
     progress: bool,
 ) -> tuple[Result, list[str]]:
     """The result of one scene and the InputWarnings on the way, each once; other warnings are passed on."""
-    from mvseg.pipeline import run_scene  # keeps --help and wrong options quick
-
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         if masks is not None and config.detect != DetectConfig():
@@ -106,10 +110,6 @@ def save_scene(
 ) -> None:
     """Write the result folder, run.json included; with the report, the findings of the checks of the scene and its
     masks."""
-    from mvseg.checks.check_scene import check_scene
-    from mvseg.results.folder import save_result
-    from mvseg.results.provenance import describe_run
-
     run = describe_run(result, masks, config, messages=messages)
     run["config"] = {"scene": str(scene.resolve()), "out": str(out)} | run["config"]
     if config.report:
@@ -118,13 +118,42 @@ def save_scene(
     save_result(result, out, run, progress=progress, report=config.report)
 
 
+def describe_run(
+    result: Result, masks: Path | None, config: RunConfig, *, messages: Sequence[str] = ()
+) -> dict[str, Any]:
+    """Where a result comes from, for run.json: version, inputs with their SHA-256 (of the detector's weights, where no
+    `masks` were given), the options of the stages that ran, and the `messages` of the run."""
+    options = asdict(config)
+    if masks is not None:
+        del options["detect"]
+    if config.reconstruct is None:
+        for name in ("reconstruct", "traits", "scale", "unit", "up", "color_card"):
+            del options[name]
+    if masks is None:
+        from mvseg.detectors.zoo import weights_path  # loads torchvision
+
+    sources = [result.scene.source, masks or weights_path(config.detect.weights)]
+    corrections = None if result.corrections is None else result.corrections.source
+    if corrections is not None:
+        sources.append(corrections)
+        options["corrections"] = str(corrections)
+    return {
+        **made_by(),
+        "torch": torch.__version__,
+        "python": platform.python_version(),
+        "scene": result.scene.name,
+        "inputs": {str(path): hash_files(path) for path in sources if path is not None},
+        "config": {"masks": masks and str(masks)} | options,
+        "mask_kind": result.mask_kind or None,
+        "warnings": list(messages),
+    }
+
+
 def find_masks(scene: Path, masks: Path, beside: Path = Path(), *, what: str = "masks") -> Path:
     """Where masks, or `what` else is given with a scene, lie.
 
     A relative path may start at the scene folder or at `beside`, as long as only one of the two exists.
     """
-    from mvseg.formats.find_views import list_some
-
     inside, outside = scene / masks, beside / masks
     if inside.exists() and outside.exists() and not inside.samefile(outside):
         raise InputError(f"both {inside} and {outside.resolve()} exist, expected --{what} with the full path of one")

@@ -1,18 +1,13 @@
-"""The scene folder that `mvseg pose` writes: what it may replace, and `pose.json`, which lists the files of mvseg."""
+"""The scene folder that `mvseg pose` writes: what it may replace; `pose.json` lists the files of mvseg."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
-from mvseg._version import made_by
 from mvseg.errors import InputError
 from mvseg.poses.photo_files import list_photos
-from mvseg.results.earlier import check_out, keep_user_files, list_files
-from mvseg.system.atomic import folder_whole, sweep_abandoned
+from mvseg.results.earlier import check_out
+from mvseg.system.atomic import sweep_abandoned
 
 POSE_FILE = "pose.json"
 
@@ -29,24 +24,3 @@ def check_folders(photos: Path, out: Path) -> tuple[Path, list[str]]:
     if out.resolve() in (source.resolve(), *source.resolve().parents):
         raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
     return source, names
-
-
-@contextmanager
-def new_scene_folder(out: Path) -> Iterator[Path]:
-    """A new folder that becomes `out` when the block ends, see `folder_whole`.
-
-    Raises:
-        InputError: it cannot be written.
-    """
-    try:
-        with folder_whole(out) as folder:
-            yield folder
-    except OSError as error:
-        raise InputError(f"{out}: the scene folder is not writable ({error.strerror})") from None
-
-
-def write_pose_file(folder: Path, out: Path, run: Mapping[str, Any]) -> None:
-    """Write pose.json into the new folder, last of mvseg's files, and copy the user's files from `out`."""
-    content = {**made_by(), **run, "files": list_files(folder, POSE_FILE)}
-    (folder / POSE_FILE).write_text(json.dumps(content, indent=1, default=str) + "\n", encoding="utf-8")
-    keep_user_files(out, folder, POSE_FILE)

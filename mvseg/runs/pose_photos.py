@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 import pycolmap
-import torch
 
+from mvseg._version import made_by
 from mvseg.errors import InputWarning
 from mvseg.formats.find_views import list_some
 from mvseg.formats.opencv_yaml import read_calibration
@@ -22,12 +22,11 @@ from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
-from mvseg.runs.pose_folder import check_folders, new_scene_folder, write_pose_file
+from mvseg.results.earlier import replace_result
+from mvseg.runs.pose_folder import POSE_FILE, check_folders
 from mvseg.scene import Scene
 from mvseg.traits.config import Up
-from mvseg.traits.up import find_up
-
-UPSIDE_DOWN = -0.5  # mean of the cameras' own up along the known one
+from mvseg.traits.world_frame import place_scene
 
 
 def pose_photos(
@@ -60,8 +59,8 @@ def pose_photos(
     calibration = None if file is None else read_calibration(file.parent, file.name)
     if known.positions is not None:
         read_positions(known.positions)  # to find mistakes in it before the minutes that follow
-    start = time.perf_counter()
-    with warnings.catch_warnings(record=True) as caught, new_scene_folder(out) as folder:
+    start, run = time.perf_counter(), dict[str, Any](made_by())
+    with warnings.catch_warnings(record=True) as caught, replace_result(out, run, POSE_FILE) as folder:
         warnings.simplefilter("always", InputWarning)
         files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
         structure = find_structure(
@@ -69,29 +68,17 @@ def pose_photos(
         )
         placement = place(write_structure(structure, folder), known, progress=not quiet)
         scene = move_structure(structure, placement.similarity, folder)
-        scene = find_up(replace(scene, unit=placement.unit, up=placement.up), up)
-        warn_of_upside_down(scene)
+        scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
         write_cameras(scene, folder)
         messages = list(dict.fromkeys(str(each.message) for each in caught))
-        run = describe_poses(structure, placement, files)
+        run |= describe_poses(structure, placement, files)
         run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
         run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}
-        write_pose_file(folder, out, run)
     for message in messages:
         print(f"mvseg: warning: {message}", file=sys.stderr)
     if not quiet:
         print(describe_result(out, structure, placement=placement, scene=scene))
     return scene
-
-
-def warn_of_upside_down(scene: Scene) -> None:
-    """Warn (InputWarning) if the cameras hang upside down, as a result of left-handed positions in one plane."""
-    if scene.up is None:
-        return
-    own = -(scene.cameras.R[:, 1] @ torch.tensor(scene.up, dtype=torch.float64)).mean().item()
-    if own < UPSIDE_DOWN:
-        message = "the cameras hang upside down in this world: expected right-handed axes, and up as --up says"
-        warnings.warn(message, InputWarning, stacklevel=2)
 
 
 def describe_poses(structure: Structure, placement: Placement, files: Sequence[PhotoFile]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
+from mvseg._version import made_by
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.image_file import read_rgb
@@ -22,7 +23,8 @@ from mvseg.poses.board_calibration import calibrate_turntable
 from mvseg.poses.photo_files import PhotoFile, copy_photos
 from mvseg.poses.scene_files import IMAGES
 from mvseg.poses.table_fit import TableCamera
-from mvseg.runs.pose_folder import check_folders, new_scene_folder, write_pose_file
+from mvseg.results.earlier import replace_result
+from mvseg.runs.pose_folder import POSE_FILE, check_folders
 from mvseg.scene import Scene
 
 TURNTABLE_FILE = "turntable.json"
@@ -46,28 +48,31 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
         InputError: see `calibrate_turntable`; a photo is broken, or `out` holds something else.
     """
     source, names = check_folders(photos, out)
-    with new_scene_folder(out) as folder:
+    run: dict[str, Any] = made_by() | {"board": asdict(board), "unit": unit}
+    with replace_result(out, run, POSE_FILE) as folder:
         files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
-        by_camera = _group_by_folder(files)
-        grey = iter(_read_grey(folder, [file for each in by_camera.values() for file in each], quiet=quiet))
-        found = calibrate_turntable({name: [next(grey) for _ in each] for name, each in by_camera.items()}, board)
-        views, shown = [], []
+        by_camera: dict[str, list[PhotoFile]] = {}
+        grey: dict[str, list[np.ndarray]] = {}
+        for file in tqdm(files, desc="board", unit="photo", disable=quiet):
+            camera = file.folder or ONLY_CAMERA
+            by_camera.setdefault(camera, []).append(file)
+            photo = cv2.cvtColor(read_rgb(folder / IMAGES / file.name), cv2.COLOR_RGB2GRAY)
+            grey.setdefault(camera, []).append(photo)
+        found = calibrate_turntable(grey, board)
+        views = []
         for camera, each in by_camera.items():
             for file, angle in zip(each, found.angles.tolist(), strict=True):
                 if np.isfinite(angle):
                     views.append((f"{IMAGES}/{file.name}", camera, round(angle, 6)))
-                    shown.append(file.name)
                 else:
                     (folder / IMAGES / file.name).unlink()
-        cameras = {name: _describe_camera(camera) for name, camera in found.cameras.items()}
-        write_turntable(folder / TURNTABLE_FILE, {name: cameras[name] for name in by_camera}, views, unit=unit)
+        cameras = {name: _describe_camera(found.cameras[name]) for name in by_camera}
+        write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
         scene = load_scene(folder)
-        run: dict[str, Any] = {"residual_px": round(found.residual_px, 4), "corners": found.num_corners}
-        run["photos"] = len(files)
-        run |= {"registered": shown, "board": asdict(board), "unit": unit}
-        write_pose_file(folder, out, run)
+        run |= {"residual_px": round(found.residual_px, 4), "corners": found.num_corners, "photos": len(files)}
+        run["registered"] = [name.removeprefix(f"{IMAGES}/") for name, _, _ in views]
     if not quiet:
-        share = f"{len(shown)} of {len(files)} photos are at angles at which the board is seen"
+        share = f"{len(views)} of {len(files)} photos are at angles at which the board is seen"
         print(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
         print(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
     return scene
@@ -94,34 +99,24 @@ def pose_turntable_photos(
     cameras, known, unit = read_turntable_parts(turntable)
     camera_of = _camera_of(names, list(cameras), turntable)
     angle_of = _angles_of(names, camera_of, known, angles=angles, turntable=turntable)
-    with new_scene_folder(out) as folder:
+    run: dict[str, Any] = made_by() | {"photos": len(names), "turntable": str(turntable), "unit": unit}
+    with replace_result(out, run, POSE_FILE) as folder:
         files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
         for file, camera in zip(files, camera_of, strict=True):
             size, expected = (file.width, file.height), (cameras[camera]["width"], cameras[camera]["height"])
             if size != expected:
                 given = f"{size[0]} x {size[1]} pixels, the turntable's camera {expected[0]} x {expected[1]}"
                 raise InputError(f"{file.name} has {given}, expected photos of that camera")
-        run: dict[str, Any] = {"photos": len(files), "turntable": str(turntable), "unit": unit}
-        views = [
-            (f"{IMAGES}/{file.name}", camera, angle)
-            for file, camera, angle in zip(files, camera_of, angle_of, strict=True)
-        ]
-        write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
+        places = [f"{IMAGES}/{file.name}" for file in files]
+        write_turntable(
+            folder / TURNTABLE_FILE, cameras, list(zip(places, camera_of, angle_of, strict=True)), unit=unit
+        )
         scene = load_scene(folder)
-        write_pose_file(folder, out, run)
     if not quiet:
         has_step = isinstance(angles, float)
         described = f"steps of {angles:g} degrees" if has_step else f"the angles of {angles or turntable}"
         print(f"{out}: {len(files)} photos at {described}")
     return replace(scene, source=out / TURNTABLE_FILE)
-
-
-def _group_by_folder(files: Sequence[PhotoFile]) -> dict[str, list[PhotoFile]]:
-    """The photos of each camera."""
-    grouped: dict[str, list[PhotoFile]] = {}
-    for file in files:
-        grouped.setdefault(file.folder or ONLY_CAMERA, []).append(file)
-    return grouped
 
 
 def _camera_of(names: Sequence[str], cameras: Sequence[str], turntable: Path) -> list[str]:
@@ -163,11 +158,6 @@ def _angles_of(
         message = f"{len(of_camera[wrong])} views{of} for {counts[wrong]} photos"
         raise InputError(f"{turntable}: {message}, expected one per photo, in the order of their names, or --angles")
     return [of_camera[camera][place] for camera, place in zip(camera_of, places, strict=True)]
-
-
-def _read_grey(folder: Path, files: Sequence[PhotoFile], *, quiet: bool) -> list[np.ndarray]:
-    bar = tqdm(files, desc="board", unit="photo", disable=quiet)
-    return [cv2.cvtColor(read_rgb(folder / IMAGES / file.name), cv2.COLOR_RGB2GRAY) for file in bar]
 
 
 def _describe_camera(camera: TableCamera) -> dict[str, Any]:

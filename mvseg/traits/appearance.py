@@ -7,12 +7,12 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from skimage.color import rgb2hsv
 
 from mvseg.formats.image_file import is_grey
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
-from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
-from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.traits.color_correction import correct_colors
 from mvseg.traits.config import ColorCorrection
@@ -53,63 +53,44 @@ def measure_appearance(
     Raises:
         InputError: a photo is broken, or missing while others exist.
     """
-    has_photos = bool(surfaces) and photos.exist
+    has_photos, is_corrected = bool(surfaces) and photos.exist, any(corrections)
+    method, has_colors = describe_colors(corrections), False
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
     colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # see `mean_colors`
-    has_colors, is_corrected = False, any(corrections)
-    for view in range(len(cameras)):
+    on_cpu = cameras.to("cpu")
+    for view, size in enumerate(cameras.sizes.tolist()):
         photo = photos(view) if has_photos else None
         if photo is not None and is_grey(photo):
             photo = None
         has_colors |= photo is not None
         correction = corrections[view] if is_corrected else None
-        labels = masks.regions.label_map(view, masks.instance_ids, cameras.sizes[view].tolist()).cpu().numpy()
+        labels = masks.regions.label_map(view, masks.instance_ids, size).cpu().numpy().astype(np.uint16)
+        is_sure = sure_pixels(labels)
         for instance, surface in surfaces.items():
-            covered, (x, y) = project_crop(surface, cameras, view)
-            if not covered.any():
-                continue
-            window = np.s_[y : y + covered.shape[0], x : x + covered.shape[1]]
-            own = labels[window] == instance
-            pixels[instance] += (covered.sum(), (covered & own).sum())
-            if photo is not None and (correction is not None or not is_corrected):
-                sure = covered & shrink(own)
-                if sure.any():
-                    seen = photo[window][sure]
-                    shown = seen / 255 if correction is None else correct_colors(correction, seen)
-                    is_senescent = hues(shown) < YELLOW_DEG
-                    colors[instance].append((int(sure.sum()), np.append(shown.mean(0), is_senescent.mean())))
+            (x1, y1, x2, y2), covered = surface.project_parts(on_cpu)[view]
+            window = np.s_[y1:y2, x1:x2]
+            own = covered & (labels[window] == instance)
+            pixels[instance] += (covered.sum(), own.sum())
+            sure = own & is_sure[window]
+            if photo is not None and (correction is not None or not is_corrected) and sure.any():
+                seen = photo[window][sure]
+                shown = seen / 255 if correction is None else correct_colors(correction, seen)
+                is_senescent = hues(shown) < YELLOW_DEG
+                colors[instance].append((int(sure.sum()), np.append(shown.mean(0), is_senescent.mean())))
     found = {}
     for instance in surfaces:
         projected, visible = pixels[instance].tolist()
         share = Measurement(visible / projected, float("nan"), "masks") if projected else OUTSIDE
-        why, method = GREY if has_photos else NO_PHOTOS, describe_colors(corrections)
-        of_photos = mean_colors(colors[instance], method) if has_colors else dict.fromkeys(COLORS, why)
-        found[instance] = {"visible_share": share, **of_photos}
+        without = dict.fromkeys(COLORS, GREY if has_photos else NO_PHOTOS)
+        found[instance] = {"visible_share": share} | (mean_colors(colors[instance], method) if has_colors else without)
     return found
 
 
-def project_crop(surface: LeafSurface, cameras: Cameras, view: int) -> tuple[NDArray[np.bool_], tuple[int, int]]:
-    """What `surface.project` gives for one view, as a crop with a margin: (h, w) bool and the crop's corner x, y."""
-    width, height = cameras.sizes[view].tolist()
-    points, depths = cameras[[view]].project(surface.points().reshape(-1, 3))
-    is_ahead = (grid_quads(depths.reshape(*MESH_SHAPE, 1).cpu().numpy()) > 0).all((1, 2))
-    quads = grid_quads(points.reshape(*MESH_SHAPE, 2).cpu().numpy())[is_ahead]
-    if not len(quads):
-        return np.zeros((0, 0), bool), (0, 0)
-    margin = BORDER_PX + 1
-    low, high = quads.min((0, 1)) - margin, quads.max((0, 1)) + margin
-    x1, y1 = np.floor(np.clip(low, 0, (width, height))).astype(int).tolist()
-    x2, y2 = np.ceil(np.clip(high, 0, (width, height))).astype(int).tolist()
-    if x1 == x2 or y1 == y2:
-        return np.zeros((0, 0), bool), (0, 0)
-    return draw_polygons(quads, (x2 - x1, y2 - y1), np.array([x1, y1])) >= 0.5, (x1, y1)
-
-
-def shrink(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """A mask (h, w) without the pixels within BORDER_PX of others; what lies outside the picture is no other."""
-    side = 2 * BORDER_PX + 1
-    eroded = cv2.erode(mask.astype(np.uint8), np.ones((side, side), np.uint8), borderType=cv2.BORDER_REPLICATE)
-    return np.asarray(eroded, bool)
+def sure_pixels(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
+    """(H, W) bool, pixels with no other label within BORDER_PX; what lies outside the picture is no other."""
+    near = np.ones((2 * BORDER_PX + 1, 2 * BORDER_PX + 1), np.uint8)
+    low, high = (filter(labels, near, borderType=cv2.BORDER_REPLICATE) for filter in (cv2.erode, cv2.dilate))
+    return np.asarray(low == high)
 
 
 def describe_colors(corrections: Sequence[ColorCorrection | None]) -> str:
@@ -141,9 +122,4 @@ def mean_colors(views: list[tuple[int, Floats]], method: str) -> dict[str, Measu
 
 def hues(colors: Floats) -> Floats:
     """(n,) hues of colours (n, 3), 0 to 1: degrees in [0, 360), 0 red, 60 yellow, 120 green; 0 for greys."""
-    low, high = colors.min(1), colors.max(1)
-    spread = np.where(high > low, high - low, 1)
-    (red, green, blue), top = colors.T, colors.argmax(1)
-    sixths = np.choose(top, [(green - blue) / spread, 2 + (blue - red) / spread, 4 + (red - green) / spread])
-    degrees: Floats = 60 * sixths % 360
-    return np.where(degrees >= 360, 0.0, degrees)
+    return np.asarray(360 * rgb2hsv(colors)[:, 0])

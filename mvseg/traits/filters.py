@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -34,20 +36,6 @@ class Rejection:
     reason: str
 
 
-@dataclass(frozen=True)
-class Support:
-    """What speaks for instances.
-
-    Attributes:
-        sure_views: {instance id: views with a sure match}; empty where the matcher gives no probabilities.
-        visible_shares: {instance id: share of its surface, over all photos, that its masks cover}, of those with a
-            surface.
-    """
-
-    sure_views: Mapping[int, int] = field(default_factory=dict)
-    visible_shares: Mapping[int, float] = field(default_factory=dict)
-
-
 @dataclass(frozen=True, eq=False)
 class _Body:
     """Where an instance is, and how large.
@@ -57,22 +45,24 @@ class _Body:
         deviations: (3,) standard deviations along its principal axes, the largest first.
         axis: (3,) the first of these.
         area: one-sided.
+        iou: see `median_iou`; 0 for voxels.
     """
 
     points: Floats
     deviations: Floats
     axis: Floats
     area: float
+    iou: float
 
     @staticmethod
     def of(shape: LeafSurface | VoxelGrid) -> _Body:
-        every = shape.points().reshape(-1, 3) if isinstance(shape, LeafSurface) else shape.points
-        points = every.cpu().numpy()
+        is_surface = isinstance(shape, LeafSurface)
+        points = (shape.points().reshape(-1, 3) if is_surface else shape.points).cpu().numpy()
         variances, axes = np.linalg.eigh(np.cov(points.T, bias=True))
         deviations = np.sqrt(np.maximum(variances[::-1], 0))
-        area = shape.area if isinstance(shape, LeafSurface) else 12 * float(deviations[0] * deviations[1])
+        area = shape.area if is_surface else 12 * float(deviations[0] * deviations[1])
         few = points[:: max(1, len(points) // NUM_POINTS)]
-        return _Body(points=few, deviations=deviations, axis=axes[:, -1], area=area)
+        return _Body(few, deviations, axes[:, -1], area, iou=median_iou(shape) if is_surface else 0.0)
 
     @property
     def length(self) -> float:
@@ -81,21 +71,28 @@ class _Body:
 
 
 def find_rejected(
-    shapes: Mapping[int, LeafSurface | VoxelGrid], support: Support, up: Floats | None, *, config: TraitsConfig
+    shapes: Mapping[int, LeafSurface | VoxelGrid],
+    up: Floats | None,
+    *,
+    config: TraitsConfig,
+    sure_views: Mapping[int, int] = MappingProxyType({}),
+    visible_shares: Mapping[int, float] = MappingProxyType({}),
 ) -> dict[int, Rejection]:
     """The instances that are not measured as leaves.
 
     Args:
         shapes: {instance id: its shape}, instances without one left out.
-        support: what speaks for them.
         up: (3,) unit vector; None: not known, so that stems and the floor are not told.
         config: what is asked of a leaf.
+        sure_views: {instance id: views with a sure match}; empty where the matcher gives no probabilities.
+        visible_shares: {instance id: share of its surface, over all photos, that its masks cover}, of those with a
+            surface.
 
     Returns:
         {instance id: why}. One that several rules reject has the first of their reasons.
     """
     found: dict[int, Rejection] = {}
-    for instance, num_views in support.sure_views.items():
+    for instance, num_views in sure_views.items():
         if num_views < config.min_sure_views:
             reason = f"{num_views} sure views, asked for are {config.min_sure_views}"
             found[instance] = Rejection("few_sure_views", reason)
@@ -103,22 +100,17 @@ def find_rejected(
         if isinstance(shape, LeafSurface) and (iou := median_iou(shape)) < config.min_quality:
             reason = f"median IoU {iou:.2f} with its masks, asked for is {config.min_quality:g}"
             found.setdefault(instance, Rejection("low_quality", reason))
-    for instance, share in support.visible_shares.items():
+    for instance, share in visible_shares.items():
         if share < config.min_visible_share:
             reason = f"its masks cover a share of {share:.2f} of its surface, asked for is {config.min_visible_share:g}"
             found.setdefault(instance, Rejection("hardly_visible", reason))
     if not config.leaves_only:
         return found
     bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in found}
-    if up is not None:
-        found |= find_stems(bodies, shapes, up)
-        found |= find_floor(_without(bodies, found), up)
-    found |= find_distant(_without(bodies, found))
+    rules = [] if up is None else [partial(find_stems, up=up), partial(find_floor, up=up)]
+    for rule in (*rules, find_distant):
+        found |= rule({instance: body for instance, body in bodies.items() if instance not in found})
     return dict(sorted(found.items()))
-
-
-def _without(bodies: Mapping[int, _Body], found: Mapping[int, Rejection]) -> dict[int, _Body]:
-    return {instance: body for instance, body in bodies.items() if instance not in found}
 
 
 def median_iou(surface: LeafSurface) -> float:
@@ -127,17 +119,13 @@ def median_iou(surface: LeafSurface) -> float:
     return float(iou.median()) if len(iou) else 0.0
 
 
-def find_stems(
-    bodies: Mapping[int, _Body], shapes: Mapping[int, LeafSurface | VoxelGrid], up: Floats
-) -> dict[int, Rejection]:
+def find_stems(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
     """Long and steep ones; a blade that stands upright is told from them by a surface that explains its masks."""
     found = {}
     for instance, body in bodies.items():
-        shape = shapes[instance]
         elongation = body.deviations[0] / max(body.deviations[1], 1e-12)
         steepness = np.degrees(np.arcsin(min(1.0, abs(float(body.axis @ up)))))
-        is_blade = isinstance(shape, LeafSurface) and median_iou(shape) >= TUBE_IOU
-        if elongation > LONG and steepness > STEEP_DEG and not is_blade:
+        if elongation > LONG and steepness > STEEP_DEG and body.iou < TUBE_IOU:
             reason = f"looks like a stem: {elongation:.0f} times longer than wide, {steepness:.0f} degrees steep"
             found[instance] = Rejection("stem", reason)
     return found
@@ -171,10 +159,11 @@ def find_distant(bodies: Mapping[int, _Body]) -> dict[int, Rejection]:
     if sizes.max() <= len(bodies) / 2:
         return {}
     plant = group == sizes.argmax()
-    found = {}
-    for index, instance in enumerate(bodies):
-        if not plant[index]:
-            steps = gaps[index, plant].min() / length
-            reason = f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
-            found[instance] = Rejection("beside_the_plant", reason)
-    return found
+    away = gaps[:, plant].min(1) / length
+    return {
+        instance: Rejection(
+            "beside_the_plant", f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
+        )
+        for instance, steps, is_plant in zip(bodies, away, plant, strict=True)
+        if not is_plant
+    }

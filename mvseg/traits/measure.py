@@ -17,9 +17,9 @@ from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
 from mvseg.traits.config import ColorCorrection, TraitsConfig
-from mvseg.traits.filters import Rejection, Support, find_rejected, median_iou
-from mvseg.traits.from_above import Cells, look_from_above
-from mvseg.traits.leaf import UP_UNKNOWN, Floats, Measurement, measure_leaf, measure_voxels, missing
+from mvseg.traits.filters import Rejection, find_rejected, median_iou
+from mvseg.traits.from_above import look_from_above
+from mvseg.traits.leaf import UP_UNKNOWN, Measurement, measure_leaf, measure_voxels, missing
 from mvseg.traits.ontology import LEAF_TRAITS
 from mvseg.traits.plant import measure_whole
 from mvseg.traits.up import level_frame
@@ -102,45 +102,36 @@ def measure_plant(
     """
     instances = range(1, matching.num_instances + 1)
     best = {instance: best_shape(instance, surfaces, voxels) for instance in instances}
-    frame = None if scene.up is None else level_frame(scene.up)
-    up = None if frame is None else frame[2]
-    sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     shapes = {instance: shape for instance, shape in best.items() if shape is not None}
     every = {instance: shape for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
+    frame = None if scene.up is None else level_frame(scene.up)
+    sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     appearance = measure_appearance(
         every, matching.masks, scene.cameras, photos=photos or Photos(scene), corrections=corrections
     )
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
-    rejected = find_rejected(shapes, Support(sure_views, visible), up, config=config)
+    rejected = find_rejected(
+        shapes, None if frame is None else frame[2], config=config, sure_views=sure_views, visible_shares=visible
+    )
     blades = {instance: surface for instance, surface in every.items() if instance not in rejected}
     cells = {} if frame is None else look_from_above(blades, frame)
-    numbers = {instance: _count(instance, matching.masks, sure_views=sure_views) for instance in instances}
-    for instance, found in measure_blades(blades, frame, cells=cells).items():
-        numbers[instance] |= found | appearance[instance]
-    for instance in voxels.keys() - rejected.keys():
-        numbers[instance] |= measure_voxels(voxels[instance])
+    ground = 0.0  # heights start from the lowest point of all blades
+    if frame is not None and blades:
+        ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
     leaves = []
     for instance in instances:
+        numbers = _count(instance, matching.masks, sure_views=sure_views)
+        if instance in blades:
+            lit = UP_UNKNOWN if frame is None else Measurement(cells[instance].lit_share, float("nan"), "surface")
+            numbers |= measure_leaf(blades[instance], frame, ground=ground) | {"lit_share": lit} | appearance[instance]
+        if instance in voxels and instance not in rejected:
+            numbers |= measure_voxels(voxels[instance])
         fitted = None if surfaces is None else surfaces.get(instance, LeafSurface.none(NO_VIEWS, "has no masks"))
         rejection = rejected.get(instance)
-        leaves.append(describe_leaf(instance, numbers[instance], best[instance], fitted=fitted, rejection=rejection))
+        leaves.append(describe_leaf(instance, numbers, best[instance], fitted=fitted, rejection=rejection))
     whole = measure_whole(blades, cells, frame, num_leaves=len(instances) - len(rejected))
     known = tuple(dict.fromkeys(each for each in corrections if each is not None))
     return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, corrections=known)
-
-
-def measure_blades(
-    blades: Mapping[int, LeafSurface], frame: Floats | None, *, cells: Mapping[int, Cells]
-) -> dict[int, dict[str, Measurement]]:
-    """{instance id: sizes, angles and lit share}; heights start from the lowest point of all blades."""
-    ground = 0.0
-    if frame is not None and blades:
-        ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
-    measured = {}
-    for instance, surface in blades.items():
-        lit = UP_UNKNOWN if frame is None else Measurement(cells[instance].lit_share, float("nan"), "surface")
-        measured[instance] = measure_leaf(surface, frame, ground=ground) | {"lit_share": lit}
-    return measured
 
 
 def describe_leaf(
@@ -173,17 +164,15 @@ def describe_leaf(
         why = "not measured: only voxels have it"
     else:
         why = "; ".join(("no credible surface", *reasons))
-    found = dict(numbers)
+        reasons = (why,)
+    found = {trait.name: numbers.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
     if isinstance(shape, LeafSurface):
         found["quality"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons)))
-    elif fitted is not None and rejection is None:
-        reasons = (why,)
-    if isinstance(shape, VoxelGrid) and (num_pieces := shape.num_pieces) > 1:
-        reasons = (*reasons, f"in {num_pieces} pieces")
-        found["quality"] = missing(f"{why}; in {num_pieces} pieces")
+    elif shape is not None and (num_parts := shape.num_pieces) > 1:
+        reasons = (*reasons, f"in {num_parts} pieces")
+        found["quality"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
-    full = {trait.name: found.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
-    return LeafTraits(leaf=instance, numbers=full, method=method, reasons=reasons, rejection=rejection)
+    return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=rejection)
 
 
 def _count(instance: int, masks: Masks, *, sure_views: Mapping[int, int]) -> dict[str, Measurement]:

@@ -1,8 +1,4 @@
-"""Which way is up.
-
-Photographers hold cameras level: the horizontal axis of a photo is horizontal in the world, too. Up is the direction
-that is perpendicular to the horizontal axes of all cameras.
-"""
+"""Which way is up: as the user says, or as cameras or markers that lie flat show."""
 
 from __future__ import annotations
 
@@ -12,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.errors import InputError
+from mvseg.formats.markers import find_scene_markers
+from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Cameras, Scene
-from mvseg.traits.board import up_of_board
 from mvseg.traits.config import Up
 
 Floats = NDArray[np.float64]
@@ -21,6 +18,7 @@ Floats = NDArray[np.float64]
 LEVEL = np.radians(2.0)  # how level cameras are at best
 MOST_TILT = np.radians(10.0)  # root mean square, of cameras that were held level
 MOST_DOUBT = np.radians(6.0)  # standard deviation of the answer
+MOST_BEND = 0.1  # smallest spread of the corners of markers over their middle one: they lie in one plane
 
 
 def find_up(scene: Scene, up: Up | None) -> Scene:
@@ -32,16 +30,15 @@ def find_up(scene: Scene, up: Up | None) -> Scene:
     """
     if up is None:
         return scene
-    if up == "board":
-        up = tuple(up_of_board(scene).tolist())
-    elif up == "rig":
-        up = tuple(up_of_cameras(scene.cameras).tolist())
-    x, y, z = up
-    return replace(scene, up=(x, y, z))
+    if isinstance(up, str):
+        x, y, z = (up_of_board(scene) if up == "board" else up_of_cameras(scene.cameras)).tolist()
+        up = x, y, z
+    return replace(scene, up=up)
 
 
 def up_of_cameras(cameras: Cameras) -> Floats:
-    """(3,) unit vector up, from V cameras that were held level, at any height and pitch.
+    """(3,) unit vector up, from V cameras that were held level, at any height and pitch: it is perpendicular to the
+    horizontal axes of their photos.
 
     Raises:
         InputError: the cameras were not held level, or all look in nearly the same direction.
@@ -55,6 +52,26 @@ def up_of_cameras(cameras: Cameras) -> Floats:
         raise InputError(f"up is 'rig', but the cameras {reason}: expected the direction as three numbers, as in 0 0 1")
     # Level cameras have their own up on the upper side, and look down on plants rather than up at them.
     towards = -R[:, 1].mean(0) - R[:, 2].mean(0)
+    return axes[2] if axes[2] @ towards >= 0 else -axes[2]
+
+
+def up_of_board(scene: Scene) -> Floats:
+    """(3,) unit vector up: the normal of the plane of all ArUco or ChArUco markers, on the side of the cameras.
+
+    The family of markers with the most corners in space counts.
+
+    Raises:
+        InputError: a photo is missing or broken; no marker is seen in two photos, or the markers lie in no one plane.
+    """
+    found = [triangulate_points(scene.cameras, seen) for seen in find_scene_markers(scene).values()]
+    corners = np.array(list(max(found, key=len).values()))
+    if not len(corners):
+        raise InputError("up is 'board', but no ArUco marker is seen in two photos, expected one that lies flat")
+    middle = corners.mean(0)
+    _, spreads, axes = np.linalg.svd(corners - middle, full_matrices=False)
+    if spreads[2] > MOST_BEND * spreads[1]:
+        raise InputError(f"up is 'board', but the {len(corners)} corners of its markers lie in no one plane")
+    towards = scene.cameras.centers.mean(0).cpu().numpy() - middle
     return axes[2] if axes[2] @ towards >= 0 else -axes[2]
 
 

@@ -22,7 +22,6 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import State, measure, reconstruct, verify
 from mvseg.results.folder import save_result
-from mvseg.results.result import Result
 
 SIZE = 40
 
@@ -96,12 +95,12 @@ def test_a_leaf_in_one_photo_comes_out_marked(tmp_path: Path, min_views: int) ->
     state = measure(reconstruct(state))
     assert state.surfaces is not None
     assert state.traits is not None
-    save_result(Result(scene=leafy.scene, matching=state.matched, traits=state.traits), tmp_path / "out", {})
+    save_result(state.result(), tmp_path / "out", {})
     entries = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
     marked = [entry for entry in entries if entry.get("from_few_views")]
     assert len(marked) == (min_views == 1)
     for entry in marked:
-        assert (entry["image_id"], entry["instance_id"], entry["score"]) == (1, state.matched.num_instances, 0.7)
+        assert (entry["image_id"], entry["instance_id"], entry["score"]) == (1, state.matching.num_instances, 0.7)
         leaf = state.traits.leaves[-1]
         assert (leaf.leaf, leaf.method) == (entry["instance_id"], "none")
         assert "seen in one view only" in " ".join(leaf.reasons)

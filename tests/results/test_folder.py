@@ -36,7 +36,7 @@ from mvseg.results.earlier import check_out
 from mvseg.results.folder import save_result
 from mvseg.results.overlay import instance_color
 from mvseg.results.read import read_instances
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from mvseg.traits.measure import measure_plant
 from scene_folders import (
     BALLS,
@@ -94,7 +94,7 @@ def saved(result: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def ids_only(result: Result) -> Result:
-    return replace(result, surfaces=None, voxels=None, traits=None)
+    return replace(result, instances=Instances())
 
 
 def files_below(folder: Path) -> set[str]:
@@ -168,7 +168,8 @@ class TestContent:
         masks = replace(result.masks, match_scores=scores).with_merged(merged)
         matching = replace(result.matching, masks=masks, report=report)
         traits = measure_plant(result.scene, matching, surfaces=None, voxels=result.voxels or {})
-        save_result(replace(result, matching=matching, traits=traits), tmp_path / "out", {})
+        instances = replace(result.instances, traits=traits)
+        save_result(replace(result, matching=matching, instances=instances), tmp_path / "out", {})
         annotations = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
         others = {n: entry["other_instance_id"] for n, entry in enumerate(annotations) if "other_instance_id" in entry}
         assert others == {3: 3}
@@ -304,7 +305,7 @@ class TestVariants:
         assert result.voxels is not None
         voxels = {instance: grid for instance, grid in result.voxels.items() if instance != 2}
         traits = measure_plant(result.scene, result.matching, surfaces=None, voxels=voxels)
-        save_result(replace(result, voxels=voxels, traits=traits), tmp_path / "out", {})
+        save_result(replace(result, instances=Instances(voxels=voxels, traits=traits)), tmp_path / "out", {})
         rows = read_rows(tmp_path / "out")
         assert [row["leaf"] for row in rows] == ["1", "2", "3"]
         assert [row["quality"] == "good" for row in rows] == [True, False, True]
@@ -317,7 +318,8 @@ class TestVariants:
         blade = bent_blade()
         none = LeafSurface.none(torch.tensor([0]), "seen in one view only")
         surfaces, voxels = {1: blade, 2: blade, 3: none}, {1: result.voxels[1], 3: result.voxels[3]}
-        save_result(replace(result, surfaces=surfaces, voxels=voxels), tmp_path / "out", {})
+        instances = replace(result.instances, surfaces=surfaces, voxels=voxels)
+        save_result(replace(result, instances=instances), tmp_path / "out", {})
         folder = tmp_path / "out" / "leaves"
         assert files_below(folder) == {*(f"leaf_00{leaf}.ply" for leaf in (1, 2, 3)), "leaf_001_voxels.ply"}
         closed = [trimesh.load_mesh(folder / f"leaf_00{leaf}.ply").is_watertight for leaf in (1, 2, 3)]

@@ -15,7 +15,7 @@ from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
-from mvseg.traits.appearance import COLORS, hues, mean_colors, measure_appearance, project_crop, shrink
+from mvseg.traits.appearance import COLORS, hues, mean_colors, measure_appearance, sure_pixels
 from mvseg.traits.color_correction import from_linear, to_linear
 from mvseg.traits.config import ColorCorrection
 
@@ -103,17 +103,6 @@ def test_visible_share_counts_all_views(tmp_path: Path) -> None:
     assert found["mean_red"].method == "not measured: there are no photos"
 
 
-def test_crops_are_the_projections(tmp_path: Path) -> None:
-    """The naive twin draws whole pictures; leaves at the edge of the picture, and outside of it, too."""
-    for at in ((-1, 0, 0), (0.5, 1, 0), (-40, 30, 0), (0, 0, 7)):
-        leaf = flat_leaf(length=2, half_width=0.45, at=at)
-        for view, whole in enumerate(leaf.project(CAMERAS)):
-            crop, (x, y) = project_crop(leaf, CAMERAS, view)
-            frame = np.zeros((SIZE, SIZE), bool)
-            frame[y : y + crop.shape[0], x : x + crop.shape[1]] = crop
-            assert (frame != whole.numpy()).sum() == 0
-
-
 def test_a_leaf_outside_all_photos_has_no_share(tmp_path: Path) -> None:
     far = flat_leaf(length=2, half_width=0.45, at=(-40, 30, 0))
     empty = [np.zeros((SIZE, SIZE), bool)] * 3
@@ -122,12 +111,12 @@ def test_a_leaf_outside_all_photos_has_no_share(tmp_path: Path) -> None:
     assert not any(number.exists for number in found[1].values())
 
 
-def test_shrunken_masks_keep_to_the_edge_of_the_picture() -> None:
-    mask = np.zeros((9, 9), bool)
-    mask[:6, :6] = True
+def test_pixels_at_the_edge_of_the_picture_are_sure() -> None:
+    labels = np.zeros((9, 9), np.uint16)
+    labels[:6, :6], labels[:6, 6:] = 1, 2
     expected = np.zeros((9, 9), bool)
-    expected[:4, :4] = True
-    assert (shrink(mask) == expected).all()
+    expected[:4, :4] = expected[:4, 8:] = expected[8:] = True
+    assert (sure_pixels(labels) == expected).all()
 
 
 def test_views_weigh_as_much_as_their_pixels() -> None:

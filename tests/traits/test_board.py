@@ -13,8 +13,7 @@ from known_leaves import turn_about
 from mvseg.errors import InputError
 from mvseg.formats.image_file import write_png
 from mvseg.scene import Cameras, Scene, View
-from mvseg.traits.board import up_of_board
-from mvseg.traits.up import find_up
+from mvseg.traits.up import find_up, up_of_board
 
 SCALE = 4  # of the small photos of the ring
 BOARD_PX = 400

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from mvseg.errors import InputError
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.traits.config import TraitsConfig
-from mvseg.traits.filters import Support, find_rejected
+from mvseg.traits.filters import find_rejected
 
 UP = np.array([0.0, 0.0, 1.0])
 CONFIG = TraitsConfig()
@@ -39,7 +40,7 @@ def voxel_rod(height: int) -> VoxelGrid:
 
 
 def kinds(shapes: Mapping[int, Shape], *, up: np.ndarray | None = UP, config: TraitsConfig = CONFIG) -> dict[int, str]:
-    return {i: rejection.kind for i, rejection in find_rejected(shapes, Support(), up, config=config).items()}
+    return {i: rejection.kind for i, rejection in find_rejected(shapes, up, config=config).items()}
 
 
 def test_leaves_are_leaves() -> None:
@@ -84,8 +85,9 @@ def test_two_groups_apart_are_both_kept() -> None:
 
 def test_what_little_speaks_for() -> None:
     shapes = plant() | {5: make_surface(bent_blade().coefficients.numpy(), iou=0.4)}
-    support = Support({1: 5, 2: 1, 3: 2, 4: 0, 5: 4}, {1: 0.01, 2: 0.9, 3: 0.05, 4: float("nan"), 5: 0.9})
-    found = find_rejected(shapes, support, UP, config=CONFIG)
+    sure_views, shares = {1: 5, 2: 1, 3: 2, 4: 0, 5: 4}, {1: 0.01, 2: 0.9, 3: 0.05, 4: float("nan"), 5: 0.9}
+    ask = partial(find_rejected, shapes, UP, sure_views=sure_views, visible_shares=shares)
+    found = ask(config=CONFIG)
     assert {i: rejection.kind for i, rejection in found.items()} == {
         1: "hardly_visible", 2: "few_sure_views", 4: "few_sure_views", 5: "low_quality"
     }  # fmt: skip
@@ -93,7 +95,7 @@ def test_what_little_speaks_for() -> None:
     assert found[2].reason == "1 sure views, asked for are 2"
     assert found[5].reason == "median IoU 0.40 with its masks, asked for is 0.5"
     anything = TraitsConfig(min_sure_views=0, min_quality=0, min_visible_share=0)
-    assert find_rejected(shapes, support, UP, config=anything) == {}
+    assert ask(config=anything) == {}
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from report_browser import CHROMIUM, OPTIONS, WAIT_MS, Opened, sync_api
 from report_pages import HOSTILE, rename_hostile, write_page
 
@@ -26,7 +26,7 @@ def browser() -> Iterator[sync_api.Browser]:
 @pytest.fixture(scope="module")
 def files(balls: Result, tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("pages")
-    ids = replace(balls, surfaces=None, voxels=None, traits=None)
+    ids = replace(balls, instances=Instances())
     kinds = {"hostile": rename_hostile(balls), "ids": ids}
     return {kind: write_page(folder / f"{kind}.html", result) for kind, result in kinds.items()}
 

@@ -12,7 +12,7 @@ from mvseg.results.report.leaves import (
     describe_plant_traits,
     describe_traits,
 )
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.ontology import DEFINITIONS
 
@@ -48,6 +48,6 @@ def test_units_are_written_as_people_do_and_columns_chosen(balls: Result) -> Non
 
 
 def test_ids_alone_have_no_numbers(balls: Result) -> None:
-    ids = replace(balls, surfaces=None, voxels=None, traits=None)
+    ids = replace(balls, instances=Instances())
     assert [set(leaf) for leaf in describe_leaves(ids)] == [{"id", "color"}] * 3
     assert (describe_traits(None), describe_plant_traits(None), describe_plant(None)) == ([], [], {})

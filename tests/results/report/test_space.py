@@ -22,7 +22,7 @@ from mvseg.results.report.space import (
     grid_step,
     small_meshes,
 )
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from mvseg.scene import Cameras, Scene, View
 
 CAMERAS = ring_cameras(5)
@@ -72,7 +72,7 @@ def test_cameras_that_look_straight_down_have_an_up() -> None:
 
 def test_meshes_are_small_and_where_the_leaves_are(balls: Result) -> None:
     blade = bent_blade(length=8)
-    mixed = replace(balls, surfaces={2: blade})
+    mixed = replace(balls, instances=replace(balls.instances, surfaces={2: blade}))
     meshes = small_meshes(mixed)
     assert set(meshes) == {1, 2, 3}
     assert [len(meshes[leaf].faces) <= VOXEL_FACES for leaf in (1, 2, 3)] == [True] * 3
@@ -93,7 +93,7 @@ def test_meshes_are_small_and_where_the_leaves_are(balls: Result) -> None:
 
 
 def test_without_shapes_there_are_cameras(balls: Result) -> None:
-    space = describe_space(replace(balls, surfaces=None, voxels=None, traits=None))
+    space = describe_space(replace(balls, instances=Instances()))
     assert space["leaves"] == {}
     distances = [np.linalg.norm(entry["center"]) for entry in space["cameras"]]
     np.testing.assert_allclose(distances, 4, rtol=0.3)
