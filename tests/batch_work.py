@@ -21,9 +21,9 @@ def do_as_told(item: str, *_: object) -> tuple[str, int]:
     verb, _, argument = item.partition(":")
     if verb == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
-    elif verb == "kill-once" and not Path(argument).exists():
+    elif verb == "touch":
+        time.sleep(0.1)
         Path(argument).touch()
-        os.kill(os.getpid(), signal.SIGKILL)
     elif verb == "exit":
         os._exit(7)
     elif verb == "raise":

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from mvseg.batch.observations import Observation
@@ -20,9 +20,8 @@ def brapi_observations(observations: Sequence[Observation]) -> dict[str, Any]:
     data = [_observation(each) for each in observations]
     page = {"currentPage": 0, "pageSize": len(data), "totalCount": len(data), "totalPages": 1}
     metadata = {"datafiles": [], "pagination": page, "status": []}
-    return {"@context": ["https://brapi.org/jsonld/context/metadata.jsonld"], "metadata": metadata} | {
-        "result": {"data": data}
-    }
+    context = ["https://brapi.org/jsonld/context/metadata.jsonld"]
+    return {"@context": context, "metadata": metadata, "result": {"data": data}}
 
 
 def _observation(each: Observation) -> dict[str, Any]:
@@ -35,14 +34,10 @@ def _observation(each: Observation) -> dict[str, Any]:
         "observationUnitDbId": each.facts["plant"],
         "observationUnitName": each.facts["plant"],
         "observationVariableDbId": each.variable,
-        "observationVariableName": f"{'leaf ' if each.leaf else ''}{each.trait.replace('_', ' ')}",
+        "observationVariableName": each.title,
         "value": each.value,
         "collector": "mvseg",
-        **_time(each),
+        **({"observationTimeStamp": each.time_stamp} if each.time_stamp else {}),
         **linked,
         "additionalInfo": {name: text for name, text in more.items() if text},
     }
-
-
-def _time(each: Observation) -> Mapping[str, str]:
-    return {"observationTimeStamp": each.time_stamp} if each.time_stamp else {}

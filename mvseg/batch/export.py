@@ -42,7 +42,7 @@ def export_batch(batch: Path, out: Path, *, miappe: bool, brapi: bool, factors: 
     tables = describe_batch(observations, factors) if miappe else {}
     with folder_whole(out) as partial:
         for name, table in tables.items():
-            write_csv(partial / f"{name}.csv", table.columns, table.rows)
+            write_csv(partial / f"{name}.csv", list(table[0]), [list(row.values()) for row in table])
         if brapi:
             text = json.dumps(brapi_observations(observations), indent=1, ensure_ascii=False)
             (partial / BRAPI_FILE).write_text(text + "\n", encoding="utf-8")

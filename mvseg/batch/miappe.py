@@ -8,15 +8,13 @@ numbers are observations of the plant, with variables of single leaves.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 
 from mvseg.batch.observations import Observation
 from mvseg.errors import InputError
 from mvseg.traits.ontology import DEFINITIONS
 
 DATA_FILE = "observations.csv"
-DATA_COLUMNS = ("Observation unit ID", "scene", "time", "leaf", "Variable ID", "value", "sd", "method")
 STUDY, UNIT = "Study unique ID", "Observation unit ID"
 DATA_ABOUT = "CSV in UTF-8, one row per number; leaf: number of the leaf in this scene; sd: standard deviation"
 UNIT_ABOUT = "single plants, each photographed from several sides with calibrated cameras"
@@ -52,22 +50,12 @@ KNOWN = {
     "Data file description": DATA_ABOUT,
     "Data file version": "1",
 }
-
-
-@dataclass(frozen=True)
-class Table:
-    """One table: its columns, and its rows as text."""
-
-    columns: tuple[str, ...]
-    rows: tuple[tuple[str, ...], ...]
+Table = list[dict[str, str]]  # one row or more of {column: cell}
 
 
 def describe_batch(observations: Sequence[Observation], factors: Sequence[str] = ()) -> dict[str, Table]:
-    """{name of a file, without suffix: table} of a batch.
-
-    Args:
-        observations: one or more.
-        factors: columns of the batch's table that are experimental factors.
+    """{name of a file, without suffix: table} of a batch with one observation or more; `factors` are columns of the
+    batch's table that are experimental factors.
 
     Raises:
         InputError: the batch's table lacks what MIAPPE requires (the sentence names all of it); it has no column of
@@ -90,60 +78,51 @@ def describe_batch(observations: Sequence[Observation], factors: Sequence[str] =
     if factors:
         tables["experimental_factor"] = _table("experimental_factor", _factor_facts(facts, factors))
     tables["observed_variable"] = _table("observed_variable", _variables(observations))
-    return tables | {"observations": _data_table(observations)}
+    return tables | {"observations": [_numbers(each) for each in observations]}
 
 
-def _columns(section: str) -> tuple[str, ...]:
-    return tuple(field.rstrip("*") for field in FIELDS[section].split("|"))
-
-
-def _needed(section: str) -> list[bool]:
-    return [field.endswith("*") for field in FIELDS[section].split("|")]
+def _fields(section: str) -> dict[str, bool]:
+    """{field of a section: it must be there}."""
+    return {field.rstrip("*"): field.endswith("*") for field in FIELDS[section].split("|")}
 
 
 def _complete(plant: Mapping[str, str], factors: Sequence[str]) -> dict[str, str]:
     """What is known of a plant, by the checklist's names; the case of the table's columns is ignored."""
     said = {name.casefold(): cell for name, cell in plant.items() if cell}
-    names = {name for section in FIELDS for name in _columns(section)}
+    names = {name for section in FIELDS for name in _fields(section)}
     facts = KNOWN | {name: said[name.casefold()] for name in names if name.casefold() in said}
-    values = "; ".join(f"{factor}:{plant[factor]}" for factor in factors)
-    return facts | {UNIT: plant["plant"]} | ({"Observation Unit factor value": values} if values else {}) | {
-        factor: plant[factor] for factor in factors
-    }  # fmt: skip
+    if factors:
+        facts["Observation Unit factor value"] = "; ".join(f"{factor}:{plant[factor]}" for factor in factors)
+    return facts | {UNIT: plant["plant"]} | {factor: plant[factor] for factor in factors}
 
 
 def _missing(facts: Sequence[Mapping[str, str]]) -> list[str]:
     """Required fields that are not filled for every plant."""
     sections = ("investigation", "study", "person", "biological_material", "observation_unit")
-    fields = [pair for section in sections for pair in zip(_columns(section), _needed(section), strict=True)]
-    needed = dict.fromkeys(name for name, is_needed in fields if is_needed)
+    needed = dict.fromkeys(name for section in sections for name, is_needed in _fields(section).items() if is_needed)
     return [name for name in needed if not all(each.get(name) for each in facts)]
 
 
-def _table(section: str, facts: Iterable[Mapping[str, str]]) -> Table:
+def _table(section: str, facts: Sequence[Mapping[str, str]]) -> Table:
     """Each row once; empty columns are left out unless they are required."""
-    columns, needed = _columns(section), _needed(section)
-    rows = dict.fromkeys(tuple(each.get(name, "") for name in columns) for each in facts)
-    kept = [index for index in range(len(columns)) if needed[index] or any(row[index] for row in rows)]
-    return Table(
-        columns=tuple(columns[index] for index in kept), rows=tuple(tuple(row[index] for index in kept) for row in rows)
-    )
+    kept = [name for name, is_needed in _fields(section).items() if is_needed or any(each.get(name) for each in facts)]
+    rows = dict.fromkeys(tuple(each.get(name, "") for name in kept) for each in facts)
+    return [dict(zip(kept, row, strict=True)) for row in rows]
 
 
 def _check_once(table: Table, key: str, one: str = "") -> None:
     """Raises InputError where two rows describe the same thing differently; `one` is what there may be one of only."""
-    index = table.columns.index(key)
-    seen: dict[str, tuple[str, ...]] = {}
-    for row in table.rows:
-        other = seen.setdefault(one or row[index], row)
+    seen: dict[str, Mapping[str, str]] = {}
+    for row in table:
+        other = seen.setdefault(one or row[key], row)
         if other is not row:
-            place = next(column for column, pair in enumerate(zip(row, other, strict=True)) if pair[0] != pair[1])
-            what = f"{table.columns[place]} is '{other[place]}' and '{row[place]}'"
-            whose = one or f"{key} ({row[index]})"
+            column = next(name for name in row if row[name] != other[name])
+            what = f"{column} is '{other[column]}' and '{row[column]}'"
+            whose = one or f"{key} ({row[key]})"
             raise InputError(f"the batch's table: {what} for one {whose}, expected one of them")
 
 
-def _factor_facts(facts: Sequence[Mapping[str, str]], factors: Sequence[str]) -> list[dict[str, str]]:
+def _factor_facts(facts: Sequence[Mapping[str, str]], factors: Sequence[str]) -> Table:
     rows = []
     for factor in factors:
         for study in dict.fromkeys(each[STUDY] for each in facts):
@@ -157,32 +136,22 @@ def _factor_facts(facts: Sequence[Mapping[str, str]], factors: Sequence[str]) ->
     return rows
 
 
-def _variables(observations: Sequence[Observation]) -> list[dict[str, str]]:
-    rows = []
-    for each in {each.variable: each for each in observations}.values():
-        definition = DEFINITIONS[each.trait]
-        whose = "of one leaf: " if each.leaf else "of the plant: "
-        rows.append(
-            {
-                "Variable ID": each.variable,
-                "Variable name": f"{'leaf ' if each.leaf else ''}{each.trait.replace('_', ' ')}",
-                "Trait": f"{'leaf ' if each.leaf else ''}{each.trait.replace('_', ' ')}",
-                "Trait accession number": each.ontology,
-                "Method": "mvseg: multi-view photos, surfaces of leaves",
-                "Method description": whose + definition.meaning,
-                "Scale": each.unit,
-                "Time scale": "Date/Time" if each.time_stamp else "",
-            }
-        )
-    return rows
+def _variables(observations: Sequence[Observation]) -> Table:
+    return [
+        {
+            "Variable ID": each.variable,
+            "Variable name": each.title,
+            "Trait": each.title,
+            "Trait accession number": each.ontology,
+            "Method": "mvseg: multi-view photos, surfaces of leaves",
+            "Method description": f"of {'one leaf' if each.leaf else 'the plant'}: {DEFINITIONS[each.trait].meaning}",
+            "Scale": each.unit,
+            "Time scale": "Date/Time" if each.time_stamp else "",
+        }
+        for each in {each.variable: each for each in observations}.values()
+    ]
 
 
-def _data_table(observations: Sequence[Observation]) -> Table:
-    rows = tuple(
-        (
-            each.facts["plant"], each.facts["scene"], each.facts["time"], each.leaf,
-            each.variable, each.value, each.sd, each.method,
-        )
-        for each in observations
-    )  # fmt: skip
-    return Table(columns=DATA_COLUMNS, rows=rows)
+def _numbers(each: Observation) -> dict[str, str]:
+    facts = {UNIT: each.facts["plant"], "scene": each.facts["scene"], "time": each.facts["time"], "leaf": each.leaf}
+    return facts | {"Variable ID": each.variable, "value": each.value, "sd": each.sd, "method": each.method}

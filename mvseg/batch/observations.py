@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from mvseg.batch.places import tables_folder
+from mvseg.batch.status import TABLES
 from mvseg.errors import InputError
 
 OWN_COLUMNS = ("leaf", "trait", "value", "sd", "unit", "method", "ontology")
@@ -41,6 +41,11 @@ class Observation:
         return f"{'leaf_' if self.leaf else ''}{self.trait}_mvseg_{scale}"
 
     @property
+    def title(self) -> str:
+        """The trait in words: leaf area."""
+        return f"{'leaf ' if self.leaf else ''}{self.trait.replace('_', ' ')}"
+
+    @property
     def time_stamp(self) -> str:
         """Time of the observation in ISO 8601 with a time zone (UTC if `time` names none); "" if `time` is not a
         date."""
@@ -57,7 +62,7 @@ def read_observations(batch: Path) -> list[Observation]:
     Raises:
         InputError: `batch` is not the --out of a finished batch, its table is broken, or there are no numbers.
     """
-    path = tables_folder(batch) / "traits.csv"
+    path = batch / TABLES / "traits.csv"
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = list(csv.DictReader(file, restkey="", restval=""))
@@ -69,12 +74,11 @@ def read_observations(batch: Path) -> list[Observation]:
     missing = [name for name in ("scene", "plant", "time", *OWN_COLUMNS) if rows and name not in rows[0]]
     if missing:
         raise InputError(f"{path}: has no column '{missing[0]}', expected the table of a batch")
-    found = [_observation(row) for row in rows if row["value"]]
+    found = [
+        Observation({name: cell for name, cell in row.items() if name not in OWN_COLUMNS},
+                    **{name: row[name] for name in OWN_COLUMNS})
+        for row in rows if row["value"]
+    ]  # fmt: skip
     if not found:
         raise InputError(f"{path}: holds no numbers, expected the traits of one plant or more")
     return found
-
-
-def _observation(row: Mapping[str, str]) -> Observation:
-    facts = {name: cell for name, cell in row.items() if name not in OWN_COLUMNS}
-    return Observation(facts=facts, **{name: row[name] for name in OWN_COLUMNS})

@@ -2,31 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import closing, suppress
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+
+from tqdm import tqdm
 
 from mvseg._version import made_by
-from mvseg.batch.dask_workers import connect, run_on_dask
-from mvseg.batch.local_workers import run_locally
-from mvseg.batch.lost import Lost
-from mvseg.batch.places import STATE, scene_result, scene_state, tables_folder
-from mvseg.batch.progress import Progress
 from mvseg.batch.scene_list import BatchScene, list_scenes
-from mvseg.batch.status import Status, write_status
+from mvseg.batch.status import STATE, TABLES, Status, scene_state, write_status
 from mvseg.batch.tables import write_tables
 from mvseg.batch.work import Finished, work_on_scene
+from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.config import RunConfig
 from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.results.earlier import check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
 
-Started = Callable[[int], object]
-Engine = Callable[[dict[int, BatchScene], int | None, Started], Generator[tuple[int, Any], None, None]]
+SHOWN = 4  # names of running scenes beside the progress bar
 
 
 @dataclass(frozen=True)
@@ -73,17 +70,17 @@ def run_batch(
     if any(scene.masks is None for scene in scenes):
         config = _find_weights(config)
     place = resolve_place(out)
-    with _engine(partial(work_on_scene, place, config), num_workers, scheduler) as engine:
+    with open_workers(partial(work_on_scene, place, config), num_workers, scheduler) as engine:
         _claim(out, resume=resume)
         with lock_folder(place):
-            check_out(tables_folder(place))
+            check_out(place / TABLES)
             if any(is_partial(path) for path in place.iterdir()):  # a run was killed
                 for scene in scenes:
-                    sweep_abandoned(scene_result(place, scene.name))
+                    sweep_abandoned(place / scene.name)
             finished = _work_on_all(scenes, engine, place, quiet=quiet)
             rows = [(scene, finished[index].status) for index, scene in enumerate(scenes)]
             run = {**made_by(), "source": str(source), "masks": masks and str(masks)}
-            write_tables(tables_folder(place), place, rows, run={**run, "config": asdict(config)})
+            write_tables(place / TABLES, place, rows, run={**run, "config": asdict(config)})
     done = [status for _, status in rows if status.state == "done"]
     return BatchCounts(
         done=len(done),
@@ -123,46 +120,48 @@ def _claim(out: Path, *, resume: bool) -> None:
     (out / STATE).mkdir(parents=True, exist_ok=True)
 
 
-@contextmanager
-def _engine(work: Callable[[BatchScene], Finished], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
-    """The engine that does `work` on many scenes, in parallel or one after another."""
-    if scheduler is None:
-        yield lambda scenes, at_once, started: run_locally(
-            work, scenes, num_workers=at_once or num_workers, started=started
-        )
-        return
-    with connect(scheduler) as client:
-        yield lambda scenes, at_once, started: run_on_dask(
-            work, scenes, client=client, at_once=at_once, started=started
-        )
-
-
 def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path, *, quiet: bool) -> dict[int, Finished]:
-    """Run all scenes in parallel; those whose worker died are tried once more, one at a time, when memory is free
-    again."""
+    """Run all scenes in parallel, then those whose worker died once more, one at a time, when memory is free again."""
     finished: dict[int, Finished] = {}
-    progress = Progress([scene.name for scene in scenes], quiet=quiet)
-    with closing(progress):
-        for at_once in (None, 1):
-            left = {index: scene for index, scene in enumerate(scenes) if index not in finished}
-            if not left:
-                break
+    again: list[int] = []
+    running: dict[int, str] = {}  # in the order in which they began
+
+    def show() -> None:
+        more = f" and {len(running) - SHOWN} more" if len(running) > SHOWN else ""
+        bar.set_postfix_str(", ".join(list(running.values())[:SHOWN]) + more)
+
+    def start(index: int) -> None:
+        running[index] = scenes[index].name
+        show()
+
+    def rounds() -> Iterator[tuple[bool, dict[int, BatchScene]]]:
+        yield False, dict(enumerate(scenes))
+        for index in again:
+            yield True, {index: scenes[index]}
+
+    with tqdm(total=len(scenes), desc="batch", unit="scene", disable=quiet) as bar:
+        for is_last, items in rounds():
             try:
-                with closing(engine(left, at_once, progress.start)) as answers:
+                with closing(engine(items, start)) as answers:
                     for index, answer in answers:
-                        if isinstance(answer, Lost) and at_once is None:
-                            progress.say(f"{scenes[index].name}: the process {answer.reason}; it is tried again")
-                            progress.stop(index, is_finished=False)
+                        del running[index]
+                        show()
+                        if isinstance(answer, Lost) and not is_last:
+                            _say(f"{scenes[index].name}: the process {answer.reason}; it is tried again")
+                            again.append(index)
                             continue
                         finished[index] = _give_up(scenes[index], answer, out) if isinstance(answer, Lost) else answer
-                        status = finished[index].status
-                        if status.state == "failed":
-                            progress.say(f"{scenes[index].name}: {status.sentence}")
-                        progress.stop(index, is_finished=True)
+                        if finished[index].status.state == "failed":
+                            _say(f"{scenes[index].name}: {finished[index].status.sentence}")
+                        bar.update()
             finally:
-                for index in progress.running:  # killed workers did not clean up
-                    sweep_abandoned(scene_result(out, scenes[index].name))
+                for index in running:  # killed workers did not clean up
+                    sweep_abandoned(out / scenes[index].name)
     return finished
+
+
+def _say(text: str) -> None:
+    tqdm.write(f"mvseg: {text}", file=sys.stderr)
 
 
 def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:
@@ -173,5 +172,5 @@ def _give_up(scene: BatchScene, lost: Lost, out: Path) -> Finished:
     with suppress(OSError):  # the tables report it, too
         folder.mkdir(parents=True, exist_ok=True)
         write_status(folder, status)
-    sweep_abandoned(scene_result(out, scene.name))
+    sweep_abandoned(out / scene.name)
     return Finished(status)

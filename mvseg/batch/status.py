@@ -1,4 +1,7 @@
-"""The status of one scene of a batch: a small JSON file, written whole whenever it changes."""
+"""The folder of a batch, and the status of its scenes: a small JSON file each, written whole whenever it changes.
+
+OUT/NAME holds the result of a scene; three folders beside them belong to the batch.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from mvseg.errors import InputError
 from mvseg.formats.json_file import read_json
 from mvseg.system.atomic import write_text_whole
 
+STATE, TABLES, EXPORT = "_batch", "tables", "export"
 STATUS_FILE = "status.json"
 
 
@@ -44,8 +48,13 @@ class Status(BaseModel, frozen=True):
     trace: str = ""
 
 
+def scene_state(out: Path, name: str) -> Path:
+    """The folder of a scene's status and its cached detections; locked while a process works on the scene."""
+    return out / STATE / name
+
+
 def read_status(folder: Path) -> Status | None:
-    """The status in a scene's folder of the batch; None where there is none, or a broken one."""
+    """The status in the state folder of a scene; None where there is none, or a broken one."""
     try:
         return read_json(folder / STATUS_FILE, Status)
     except InputError:
@@ -53,9 +62,5 @@ def read_status(folder: Path) -> Status | None:
 
 
 def write_status(folder: Path, status: Status) -> None:
-    """Write the status; the folder must exist.
-
-    Raises:
-        OSError: it cannot be written; the earlier one stays.
-    """
+    """Raises OSError where the folder is missing or cannot be written; the earlier status stays."""
     write_text_whole(folder / STATUS_FILE, status.model_dump_json(indent=1) + "\n")

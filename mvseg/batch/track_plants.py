@@ -5,8 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Callable, Generator, Sequence
-from contextlib import ExitStack, closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,10 +15,8 @@ from typing import Any
 from tqdm import tqdm
 
 from mvseg._version import made_by
-from mvseg.batch.dask_workers import connect, run_on_dask
-from mvseg.batch.local_workers import run_locally
-from mvseg.batch.lost import Lost
-from mvseg.batch.places import scene_result, tables_folder
+from mvseg.batch.status import TABLES
+from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import TrackLink
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
@@ -27,7 +25,7 @@ from mvseg.system.file_hash import hash_files
 from mvseg.tracking.corrections import find_links, read_track_links
 from mvseg.tracking.dates import read_date
 from mvseg.tracking.growth import measure_growth
-from mvseg.tracking.page import INDEX_FILE, write_index, write_page
+from mvseg.tracking.page import PAGE_FILE, write_index, write_page
 from mvseg.tracking.tables import join_tables, write_tables
 from mvseg.tracking.track import track_leaves
 
@@ -57,7 +55,7 @@ def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
     Raises:
         InputError: `batch` is not the output of a batch, or no plant has two dates.
     """
-    path = tables_folder(batch) / "summary.csv"
+    path = batch / TABLES / "summary.csv"
     try:
         with path.open(newline="", encoding="utf-8") as file:
             rows = [(row["scene"], row["plant"], row["time"]) for row in csv.DictReader(file) if row["state"] == "done"]
@@ -69,11 +67,7 @@ def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
     for scene, plant, time in rows:
         scenes.setdefault(plant, []).append((scene, time))
     plants = [
-        PlantResults(
-            plant=plant,
-            folders=tuple(scene_result(batch, scene) for scene, _ in seen),
-            times=tuple(time for _, time in seen),
-        )
+        PlantResults(plant, tuple(batch / scene for scene, _ in seen), tuple(time for _, time in seen))
         for plant, seen in scenes.items()
         if len(seen) > 1
     ]
@@ -119,18 +113,18 @@ def track_plants(
             places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
             places = places if len(plants) > 1 else [folder]
             work = partial(_track_plant, edits, report=report)
-            tracked = _work_on_all(
-                list(zip(plants, places, strict=True)), work, num_workers=num_workers, scheduler=scheduler, quiet=quiet
-            )
+            items = dict(enumerate(zip(plants, places, strict=True)))
+            with _open(work, min(num_workers, len(items)), scheduler) as engine, closing(engine(items, int)) as answers:
+                bar = tqdm(answers, total=len(plants), desc="track", unit="plant", disable=quiet)
+                done = {index: _or_failed(answer, plants[index]) for index, answer in bar}
+            tracked = [done[index] for index in items]
             if all(plant.sentence for plant in tracked):
                 raise InputError(tracked[0].sentence)
             if len(plants) > 1:
                 join_tables(folder, places)
                 if report:
-                    pages = [
-                        (plant.plant, each.dates, each.tracks) for plant, each in zip(plants, tracked, strict=True)
-                    ]
-                    write_index(folder / INDEX_FILE, pages)
+                    pairs = zip(plants, tracked, strict=True)
+                    write_index(folder / PAGE_FILE, [(plant.plant, each.dates, each.tracks) for plant, each in pairs])
                 else:
                     shutil.rmtree(folder / "plants")
             _write_run(folder, plants, tracked, corrections)
@@ -140,36 +134,20 @@ def track_plants(
     return tracked
 
 
-def _work_on_all(
-    plants: Sequence[tuple[PlantResults, Path]],
-    work: Callable[[tuple[PlantResults, Path]], TrackedPlant],
-    *,
-    num_workers: int,
-    scheduler: str | None,
-    quiet: bool,
-) -> list[TrackedPlant]:
-    items, done = dict(enumerate(plants)), {}
-    with ExitStack() as stack:
-        answers: Generator[tuple[int, Any], None, None]
-        if scheduler is not None:
-            client = stack.enter_context(connect(scheduler))
-            answers = run_on_dask(work, items, client=client, at_once=None, started=_ignore)
-        elif num_workers > 1 and len(plants) > 1:
-            answers = run_locally(work, items, num_workers=num_workers, started=_ignore)
-        else:
-            answers = ((index, work(item)) for index, item in items.items())
-        stack.enter_context(closing(answers))
-        for index, answer in tqdm(answers, total=len(plants), desc="track", unit="plant", disable=quiet):
-            if isinstance(answer, Lost):
-                answer = TrackedPlant(
-                    sentence=f"{plants[index][0].plant}: the process that worked on it {answer.reason}"
-                )
-            done[index] = answer
-    return [done[index] for index in range(len(plants))]
+@contextmanager
+def _open(work: Callable[[Any], Any], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
+    """As `open_workers`, but one worker is this process."""
+    if scheduler is None and num_workers == 1:
+        yield lambda items, _: ((index, work(item)) for index, item in items.items())
+    else:
+        with open_workers(work, num_workers, scheduler) as engine:
+            yield engine
 
 
-def _ignore(_: int) -> None:
-    """No progress is shown per plant."""
+def _or_failed(answer: TrackedPlant | Lost, plant: PlantResults) -> TrackedPlant:
+    if isinstance(answer, Lost):
+        return TrackedPlant(sentence=f"{plant.plant}: the process that worked on it {answer.reason}")
+    return answer
 
 
 def _track_plant(edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *, report: bool) -> TrackedPlant:
@@ -205,11 +183,8 @@ def _write_run(
         "config": {"corrections": corrections and str(corrections)},
         "warnings": [sentence for plant in tracked for sentence in plant.warnings],
         "failures": [plant.sentence for plant in tracked if plant.sentence],
-        "counts": {
-            "plants": len(plants),
-            "dates": sum(plant.dates for plant in tracked),
-            "tracks": sum(plant.tracks for plant in tracked),
-        },
+        "counts": {"plants": len(plants), "dates": sum(plant.dates for plant in tracked),
+                   "tracks": sum(plant.tracks for plant in tracked)},
         "files": list_files(folder),
-    }
+    }  # fmt: skip
     (folder / RUN_FILE).write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")

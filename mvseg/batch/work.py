@@ -14,10 +14,9 @@ from pathlib import Path
 import cv2
 import torch
 
-from mvseg.batch.places import scene_detections, scene_result, scene_state
 from mvseg.batch.scene_key import scene_key
 from mvseg.batch.scene_list import BatchScene
-from mvseg.batch.status import Status, read_status, write_status
+from mvseg.batch.status import Status, read_status, scene_state, write_status
 from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_scene
@@ -50,36 +49,26 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
     """
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
-    cache = scene_detections(out, scene.name)
-    folder, started = scene_state(out, scene.name), time.monotonic()
+    folder, place, started = scene_state(out, scene.name), out / scene.name, time.monotonic()
     folder.mkdir(parents=True, exist_ok=True)
     with _one_at_a_time, lock_folder(folder, wait=True):
         earlier = read_status(folder)
         try:
             masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
-            corrections = _find_corrections(scene)
-            key = _key_of(scene, masks, config, corrections=corrections)
-            if earlier is not None and earlier.key == key and _is_done(earlier, scene_result(out, scene.name)):
+            edits = scene.corrections and find_masks(scene.folder, scene.corrections, what="corrections")
+            with warnings.catch_warnings(action="ignore", category=InputWarning):  # the run itself gives them
+                key = scene_key(load_scene(scene.folder), masks, config, corrections=edits)
+            if earlier is not None and earlier.key == key and _is_done(earlier, place):
                 return Finished(earlier, is_kept=True)
             write_status(folder, Status(state="running", scene=str(scene.folder), key=key))
-            place = scene_result(out, scene.name)
-            status = _finish(scene, masks, place, config=config, corrections=corrections, cache=cache)
+            cache = folder / "detections"
+            status = _finish(scene, masks, place, config=config, corrections=edits, cache=cache)
         except Exception as error:  # whatever it is, the other scenes continue
             status, key = _describe_failure(error, scene), ""
         seconds = round(time.monotonic() - started, 3)
         status = status.model_copy(update={"key": key, "seconds": seconds, "peak_mb": _peak_mb()})
         write_status(folder, status)
     return Finished(status)
-
-
-def _find_corrections(scene: BatchScene) -> Path | None:
-    return None if scene.corrections is None else find_masks(scene.folder, scene.corrections, what="corrections")
-
-
-def _key_of(scene: BatchScene, masks: Path | None, config: RunConfig, *, corrections: Path | None) -> str:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # the run itself gives them
-        return scene_key(load_scene(scene.folder), masks, config, corrections=corrections)
 
 
 def _is_done(status: Status, result: Path) -> bool:

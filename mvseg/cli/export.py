@@ -24,7 +24,7 @@ def add(verbs: Any) -> None:
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.batch.export import export_batch  # keeps --help and wrong options quick
-    from mvseg.batch.places import EXPORT
+    from mvseg.batch.status import EXPORT
 
     out = args.out or args.batch / EXPORT
     factors = [name.strip() for name in args.factors.split(",")] if args.factors else []

@@ -1,6 +1,6 @@
 """Spreads independent items of one job over processes of this machine; the answers come in order.
 
-(In a batch of scenes, one that dies must not stop the others: see `batch.local_workers`.)
+(In a batch of scenes, one that dies must not stop the others: see `batch.workers`.)
 """
 
 from __future__ import annotations

@@ -27,7 +27,7 @@ from mvseg.tracking.dates import ROWS, PlantOnDate
 from mvseg.tracking.growth import SIZES, Growth
 from mvseg.tracking.track import Tracks
 
-PAGE_FILE, INDEX_FILE, CHART_FILE = "tracks.html", "tracks.html", "growth.png"
+PAGE_FILE, CHART_FILE = "tracks.html", "growth.png"
 CROP, QUALITY = 72, 70  # pixels and JPEG quality of a leaf's picture
 CURVE_STEPS = 40
 CHART = (1500, 1000)  # pixels of growth.png

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from batch_work import describe_process, do_as_told
-from mvseg.batch.dask_workers import connect, run_on_dask
-from mvseg.batch.lost import Lost
+from mvseg.batch.workers import Lost, connect, run_on_dask
 from mvseg.errors import InputError
 
 distributed = pytest.importorskip("distributed")
@@ -41,8 +40,9 @@ def test_a_worker_that_dies_loses_what_it_had_and_the_rest_goes_on(cluster: Any,
     file = tmp_path / "scheduler.json"
     file.write_text(json.dumps({"address": cluster.scheduler_address}))
     with connect(str(file)) as client:
-        items = dict(enumerate(words))
-        answers = dict(run_on_dask(do_as_told, items, client=client, at_once=1, started=begun.append))
+        answers = {}
+        for number, word in enumerate(words):  # one by one: what waits on a worker may be lost with it
+            answers |= dict(run_on_dask(do_as_told, {number: word}, begun.append, client=client))
     assert sorted(answers) == list(range(6))
     assert [answers[key][0] for key in (0, 2, 4, 5)] == ["A", "B", "C", "D"]
     assert isinstance(answers[1], Lost)
@@ -57,7 +57,7 @@ def test_workers_end_on_sigterm_as_dask_has_it(cluster: Any) -> None:
     with connect(cluster.scheduler_address) as client:
         cluster.wait_for_workers(2, timeout=120)
         before = client.run(describe_process)
-        list(run_on_dask(do_as_told, {0: "a"}, client=client, at_once=None, started=int))
+        list(run_on_dask(do_as_told, {0: "a"}, int, client=client))
         after = client.run(describe_process)
     assert len(after) == 2
     assert {is_loaded for is_loaded, _ in after.values()} == {True}
@@ -66,12 +66,13 @@ def test_workers_end_on_sigterm_as_dask_has_it(cluster: Any) -> None:
 
 def test_items_are_given_to_all_workers_at_once_and_taken_back(cluster: Any, tmp_path: Path) -> None:
     with connect(cluster.scheduler_address) as client:
-        answers = dict(run_on_dask(do_as_told, dict(enumerate("abcdef")), client=client, at_once=None, started=int))
+        answers = dict(run_on_dask(do_as_told, dict(enumerate("abcdef")), int, client=client))
         assert [answers[key][0] for key in range(6)] == list("ABCDEF")
-        items = dict(enumerate(["a", *(f"kill-once:{tmp_path / str(number)}" for number in range(20))]))
-        with closing(run_on_dask(do_as_told, items, client=client, at_once=1, started=int)) as some:
+        items = dict(enumerate(["a", *(f"touch:{tmp_path / str(number)}" for number in range(40))]))
+        with closing(run_on_dask(do_as_told, items, int, client=client)) as some:
             assert next(some)[0] == 0
-    assert len(list(tmp_path.iterdir())) <= 1
+        client.submit(do_as_told, "b", pure=False).result()
+    assert len(list(tmp_path.iterdir())) < 20
 
 
 @pytest.mark.parametrize(
@@ -87,7 +88,7 @@ def test_items_are_given_to_all_workers_at_once_and_taken_back(cluster: Any, tmp
 def test_a_scheduler_that_is_not_there(
     scheduler: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mvseg.batch.dask_workers.TIMEOUT", 0.5)
+    monkeypatch.setattr("mvseg.batch.workers.TIMEOUT", 0.5)
     monkeypatch.chdir(tmp_path)
     Path("broken.json").write_text("{")
     Path("list.json").write_text("[]")

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from batch_work import Unpicklable, do_as_told
-from mvseg.batch.local_workers import run_locally
-from mvseg.batch.lost import Lost
+from mvseg.batch.workers import Lost, run_locally
 from mvseg.errors import InputError
 
 
@@ -22,7 +21,7 @@ def run(items: list[str], num_workers: int) -> tuple[dict[int, Any], list[int]]:
     """The answers, and the keys in the order in which workers took them."""
     begun: list[int] = []
     numbered = dict(enumerate(items))
-    answers = run_locally(do_as_told, numbered, num_workers=num_workers, started=begun.append)
+    answers = run_locally(do_as_told, numbered, begun.append, num_workers=num_workers)
     found = list(answers)
     assert len(found) == len({key for key, _ in found})
     return dict(found), begun
@@ -56,12 +55,12 @@ def test_nothing_to_do() -> None:
 def test_workers_that_cannot_start_are_an_error() -> None:
     work = partial(do_as_told, Unpicklable())  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"^no worker can be started: the process dies before"):
-        list(run_locally(work, {0: "a", 1: "b"}, num_workers=2, started=int))
+        list(run_locally(work, {0: "a", 1: "b"}, int, num_workers=2))
 
 
 def test_workers_end_when_the_caller_has_enough(tmp_path: Path) -> None:
     items = {0: f"wait:{tmp_path}", 1: "a"}
-    with closing(run_locally(do_as_told, items, num_workers=2, started=int)) as answers:
+    with closing(run_locally(do_as_told, items, int, num_workers=2)) as answers:
         assert next(answers)[1][0] == "A"  # type: ignore[index]
         while not (tmp_path / "begun").exists() or not (tmp_path / "begun").read_text():
             time.sleep(0.01)

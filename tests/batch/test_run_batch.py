@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 
 from mvseg.batch import run_batch as batch
-from mvseg.batch.lost import Lost
-from mvseg.batch.places import scene_state
+from mvseg.batch import workers
 from mvseg.batch.run_batch import BatchCounts, run_batch
-from mvseg.batch.status import read_status
+from mvseg.batch.status import read_status, scene_state
+from mvseg.batch.workers import Lost
 from mvseg.cli import main
 from mvseg.cli.command import build_parser
 from mvseg.cli.options import build_run
@@ -48,14 +48,14 @@ def here(monkeypatch: pytest.MonkeyPatch) -> None:
     """Work in this process: others take seconds to start."""
 
     def run(
-        work: Callable[[Any], Any], items: Mapping[int, Any], *, num_workers: int, started: Callable[[int], object]
+        work: Callable[[Any], Any], items: Mapping[int, Any], started: Callable[[int], object], *, num_workers: int
     ) -> Iterator[tuple[int, Any]]:
         assert num_workers >= 1
         for key, item in items.items():
             started(key)
             yield key, work(item)
 
-    monkeypatch.setattr(batch, "run_locally", run)
+    monkeypatch.setattr(workers, "run_locally", run)
 
 
 def arguments(scenes: Path, out: Path, *more: str) -> list[str]:
@@ -155,16 +155,16 @@ def test_a_scene_whose_worker_dies_gets_one_more_try_alone(
 ) -> None:
     rounds = []
 
-    def run(work: Any, items: Any, *, num_workers: int, started: Any) -> Iterator[tuple[int, Any]]:
-        rounds.append((num_workers, [item.name for item in items.values()]))
+    def run(work: Any, items: Any, started: Any, *, num_workers: int) -> Iterator[tuple[int, Any]]:
+        rounds.append([item.name for item in items.values()])
         for key, item in items.items():
             started(key)
-            dies = item.name == "basil" or (item.name == "mint" and num_workers > 1)
+            dies = item.name == "basil" or (item.name == "mint" and len(items) > 1)
             yield key, Lost("was killed") if dies else work(item)
 
-    monkeypatch.setattr(batch, "run_locally", run)
+    monkeypatch.setattr(workers, "run_locally", run)
     assert main(arguments(plants, tmp_path / "out", "--quiet", "--num_workers", "3")) == 3
-    assert rounds == [(3, ["basil", "cactus", "mint"]), (1, ["basil", "mint"])]
+    assert rounds == [["basil", "cactus", "mint"], ["basil"], ["mint"]]
     said = capsys.readouterr().err
     assert "mvseg: mint: the process was killed; it is tried again\n" in said
     sentence = "the process that worked on this scene was killed, twice"

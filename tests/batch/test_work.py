@@ -16,9 +16,8 @@ import torch
 from PIL import Image, ImageOps
 
 from mvseg.batch import work as batch_work
-from mvseg.batch.places import scene_detections, scene_state
 from mvseg.batch.scene_list import BatchScene
-from mvseg.batch.status import Status, read_status
+from mvseg.batch.status import Status, read_status, scene_state
 from mvseg.batch.work import Finished, work_on_scene
 from mvseg.config import RunConfig
 from mvseg.detection import mask_rcnn
@@ -133,7 +132,7 @@ def test_detections_are_kept_for_other_options_of_later_stages(
     assert len(looked) == 3 + 1
     assert not work_on_scene(out, replace(CONFIG, detect=DetectConfig(min_score=0.06)), scene).is_kept
     assert len(looked) == 3 + 1 + 3
-    kept = sorted(scene_detections(out, "p").iterdir())
+    kept = sorted((scene_state(out, "p") / "detections").iterdir())
     assert len(kept) == 3  # what other options left is gone
 
 

@@ -1,0 +1,211 @@
+"""Workers that go through a list of items: processes of this machine, or those of a Dask cluster.
+
+A pool of `concurrent.futures` breaks when one of its processes is killed. So each local process is a pool of its own:
+if it dies, only its own item is lost. The workers of a cluster are on other machines, started by Slurm, PBS or by hand;
+they need the same mvseg, and the same paths to scenes and results: a shared disk.
+"""
+
+from __future__ import annotations
+
+import json
+import signal
+import threading
+import uuid
+from collections.abc import Callable, Generator, Iterator, Mapping
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+from mvseg.errors import InputError
+from mvseg.system.sigterm import held_back
+from mvseg.system.worker_pool import one_thread, start_pools
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+Started = Callable[[int], object]
+Engine = Callable[[Mapping[int, Any], Started], Generator[tuple[int, Any], None, None]]
+TIMEOUT = 30  # seconds, for a Dask scheduler to answer
+
+
+@dataclass(frozen=True)
+class Lost:
+    """The answer for an item whose worker died, or could not even report what went wrong.
+
+    Attributes:
+        reason: the end of a sentence: "the process that worked on it ...".
+    """
+
+    reason: str
+
+
+@contextmanager
+def open_workers(work: Callable[[Any], Any], num_workers: int, scheduler: str | None) -> Iterator[Engine]:
+    """What does `work` on items: `run_on_dask` where there is a scheduler, else `run_locally`.
+
+    Raises:
+        InputError: see `connect`.
+    """
+    if scheduler is None:
+        yield partial(run_locally, work, num_workers=num_workers)
+    else:
+        with connect(scheduler) as client:
+            yield partial(run_on_dask, work, client=client)
+
+
+# --- processes of this machine
+
+
+def run_locally(
+    work: Callable[[Item], Answer], items: Mapping[int, Item], started: Started, *, num_workers: int
+) -> Generator[tuple[int, Answer | Lost], None, None]:
+    """The answers of `work` in the order in which they come, each with the key of its item.
+
+    Workers are spawned, use one thread, and end with this process, however that ends. When the iterator is closed
+    early, they are stopped at once.
+
+    Args:
+        work: what a module holds, or `partial` of it.
+        items: items that can be pickled, by key.
+        started: called with the key of an item when a worker takes it.
+        num_workers: at most that many processes, >= 1.
+
+    Raises:
+        InputError: no worker can be started.
+    """
+    todo = dict(items)
+    asked: dict[Future[Any], tuple[int | None, ProcessPoolExecutor]] = {}  # None: whether the worker has started
+    with start_pools() as start_pool:
+        for _ in range(min(num_workers, len(items))):
+            asked |= _start_worker(start_pool(1), work)
+        while asked:
+            for future in wait(asked, return_when=FIRST_COMPLETED).done:
+                key, worker = asked.pop(future)
+                error = future.exception()
+                has_died = isinstance(error, BrokenProcessPool)
+                if key is None and has_died:
+                    if not asked:
+                        raise InputError("no worker can be started: the process dies before it has anything to do")
+                    continue  # the others go on
+                if todo and has_died:
+                    asked |= _start_worker(start_pool(1), work)
+                elif todo:
+                    following = next(iter(todo))
+                    started(following)
+                    asked[worker.submit(work, todo.pop(following))] = following, worker
+                if has_died:
+                    yield key, Lost("died, most likely because memory ran out")  # type: ignore[misc]  # is not None
+                elif key is not None:
+                    yield key, future.result() if error is None else _stopped_with(error)
+
+
+def _start_worker(
+    worker: ProcessPoolExecutor, work: Callable[[Any], Any]
+) -> dict[Future[Any], tuple[None, ProcessPoolExecutor]]:
+    # it inherits the blocked signals: Ctrl-C is left to the parent
+    with one_thread(), held_back(signal.SIGINT):
+        return {worker.submit(_load, work): (None, worker)}
+
+
+def _load(work: Callable[[Any], Any]) -> None:
+    """In a worker: import the modules that `work` needs, and pycolmap without its handler of SIGTERM."""
+    import pycolmap  # noqa: F401
+
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+
+def _stopped_with(error: BaseException) -> Lost:
+    return Lost(f"stopped with {type(error).__name__}: {' '.join(str(error).split())}")
+
+
+# --- a Dask cluster
+
+
+def connect(scheduler: str) -> Client:
+    """A client of a Dask scheduler.
+
+    Args:
+        scheduler: its address ("tcp://node-07:8786"), or the file that `dask scheduler --scheduler-file FILE` wrote.
+
+    Raises:
+        InputError: Dask is not installed, the file is missing or broken, or no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ModuleNotFoundError as error:
+        raise InputError(f"--scheduler needs {error.name}: pip install 'mvseg[batch]'") from None
+    host, _, port = scheduler.rpartition(":")
+    is_address = "://" in scheduler or (host and port.isdigit() and not Path(scheduler).exists())
+    address = scheduler if is_address else _read_scheduler_file(Path(scheduler))
+    try:
+        return Client(address, timeout=TIMEOUT, name="mvseg")
+    except (OSError, ValueError) as error:
+        raise InputError(f"no Dask scheduler answers at {address} ({' '.join(str(error).split())})") from None
+
+
+def _read_scheduler_file(path: Path) -> str:
+    try:
+        return str(json.loads(path.read_text(encoding="utf-8"))["address"])
+    except OSError as error:
+        message = f"cannot be read ({error.strerror}), expected the address of a Dask scheduler, or its file"
+        raise InputError(f"{path}: {message}") from None
+    except (ValueError, KeyError, TypeError):
+        raise InputError(f"{path}: is not a scheduler file of Dask, expected that of dask scheduler") from None
+
+
+def run_on_dask(
+    work: Callable[[Item], Answer], items: Mapping[int, Item], started: Started, *, client: Client
+) -> Generator[tuple[int, Answer | Lost], None, None]:
+    """As `run_locally`; `started` is called when an item is submitted, which all are at once.
+
+    When a worker dies, the scheduler gives its items to others, up to `allowed-failures` times; then they are lost.
+    When the iterator is closed early, items that no worker has started are cancelled; workers finish those that they
+    have started.
+    """
+    from distributed import as_completed
+
+    client.register_plugin(_build_plugin(), name="mvseg")
+    batch, key_of = uuid.uuid4().hex[:8], {}
+    try:
+        for key, item in items.items():
+            key_of[client.submit(work, item, key=f"mvseg-{batch}-{key}", pure=False)] = key
+            started(key)
+        for future in as_completed(list(key_of), loop=client.loop):
+            answer = _read_answer(future)
+            yield key_of.pop(future), answer
+    finally:
+        client.cancel(list(key_of))
+
+
+def _read_answer(future: Any) -> Any:
+    try:
+        error = future.exception()
+    except CancelledError as cancelled:
+        error = cancelled
+    if error is None:
+        return future.result()
+    if type(error).__name__ == "KilledWorker":
+        return Lost("died with its worker, most likely because memory ran out; see the worker's log")
+    return _stopped_with(error)
+
+
+def _build_plugin() -> Any:
+    """For each worker's main thread: pycolmap's import sets a handler for SIGTERM that prints a trace and may hang."""
+    from distributed import WorkerPlugin
+
+    class OwnSigterm(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            if threading.current_thread() is not threading.main_thread():
+                return
+            earlier = signal.getsignal(signal.SIGTERM)
+            import pycolmap  # noqa: F401
+
+            signal.signal(signal.SIGTERM, signal.SIG_DFL if earlier is None else earlier)
+
+    return OwnSigterm()
