@@ -24,7 +24,7 @@ from mvseg.cli import main
 from mvseg.detectors.weights_file import read_weights
 from mvseg.results.read import read_instances
 from mvseg.system.file_hash import hash_files
-from mvseg.training.files import read_checkpoint
+from mvseg.training.state import read_checkpoint
 from scene_folders import write_scene
 from tiny_training import write_photos
 

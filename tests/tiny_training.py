@@ -29,8 +29,7 @@ from torchvision.ops import MultiScaleRoIAlign
 
 import mvseg.training.loop
 from mvseg.detectors.mask_rcnn import build_detector
-from mvseg.detectors.weights_file import Description
-from mvseg.training.files import write_config, write_metrics, write_weights
+from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.training.loop import TrainConfig, train
 from mvseg.training.state import apply_gradients
 
@@ -117,9 +116,9 @@ def write_finished_run(folder: Path) -> Path:
         torch.manual_seed(0)
         model = build_detector("mobilenet_v3_large_fpn", 4)
     description = Description("mobilenet_v3_large_fpn", ("a", "b", "c"), 96)
-    write_weights(folder / "model.safetensors", model, description)
-    write_metrics(folder / "metrics.json", {"best": {"epoch": 3, "mask_AP": 0.5, "mask_AP50": 0.75}})
-    write_config(folder / "config.yaml", {"arch": "mobilenet_v3_large_fpn"})
+    (folder / "model.safetensors").write_bytes(encode_weights(model.state_dict(), description))
+    (folder / "metrics.json").write_text('{"best": {"epoch": 3, "mask_AP": 0.5, "mask_AP50": 0.75}}')
+    (folder / "config.yaml").write_text("arch: mobilenet_v3_large_fpn\n")
     return folder
 
 

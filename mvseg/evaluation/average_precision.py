@@ -51,27 +51,19 @@ def annotate_detections(detections: dict[str, Tensor], masks: Iterable[Tensor], 
         masks: D masks (H, W) of probabilities, cut at 0.5 here, as torchvision's are by convention.
         image_id: number of the photo, from 0 on.
     """
-    annotations = []
-    for box, category, score, mask in zip(
-        detections["boxes"].tolist(), detections["labels"].tolist(), detections["scores"].tolist(), masks, strict=True
-    ):
-        x1, y1, x2, y2 = box
-        described = describe_mask(mask > 0.5, image_id)
-        annotations.append(
-            {**described, "category_id": category, "iscrowd": 0, "score": score, "bbox": [x1, y1, x2 - x1, y2 - y1]}
-        )
-    return annotations
+    columns = (detections[key].tolist() for key in ("boxes", "labels", "scores"))
+    return [
+        describe_mask(mask > 0.5, image_id)
+        | {"category_id": category, "iscrowd": 0, "score": score, "bbox": [x1, y1, x2 - x1, y2 - y1]}
+        for (x1, y1, x2, y2), category, score, mask in zip(*columns, masks, strict=True)
+    ]
 
 
 def describe_mask(mask: Tensor, image_id: int) -> dict[str, Any]:
     """COCO fields of a (H, W) bool mask: run lengths, area in pixels, box xywh."""
     encoded = encode_mask(mask.cpu().numpy())
-    return {
-        "image_id": image_id,
-        "segmentation": encoded,
-        "area": float(coco_mask.area(encoded)),
-        "bbox": coco_mask.toBbox(encoded).tolist(),
-    }
+    area, box = float(coco_mask.area(encoded)), coco_mask.toBbox(encoded).tolist()
+    return {"image_id": image_id, "segmentation": encoded, "area": area, "bbox": box}
 
 
 def average_precision(truth: Annotations, detections: Annotations, num_images: int) -> dict[str, float | None]:

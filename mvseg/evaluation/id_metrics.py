@@ -53,34 +53,20 @@ def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
     if instance_ids.shape != true_ids.shape or instance_ids.ndim != 1:
         shapes = f"{tuple(instance_ids.shape)} estimated ids with {tuple(true_ids.shape)} true ones"
         raise InputError(f"{shapes}, expected two vectors of equal length")
-    estimated, true = separate_unmatched(instance_ids.cpu().numpy()), true_ids.cpu().numpy()
-    if not len(true):
-        return MatchingMetrics(
-            s_match=1.0,
-            e_k=0,
-            ari=1.0,
-            pair_precision=1.0,
-            pair_recall=1.0,
-            pair_f1=1.0,
-            num_regions=0,
-            num_estimated=0,
-            num_true=0,
-        )
-    table = contingency_table(true, estimated)
+    table = contingency_table(true_ids.cpu().numpy(), separate_unmatched(instance_ids.cpu().numpy()))
     both, true_pairs, estimated_pairs = (count_pairs(sizes) for sizes in (table, table.sum(1), table.sum(0)))
-    precision = both / estimated_pairs if estimated_pairs else 1.0
-    recall = both / true_pairs if true_pairs else 1.0
+    count = len(true_ids)
     # Hubert and Arabie (1985): pairs in both, less those expected by chance, over the largest possible difference
-    by_chance = true_pairs * estimated_pairs / max(count_pairs(np.array([len(true)])), 1)
+    by_chance = true_pairs * estimated_pairs / max(count_pairs(np.array([count])), 1)
     largest = (true_pairs + estimated_pairs) / 2
     return MatchingMetrics(
-        s_match=float(table.max(0).sum() / len(true)),
+        s_match=share(int(table.max(0, initial=0).sum()), count),
         e_k=abs(table.shape[1] - table.shape[0]),
         ari=1.0 if largest == by_chance else (both - by_chance) / (largest - by_chance),
-        pair_precision=precision,
-        pair_recall=recall,
-        pair_f1=2 * precision * recall / (precision + recall) if precision + recall else 0.0,
-        num_regions=len(true),
+        pair_precision=share(both, estimated_pairs),
+        pair_recall=share(both, true_pairs),
+        pair_f1=share(2 * both, estimated_pairs + true_pairs),
+        num_regions=count,
         num_estimated=table.shape[1],
         num_true=table.shape[0],
     )
@@ -92,6 +78,11 @@ def contingency_table(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     columns, column = np.unique(second, return_inverse=True)
     counts = np.bincount(row * len(columns) + column, minlength=len(rows) * len(columns))
     return counts.reshape(len(rows), len(columns))
+
+
+def share(part: float, whole: float) -> float:
+    """`part` / `whole`; 1 where there is nothing to count."""
+    return part / whole if whole else 1.0
 
 
 def count_pairs(sizes: np.ndarray) -> int:

@@ -51,14 +51,7 @@ def label_photo(photo: np.ndarray, labels: np.ndarray) -> LabelledPhoto:
 def mask_photo(
     photo: np.ndarray, masks: Sequence[np.ndarray], *, classes: Sequence[int], ignore: np.ndarray
 ) -> LabelledPhoto:
-    """A photo with the instances of N masks, which may overlap.
-
-    Args:
-        photo: (H, W, 3) uint8 RGB.
-        masks: N times (H, W) bool.
-        classes: N classes.
-        ignore: (H, W) bool.
-    """
+    """A photo (H, W, 3) uint8 RGB with the instances of N masks (H, W) bool, which may overlap, and their N classes."""
     return LabelledPhoto(
         photo=_channels_first(photo),
         layers=stack_masks(masks, ignore.shape),

@@ -15,7 +15,7 @@ import numpy as np
 from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.evaluation.id_metrics import contingency_table, count_pairs
+from mvseg.evaluation.id_metrics import contingency_table, count_pairs, share
 from mvseg.matching.partition import separate_unmatched
 from mvseg.regions import IGNORE_LABEL, Regions
 
@@ -99,20 +99,16 @@ def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndar
     right, estimated, true = count_shared_pairs(masks, ids, np.array([label for _, label in true_masks], np.int64))
     num_false, num_missed = int(leaves.is_false.sum()), leaves.num_true - leaves.num_right
     return LeafMetrics(
-        mask_precision=_share(masks.num_right, masks.num_right + int(masks.is_false.sum())),
-        mask_recall=_share(masks.num_right, masks.num_true),
-        all_pair_precision=_share(right, estimated),
-        all_pair_recall=_share(right, true),
-        all_pair_f1=_share(2 * right, estimated + true),
-        mv_pq=_share(float(leaves.iou.sum()), leaves.num_right + (num_false + num_missed) / 2),
+        mask_precision=share(masks.num_right, masks.num_right + int(masks.is_false.sum())),
+        mask_recall=share(masks.num_right, masks.num_true),
+        all_pair_precision=share(right, estimated),
+        all_pair_recall=share(right, true),
+        all_pair_f1=share(2 * right, estimated + true),
+        mv_pq=share(float(leaves.iou.sum()), leaves.num_right + (num_false + num_missed) / 2),
         num_right=leaves.num_right,
         num_false=num_false,
         num_missed=num_missed,
     )
-
-
-def _share(part: float, whole: float) -> float:
-    return part / whole if whole else 1.0
 
 
 def find_segments(

@@ -166,12 +166,5 @@ def leaf_from_blade(leaf_id: int, vertices: Floats) -> Leaf:
     width = float(np.linalg.norm(np.diff(grid, axis=1), axis=2).sum(1).max())
     corner = vertices[faces]
     area = np.linalg.norm(np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]), axis=1).sum() / 2
-    return Leaf(
-        leaf_id=leaf_id,
-        vertices=vertices,
-        faces=faces,
-        uv=blade_uv(len(grid)),
-        length=length,
-        width=width,
-        area=float(area),
-    )
+    uv = blade_uv(len(grid))
+    return Leaf(leaf_id=leaf_id, vertices=vertices, faces=faces, uv=uv, length=length, width=width, area=float(area))

@@ -48,10 +48,8 @@ def arc_cameras(
         raise InputError(f"the arc spans {span_deg:g} degrees, expected more than 0 and at most 360")
     if not elevations_deg or max(abs(angle) for angle in elevations_deg) >= 90:
         raise InputError("the elevations must be one or more numbers between -90 and 90 degrees")
-    points = np.concatenate(
-        [leaf.vertices for leaf in plant.leaves]
-        + [part.vertices for part in plant.parts if part.material == "stem"]
-    )
+    meshes = [*plant.leaves, *(part for part in plant.parts if part.material == "stem")]
+    points = np.concatenate([mesh.vertices for mesh in meshes])
     center = (points.min(0) + points.max(0)) / 2
     distance = DISTANCE * float(np.linalg.norm(points - center, axis=1).max())
     gaps = max(num_views - 1, 1) if span_deg < 360 else num_views
@@ -73,8 +71,7 @@ def arc_cameras(
 
 def look_at(azimuth: float, elevation: float) -> NDArray[np.float64]:
     """(3, 3) rotation of cam_from_world of an upright camera that looks at the origin from these angles (radians)."""
-    outwards = np.array(
-        [math.cos(elevation) * math.cos(azimuth), math.cos(elevation) * math.sin(azimuth), math.sin(elevation)]
-    )
+    level = math.cos(elevation)
+    outwards = np.array([level * math.cos(azimuth), level * math.sin(azimuth), math.sin(elevation)])
     right = np.array([-math.sin(azimuth), math.cos(azimuth), 0.0])
     return np.stack([right, np.cross(-outwards, right), -outwards])

@@ -100,14 +100,9 @@ def list_scenes(preset: Preset, seed: int) -> list[SceneSpec]:
                 entropy = [seed, num_leaves, index, *split.encode()]
                 plant_seed = int(np.random.SeedSequence(entropy).generate_state(1)[0])
                 for num_views in preset.views:
-                    spec = SceneSpec(
-                        folder=f"{split}/{family}-{index:03d}_leaves-{num_leaves:02d}_views-{num_views:02d}",
-                        split=split,
-                        family=family,
-                        num_leaves=num_leaves,
-                        num_views=num_views,
-                        seed=plant_seed,
-                    )
+                    name = f"{split}/{family}-{index:03d}_leaves-{num_leaves:02d}_views-{num_views:02d}"
+                    spec = SceneSpec(folder=name, split=split, family=family, num_leaves=num_leaves,
+                                     num_views=num_views, seed=plant_seed)  # fmt: skip
                     scenes.append(spec)
     return scenes
 
@@ -136,7 +131,7 @@ def write_dataset(preset: Preset | str, folder: Path | str, *, seed: int = 0, nu
         if preset not in PRESETS:
             raise InputError(f"unknown preset '{preset}', expected one of {', '.join(PRESETS)}")
         preset = PRESETS[preset]
-    if num_workers < 1:
+    if num_workers < 1:  # before the folder is made
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
     if seed < 0:
         raise InputError(f"the seed is {seed}, expected 0 or more")
@@ -194,9 +189,8 @@ def scene_cameras(scene: SceneSpec, plant: Plant, preset: Preset) -> Cameras:
     if not preset.has_free_cameras:
         return arc_cameras(scene.num_views, plant, start_deg=start, width=width, height=height)
     heights = tuple(rng.uniform(5, 85, 5))
-    cameras = arc_cameras(
-        scene.num_views, plant, span_deg=360, start_deg=start, elevations_deg=heights, width=width, height=height
-    )
+    cameras = arc_cameras(scene.num_views, plant, span_deg=360, start_deg=start, elevations_deg=heights,
+                          width=width, height=height)  # fmt: skip
     K = cameras.K.clone()
     K[:, :2, :2] *= rng.uniform(0.6, 1.5)
     return replace(cameras, K=K)
@@ -213,10 +207,7 @@ def annotate_photo(dataset: Path, name: str, size: tuple[int, int]) -> Photo:
 
 def write_annotations(path: Path, photos: list[Photo]) -> None:
     """Write one COCO file of photos and their annotations, ids from 1 in order, whole or not at all."""
-    images = [{"id": number, **image} for number, (image, _) in enumerate(photos, start=1)]
-    annotations = [
-        {"image_id": number, **annotation}
-        for number, (_, of_photo) in enumerate(photos, start=1)
-        for annotation in of_photo
-    ]
+    numbered = list(enumerate(photos, start=1))
+    images = [{"id": number, **image} for number, (image, _) in numbered]
+    annotations = [{"image_id": number, **each} for number, (_, of_photo) in numbered for each in of_photo]
     write_whole(path, lambda partial_path: write_coco(partial_path, images, annotations, category="leaf"))

@@ -23,6 +23,7 @@ MAX_LEAVES = 64
 GOLDEN_ANGLE = math.radians(137.50776)
 POSES_TRIED = 8  # per frond; the least crowded one is kept, so that blades seldom cut through each other
 CLEARANCE = 6.0  # mm; blades that come closer than this crowd each other
+FAR_AWAY = np.array([[0.0, 0.0, -1e6]])  # a point that crowds nothing
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,6 +62,11 @@ class Frond:
     rachis: Floats
     radius: float
     blades: tuple[Floats, ...]
+
+    @property
+    def points(self) -> Floats:
+        """Every second vertex of the blades."""
+        return np.concatenate([blade[::2] for blade in self.blades])
 
 
 def grow_plant(family: str, num_leaves: int, seed: int) -> Plant:
@@ -118,15 +124,19 @@ def place_frond(
     node: Node, family: Family, rng: np.random.Generator, *, num_blades: int, pot: Pot, others: list[Frond]
 ) -> Frond:
     """The least crowded of a few random poses, lifted off the soil."""
-    taken = cKDTree(np.concatenate([[[0.0, 0.0, -1e6]], *[blade[::2] for other in others for blade in other.blades]]))
-    poses = []
-    for _ in range(POSES_TRIED):
-        frond = grow_frond(node, family, rng, num_blades=num_blades)
-        lifted = replace(frond, rachis=lift(pot, frond.rachis), blades=tuple(lift(pot, b) for b in frond.blades))
-        points = np.concatenate([blade[::2] for blade in lifted.blades])
-        distance = taken.query(points, distance_upper_bound=CLEARANCE)[0]
-        poses.append((float(np.isfinite(distance).mean()), lifted))
-    return min(poses, key=lambda pose: pose[0])[1]
+    taken = cKDTree(np.concatenate([FAR_AWAY, *(other.points for other in others)]))
+    poses = [lift_frond(grow_frond(node, family, rng, num_blades=num_blades), pot) for _ in range(POSES_TRIED)]
+    return min(poses, key=lambda frond: crowding(frond, taken))
+
+
+def crowding(frond: Frond, taken: cKDTree) -> float:
+    """Share of the frond's points that are close to others."""
+    return float(np.isfinite(taken.query(frond.points, distance_upper_bound=CLEARANCE)[0]).mean())
+
+
+def lift_frond(frond: Frond, pot: Pot) -> Frond:
+    """The frond off the soil, see `pot.lift`."""
+    return replace(frond, rachis=lift(pot, frond.rachis), blades=tuple(lift(pot, blade) for blade in frond.blades))
 
 
 def grow_frond(node: Node, family: Family, rng: np.random.Generator, *, num_blades: int) -> Frond:
@@ -169,18 +179,23 @@ def grow_shoots(num_fronds: int, family: Family, rng: np.random.Generator) -> tu
     for index, share in enumerate(shares):
         azimuth = start + index * GOLDEN_ANGLE
         if index == 0 or is_tillering:
-            out = rng.uniform(0.2, 0.45) * family.pot_radius * (index > 0)
-            point = np.array([out * math.cos(azimuth), out * math.sin(azimuth), 0.0])
-            tilt, scale = math.radians(rng.uniform(*family.lean) + 6 * (index > 0)), rng.uniform(0.85, 1.1)
+            foot, tilt = place_foot(family, rng, azimuth=azimuth, is_first=index == 0)
         else:
             parent = nodes[(2 * (index - 1)) % max(len(shares[0]) // 2, 1)]
-            point, azimuth = parent.point, parent.azimuth + rng.normal(0, 0.3)
-            tilt, scale = math.radians(rng.uniform(35, 50)), rng.uniform(0.7, 0.85)
-        foot = Node(point=point, azimuth=azimuth, age=1.0, scale=scale)
+            azimuth, tilt = parent.azimuth + rng.normal(0, 0.3), math.radians(rng.uniform(35, 50))
+            foot = Node(point=parent.point, azimuth=azimuth, age=1.0, scale=rng.uniform(0.7, 0.85))
         stem, shoot_nodes = grow_shoot(foot, family, rng, tilt=tilt, num_fronds=len(share))
         stems.append(stem)
         nodes += shoot_nodes
     return stems, nodes
+
+
+def place_foot(family: Family, rng: np.random.Generator, *, azimuth: float, is_first: bool) -> tuple[Node, float]:
+    """Where a shoot comes out of the soil, the first one in the middle, and its tilt."""
+    out = rng.uniform(0.2, 0.45) * family.pot_radius * (not is_first)
+    point = np.array([out * math.cos(azimuth), out * math.sin(azimuth), 0.0])
+    tilt = math.radians(rng.uniform(*family.lean) + 6 * (not is_first))
+    return Node(point=point, azimuth=azimuth, age=1.0, scale=rng.uniform(0.85, 1.1)), tilt
 
 
 def grow_shoot(

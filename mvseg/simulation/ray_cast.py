@@ -10,11 +10,13 @@ from __future__ import annotations
 import math
 import zlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from embreex.mesh_construction import TriangleMesh
 from embreex.rtcore_scene import EmbreeScene
 from numpy.typing import NDArray
+from skimage.segmentation import find_boundaries
 
 from mvseg.scene import Cameras
 from mvseg.simulation.families import FAMILIES
@@ -69,69 +71,47 @@ class Stage:
     look: Look
 
 
-@dataclass(frozen=True, eq=False)
-class Pinhole:
-    """A camera that rays leave: center (3,) and world_from_px (3, 3)."""
-
-    center: Floats
-    world_from_px: Doubles
-
-
 # --- views
 
 
-def render_view(plant: Plant, cameras: Cameras, view: int, *, seed: int) -> Rendering:
-    """Photograph a plant.
-
-    Args:
-        plant: world units as in `Plant`.
-        cameras: V cameras.
-        view: which of them.
-        seed: of light, materials and camera noise; ids and depth do not depend on it.
-    """
-    return render_stage(build_stage(plant, seed=seed), cameras, view)
-
-
 def render_stage(stage: Stage, cameras: Cameras, view: int) -> Rendering:
-    """As `render_view`, for a stage that serves many views."""
+    """Photograph a plant with one of V cameras, in the world units of `Plant`; ids and depth do not depend on the seed
+    of the stage."""
     K, R, t = (part[view].numpy() for part in (cameras.K, cameras.R, cameras.t))
     width, height = cameras.sizes[view].tolist()
-    pinhole = Pinhole((-R.T @ t).astype(np.float32), R.T @ np.linalg.inv(K))
+    center, world_from_px = (-R.T @ t).astype(np.float32), R.T @ np.linalg.inv(K)
     # the noise differs from view to view and from look to look, but not from run to run
     drawn_from = [np.asarray(part, np.float64).tobytes() for part in (K, R, t, stage.look.exposure)]
     rng = np.random.default_rng(zlib.crc32(b"".join(drawn_from)))
     rows, columns = np.mgrid[:height, :width]
     centres = np.stack([columns.ravel(), rows.ravel()], 1) + 0.5
-    color, face, depth = trace(stage, pinhole, centres, rng=rng)
+
+    def look(px: Doubles) -> tuple[Floats, NDArray[np.int32], Floats]:
+        x, y, z = world_from_px.T
+        rays = (px[:, :1] * x + px[:, 1:] * y + z).astype(np.float32)  # depth 1 along +z; no BLAS, whose sums may vary
+        return trace(stage, np.tile(center, (len(rays), 1)), rays, rng=rng)
+
+    color, face, depth = look(centres)
     hit = face >= 0
     ids = np.where(hit, stage.mesh.owner[face], 0).astype(np.uint16).reshape(height, width)
     kinds = np.where(hit, stage.mesh.material[face], len(MATERIALS)).reshape(height, width)
 
     borders = np.flatnonzero(border_pixels(ids.astype(np.int32) * (len(MATERIALS) + 1) + kinds))
     quarters = [(dx, dy) for dx in (-0.25, 0.25) for dy in (-0.25, 0.25)]
-    color[borders] = sum(trace(stage, pinhole, centres[borders] + shift, rng=rng)[0] for shift in quarters) / 4
+    color[borders] = sum(look(centres[borders] + shift)[0] for shift in quarters) / 4
     rgb = develop(color.reshape(height, width, 3), stage.look, rng)
     return Rendering(rgb, ids, depth.reshape(height, width))
 
 
 def border_pixels(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
     """(H, W) pixels with another label among their four neighbours."""
-    border = np.zeros(labels.shape, bool)
-    below, right = labels[1:] != labels[:-1], labels[:, 1:] != labels[:, :-1]
-    border[1:] |= below
-    border[:-1] |= below
-    border[:, 1:] |= right
-    border[:, :-1] |= right
-    return border
+    return np.asarray(find_boundaries(labels))
 
 
 def trace(
-    stage: Stage, pinhole: Pinhole, px: Doubles, *, rng: np.random.Generator
+    stage: Stage, origins: Floats, rays: Floats, *, rng: np.random.Generator
 ) -> tuple[Floats, NDArray[np.int32], Floats]:
-    """Radiance (n, 3), face (n,) (-1 for none) and depth (n,) seen through the pixel positions (n, 2)."""
-    x, y, z = pinhole.world_from_px.T
-    rays = (px[:, :1] * x + px[:, 1:] * y + z).astype(np.float32)  # depth 1 along +z; no BLAS, whose sums may vary
-    origins = np.tile(pinhole.center, (len(rays), 1))
+    """Radiance (n, 3), face (n,) (-1 for none) and depth (n,) seen along rays (n, 3), whose length is a depth of 1."""
     first_hit = stage.bvh.run(origins, rays, output=True)
     face = first_hit["primID"]
     depth = np.where(face >= 0, first_hit["tfar"], np.inf).astype(np.float32)
@@ -139,25 +119,16 @@ def trace(
     color = backdrop_color(stage.look, view)
     hit = np.flatnonzero(face >= 0)
     u, v, face_hit = first_hit["u"][hit, None], first_hit["v"][hit, None], face[hit]
-    corners = stage.mesh.faces[face_hit]
-    values = stage.attributes[corners[:, 0]] * (1 - u - v)
-    values += stage.attributes[corners[:, 1]] * u
-    values += stage.attributes[corners[:, 2]] * v
+    one, two, three = (stage.attributes[corner] for corner in stage.mesh.faces[face_hit].T)
+    values = one * (1 - u - v) + two * u + three * v
     points, face_normal = origins[hit] + depth[hit, None] * rays[hit], stage.face_normals[face_hit]
+    mesh = stage.mesh
     hits = Hits(
-        points=points,
-        view=view[hit],
-        material=stage.mesh.material[face_hit],
-        leaf_id=stage.mesh.owner[face_hit],
-        dryness=stage.mesh.dryness[face_hit],
-        face_normal=face_normal,
-        normal=values[:, :3],
-        along=stage.along[face_hit],
-        upper=values[:, 3:6],
-        lower=values[:, 6:9],
-        uv=values[:, 9:],
+        points=points, view=view[hit], face_normal=face_normal, along=stage.along[face_hit],
+        material=mesh.material[face_hit], leaf_id=mesh.owner[face_hit], dryness=mesh.dryness[face_hit],
+        normal=values[:, :3], upper=values[:, 3:6], lower=values[:, 6:9], uv=values[:, 9:],
         lit=gather_sunlight(stage, points, face_normal, rng=rng),
-    )
+    )  # fmt: skip
     color[hit] = shade(stage.look, hits, has_parallel_veins=stage.has_parallel_veins)
     return color, face, depth
 
@@ -190,15 +161,11 @@ def build_stage(plant: Plant, *, seed: int) -> Stage:
     if plant.is_wild:
         look = draw_wild_look(look, np.random.default_rng([seed, 1]))
     upper, lower = gather_skylight(bvh, look, vertices=vertices.astype(np.float32), normals=normals)
+    attributes = np.concatenate([normals, upper, lower, mesh.uv.astype(np.float32)], 1)
     return Stage(
-        mesh=mesh,
-        bvh=bvh,
-        attributes=np.concatenate([normals, upper, lower, mesh.uv.astype(np.float32)], 1),
-        face_normals=unit(across),
-        along=unit(along),
-        has_parallel_veins=FAMILIES[plant.family].has_parallel_veins,
-        look=look,
-    )
+        mesh=mesh, bvh=bvh, attributes=attributes, face_normals=unit(across), along=unit(along),
+        has_parallel_veins=FAMILIES[plant.family].has_parallel_veins, look=look,
+    )  # fmt: skip
 
 
 def merge_meshes(plant: Plant) -> Mesh:
@@ -211,14 +178,13 @@ def merge_meshes(plant: Plant) -> Mesh:
     faces = np.concatenate([mesh[1] + start for mesh, start in zip(meshes, starts[:-1], strict=True)]).astype(np.int32)
     uv = np.zeros((starts[-1], 2))
     uv[: starts[len(plant.leaves)]] = np.concatenate([np.zeros((0, 2)), *(leaf.uv for leaf in plant.leaves)])
-    return Mesh(
-        vertices=np.concatenate([mesh[0] for mesh in meshes]),
-        faces=faces,
-        uv=uv,
-        owner=np.repeat(np.array([mesh[3] for mesh in meshes], np.uint16), counts),
-        material=np.repeat(np.array([mesh[2] for mesh in meshes], np.uint8), counts),
-        dryness=np.repeat(np.array([mesh[4] for mesh in meshes], np.float32), counts),
-    )
+
+    def per_face(column: int, dtype: type) -> NDArray[Any]:
+        return np.repeat(np.array([mesh[column] for mesh in meshes], dtype), counts)
+
+    vertices = np.concatenate([mesh[0] for mesh in meshes])
+    material, owner, dryness = per_face(2, np.uint8), per_face(3, np.uint16), per_face(4, np.float32)
+    return Mesh(vertices=vertices, faces=faces, uv=uv, owner=owner, material=material, dryness=dryness)
 
 
 def build_bvh(mesh: Mesh) -> EmbreeScene:

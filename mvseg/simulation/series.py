@@ -22,16 +22,19 @@ from mvseg.simulation.blades import Arc, Floats, Leaf, arc_points, leaf_from_bla
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES, Family
 from mvseg.simulation.growth import (
-    CLEARANCE,
+    FAR_AWAY,
     GOLDEN_ANGLE,
     POSES_TRIED,
     Frond,
     Node,
     Plant,
+    crowding,
     grow_frond,
+    lift_frond,
+    place_foot,
     split_into_fronds,
-)
-from mvseg.simulation.pot import Part, Pot, draw_pot, lift, make_tube, pot_parts
+)  # fmt: skip
+from mvseg.simulation.pot import Part, Pot, draw_pot, make_tube, pot_parts
 from mvseg.simulation.scene_writer import write_scene, write_table
 from mvseg.simulation.wild import hang, roll_up
 from mvseg.system.atomic import folder_whole
@@ -160,8 +163,7 @@ class GrowingPlant:
         scale = seat.scale * size / (0.4 + 0.6 * age)
         node = Node(point=stem[3 * seat.level + 3], azimuth=azimuth, age=age, scale=scale)
         frond = grow_frond(node, family, np.random.default_rng(seat.seed), num_blades=len(seat.ids))
-        blades = tuple(lift(self.pot, blade) for blade in frond.blades)
-        return replace(frond, rachis=lift(self.pot, frond.rachis), blades=blades)
+        return lift_frond(frond, self.pot)
 
 
 def plan_plant(spec: SeriesSpec) -> GrowingPlant:
@@ -172,11 +174,9 @@ def plan_plant(spec: SeriesSpec) -> GrowingPlant:
     num_shoots = math.ceil(len(counts) / family.per_shoot)
     shoots, start = [], rng.uniform(0, 2 * np.pi)
     for index, share in enumerate(np.array_split(np.arange(len(counts)), num_shoots)):
-        azimuth, out = start + index * GOLDEN_ANGLE, rng.uniform(0.2, 0.45) * family.pot_radius * (index > 0)
-        point = np.array([out * math.cos(azimuth), out * math.sin(azimuth), 0.0])
-        tilt = math.radians(rng.uniform(*family.lean) + 6 * (index > 0))
-        scale, levels = rng.uniform(0.85, 1.1), math.ceil(len(share) / family.per_node)
-        shoots.append((Node(point, azimuth, 1.0, scale), scale * rng.uniform(*family.internode, levels), tilt))
+        foot, tilt = place_foot(family, rng, azimuth=start + index * GOLDEN_ANGLE, is_first=index == 0)
+        levels = math.ceil(len(share) / family.per_node)
+        shoots.append((foot, foot.scale * rng.uniform(*family.internode, levels), tilt))
     seats = _seat_fronds(spec, counts, shoots, rng)
     return _uncrowd(GrowingPlant(spec, pot, tuple(shoots), tuple(seats)))
 
@@ -212,17 +212,14 @@ def _seat_fronds(
 def _uncrowd(plant: GrowingPlant) -> GrowingPlant:
     """The plant with each frond in the least crowded of a few poses, as full-grown plants have them."""
     seats, day = list(plant.seats), plant.spec.times[-1] - plant.spec.times[0] + EXPANSION
-    taken = np.array([[0.0, 0.0, -1e6]])
+    taken = FAR_AWAY
     for index, seat in enumerate(seats):
         stem, tree, tried = plant._stem(seat.shoot, day), cKDTree(taken), []
         for attempt in range(POSES_TRIED):
             other = replace(seat, seed=(*seat.seed[:2], attempt))
-            frond = plant._frond(other, day, stem, FAMILIES[plant.spec.family])
-            points = np.concatenate([blade[::2] for blade in frond.blades])
-            distance = tree.query(points, distance_upper_bound=CLEARANCE)[0]
-            tried.append((float(np.isfinite(distance).mean()), other, points))
-        _, seats[index], points = min(tried, key=lambda pose: pose[0])
-        taken = np.concatenate([taken, points])
+            tried.append((other, plant._frond(other, day, stem, FAMILIES[plant.spec.family])))
+        seats[index], frond = min(tried, key=lambda pose: crowding(pose[1], tree))
+        taken = np.concatenate([taken, frond.points])
     return replace(plant, seats=tuple(seats))
 
 

@@ -200,20 +200,14 @@ def _fit(first: Leaves, second: Leaves, pairs: np.ndarray, weights: Floats, *, k
     mass /= mass.sum()
     middle, aim = mass @ source, mass @ target
     source, target = source - middle, target - aim
+    moment = (target * mass[:, None]).T @ source
     if knows_up:
-        moment = (target * mass[:, None]).T @ source
-        upright = UPRIGHT / max(len(pairs), 1) * np.linalg.norm(moment)
-        mass, up = np.append(mass, upright), [(0.0, 0.0, 1.0)]
-        rotation = _best_rotation(np.vstack([source, up]), np.vstack([target, up]), mass)
-        if np.arccos(np.clip(rotation[2, 2], -1, 1)) > MOST_LEAN:
-            turn = np.arctan2(moment[1, 0] - moment[0, 1], moment[0, 0] + moment[1, 1])
-            rotation = Rotation.from_rotvec((0, 0, turn)).as_matrix()
-    else:
-        rotation = _best_rotation(source, target, mass)
-    return make_poses(rotation, aim - rotation @ middle)
-
-
-def _best_rotation(source: Floats, target: Floats, weights: Floats) -> Floats:
-    """(3, 3) least squares rotation of vectors (P, 3)."""
+        up = [(0.0, 0.0, 1.0)]
+        source, target = np.vstack([source, up]), np.vstack([target, up])
+        mass = np.append(mass, UPRIGHT / max(len(pairs), 1) * np.linalg.norm(moment))
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # on one line, any of the best will do
-        return Rotation.align_vectors(target, source, weights)[0].as_matrix()
+        rotation = Rotation.align_vectors(target, source, mass)[0].as_matrix()
+    if knows_up and np.arccos(np.clip(rotation[2, 2], -1, 1)) > MOST_LEAN:
+        turn = np.arctan2(moment[1, 0] - moment[0, 1], moment[0, 0] + moment[1, 1])
+        rotation = Rotation.from_rotvec((0, 0, turn)).as_matrix()
+    return make_poses(rotation, aim - rotation @ middle)

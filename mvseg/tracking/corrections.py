@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-import numpy as np
-
 from mvseg.corrections.file import TrackLink, load_corrections
 from mvseg.formats.label_png import read_labels
 from mvseg.tracking.dates import PlantOnDate
@@ -48,10 +46,10 @@ def leaf_at(folder: Path, view: str, x: float, y: float) -> int:
 
     The view is named with or without the suffix of its photo.
     """
-    inside = (folder / "labels").resolve()
-    paths = [(inside / f"{name}.png").resolve() for name in (view, Path(view).with_suffix(""))]
-    found = [path for path in paths if path.is_relative_to(inside) and path.is_file()]
-    labels = read_labels(found[0]) if found else np.zeros((0, 0))
-    column, row = int(x // 1), int(y // 1)
+    labels_of = {path.stem: path for path in (folder / "labels").glob("*.png")}
+    path = labels_of.get(view, labels_of.get(Path(view).stem))
+    if path is None:
+        return 0
+    labels, column, row = read_labels(path), int(x // 1), int(y // 1)
     is_inside = 0 <= row < labels.shape[0] and 0 <= column < labels.shape[1]
     return int(labels[row, column]) if is_inside else 0

@@ -21,7 +21,7 @@ RISE = 0.02  # more of ALONG per day: internodes stretch
 GROWTH = 0.25  # log length per day that a leaf much shorter than the others may gain
 LOOSE = 0.35  # floor of SIZE and BEND for leaves that only voxels show
 TAIL = 3.0  # degrees of freedom of the differences
-FLIPPED = 3.0  # cost of a midrib that runs the other way on the other date, where both seem to be known
+FLIPPED = 0.5  # cost of a midrib that runs the other way on the other date
 PARTING = 9.0  # log of how much rarer a stranger's differences are in each place, see `pair_costs`
 CLOUDS = 0.04  # scale of the distance between the points of two sights, as ACROSS
 APART = 3.0  # as PARTING, of `cloud_costs`
@@ -136,8 +136,7 @@ def pair_costs(first: Leaves, second: Leaves, *, days: float, scale: float, spre
     """
     straight = _directed_costs(first, second, days=days, scale=scale, spread=spread)
     turned = _directed_costs(first.flipped(), second, days=days, scale=scale, spread=spread)
-    both = first.is_oriented[:, None] & second.is_oriented[None]
-    return np.minimum(straight, turned + np.where(both, FLIPPED, 0.5))
+    return np.minimum(straight, turned + FLIPPED)
 
 
 def cloud_costs(first: Leaves, second: Leaves, *, days: float, scale: float, spread: float = 1.0) -> Floats:

@@ -225,16 +225,13 @@ def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
         found = {name: (number, *units.get(number.unit, (number.unit, 1.0))) for name, number in numbers.items()}
         return {name: Number(n.value * times, n.sd * times, unit) for name, (n, unit, times) in found.items()}
 
-    leaves = tuple(
-        replace(
-            leaf,
-            midrib=None if leaf.midrib is None else leaf.midrib * factor,
-            points=None if leaf.points is None else leaf.points * factor,
-            numbers=convert(leaf.numbers),
-        )
-        for leaf in date.leaves
-    )
-    return replace(date, unit=first.unit, leaves=leaves, whole=convert(date.whole))
+    def enlarge(leaf: SeenLeaf) -> SeenLeaf:
+        leaf = replace(leaf, numbers=convert(leaf.numbers))
+        if leaf.midrib is None or leaf.points is None:
+            return leaf
+        return replace(leaf, midrib=leaf.midrib * factor, points=leaf.points * factor)
+
+    return replace(date, unit=first.unit, leaves=tuple(map(enlarge, date.leaves)), whole=convert(date.whole))
 
 
 def _read_traits(path: Path) -> tuple[dict[int, dict[str, Number]], dict[int, dict[str, str]]]:

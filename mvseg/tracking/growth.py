@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -54,8 +54,8 @@ class GrowthCurve:
     track: int
     trait: str
     model: str
-    parameters: tuple[float, float, float]
-    sds: tuple[float, float, float]
+    parameters: tuple[float, ...]
+    sds: tuple[float, ...]
     residual: float
     criterion: float
 
@@ -120,10 +120,7 @@ def measure_growth(tracks: Tracks) -> Growth:
             sds = np.array([number.sd for number in seen.values()])
             for place, (date, number) in enumerate(seen.items()):
                 near = slice(max(place - 1, 0), place + 2)
-                rate, rate_sd = slope(times[near], values[near], sds[near])
-                points.append(
-                    GrowthPoint(track=track, trait=trait, date=date, number=number, rate=rate, rate_sd=rate_sd)
-                )
+                points.append(GrowthPoint(track, trait, date, number, *slope(times[near], values[near], sds[near])))
             if trait in SIZES and len(seen) >= LEAST_DATES:
                 curves.append(fit_curve(track, trait, (times, values, sds)))
     return Growth(tuple(points), tuple(curves), tuple(_plant_rows(tracks, points)))
@@ -188,21 +185,12 @@ def _divergence(date: PlantOnDate) -> tuple[float, ...]:
     return tuple(round(abs((upper - lower + 180) % 360 - 180), 1) for (_, lower), (_, upper) in pairwise(leaves))
 
 
-def _constant(parameters: Sequence[float], times: Floats) -> Floats:
-    return np.full(len(times), parameters[0])
-
-
-def _logistic(parameters: Sequence[float], times: Floats) -> Floats:
-    size, rate, middle = parameters
-    return size * np.asarray(expit(rate * (times - middle)))
-
-
-def _expolinear(parameters: Sequence[float], times: Floats) -> Floats:
-    size, rate, middle = parameters
-    return size / rate * np.logaddexp(0, rate * (times - middle))
-
-
-CURVES = {"constant": _constant, "logistic": _logistic, "expolinear": _expolinear}
+# {model: the sizes at times (T,) by its parameters}, see `GrowthCurve`
+CURVES: dict[str, Callable[[Sequence[float], Floats], Floats]] = {
+    "constant": lambda p, times: np.full(len(times), p[0]),
+    "logistic": lambda p, times: p[0] * np.asarray(expit(p[1] * (times - p[2]))),
+    "expolinear": lambda p, times: p[0] / p[1] * np.logaddexp(0, p[1] * (times - p[2])),
+}
 
 
 def _fit(track: int, trait: str, model: str, seen: tuple[Floats, Floats, Floats]) -> GrowthCurve:
@@ -225,8 +213,7 @@ def _fit(track: int, trait: str, model: str, seen: tuple[Floats, Floats, Floats]
     if np.linalg.cond(information) < 1e14:
         errors[:count] = np.sqrt(np.maximum(np.diag(np.linalg.inv(information)), 0))
     residual = float(np.sqrt(np.mean(np.square((shape(best.x, times) - values) / sds))))
-    (size, rate, middle), (size_sd, rate_sd, middle_sd) = parameters.tolist(), errors.tolist()
     return GrowthCurve(
-        track=track, trait=trait, model=model, parameters=(size, rate, middle), sds=(size_sd, rate_sd, middle_sd),
+        track=track, trait=trait, model=model, parameters=tuple(parameters.tolist()), sds=tuple(errors.tolist()),
         residual=residual, criterion=2 * float(best.cost) + 2 * count,
     )  # fmt: skip

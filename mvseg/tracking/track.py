@@ -109,7 +109,12 @@ def track_leaves(
     if len(results) < 2:
         raise InputError(f"{plant}: has {len(results)} date, expected two or more")
     written = range(len(results)) if times is None else times
-    dates = order_dates([_date(result, time) for result, time in zip(results, written, strict=True)])
+    dates = order_dates([
+        result if isinstance(result, PlantOnDate)
+        else read_date(Path(result), time) if isinstance(result, Path | str)
+        else date_of(result, time)
+        for result, time in zip(results, written, strict=True)
+    ])  # fmt: skip
     leaves = [leaves_of(date) for date in dates]
     compared = compare_dates(leaves, [date.time for date in dates], knows_up=all(date.knows_up for date in dates))
     same, different = _sights_of(links, dates)
@@ -119,12 +124,6 @@ def track_leaves(
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
         warnings=tuple(_warnings(dates, compared)),
     )  # fmt: skip
-
-
-def _date(result: Path | str | Result | PlantOnDate, time: float | str) -> PlantOnDate:
-    if isinstance(result, PlantOnDate):
-        return result
-    return read_date(Path(result), time) if isinstance(result, Path | str) else date_of(result, time)
 
 
 def _sights_of(

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional
 from torch.utils.data import Dataset
 from torchvision import tv_tensors
 from torchvision.transforms import v2
@@ -71,7 +72,7 @@ def augment(
         (3, S, S) float32 photo in [0, 1] and its target, see `make_target`.
     """
     photo = labelled.photo.clone()
-    photo[:, labelled.ignore] = mean_color(photo)[:, None]
+    photo[:, labelled.ignore] = torch.tensor(MEAN_COLOR, dtype=photo.dtype)[:, None]
     with torch.random.fork_rng(devices=[]):
         torch.default_generator.manual_seed(seed)
         if config.recolor:
@@ -117,44 +118,29 @@ def rescale(photo: Tensor, layers: Tensor, config: TrainConfig) -> tuple[Tensor,
     factor = math.exp(low + (high - low) * float(torch.rand(()))) * side / max(photo.shape[1:])
     size = [max(1, round(factor * length)) for length in photo.shape[1:]]
     photo = v2.functional.resize(photo, size, antialias=True)
-    layers = torch.nn.functional.interpolate(layers[None].float(), size, mode="nearest-exact")[0].to(layers.dtype)
-    spare = [side - length for length in size]
-    top, left = (int(torch.randint(min(0, free), max(0, free) + 1, ())) for free in spare)
-    frame = mean_color(photo)[:, None, None].expand(3, side, side)
-    empty = layers.new_zeros((len(layers), side, side))
-    return paste(photo, frame.clone(), top=top, left=left), paste(layers, empty, top=top, left=left)
-
-
-def paste(image: Tensor, frame: Tensor, *, top: int, left: int) -> Tensor:
-    """Put an image (C, h, w) into a frame (C, H, W), which is changed, at an offset that may be negative."""
-    rows = slice(max(0, top), max(0, min(frame.shape[1], top + image.shape[1])))
-    columns = slice(max(0, left), max(0, min(frame.shape[2], left + image.shape[2])))
-    frame[:, rows, columns] = image[:, rows.start - top : rows.stop - top, columns.start - left : columns.stop - left]
-    return frame
-
-
-def mean_color(photo: Tensor) -> Tensor:
-    """(3,) the neutral colour, in the photo's dtype."""
-    return torch.tensor(MEAN_COLOR, dtype=photo.dtype)
+    layers = functional.interpolate(layers[None].float(), size, mode="nearest-exact")[0].to(layers.dtype)
+    free = [side - length for length in size]
+    top, left = (int(torch.randint(min(0, length), max(0, length) + 1, ())) for length in free)
+    around = [left, free[1] - left, top, free[0] - top]  # negative where the photo is cropped
+    mean = torch.tensor(MEAN_COLOR, dtype=torch.int16)[:, None, None]
+    photo = (functional.pad(photo.to(torch.int16) - mean, around) + mean).to(photo.dtype)
+    return photo, functional.pad(layers, around)
 
 
 def distort_color(config: TrainConfig) -> v2.Transform:
     """Colour jitter and blur, for uint8 photos."""
     strength = config.color_jitter
-    return v2.Compose(
-        [
-            v2.ColorJitter(strength, strength, strength, strength / 10),
-            v2.RandomApply([v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))], p=config.blur_probability),
-        ]
-    )
+    jitter = v2.ColorJitter(strength, strength, strength, strength / 10)
+    blur = v2.GaussianBlur(kernel_size=7, sigma=(0.1, 2.0))
+    return v2.Compose([jitter, v2.RandomApply([blur], p=config.blur_probability)])
 
 
 def make_target(layers: Tensor, classes: Tensor, min_pixels: int = MIN_INSTANCE_PX) -> Target:
     """The target of torchvision's detectors.
 
     Args:
-        layers: (L, H, W) int, k where instance k is, see `LabelledPhoto`.
-        classes: (N,) int64, class of instance 1..N.
+        layers: (L, H, W) int, see `LabelledPhoto`.
+        classes: (N,) int64.
         min_pixels: instances of fewer pixels are discarded.
 
     Returns:

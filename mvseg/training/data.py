@@ -139,15 +139,10 @@ def list_coco(photos: Path, labels: Path) -> SampleList:
         raise InputError(f"{labels} has annotations of image {unlisted[0]}, which it does not list")
     class_of = {category: number for number, (category, _) in enumerate(categories, start=1)}
     samples = (
-        Sample(
-            name=image.file_name,
-            photo=photos / image.file_name,
-            annotations=tuple(annotations_of[image.id]),
-            size=(image.width, image.height),
-            class_of=class_of,
-        )
+        Sample(name=image.file_name, photo=photos / image.file_name, annotations=tuple(annotations_of[image.id]),
+               size=(image.width, image.height), class_of=class_of)
         for image in images
-    )
+    )  # fmt: skip
     return SampleList(tuple(samples), tuple(name for _, name in categories))
 
 
@@ -161,33 +156,28 @@ def read_sample(sample: Sample) -> LabelledPhoto:
         InputError: the photo or its label map is missing or cannot be read, sizes differ, or an annotation has an
             unknown category, no pixels, or a malformed mask. The message starts with the sample's name.
     """
-    if not sample.photo.is_file():
-        raise InputError(f"{sample.name}: the photo {sample.photo} is missing")
     try:
-        photo = read_rgb(sample.photo)
-    except InputError as error:
-        message = f"{sample.name}: the photo cannot be read, expected a whole image file: {error}"
-        raise InputError(message) from None
-    if sample.label_map is not None:
-        return label_photo(photo, read_label_map(sample, sample.label_map, photo.shape[:2]))
-    return read_annotations(sample, photo)
-
-
-def read_label_map(sample: Sample, path: Path, size: tuple[int, ...]) -> np.ndarray:
-    """The label map of a sample, checked against the (height, width) of its photo."""
-    if not path.is_file():
-        raise InputError(
-            f"{sample.name}: its label map {path} is missing (a photo without instances needs an all-zero one)"
-        )
-    try:
-        labels = read_labels(path)
+        if not sample.photo.is_file():
+            raise InputError(f"the photo {sample.photo} is missing")
+        try:
+            photo = read_rgb(sample.photo)
+        except InputError as error:
+            raise InputError(f"the photo cannot be read, expected a whole image file: {error}") from None
+        if sample.label_map is not None:
+            return label_photo(photo, read_label_map(sample.label_map, photo.shape[:2]))
+        return read_annotations(sample, photo)
     except InputError as error:
         raise InputError(f"{sample.name}: {error}") from None
+
+
+def read_label_map(path: Path, size: tuple[int, ...]) -> np.ndarray:
+    """A label map, checked against the (height, width) of its photo."""
+    if not path.is_file():
+        raise InputError(f"its label map {path} is missing (a photo without instances needs an all-zero one)")
+    labels = read_labels(path)
     if labels.shape != size:
-        raise InputError(
-            f"{sample.name}: its label map is {labels.shape[1]} x {labels.shape[0]} pixels, "
-            f"the photo {size[1]} x {size[0]}"
-        )
+        found = f"{labels.shape[1]} x {labels.shape[0]} pixels, the photo {size[1]} x {size[0]}"
+        raise InputError(f"its label map is {found}")
     return labels
 
 
@@ -195,13 +185,11 @@ def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
     """A photo with its COCO annotations; crowds become ignored pixels, but for those of other annotations."""
     height, width = photo.shape[:2]
     if sample.size is not None and sample.size != (width, height):
-        raise InputError(
-            f"{sample.name}: the photo is {width} x {height} pixels, "
-            f"its COCO entry says {sample.size[0]} x {sample.size[1]}"
-        )
+        stated = f"{sample.size[0]} x {sample.size[1]}"
+        raise InputError(f"the photo is {width} x {height} pixels, its COCO entry says {stated}")
     masks, classes, ignore = [], [], np.zeros((height, width), bool)
     for annotation in sample.annotations:
-        where = f"{sample.name}: annotation {annotation.id}"
+        where = f"annotation {annotation.id}"
         try:
             mask = decode_segmentation(annotation.segmentation, width, height)
         except InputError as error:
@@ -222,11 +210,8 @@ def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
 
 
 def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]:
-    """Read every sample once, in threads, with a progress bar.
-
-    Returns:
-        The number of instances of each sample (0 for a broken one), and index -> what is wrong with it.
-    """
+    """Read every sample once, in threads, with a progress bar: the number of instances of each (0 for a broken one),
+    and {index: what is wrong with it}."""
 
     def inspect(sample: Sample) -> int | str:
         try:
@@ -244,12 +229,7 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
 
 
 def keep_sound(samples: SampleList, what: str, *, skip_broken: bool) -> tuple[SampleList, dict[int, str]]:
-    """The samples that can be used, and what is wrong with the others.
-
-    Args:
-        samples: all that were found.
-        what: what to call them in the message, "training" or "validation".
-        skip_broken: go on without broken samples instead of raising.
+    """The samples that can be used, and what is wrong with the others; `what` they are called in messages.
 
     Raises:
         InputError: a sample is broken and `skip_broken` is off (the message counts them and describes the first three);

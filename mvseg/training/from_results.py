@@ -57,9 +57,8 @@ def list_results(folder: Path) -> SampleList:
         InputError: no result, one of a version that did not write what is needed, one without photos or without a mask
             to learn from, or whose photos are gone.
     """
-    found = (
-        [folder] if (folder / INSTANCES).is_file() else sorted(path.parent for path in folder.glob(f"*/{INSTANCES}"))
-    )
+    is_result = (folder / INSTANCES).is_file()
+    found = [folder] if is_result else sorted(path.parent for path in folder.glob(f"*/{INSTANCES}"))
     if not found:
         raise InputError(f"{folder}: holds no result (no {INSTANCES}), expected a folder that `mvseg infer` wrote")
     return SampleList(tuple(sample for result in found for sample in _list_photos(result)), ("leaf",))
@@ -69,10 +68,8 @@ def _list_photos(result: Path) -> list[Sample]:
     try:
         content, scene = read_json(result / INSTANCES, _Masks), read_json(result / RUN, _Run).config.scene
     except (OSError, InputError) as error:
-        reason = str(error).splitlines()[0]
-        raise InputError(
-            f"{result}: is no result of this version of mvseg ({reason}); run `mvseg infer` again"
-        ) from None
+        message = f"is no result of this version of mvseg ({str(error).splitlines()[0]}); run `mvseg infer` again"
+        raise InputError(f"{result}: {message}") from None
     if not any(mask.is_label for mask in content.annotations):
         raise InputError(f"{result}: holds no mask that is sure enough to learn from, expected a result with leaves")
     if not scene.is_dir():
@@ -82,20 +79,13 @@ def _list_photos(result: Path) -> list[Sample]:
     for image in sorted(content.images, key=lambda image: image.file_name):
         photo = photo_of.get(image.file_name)
         if photo is None or not photo.is_file():
-            raise InputError(
-                f"{result}: its photo {image.file_name} is not in {scene}, expected the photos of the result"
-            )
+            message = f"its photo {image.file_name} is not in {scene}, expected the photos of the result"
+            raise InputError(f"{result}: {message}")
         masks = tuple(
             mask.model_copy(update={"category_id": 1, "iscrowd": int(not mask.is_label)})
             for mask in content.annotations
             if mask.image_id == image.id
         )
-        sample = Sample(
-            name=f"{result.name}/{image.file_name}",
-            photo=photo,
-            annotations=masks,
-            size=(image.width, image.height),
-            class_of={1: 1},
-        )
-        samples.append(sample)
+        name, size = f"{result.name}/{image.file_name}", (image.width, image.height)
+        samples.append(Sample(name=name, photo=photo, annotations=masks, size=size, class_of={1: 1}))
     return samples

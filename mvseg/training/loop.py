@@ -17,6 +17,7 @@ best epoch by mask AP; without validation samples the last), checkpoint.pt, brok
 
 from __future__ import annotations
 
+import json
 import logging
 import math
 import sys
@@ -24,9 +25,11 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, nullcontext
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
+import yaml  # type: ignore[import-untyped]
 from torch import Tensor, nn
 from torch.nn.parallel import DistributedDataParallel
 from torch.utils.data import DataLoader
@@ -34,26 +37,18 @@ from torchvision.models.detection import MaskRCNN
 from tqdm import tqdm
 
 from mvseg.detectors.mask_rcnn import count_parameters
-from mvseg.detectors.weights_file import Description
+from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
 from mvseg.evaluation.average_precision import average_precision
-from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole
+from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole, write_whole
 from mvseg.training.augmentation import AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
 from mvseg.training.data import SampleList, keep_sound, list_samples
-from mvseg.training.files import (
-    append_record,
-    cut_log,
-    write_config,
-    write_metrics,
-    write_weights,
-)
 from mvseg.training.from_results import list_results
 from mvseg.training.precision import choose_bf16
 from mvseg.training.processes import Processes, join_processes
-from mvseg.training.schedule import learning_rate
-from mvseg.training.state import TrainingState, apply_gradients, save_state, start_state
+from mvseg.training.state import TrainingState, apply_gradients, learning_rate, save_state, start_state
 from mvseg.training.validation import detect_and_label
 
 logger = logging.getLogger(__name__)
@@ -184,11 +179,8 @@ def run_epochs(run: Run, state: TrainingState) -> None:
 def train_epoch(run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk]) -> None:
     """Do the remaining steps of the current epoch, with checkpoints on the way and one at the end.
 
-    Args:
-        run: what stays the same.
-        state: what changes.
-        network: the state's model, wrapped if several processes train.
-        chunks: this process's chunks from the state's step on.
+    `network` is the state's model, wrapped if several processes train; `chunks` are those of this process from the
+    state's step on.
 
     Raises:
         InputError: a loss or a gradient is not finite; the message names the photos.
@@ -201,22 +193,20 @@ def train_epoch(run: Run, state: TrainingState, *, network: nn.Module, chunks: I
         losses = add_gradients(run, state, network=network, chunks=chunks)
         if not apply_gradients(config, state, rate):
             batch = order_epoch(run.epoch_size, config.batch_size, seed=config.seed, epoch=epoch)[step]
-            raise not_finite(f"the gradient of {name_step(state)}", run, batch)
+            raise not_finite("gradient", run, state, batch)
         for name, value in losses.items():
             state.loss_sums[name] = state.loss_sums.get(name, 0.0) + value
         if run.processes.is_first:
             if state.step % config.log_every == 0:
-                append_record(config.output / "log.jsonl", {"step": state.step, "lr": rate, **losses})
+                with (config.output / "log.jsonl").open("a", encoding="utf-8") as log:
+                    log.write(json.dumps({"step": state.step, "lr": rate, **losses}) + "\n")
             if state.step % config.checkpoint_every == 0 or step == num_steps - 1:
                 save_state(state, config, run.samples)
 
 
 def add_gradients(run: Run, state: TrainingState, *, network: nn.Module, chunks: Iterator[Chunk]) -> dict[str, float]:
-    """Forward and backward of this process's chunks of a step.
-
-    Returns:
-        The losses and their sum "loss", averaged over all chunks of all processes.
-    """
+    """Forward and backward of this process's chunks of a step; the losses and their sum "loss", averaged over all
+    chunks of all processes."""
     processes, config = run.processes, run.config
     state.optimizer.zero_grad()
     numbers = range(processes.rank, config.num_chunks, processes.count)
@@ -233,21 +223,18 @@ def add_gradients(run: Run, state: TrainingState, *, network: nn.Module, chunks:
             losses = {name: value.float() for name, value in losses.items()}
             losses["loss"] = torch.stack(list(losses.values())).sum()
             if not math.isfinite(losses["loss"].item()):
-                raise not_finite(f"the loss of {name_step(state)}", run, indices)
+                raise not_finite("loss", run, state, indices)
             (losses["loss"] / len(numbers)).backward()
         for name, value in losses.items():
             sums[name] = sums.get(name, torch.zeros_like(value)) + value.detach() / config.num_chunks
     return processes.add_up(sums)
 
 
-def name_step(state: TrainingState) -> str:
-    return f"step {state.step} (epoch {len(state.history) + 1})"
-
-
-def not_finite(what: str, run: Run, indices: list[int]) -> InputError:
+def not_finite(what: str, run: Run, state: TrainingState, indices: list[int]) -> InputError:
     photos = [sample.name for sample in run.samples.samples]
     names = ", ".join(photos[index] if index < len(photos) else f"new plant {index}" for index in indices)
-    return InputError(f"{what} is not finite on {names}: look at these photos, or lower lr, or set precision to fp32")
+    which = f"the {what} of step {state.step} (epoch {len(state.history) + 1})"
+    return InputError(f"{which} is not finite on {names}: look at these photos, or lower lr, or set precision to fp32")
 
 
 def try_precision(run: Run, state: TrainingState) -> bool:
@@ -308,8 +295,23 @@ def open_files(run: Run, state: TrainingState) -> None:
     """Write the config, and cut the log to the state's step."""
     output = run.config.output
     sweep_folder(output)
-    write_config(output / "config.yaml", config_values(run.config))
+    write_text_whole(output / "config.yaml", yaml.safe_dump(config_values(run.config), sort_keys=False))
     cut_log(output / "log.jsonl", state.step)
+
+
+def cut_log(path: Path, step: int) -> None:
+    """Remove the records after `step`, and a torn last line: what a killed run did after its last checkpoint."""
+    if not path.is_file():
+        return
+    kept = []
+    for line in path.read_text(encoding="utf-8").splitlines():
+        try:
+            record = json.loads(line)
+        except json.JSONDecodeError:
+            break
+        if record["step"] <= step:
+            kept.append(line + "\n")
+    write_text_whole(path, "".join(kept))
 
 
 def close_epoch(run: Run, state: TrainingState) -> None:
@@ -317,7 +319,8 @@ def close_epoch(run: Run, state: TrainingState) -> None:
     config, output, best = run.config, run.config.output, best_epoch(state.history)
     if best == len(state.history) - 1:
         description = Description(config.arch, run.samples.categories, config.image_size)
-        write_weights(output / "model.safetensors", state.result, description)
+        weights = encode_weights(state.result.state_dict(), description)
+        write_whole(output / "model.safetensors", lambda partial: partial.write_bytes(weights))
     metrics = {
         "best_epoch": best,
         "best": state.history[best],
@@ -327,7 +330,7 @@ def close_epoch(run: Run, state: TrainingState) -> None:
         "num_validation_samples": 0 if run.held_out is None else len(run.held_out),
         "epochs": state.history,
     }
-    write_metrics(output / "metrics.json", metrics)
+    write_text_whole(output / "metrics.json", json.dumps(metrics, indent=2, allow_nan=False) + "\n")
     save_state(state, config, run.samples)
 
 

@@ -72,9 +72,8 @@ def place_camera(plant: Plant, size: int, rng: np.random.Generator) -> Cameras:
     from mvseg.simulation.cameras import arc_cameras
 
     elevation = math.degrees(math.asin(rng.uniform(-0.05, 0.998)))
-    cameras = arc_cameras(
-        1, plant, start_deg=rng.uniform(0, 360), elevations_deg=(elevation,), width=size, height=size
-    )
+    start = rng.uniform(0, 360)
+    cameras = arc_cameras(1, plant, start_deg=start, elevations_deg=(elevation,), width=size, height=size)
     leaf = torch.from_numpy(plant.leaves[rng.integers(len(plant.leaves))].vertices.mean(0))
     K = cameras.K.clone()
     K[:, :2, :2] *= math.exp(rng.uniform(math.log(0.6), math.log(4)))

@@ -69,12 +69,8 @@ def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
     """Put one to three objects in front that are not leaves: tapes, labels, sticks, discs and hands. All but hands take
     a colour of the photo itself in half of the cases, so that green alone does not make a leaf.
 
-    Args:
-        photo: (3, H, W) uint8.
-        layers: (L, H, W) int, k where instance k is; 0 where a thing hides it.
-
     Returns:
-        New tensors of the same shapes.
+        New tensors: photo (3, H, W) uint8 and layers (L, H, W) int, which are 0 where a thing hides an instance.
     """
     height, width = photo.shape[1:]
     rows, columns = torch.meshgrid(torch.arange(height), torch.arange(width), indexing="ij")
@@ -105,15 +101,9 @@ def add_clutter(photo: Tensor, layers: Tensor) -> tuple[Tensor, Tensor]:
 def tint_leaves(photo: Tensor, layers: Tensor) -> Tensor:
     """Give the leaves another colour, as those of coleus, beet, red lettuce or a silvery sage have; stems keep theirs.
 
-    All leaves of a photo (3, H, W) uint8 get the same hue, at different strengths; brightness is kept, up to one
-    factor.
-
-    Args:
-        photo: (3, H, W) uint8, RGB.
-        layers: (L, H, W) int, k where instance k is.
-
-    Returns:
-        A new photo. A detector that has seen green leaves only takes a red plant's stems for its leaves.
+    All leaves of a photo (3, H, W) uint8, given as layers (L, H, W), get the same hue, at different strengths;
+    brightness is kept, up to one factor. A detector that has seen green leaves only takes a red plant's stems for its
+    leaves.
     """
     color = torch.tensor(colorsys.hsv_to_rgb(draw(0, 1), draw(0, 0.8), 1.0))
     color = draw(0.6, 1.3) * color / float((LUMINANCE * color).sum())

@@ -19,9 +19,9 @@ from mvseg.detectors.run import leave_autocast
 from mvseg.detectors.weights_file import load_weights, read_weights
 from mvseg.detectors.zoo import find_weights, weights_path
 from mvseg.errors import InputError
+from mvseg.system.atomic import write_whole
 from mvseg.training.config import TrainConfig, config_difference, config_values
 from mvseg.training.data import SampleList
-from mvseg.training.files import read_checkpoint, write_checkpoint
 
 logger = logging.getLogger(__name__)
 
@@ -66,7 +66,8 @@ def start_state(
         model: a detector to train in place of `build_detector(config.arch, ...)`.
 
     Raises:
-        InputError: a checkpoint without `resume`, or one of another config or of other samples; see `build_detector`.
+        InputError: a checkpoint without `resume`, a damaged one, or one of another config or of other samples; see
+            `build_detector`.
     """
     checkpoint = config.output / "checkpoint.pt"
     if checkpoint.is_file() and not config.resume:
@@ -85,9 +86,7 @@ def start_state(
     averaged = copy.deepcopy(model).eval() if config.ema_decay else None
     state = TrainingState(model, build_optimizer(config, model), averaged)
     if checkpoint.is_file():
-        saved = read_checkpoint(checkpoint, device)
-        check_checkpoint(saved, config, samples)
-        restore_state(state, saved)
+        restore_state(state, read_checkpoint(checkpoint, device), config, samples)
         logger.info("resuming from step %d of %s", state.step, checkpoint)
     elif config.resume:
         logger.info("%s has no checkpoint yet: starting from the beginning", config.output)
@@ -109,17 +108,31 @@ def take_heads(model: MaskRCNN, path: Path) -> None:
         raise InputError(f"the heads of {path} do not fit: {error}") from error
 
 
-def check_checkpoint(saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
-    """Raises InputError unless a checkpoint's content was made with this config and these samples."""
+def read_checkpoint(path: Path, device: torch.device) -> dict[str, Any]:
+    """The content of a checkpoint; nothing in the file is executed.
+
+    Raises:
+        InputError: the file is not such a checkpoint.
+    """
+    try:
+        content = torch.load(path, map_location=device, weights_only=True)
+        content["model"], content["optimizer"], content["step"], content["config"]
+    except Exception as error:  # torch.load has no common exception for a damaged file
+        raise InputError(f"{path} is not a checkpoint of a training run ({type(error).__name__})") from error
+    return content
+
+
+def restore_state(state: TrainingState, saved: dict[str, Any], config: TrainConfig, samples: SampleList) -> None:
+    """Put a checkpoint's content into a fresh state.
+
+    Raises:
+        InputError: it was made with another config, or with other samples.
+    """
     difference = config_difference(saved["config"], config_values(config))
     if difference:
         raise InputError(f"the checkpoint in {config.output} was made with another {difference}, expected the same")
     if saved["samples"] != [sample.name for sample in samples.samples]:
         raise InputError(f"the checkpoint in {config.output} was made with other training samples, expected the same")
-
-
-def restore_state(state: TrainingState, saved: dict[str, Any]) -> None:
-    """Put a checkpoint's content into a fresh state."""
     state.model.load_state_dict(saved["model"])
     state.optimizer.load_state_dict(saved["optimizer"])
     if state.averaged is not None:
@@ -141,7 +154,7 @@ def save_state(state: TrainingState, config: TrainConfig, samples: SampleList) -
         "config": config_values(config),
         "samples": [sample.name for sample in samples.samples],
     }
-    write_checkpoint(config.output / "checkpoint.pt", content)
+    write_whole(config.output / "checkpoint.pt", lambda partial: torch.save(content, partial))
 
 
 def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimizer:
@@ -164,6 +177,24 @@ def build_optimizer(config: TrainConfig, model: nn.Module) -> torch.optim.Optimi
     if config.optimizer == "adamw":
         return torch.optim.AdamW(groups, lr=config.lr, fused=True)
     return torch.optim.SGD(groups, lr=config.lr, momentum=0.9)
+
+
+def learning_rate(config: TrainConfig, step: int, num_steps: int) -> float:
+    """The rate of step 0 <= step < num_steps, see `TrainConfig.lr`, `schedule` and `warmup_steps`.
+
+    A function of the step: unlike torch's schedulers it has no state that a checkpoint must hold.
+    """
+    scale = config.batch_size / 16
+    peak = config.lr * (scale if config.optimizer == "sgd" else math.sqrt(scale))
+    warmup = min(config.warmup_steps, num_steps // 10)
+    if step < warmup:
+        return peak * (step + 1) / (warmup + 1)
+    if config.schedule == "constant":
+        return peak
+    if config.schedule == "multistep":
+        return peak * 0.1 ** sum(step >= share * num_steps for share in (0.6, 0.85))
+    progress = (step - warmup) / (num_steps - warmup)
+    return peak * (0.01 + 0.99 * (1 + math.cos(math.pi * progress)) / 2)
 
 
 @torch.no_grad()

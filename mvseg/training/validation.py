@@ -14,15 +14,9 @@ from mvseg.training.data import SampleList, read_sample
 
 @torch.no_grad()
 def detect_and_label(model: MaskRCNN, samples: SampleList, indices: Iterable[int]) -> tuple[Annotations, Annotations]:
-    """Run a detector on samples and write down truth and detections as COCO annotations.
+    """Truth and detections (with "score") of those samples as COCO annotations without ids; the index is `image_id`.
 
-    Args:
-        model: in eval mode; photos go to the device of its parameters.
-        samples: all samples.
-        indices: which of them to run; the index becomes the annotations' `image_id`.
-
-    Returns:
-        Annotations of the truth, annotations of the detections (with "score"); without ids.
+    The model is in eval mode; photos go to the device of its parameters.
 
     Raises:
         InputError: a sample cannot be read.

@@ -15,8 +15,9 @@ from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.look import draw_look
 from mvseg.simulation.pot import Part
-from mvseg.simulation.ray_cast import Rendering, border_pixels, build_stage, render_stage, render_view
+from mvseg.simulation.ray_cast import Rendering, border_pixels, build_stage, render_stage
 from mvseg.simulation.shading import sample_texture
+from rendered import render_view
 
 SIZE = 40
 

@@ -18,8 +18,8 @@ from mvseg.scene import Cameras
 from mvseg.simulation import scene_writer
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
-from mvseg.simulation.ray_cast import render_view
 from mvseg.simulation.scene_writer import write_scene
+from rendered import render_view
 
 SIZE = 96
 

@@ -14,8 +14,8 @@ from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.look import draw_look, draw_wild_look
-from mvseg.simulation.ray_cast import render_view
 from mvseg.simulation.wild import SOIL_CLEARANCE, hang, make_wild, roll_up
+from rendered import render_view
 
 FLAT = place_blade(Blade(length=60, width=40, outline=(0.6, 0.8)), np.array([0.0, 0, 80]), azimuth=0.7, elevation=0.2)
 

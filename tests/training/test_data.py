@@ -73,9 +73,7 @@ def write_coco(folder: Path, annotations: list[dict[str, Any]], changes: dict[st
     return path
 
 
-def read_coco(
-    folder: Path, annotations: list[dict[str, Any]], changes: dict[str, Any] | None = None
-) -> LabelledPhoto:
+def read_coco(folder: Path, annotations: list[dict[str, Any]], changes: dict[str, Any] | None = None) -> LabelledPhoto:
     return read_sample(list_samples(folder / "photos", write_coco(folder, annotations, changes)).samples[0])
 
 

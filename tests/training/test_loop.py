@@ -246,9 +246,7 @@ def test_a_run_does_not_go_on_with_other_samples(tmp_path: Path) -> None:
         train(dataclasses.replace(config, resume=True), build_tiny())
 
 
-def test_processes_must_share_the_chunks_evenly(
-    leaves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processes_must_share_the_chunks_evenly(leaves: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     @contextmanager
     def three(device: str) -> Iterator[Processes]:
         yield Processes(0, 3, torch.device(device))

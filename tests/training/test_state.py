@@ -16,8 +16,8 @@ from mvseg.detectors.zoo import load_detector
 from mvseg.errors import InputError
 from mvseg.training.config import TrainConfig
 from mvseg.training.data import list_samples
-from mvseg.training.files import append_record, cut_log
-from mvseg.training.state import TrainingState, apply_gradients, build_optimizer, start_state
+from mvseg.training.loop import cut_log
+from mvseg.training.state import TrainingState, apply_gradients, build_optimizer, learning_rate, start_state
 from tiny_training import build_tiny, make_config, parse_config, write_photos
 
 # --- configs
@@ -154,14 +154,33 @@ def test_bfloat16_does_not_collapse_narrow_boxes_far_from_the_origin(tmp_path: P
     assert all(torch.isfinite(loss) for loss in sound.values())
 
 
+# --- learning rates
+
+
+def test_learning_rate_warms_up_and_falls() -> None:
+    config = make_config(Path(), Path(), lr=1.0, batch_size=16, warmup_steps=4)
+    rates = [learning_rate(config, step, 100) for step in range(100)]
+    assert rates[:5] == pytest.approx([0.2, 0.4, 0.6, 0.8, 1.0])
+    assert rates[4:] == sorted(rates[4:], reverse=True)
+    assert rates[52] == pytest.approx(0.505)
+    assert 0.01 < rates[-1] < 0.011
+    drops = [learning_rate(dataclasses.replace(config, schedule="multistep"), step, 100) for step in (10, 59, 60, 85)]
+    assert drops == pytest.approx([1.0, 1.0, 0.1, 0.01])
+    assert learning_rate(config, 0, 10) == 0.5  # ten steps: one of warm-up
+
+
+@pytest.mark.parametrize(("optimizer", "factor"), [("sgd", 0.25), ("adamw", 0.5)])
+def test_learning_rate_scales_with_the_global_batch(optimizer: Any, factor: float) -> None:
+    config = make_config(Path(), Path(), lr=1.0, batch_size=4, warmup_steps=0, optimizer=optimizer)
+    assert learning_rate(config, 0, 100) == pytest.approx(factor)
+
+
 # --- files
 
 
 def test_a_log_is_cut_where_the_run_goes_on(tmp_path: Path) -> None:
     log = tmp_path / "log.jsonl"
-    for step in (1, 2, 3):
-        append_record(log, {"step": step})
-    log.write_text(log.read_text() + '{"step": 4, "lo')
+    log.write_text('{"step": 1}\n{"step": 2}\n{"step": 3}\n{"step": 4, "lo')
     cut_log(log, 2)
     assert log.read_text() == '{"step": 1}\n{"step": 2}\n'
     cut_log(tmp_path / "none.jsonl", 2)
