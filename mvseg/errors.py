@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -16,6 +18,14 @@ class InputError(ValueError):
 
 class InputWarning(UserWarning):
     """The input is odd but usable; the message says what was done about it. Kept in a result's `run.json`."""
+
+
+def warn(sentence: str) -> None:
+    """Warn (InputWarning), as of the line outside of this package that led here."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mvseg."):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(sentence, InputWarning, stacklevel=level)
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.checks.contradictions import warn_of_contradictions
+from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import RunConfig
 from mvseg.corrections.apply import apply, apply_everywhere, fates_everywhere
 from mvseg.corrections.file import Corrections, load_corrections

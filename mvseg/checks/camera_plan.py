@@ -18,15 +18,12 @@ def draw_cameras(scene: Scene, coverage: Coverage, off: tuple[int, ...] = ()) ->
     """(900, 900, 3) uint8 RGB: a plan of the cameras.
 
     It shows the plane across `scene.up`, or the plane in which the cameras spread most. Cameras are arrows with their
-    numbers; red ones look past the point (a green dot) or are in `off`.
-
-    Args:
-        scene: of V cameras.
-        coverage: of these.
-        off: views whose masks agree with no other view.
+    numbers; red ones look past the point (a green dot) or are in `off`, the views whose poses are wrong.
     """
     cameras = scene.cameras
-    axes = _plan_axes(scene)
+    # axes (2, 3): the directions of the world that the picture shows as right and up
+    away = cameras.centers.numpy() - cameras.centers.mean(0).numpy()
+    axes = np.linalg.svd(away)[2][:2] if scene.up is None else np.linalg.svd(np.array([scene.up]))[2][1:]
     centers, gaze = cameras.centers.numpy() @ axes.T, cameras.R[:, 2].numpy() @ axes.T
     shown = np.vstack([centers, coverage.point @ axes.T])
     low, high = shown.min(0), shown.max(0)
@@ -48,11 +45,3 @@ def draw_cameras(scene: Scene, coverage: Coverage, off: tuple[int, ...] = ()) ->
         at = (start[0] + 9, start[1] - 9)
         cv2.putText(picture, str(view), at, cv2.FONT_HERSHEY_SIMPLEX, 0.55, color, 1, cv2.LINE_AA)
     return picture
-
-
-def _plan_axes(scene: Scene) -> NDArray[np.float64]:
-    """(2, 3): the directions of the world that the picture shows as right and up."""
-    if scene.up is None:
-        centers = scene.cameras.centers.numpy()
-        return np.asarray(np.linalg.svd(centers - centers.mean(0), full_matrices=True)[2][:2])
-    return np.asarray(np.linalg.svd(np.array([scene.up]), full_matrices=True)[2][1:])

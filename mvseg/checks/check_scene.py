@@ -1,4 +1,4 @@
-"""All checks of one scene, as a report that the command prints and a page can show."""
+"""All checks of one scene, as a report that the command prints and a page can show; or as the warnings of a run."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from mvseg.checks.masks import mask_findings
 from mvseg.checks.photo_matches import match_photos
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
+from mvseg.errors import warn
 from mvseg.formats.photos import read_photo
 from mvseg.matching.match import check_views
 from mvseg.matching.pencil import is_coincident
@@ -76,8 +77,7 @@ def check_scene(
             findings += pose_findings(agreement, names) + group_findings(agreement, names)
     if features:
         is_said = any(each.where == "poses" and each.level == "error" for each in findings)
-        matches = match_photos(partial(read_photo, scene), scene.cameras, progress=progress)
-        findings += distance_findings(matches, scene.cameras, names, only_focal=is_said)
+        findings += _compare_photos(scene, only_focal=is_said, progress=progress)
     return Check(
         scene=scene,
         regions=regions,
@@ -86,3 +86,28 @@ def check_scene(
         photos=tuple(photos),
         agreement=agreement,
     )
+
+
+def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = True, progress: bool = False) -> None:
+    """Warn (InputWarning) of views that agree in groups only, and of focal lengths that the photos contradict.
+
+    Groups of views are found by masks, or else by photos. The matching warns of single views that disagree.
+
+    Args:
+        scene: of V >= 2 views.
+        regions: its masks.
+        photos: compare features of the photos, if there are any, too; takes about 0.1 s per photo.
+        progress: show progress bars.
+    """
+    scene = replace(scene, cameras=scene.cameras.to("cpu"))
+    agreement = pairwise_agreement(regions, scene.cameras)
+    findings = group_findings(agreement, tuple(view.name for view in scene.views))
+    if photos:
+        findings += _compare_photos(scene, only_focal=bool(findings), progress=progress)
+    for finding in findings:
+        warn(finding.what)
+
+
+def _compare_photos(scene: Scene, *, only_focal: bool, progress: bool) -> list[Finding]:
+    matches = match_photos(partial(read_photo, scene), scene.cameras, progress=progress)
+    return distance_findings(matches, scene.cameras, tuple(view.name for view in scene.views), only_focal=only_focal)

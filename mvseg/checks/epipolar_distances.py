@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mvseg.checks.finding import Finding, name_views
+from mvseg.checks.finding import Finding, Rule, list_findings, name_views
 from mvseg.checks.groups import NAMED, NEXT_STEP
 from mvseg.checks.photo_matches import PhotoMatches
 from mvseg.scene import Cameras
@@ -39,28 +39,25 @@ def distance_findings(
     """How the features of the photos contradict the cameras.
 
     Nothing if too few features match (plain leaves before black cloth), or if most of them do not move between photos:
-    on a turntable, what does not turn says nothing about the cameras.
-
-    Args:
-        matches: see `match_photos`.
-        cameras: V cameras on the CPU.
-        names: of the V views.
-        only_focal: skip poses, of which the masks have warned already.
+    on a turntable, what does not turn says nothing about the cameras. With `only_focal` poses are skipped: masks have
+    warned of them already.
     """
     num_still = sum(pair.num_still for pair in matches)
     if num_still > sum(pair.xy.shape[1] for pair in matches):
         return []
-    telling = [pair for pair in matches if pair.is_telling]
-    factor = focal_factor(telling, cameras)
-    findings = []
+    significant = [pair for pair in matches if pair.is_significant]
+    factor = focal_factor(significant, cameras)
+    rules: list[Rule] = []
     if factor != 1:
-        before, after = (_median_px(telling, cameras, each) for each in (1.0, factor))
+        before, after = (_median_px(significant, cameras, each) for each in (1.0, factor))
         facts = f"features of the photos miss their epipolar lines by {before:.1f} px, and by {after:.1f} px with that"
         what = f"the focal lengths seem wrong, expected about {factor:.2f} times as much ({facts}): is K that of these "
         what += "photos, of this zoom and in pixels of this size?"
-        findings.append(Finding(where="poses", what=what, level="error"))
+        rules.append(("error", None, what))
         cameras = scale_focal(cameras, factor)
-    return findings if only_focal else findings + _pose_findings(telling, cameras, names)
+    if not only_focal:
+        rules += _pose_rules(significant, cameras, names)
+    return list_findings("poses", rules, names)
 
 
 def focal_factor(matches: Sequence[PhotoMatches], cameras: Cameras) -> float:
@@ -71,7 +68,7 @@ def focal_factor(matches: Sequence[PhotoMatches], cameras: Cameras) -> float:
     """
     if len(matches) < FEWEST_PAIRS:
         return 1.0
-    cost = np.array([[_miss(pair, cameras, factor) for pair in matches] for factor in FACTORS])
+    cost = np.array([[_median_distance(pair, cameras, factor) for pair in matches] for factor in FACTORS])
     best, given = int(np.median(cost, axis=1).argmin()), len(FACTORS) // 2
     is_inside = 0 < best < len(FACTORS) - 1
     is_far = abs(np.log(FACTORS[best])) > LEAST_ERROR
@@ -104,7 +101,7 @@ def epipolar_distances(xy: Floats, F: Floats) -> Floats:
     return np.asarray(np.abs((other * lines).sum(1)) / slope.clip(min=1e-300))
 
 
-def _miss(pair: PhotoMatches, cameras: Cameras, factor: float = 1) -> float:
+def _median_distance(pair: PhotoMatches, cameras: Cameras, factor: float = 1) -> float:
     """Units, median epipolar distance of the features that fit one fundamental matrix, with focal lengths `factor`
     times as long: as if the photos were as much smaller about their principal points."""
     centers = cameras.K[list(pair.views), None, :2, 2].numpy()
@@ -113,25 +110,26 @@ def _miss(pair: PhotoMatches, cameras: Cameras, factor: float = 1) -> float:
 
 
 def _median_px(matches: Sequence[PhotoMatches], cameras: Cameras, factor: float = 1) -> float:
-    return float(np.median([_miss(pair, cameras, factor) * pair.unit_px for pair in matches]))
+    return float(np.median([_median_distance(pair, cameras, factor) * pair.unit_px for pair in matches]))
 
 
-def _pose_findings(telling: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
-    """The pairs of views that contradict their cameras, as one finding; one pair among others may be a mistake."""
-    shares = [_fitting_share(pair, cameras) for pair in telling]
-    wrong = [pair for pair, share in zip(telling, shares, strict=True) if share < CONTRADICTS]
-    if not wrong or (len(wrong) == 1 and len(telling) > 1):
+def _pose_rules(significant: Sequence[PhotoMatches], cameras: Cameras, names: tuple[str, ...]) -> list[Rule]:
+    """The pairs of views that contradict their cameras, as one rule; one pair among others may be a mistake."""
+    shares = []  # of the features that fit one fundamental matrix: those that fit that of the cameras
+    for pair in significant:
+        fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < OFFSET * pair.unit_px
+        shares.append(float(fits.sum() / pair.is_rigid.sum()))
+    wrong = [pair for pair, share in zip(significant, shares, strict=True) if share < CONTRADICTS]
+    if not wrong or (len(wrong) == 1 and len(significant) > 1):
         return []
-    agreeing = [pair.views for pair, share in zip(telling, shares, strict=True) if share > AGREES]
-    facts = f"in {len(wrong)} of {len(telling)} pairs of photos they miss by {_median_px(wrong, cameras):.0f} px"
+    agreeing = [pair.views for pair, share in zip(significant, shares, strict=True) if share > AGREES]
+    facts = f"in {len(wrong)} of {len(significant)} pairs of photos they miss by {_median_px(wrong, cameras):.0f} px"
     few, many = _sides(agreeing, [pair.views for pair in wrong], len(names))
     if not few:
-        what = f"features of the photos contradict the cameras ({facts}): {QUESTION}"
-    else:
-        between = " and those of ".join(name_views(side, names, shown=NAMED) for side in (few, many))
-        step = ONE_STEP if len(few) == 1 else NEXT_STEP
-        what = f"features of the photos do not fit both the cameras of {between} ({facts}): {step}"
-    return [Finding(where="poses", what=what, level="error", views=few)]
+        return [("error", None, f"features of the photos contradict the cameras ({facts}): {QUESTION}")]
+    between = " and those of ".join(name_views(side, names, shown=NAMED) for side in (few, many))
+    step = ONE_STEP if len(few) == 1 else NEXT_STEP
+    return [("error", few, f"features of the photos do not fit both the cameras of {between} ({facts}): {step}")]
 
 
 def _sides(
@@ -151,9 +149,3 @@ def _sides(
     sides = [tuple(np.flatnonzero(np.isin(group, side)).tolist()) for side in (shared[:1], sorted(others))]
     few, many = sorted(sides, key=lambda side: (len(side), side))
     return few, many
-
-
-def _fitting_share(pair: PhotoMatches, cameras: Cameras) -> float:
-    """Number of features that fit the cameras, over the number that fit one fundamental matrix."""
-    fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < OFFSET * pair.unit_px
-    return float(fits.sum() / pair.is_rigid.sum())

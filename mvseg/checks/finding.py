@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 Level = Literal["note", "warning", "error"]
-Rule = tuple[Level, Sequence[int], str]  # views, and a sentence in which "{}" stands for them
+# Views (None: the whole scene), and a sentence in which "{}" stands for them.
+Rule = tuple[Level, Sequence[int] | None, str]
+SHOWN = 3  # names in a sentence
 
 
 @dataclass(frozen=True)
@@ -28,9 +30,6 @@ class Finding:
     views: tuple[int, ...] = ()
 
 
-SHOWN = 3  # names in a sentence
-
-
 def name_views(views: tuple[int, ...], names: tuple[str, ...], *, shown: int = SHOWN) -> str:
     """The views in a sentence: "view 3 (003)", or "5 views (000, 001, 002 and 2 more)"."""
     if len(views) == 1:
@@ -40,9 +39,11 @@ def name_views(views: tuple[int, ...], names: tuple[str, ...], *, shown: int = S
 
 
 def list_findings(where: str, rules: Iterable[Rule], names: tuple[str, ...]) -> list[Finding]:
-    """A finding for each rule that has views."""
-    return [
-        Finding(where=where, what=what.replace("{}", name_views(tuple(views), names)), level=level, views=tuple(views))
-        for level, views, what in rules
-        if views
-    ]
+    """A finding for each rule that has views, or is about the whole scene."""
+    findings = []
+    for level, indices, what in rules:
+        views = tuple(indices or ())
+        if views or indices is None:
+            said = what.replace("{}", name_views(views, names)) if views else what
+            findings.append(Finding(where=where, what=said, level=level, views=views))
+    return findings

@@ -11,7 +11,7 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.checks.finding import Finding, Level, name_views
+from mvseg.checks.finding import Finding, Level, list_findings, name_views
 from mvseg.checks.poses import OFFSET, PoseAgreement, is_sure, view_agreement
 
 Floats = NDArray[np.float64]
@@ -51,18 +51,12 @@ def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding
         return []
     members = [np.array(group) for group in groups]
     within = np.concatenate([_upper(pairs.fitting, group) for group in members])
-    between = np.concatenate([_block(pairs, one, other)[0] for one, other in combinations(members, 2)])
+    between = np.concatenate([_block(pairs.fitting, one, other) for one, other in combinations(members, 2)])
     facts = f"{np.nanmean(between):.0%} of the masks fit instead of {np.nanmean(within):.0%}"
     each = " and ".join(f"within {name_views(group, names, shown=NAMED)}" for group in groups)
     level: Level = "error" if is_sure(pairs) else "warning"
-    return [
-        Finding(
-            where="poses",
-            what=f"masks and poses agree {each}, but not between these groups ({facts}): {NEXT_STEP}",
-            level=level,
-            views=tuple(sorted(view for group in groups[1:] for view in group)),
-        )
-    ]
+    what = f"masks and poses agree {each}, but not between these groups ({facts}): {NEXT_STEP}"
+    return list_findings("poses", [(level, sorted(view for group in groups[1:] for view in group), what)], names)
 
 
 def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.int64]] | None:
@@ -88,7 +82,7 @@ def _order(pairs: PoseAgreement, members: NDArray[np.int64]) -> NDArray[np.int64
 
 def _contrast(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> float:
     """Share of the masks that fit between two groups over the share within them, corrected for chance; 1 if unknown."""
-    between, _ = _block(pairs, one, other)
+    between = _block(pairs.fitting, one, other)
     within = np.concatenate((_upper(pairs.fitting, one), _upper(pairs.fitting, other)))
     if np.isnan(between).all() or np.isnan(within).all():
         return 1.0
@@ -98,14 +92,14 @@ def _contrast(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.in
 def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
     """Whether epipolar lines miss in half of the pairs between two groups, but not within both: one of them may be of
     two worlds itself."""
-    within = [np.nanmedian(values) for values in (_upper(pairs.offset, one), _upper(pairs.offset, other))
-              if not np.isnan(values).all()]  # fmt: skip
-    return bool(np.nanmedian(_block(pairs, one, other)[1]) >= OFFSET > min(within))
+    of_groups = [_upper(pairs.offset, one), _upper(pairs.offset, other)]
+    within = [np.nanmedian(offsets) for offsets in of_groups if not np.isnan(offsets).all()]
+    return bool(np.nanmedian(_block(pairs.offset, one, other)) >= OFFSET > min(within))
 
 
-def _block(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> tuple[Floats, Floats]:
-    """Fitting and offset of all pairs between two groups."""
-    return pairs.fitting[np.ix_(one, other)].ravel(), pairs.offset[np.ix_(one, other)].ravel()
+def _block(values: Floats, one: NDArray[np.int64], other: NDArray[np.int64]) -> Floats:
+    """Of all pairs between two groups."""
+    return np.asarray(values[np.ix_(one, other)].ravel())
 
 
 def _upper(values: Floats, members: NDArray[np.int64]) -> Floats:

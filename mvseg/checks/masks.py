@@ -19,51 +19,46 @@ BEYOND = 0.1  # of the photo's longer side: how far small components reach beyon
 
 def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
     """The findings about the D masks of V views."""
-    if not len(regions):
-        what = "the masks of all views are empty: there are no instances to match"
-        return [Finding(where="masks", what=what, level="error")]
-    return [
-        *_count_findings(regions.num_per_view.numpy(), names),
-        *_size_findings(regions, cameras, names),
-        *_small_component_findings(regions, cameras, names),
-    ]
-
-
-def _count_findings(counts: NDArray[np.int64], names: tuple[str, ...]) -> list[Finding]:
-    empty = np.flatnonzero(counts == 0).tolist()
-    if len(counts) - len(empty) < 2:
-        what = "only one view has masks, so that there is nothing to match: segment the other photos"
-        return [Finding(where="masks", what=what, level="error", views=tuple(empty))]
-    usual = float(np.median(counts[counts > 0]))
-    few = np.flatnonzero((counts > 0) & (counts < FEW * usual)).tolist()
-    facts = f"there are {counts[counts > 0].min()} masks in {{}} where {usual:.0f} are usual"
-    rules: list[Rule] = [
-        ("warning", empty, "there are no masks in {}: is the plant hidden there, or a file missing?"),
-        ("warning", few, f"{facts}: are some missing?"),
-    ]
+    rules: list[Rule] = [("error", None, "the masks of all views are empty: there are no instances to match")]
+    if len(regions):
+        rules = [*_count_rules(regions.num_per_view.numpy()), *_size_rules(regions, cameras)]
+        rules.append(_small_component_rule(regions, cameras))
     return list_findings("masks", rules, names)
 
 
-def _size_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
-    findings = []
+def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
+    empty = np.flatnonzero(counts == 0).tolist()
+    if len(counts) - len(empty) < 2:
+        what = "only one view has masks, so that there is nothing to match: segment the other photos"
+        return [("error", empty, what)]
+    usual = float(np.median(counts[counts > 0]))
+    few = np.flatnonzero((counts > 0) & (counts < FEW * usual)).tolist()
+    facts = f"there are {counts[counts > 0].min()} masks in {{}} where {usual:.0f} are usual"
+    return [
+        ("warning", empty, "there are no masks in {}: is the plant hidden there, or a file missing?"),
+        ("warning", few, f"{facts}: are some missing?"),
+    ]
+
+
+def _size_rules(regions: Regions, cameras: Cameras) -> list[Rule]:
+    rules: list[Rule] = []
     areas, view = regions.areas.numpy(), regions.view_index
     tiny = areas < TINY_PX
     if tiny.mean() > MANY:
         sizes = f"fewer than {TINY_PX} pixels (median {np.median(areas):.0f})"
         what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove small components, or segment larger photos"
-        findings.append(Finding(where="masks", what=what, level="warning"))
+        rules.append(("warning", None, what))
     photo = cameras.sizes[view].prod(1).numpy()
     whole = sorted(set(view.numpy()[areas > COVERS * photo].tolist()))
-    what = f"a mask covers more than {COVERS:.0%} of {{}}: if it is the background, make it 0"
-    findings += list_findings("masks", [("error", whole, what)], names)
+    rules.append(("error", whole, f"a mask covers more than {COVERS:.0%} of {{}}: if it is the background, make it 0"))
     cut = touches_border(regions, cameras).numpy()
     if cut.mean() > MANY:
         what = f"{cut.sum()} of {len(regions)} masks touch the border of their photo, and cut leaves come out small: "
-        findings.append(Finding(where="masks", what=f"{what}step back, or add photos", level="warning"))
-    return findings
+        rules.append(("warning", None, f"{what}step back, or add photos"))
+    return rules
 
 
-def _small_component_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
+def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:
     """Masks with stray pixels, which make the search volume for the leaf's shape much too large."""
     longest = cameras.sizes.amax(1).tolist()
     views: set[int] = set()
@@ -73,5 +68,4 @@ def _small_component_findings(regions: Regions, cameras: Cameras, names: tuple[s
         reach = max(crop.shape[axis] - np.ptp(np.flatnonzero(kept.any(1 - axis))) - 1 for axis in (0, 1))
         if reach > BEYOND * longest[view]:
             views.add(view)
-    what = "masks of {} have stray pixels far from the rest of them: remove small components"
-    return list_findings("masks", [("warning", sorted(views), what)], names)
+    return "warning", sorted(views), "masks of {} have stray pixels far from the rest of them: remove small components"

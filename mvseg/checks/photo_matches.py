@@ -50,7 +50,7 @@ class PhotoMatches:
     unit_px: float
 
     @property
-    def is_telling(self) -> bool:
+    def is_significant(self) -> bool:
         """Whether enough features fit one fundamental matrix to rule out chance."""
         return bool(self.is_rigid.sum() >= max(FEWEST, LEAST_SHARE * len(self.is_rigid)))
 

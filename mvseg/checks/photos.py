@@ -47,6 +47,11 @@ class PhotoFacts:
     grey: bool = False
     digest: str = ""
 
+    @property
+    def is_blank(self) -> bool:
+        """Whether it has one colour all over. A dark photo of a plant has little contrast, too."""
+        return self.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * self.level))
+
 
 def read_photo_facts(scene: Scene, *, progress: bool = False) -> list[PhotoFacts]:
     """One entry per view; each photo is decoded once."""
@@ -55,32 +60,24 @@ def read_photo_facts(scene: Scene, *, progress: bool = False) -> list[PhotoFacts
 
 
 def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) -> list[Finding]:
-    """What is wrong with the photos of V views.
-
-    Args:
-        facts: V entries.
-        scene: whose cameras and names they are compared with.
-        has_masks: masks are given, so that all photos may be missing.
-    """
+    """What is wrong with the photos of V views, by V entries; all may be missing where masks are given."""
     names = tuple(view.name for view in scene.views)
     missing = tuple(view for view, each in enumerate(facts) if each.size is None and not each.problem)
-    if len(missing) == len(facts):
-        if has_masks:
-            what = "there are no photos: traits have no colours, and overlays are grey"
-            return [Finding(where="photos", what=what, level="note")]
-        what = f"there are neither photos nor masks: add {scene.views[0].path} and the others, or give --masks"
-        return [Finding(where="photos", what=f"{what}{_beside(scene, 0)}", level="error")]
-    what = ""
+    rules: list[Rule] = []
     if missing:
         first = scene.views[missing[0]].path
-        what = f"{{}}: no photo, the first is {first}; add it, or take its camera out{_beside(scene, missing[0])}"
-    broken: list[Rule] = [
-        ("error", (view,), f"the photo of {{}} cannot be read ({each.problem}): export it again")
-        for view, each in enumerate(facts)
-        if each.problem
-    ]
-    rules: list[Rule] = [("error", missing, what), *broken, *_size_rules(facts, scene), *_content_rules(facts)]
-    return list_findings("photos", rules, names)
+        beside = describe_folder(first.parent)
+        rules.append(
+            ("error", missing, f"{{}}: no photo, the first is {first}; add it, or take its camera out{beside}")
+        )
+        what = f"there are neither photos nor masks: add {first} and the others, or give --masks{beside}"
+    if len(missing) == len(facts):
+        note = "there are no photos: traits have no colours, and overlays are grey"
+        rules = [("note", None, note) if has_masks else ("error", None, what)]
+    for view, each in enumerate(facts):
+        if each.problem:
+            rules.append(("error", (view,), f"the photo of {{}} cannot be read ({each.problem}): export it again"))
+    return list_findings("photos", [*rules, *_size_rules(facts, scene), *_content_rules(facts)], names)
 
 
 def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
@@ -102,7 +99,7 @@ def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
 
 def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     whole = [view for view, each in enumerate(facts) if each.size is not None]
-    blank = [view for view in whole if _is_blank(facts[view])]
+    blank = [view for view in whole if facts[view].is_blank]
     shown = [view for view in whole if view not in blank]
     dark = [view for view in shown if facts[view].level < DARK]
     burnt = [view for view in shown if facts[view].burnt > BURNT]
@@ -119,18 +116,6 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
         ("note", grey, "the photos of {} are grey: leaf colours and greenness are not measured in them"),
         *(("error", views, "{} are the same photo: check which one belongs to which camera") for views in twins),
     ]
-
-
-def _is_blank(photo: PhotoFacts) -> bool:
-    """Whether a photo has one colour all over. A dark photo of a plant has little contrast, too, so contrast is judged
-    relative to its level."""
-    return photo.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * photo.level))
-
-
-def _beside(scene: Scene, view: int) -> str:
-    """What is in the folder where the photo of a view is missing, as the end of a sentence."""
-    beside = describe_folder(scene.views[view].path.parent)
-    return f"; {beside}" if beside else ""
 
 
 def _read_facts(scene: Scene, view: int) -> PhotoFacts:

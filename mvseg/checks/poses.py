@@ -139,26 +139,21 @@ def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
 def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]:
     """Views whose poses and masks contradict the others.
 
-    Args:
-        pairs: of V views.
-        names: of the V views.
-
-    Returns:
-        An error for each view that agrees with none, or one for the whole scene if most do not (warnings where views
-        or masks are few); a warning for lines that miss a little. Nothing where there are no masks to compare.
+    An error for each view that agrees with none, or one for the whole scene if most do not (warnings where views or
+    masks are few); a warning for lines that miss a little. Nothing where there are no masks to compare.
     """
     view = view_agreement(pairs)
     compared = pairs.num_masks[pairs.num_masks > 0]
     if not len(compared):
         return []
     level: Level = "error" if is_sure(pairs) else "warning"
+    rules: list[Rule] = []
     if not view.agree:
         share, px = np.nanmedian(view.fitting), np.nanmedian(view.offset_px)
         facts = f"only {share:.0%} of the masks end where others do, epipolar lines miss by {px:.0f} px or more"
         question = "do R and t map world points to the camera, and does each mask belong to its photo?"
-        what = f"masks and poses of most views disagree ({facts}): {question}"
-        return [Finding(where="poses", what=what, level=level)]
-    rules: list[Rule] = []
+        rules = [(level, None, f"masks and poses of most views disagree ({facts}): {question}")]
+        return list_findings("poses", rules, names)
     for index in view.off:
         facts = f"{view.fitting[index]:.0%} of its masks fit, epipolar lines miss by {view.offset_px[index]:.0f} px"
         step = "it has the pose or the masks of another photo, or was moved; correct it or leave it out"
@@ -207,7 +202,7 @@ def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
     return _Spans(spans[is_span], pitches[is_span])
 
 
-def _misses(first: _Spans, second: _Spans, moves: Tensor) -> Tensor:
+def _residuals(first: _Spans, second: _Spans, moves: Tensor) -> Tensor:
     """(S, N, M) pixels: how far the masks of two views are from beginning and ending together, after S moves (S, M) of
     the second view's masks, radians."""
     apart = first.ends[:, None] - second.ends
@@ -224,8 +219,8 @@ def _beats_chance(first: _Spans, second: _Spans) -> tuple[Tensor, Tensor]:
     steps = torch.arange(NUM_MOVES + 1).double()[:, None] / (NUM_MOVES + 1)
     moves = low + (middle - low + steps * reach) % reach.clamp(min=1e-12) - middle
     moves[0] = 0
-    misses = _misses(first, second, moves)
-    best = misses.amin(2), misses.amin(1)
+    residuals = _residuals(first, second, moves)
+    best = residuals.amin(2), residuals.amin(1)
     return best[0][0] < best[0][1:].amin(0), best[1][0] < best[1][1:].amin(0)
 
 
@@ -233,7 +228,7 @@ def _offset(first: _Spans, second: _Spans, unit_px: float) -> float:
     """The move, in units and without sign, at which most masks of two views begin and end together."""
     units = torch.arange(-MOST_OFFSET, MOST_OFFSET + 1).double()
     apart = (first.ends[:, None] - second.ends) / torch.hypot(first.pitch[:, None], second.pitch) / unit_px
-    misses = (apart - units[:, None, None, None]).abs().amax(3)
-    votes = sum(torch.exp(-((misses.amin(axis) / SHARPNESS) ** 2)).sum(1) for axis in (1, 2))
+    residuals = (apart - units[:, None, None, None]).abs().amax(3)
+    votes = sum(torch.exp(-((residuals.amin(axis) / SHARPNESS) ** 2)).sum(1) for axis in (1, 2))
     assert isinstance(votes, Tensor)
     return float(units[votes == votes.max()].abs().min())

@@ -1,23 +1,19 @@
-"""`mvseg batch`: many scenes, one after another or side by side, and their traits in one table."""
+"""Many scenes, one after another or side by side, and their traits in one table; see docs/batch.md."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.cli.options import DEFAULT_OUT, add_run_options, build_run
-from mvseg.errors import InputError
+from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_run, read_workers
 
 SOME_FAILED = 3
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    about = "Many scenes, one after another or side by side, and their traits in one table; see docs/batch.md."
-    parser = ArgumentParser(exit_on_error=False, description=about)
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     help_scenes = "CSV table (columns scene, and if you like name, masks, plant, time, ...), or folder of scene folders"
     parser.add_argument("scenes", type=Path, help=help_scenes)
     add_run_options(parser)
@@ -25,9 +21,7 @@ def add(verbs: Any) -> None:
     parser.add_argument("--resume", type=bool, default=False, help=help_resume)
     help_workers = "scenes worked on at once, each in a process of its own on one thread (default: 1)"
     parser.add_argument("--num_workers", type=int | None, help=help_workers)
-    help_scheduler = "work on a Dask cluster instead: the scheduler's address, or its file"
-    parser.add_argument("--scheduler", type=str | None, help=help_scheduler)
-    verbs.add_subcommand("batch", parser, help="many scenes, one table of traits")
+    add_shared(parser, "scheduler")
 
 
 def run(args: Namespace) -> int:
@@ -35,8 +29,6 @@ def run(args: Namespace) -> int:
     from mvseg.batch.run_batch import run_batch  # keeps --help and wrong options quick
     from mvseg.formats.photos import scene_name
 
-    if args.scheduler is not None and args.num_workers is not None:
-        raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
     out = args.out or DEFAULT_OUT / Path(scene_name(args.scenes)).stem
     counts = run_batch(
         args.scenes,
@@ -44,7 +36,7 @@ def run(args: Namespace) -> int:
         build_run(args),
         masks=args.masks,
         resume=args.resume,
-        num_workers=1 if args.num_workers is None else args.num_workers,
+        num_workers=read_workers(args),
         scheduler=args.scheduler,
         quiet=args.quiet,
     )

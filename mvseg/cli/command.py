@@ -8,6 +8,7 @@ import sys
 import warnings
 from collections.abc import Sequence
 from importlib.util import find_spec
+from types import ModuleType
 from typing import TextIO
 
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
@@ -17,26 +18,37 @@ from mvseg.cli import batch, check, correct, export, infer, match, models, pose,
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
-from mvseg.cli.short_help import shorten_help
 from mvseg.errors import InputError, InputWarning
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
 TERMINATED = 143
 ABOUT = "The same instance, with the same id, in every calibrated view and in 3D."
-VERBS = {
-    "pose": pose,
-    "check": check,
-    "infer": infer,
-    "correct": correct,
-    "batch": batch,
-    "export": export,
-    "track": track,
-    "match": match,
-    "eval": evaluate,
-    "train": train,
-    "simulate": simulate,
-    "models": models,
+# Each with a few words; `--help` of a verb begins with its docstring.
+VERBS: dict[str, tuple[ModuleType, str]] = {
+    "pose": (pose, "a scene folder from photos alone"),
+    "check": (check, "what would go wrong with a scene"),
+    "infer": (infer, "ids and 3D shapes of one scene"),
+    "correct": (correct, "correct a result in the browser"),
+    "batch": (batch, "many scenes, one table of traits"),
+    "export": (export, "traits of a batch for MIAPPE and BrAPI"),
+    "track": (track, "the same leaf over days"),
+    "match": (match, "ids only, of any number of scenes"),
+    "eval": (evaluate, "compare a result with true labels"),
+    "train": (train, "fine-tune a Mask R-CNN"),
+    "simulate": (simulate, "render plants with ground truth"),
+    "models": (models, "the detectors that ship with mvseg"),
 }
+# The verbs with more options than a screen has lines, and what `--help` shows of them.
+MOST_USED = {
+    "pose": ("photos", "out", "marker", "board", "distance", "positions", "unit", "up", "turntable"),
+    "infer": ("scene", "masks", "out", "config", "scale", "unit", "up", "color_card", "detect.weights",
+              "detect.image_size", "split_merged", "num_workers"),
+    "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "scheduler", "scale", "unit", "up",
+              "color_card", "detect.weights"),
+    "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method", "refine_poses"),
+    "train": ("photos", "labels", "output", "val_photos", "val_labels", "config", "arch", "weights", "image_size",
+              "epochs", "resume"),
+}  # fmt: skip
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -62,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.showwarning = _show_warning
             args = _parse(join_up(sys.argv[1:] if argv is None else argv))
             with stopped_by_sigterm():
-                return VERBS[args.verb].run(args[args.verb])
+                return VERBS[args.verb][0].run(args[args.verb])
     except (InputError, argparse.ArgumentError) as error:
         return complain(error, sys.argv[1:] if argv is None else argv)
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
@@ -117,9 +129,25 @@ def build_parser(*, short: bool = False) -> ArgumentParser:
     """The parser of all verbs; its errors are raised, not printed. With `short`, `--help` shows some options only."""
     parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__)
     verbs = parser.add_subcommands(dest="verb")
-    for verb in VERBS.values():
-        verb.add(verbs)
-    if short:
-        for name, of_verb in verbs.choices.items():
-            shorten_help(name, of_verb)
+    for name, (verb, about) in VERBS.items():
+        of_verb = ArgumentParser(exit_on_error=False, description=verb.__doc__)
+        verb.add_options(of_verb)
+        verbs.add_subcommand(name, of_verb, help=about)
+        if short and name in MOST_USED:
+            _shorten_help(name, of_verb)
     return parser
+
+
+def _shorten_help(verb: str, parser: ArgumentParser) -> None:
+    """Let the help of a verb show its most used options only, without their types."""
+    places = []
+    for action in parser._actions:
+        if action.dest != "help" and action.dest not in MOST_USED[verb]:
+            action.help = argparse.SUPPRESS
+        elif not action.option_strings:
+            places.append(f"[{action.dest}]" if action.nargs == "?" else action.dest)
+        elif action.required:
+            places.insert(0, f"--{action.dest} {action.dest.upper()}")
+    parser.formatter_class = argparse.HelpFormatter
+    parser.usage = f"mvseg {verb} [options] {' '.join(places)}"
+    parser.epilog = f"mvseg {verb} --help_all shows all options."

@@ -1,26 +1,22 @@
-"""`mvseg correct`: corrects a result in the browser, which shows the consequences at once."""
+"""Correct a result in the browser: served to this machine only, saved after every edit."""
 
 from __future__ import annotations
 
 import sys
 import threading
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
+from mvseg.cli.options import add_shared
 from mvseg.errors import InputError
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    about = "Correct a result in the browser: served to this machine only, saved after every edit."
-    parser = ArgumentParser(exit_on_error=False, description=about)
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     parser.add_argument("result", type=Path, help="result folder of mvseg infer or match")
     parser.add_argument("--no_browser", action="store_true", help="only print the address, do not open the browser")
-    help_workers = "processes that fit surfaces (default: one per core, but at most 4)"
-    parser.add_argument("--num_workers", type=int | None, help=help_workers)
-    verbs.add_subcommand("correct", parser, help="correct a result in the browser")
+    add_shared(parser, "num_workers")
 
 
 def run(args: Namespace) -> int:

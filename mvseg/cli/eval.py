@@ -1,4 +1,4 @@
-"""`mvseg eval`: compare the ids of a result with true labels."""
+"""Compare the ids of a result with true labels."""
 
 from __future__ import annotations
 
@@ -13,12 +13,10 @@ from jsonargparse import ArgumentParser, Namespace
 from mvseg.errors import InputError
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    parser = ArgumentParser(exit_on_error=False, description="Compare the ids of a result with true labels.")
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     parser.add_argument("result", type=Path, help="result folder, or the --out of mvseg match")
     parser.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids")
-    verbs.add_subcommand("eval", parser, help="compare a result with true labels")
 
 
 def run(args: Namespace) -> int:

@@ -1,24 +1,20 @@
-"""`mvseg export`: the traits of a batch in the forms that databases and journals require."""
+"""The traits of a batch by MIAPPE 1.1 and as BrAPI v2 observations; see docs/data-out.md."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    about = "The traits of a batch by MIAPPE 1.1 and as BrAPI v2 observations; see docs/data-out.md."
-    parser = ArgumentParser(exit_on_error=False, description=about)
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     parser.add_argument("batch", type=Path, help="the --out of mvseg batch")
     parser.add_argument("--out", type=Path | None, help="folder to write (default: export/ in the batch's folder)")
     parser.add_argument("--miappe", action="store_true", help="tables by the checklist of MIAPPE 1.1, as CSV")
     parser.add_argument("--brapi", action="store_true", help="BrAPI v2 observations, as JSON")
     help_factors = "columns of the batch's table that are experimental factors, as treatment,light"
     parser.add_argument("--factors", type=str | None, help=help_factors)
-    verbs.add_subcommand("export", parser, help="traits of a batch for MIAPPE and BrAPI")
 
 
 def run(args: Namespace) -> int:

@@ -1,28 +1,22 @@
-"""`mvseg infer`: ids in every view, shapes in 3D and traits, of one scene."""
+"""Ids in every view, shapes in 3D and traits, of one scene."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.cli.options import DEFAULT_OUT, add_overwrite, add_run_options, build_run
+from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_run
 from mvseg.demo import demo_scene
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    about = "Ids in every view, shapes in 3D and traits, of one scene."
-    parser = ArgumentParser(exit_on_error=False, description=about)
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     help_scene = "scene folder (photos, cameras of any kind in docs/formats.md); without it, the plant that ships"
     parser.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     add_run_options(parser)
-    add_overwrite(parser)
-    help_workers = "processes that fit surfaces (default: one per core, but at most 4)"
-    parser.add_argument("--num_workers", type=int | None, help=help_workers)
-    verbs.add_subcommand("infer", parser, help="ids and 3D shapes of one scene")
+    add_shared(parser, "corrections", "overwrite", "num_workers")
 
 
 def run(args: Namespace) -> int:

@@ -1,26 +1,23 @@
-"""`mvseg match`: ids only, of any number of scenes."""
+"""Ids only, of any number of scenes."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.complain import complain
-from mvseg.cli.options import DEFAULT_OUT, add_matching_options, add_overwrite, build_options
+from mvseg.cli.options import DEFAULT_OUT, add_matching_options, add_shared, build_options
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    parser = ArgumentParser(exit_on_error=False, description="Ids only, of any number of scenes.")
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     parser.add_argument("scenes", nargs="+", type=Path, help="scene folders")
     add_matching_options(parser, masks=Path("masks"))
-    add_overwrite(parser)
-    verbs.add_subcommand("match", parser, help="ids only, of any number of scenes")
+    add_shared(parser, "corrections", "overwrite")
 
 
 def run(args: Namespace) -> int:
@@ -35,15 +32,8 @@ def run(args: Namespace) -> int:
     if args.masks is None:
         raise InputError("masks is null, expected the masks to match; use mvseg infer to detect them in the photos")
     code, out = 0, args.out or DEFAULT_OUT
-    config = RunConfig(
-        match=build_options(MatchConfig, args.match, "match."),
-        reconstruct=None,
-        refine_poses=args.refine_poses,
-        split_merged=args.split_merged,
-        report=args.report,
-        coco_crowd=args.coco_crowd,
-        categories=args.categories,
-    )
+    plain = {name: args[name] for name in ("refine_poses", "split_merged", "report", "coco_crowd", "categories")}
+    config = RunConfig(match=build_options(MatchConfig, args.match, "match."), reconstruct=None, **plain)
     for scene, name in zip(args.scenes, names, strict=True):
         try:
             run_one_scene(

@@ -1,16 +1,12 @@
-"""`mvseg models`: list the shipped detectors."""
+"""List the shipped detectors."""
 
 from __future__ import annotations
-
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    parser = ArgumentParser(exit_on_error=False, description="List the shipped detectors.")
-    verbs.add_subcommand("models", parser, help="the detectors that ship with mvseg")
+def add_options(parser: ArgumentParser) -> None:
+    """The verb has none."""
 
 
 def run(args: Namespace) -> int:

@@ -14,7 +14,7 @@ from jsonargparse import ActionConfigFile, ArgumentParser, Namespace  # type: ig
 from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
-from mvseg.formats.yaml_file import check_yaml
+from mvseg.formats.text_file import read_yaml
 from mvseg.matching.config import MatchConfig
 from mvseg.poses.config import PoseConfig
 from mvseg.reconstruction.config import ReconstructConfig
@@ -43,7 +43,7 @@ class CheckedConfig(ActionConfigFile):
 
     def __call__(self, parser: Any, cfg: Any, values: Any, option_string: str | None = None) -> None:
         path = find_config(str(values))
-        check_yaml(path)
+        read_yaml(path, "a YAML file of options")
         super().__call__(parser, cfg, str(path), option_string)
 
 
@@ -62,45 +62,55 @@ def find_config(name: str) -> Path:
     raise InputError(f"{name}: no such file, expected a YAML file of options, or one that ships: {', '.join(shipped)}")
 
 
-def add_matching_options(parser: ArgumentParser, masks: Path | None) -> None:
+# Options that several verbs have: type (None: a flag), default, help.
+SHARED: dict[str, tuple[Any, Any, str]] = {
+    "masks": (Path | None, None, "masks (label images, COCO, labelme, YOLO, SAM, NumPy; docs/formats.md), in the scene "
+              "folder or anywhere; infer without it detects leaves"),
+    "coco_crowd": (Literal["mask", "ignore"], "mask",
+                   "whether COCO annotations with iscrowd are masks like all others, or left out"),
+    "categories": (str | None, None, "names of the categories of masks to take, as leaf,petiole (default: all)"),
+    "up": (str | list[float] | None, None,
+           "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers); default: the cameras'"),
+    "corrections": (Path | None, None, "file of a person's corrections, in the scene folder or anywhere; "
+                    "docs/corrections.md"),
+    "overwrite": (bool, False, "replace the result in --out even if it is another scene's"),
+    "num_workers": (int | None, None, "processes that fit surfaces (default: one per core, but at most 4)"),
+    "scheduler": (str | None, None, "work on a Dask cluster instead: the scheduler's address, or its file"),
+    "quiet": (None, False, "no progress bars"),
+}  # fmt: skip
+
+
+def add_shared(parser: ArgumentParser, *names: str) -> None:
+    """Add some of the options that several verbs have."""
+    for name in names:
+        kind, default, about = SHARED[name]
+        form = {"action": "store_true"} if kind is None else {"type": kind, "default": default}
+        parser.add_argument(f"--{name}", help=about, **form)
+
+
+def read_workers(args: Namespace) -> int:
+    """What --num_workers says of work that --scheduler may take over; 1 by default."""
+    if args.scheduler is not None and args.num_workers is not None:
+        raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
+    return 1 if args.num_workers is None else int(args.num_workers)
+
+
+def add_matching_options(parser: ArgumentParser, masks: Path | None = None) -> None:
     """The options of every verb that matches; `masks` is the default of --masks."""
     help_config = "YAML file with any of these options; paper.yaml ships"
     parser.add_argument("--config", action=CheckedConfig, help=help_config)
-    parser.add_argument(
-        "--masks",
-        type=Path | None,
-        default=masks,
-        help="masks (label images, COCO, labelme, YOLO, SAM, NumPy; docs/formats.md), in the scene folder or "
-        "anywhere; without it, infer detects leaves",
-    )
+    add_shared(parser, "masks", "coco_crowd", "categories", "quiet")
+    parser.set_defaults(masks=masks)
     parser.add_argument("--out", type=Path | None, help="result folder, or folder of results (default: under results/)")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
     parser.add_argument("--report", type=bool, default=True, help="write report.html, the result as one page")
     parser.add_argument("--refine_poses", type=bool, default=False, help="refine poses that are a few pixels off")
     parser.add_argument("--split_merged", type=bool, default=False, help="cut masks that cover two instances in two")
-    parser.add_argument(
-        "--coco_crowd",
-        type=Literal["mask", "ignore"],
-        default="mask",
-        help="whether COCO annotations with iscrowd are masks like all others, or left out",
-    )
-    parser.add_argument(
-        "--categories", type=str | None, help="names of the categories of masks to take, as leaf,petiole (default: all)"
-    )
     parser.add_class_arguments(MatchConfig, "match")
-
-
-def add_overwrite(parser: ArgumentParser) -> None:
-    """The options of the verbs that write the results of scenes one by one."""
-    help_corrections = "file of a person's corrections, in the scene folder or anywhere; docs/corrections.md"
-    parser.add_argument("--corrections", type=Path | None, help=help_corrections)
-    help_overwrite = "replace the result in --out even if it is another scene's"
-    parser.add_argument("--overwrite", type=bool, default=False, help=help_overwrite)
 
 
 def add_run_options(parser: ArgumentParser) -> None:
     """The options of a whole run, from photos or masks to traits; `build_run` reads them."""
-    add_matching_options(parser, masks=None)
+    add_matching_options(parser)
     parser.add_class_arguments(DetectConfig, "detect")
     parser.add_class_arguments(ReconstructConfig, "reconstruct")
     parser.add_class_arguments(TraitsConfig, "traits")
@@ -108,8 +118,7 @@ def add_run_options(parser: ArgumentParser) -> None:
     parser.add_argument("--scale", type=float | None, help=help_scale)
     help_unit = "name of the world's unit, after --scale (default: the scene's)"
     parser.add_argument("--unit", type=str | None, help=help_unit)
-    help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers); default: the scene's own"
-    parser.add_argument("--up", type=str | list[float] | None, help=help_up)
+    add_shared(parser, "up")
     help_card = "24-patch colour card that corrects the colours: a photo of it, a card file, or 'find' it in the photos"
     parser.add_argument("--color_card", type=str | None, help=help_card)
 

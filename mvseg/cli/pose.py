@@ -1,27 +1,24 @@
-"""`mvseg pose`: from photos alone to a scene folder."""
+"""Estimate the cameras of photos: a scene folder for mvseg infer, from photos alone."""
 
 from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
-from mvseg.cli.options import CheckedConfig, build_options, read_up
+from mvseg.cli.options import CheckedConfig, add_shared, build_options, read_up
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.poses.config import Known, PoseConfig
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    about = "Estimate the cameras of photos: a scene folder for mvseg infer, from photos alone."
-    parser = ArgumentParser(exit_on_error=False, description=about)
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     parser.add_argument("photos", type=Path, help="folder of photos, or of folders of photos, one per camera")
     parser.add_argument("--out", type=Path, required=True, help="the scene folder")
     parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options")
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
+    add_shared(parser, "quiet")
     parser.add_class_arguments(PoseConfig)
     help_board = "scale and axes from a printed ChArUco board: --board.columns, --board.rows, --board.square, ..."
     parser.add_argument("--board", type=BoardConfig | None, help=help_board)
@@ -32,8 +29,7 @@ def add(verbs: Any) -> None:
     help_positions = "scale and axes from camera positions: CSV with photo,x,y,z, or JSON"
     parser.add_argument("--positions", type=Path | None, help=help_positions)
     parser.add_argument("--unit", type=str | None, help="name of the unit of these lengths (mm, m, ...)")
-    help_up = "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers)"
-    parser.add_argument("--up", type=str | list[float] | None, help=help_up)
+    add_shared(parser, "up")
     help_turntable = (
         "photos from a turntable with fixed cameras: 'board' calibrates it from photos of --board on the table; the "
         "turntable.json that this writes gives the cameras for photos of a plant"
@@ -44,7 +40,6 @@ def add(verbs: Any) -> None:
         "with photo,angle, or the degrees from one photo to the next"
     )
     parser.add_argument("--angles", type=float | Path | None, help=help_angles)
-    verbs.add_subcommand("pose", parser, help="a scene folder from photos alone")
 
 
 def run(args: Namespace) -> int:

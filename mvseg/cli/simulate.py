@@ -1,18 +1,16 @@
-"""`mvseg simulate`: render plants with ground truth."""
+"""Render plants with ground truth."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.errors import InputError
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    parser = ArgumentParser(exit_on_error=False, description="Render plants with ground truth.")
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     presets = (
         "paper-eval (144 scenes of 3 to 20 photos), train (888 of 9 photos), wild (108 of 9 photos) or series "
         "(plants on 8 dates each)"
@@ -22,7 +20,6 @@ def add(verbs: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, help="random seed")
     parser.add_argument("--num_workers", type=int, default=1, help="scenes rendered at once")
     parser.add_argument("--num_plants", type=int, default=6, help="number of plants of the preset series")
-    verbs.add_subcommand("simulate", parser, help="render plants with ground truth")
 
 
 def run(args: Namespace) -> int:

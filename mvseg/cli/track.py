@@ -1,22 +1,20 @@
-"""`mvseg track`: the same leaf over days."""
+"""The same leaf over days: tracks, growth curves, births and deaths; see docs/tracking.md."""
 
 from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
+from mvseg.cli.options import add_shared, read_workers
 from mvseg.errors import InputError
 
 SOME_FAILED = 3
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    about = "The same leaf over days: tracks, growth curves, births and deaths; see docs/tracking.md."
-    parser = ArgumentParser(exit_on_error=False, description=about)
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     help_results = "output of mvseg batch (every plant with two dates or more), or the results of one plant"
     parser.add_argument("results", type=Path, nargs="+", help=help_results)
     help_times = "of each result: numbers (days) or ISO dates"
@@ -27,18 +25,14 @@ def add(verbs: Any) -> None:
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)
     parser.add_argument("--report", type=bool, default=True, help="write tracks.html and growth.png")
     parser.add_argument("--num_workers", type=int | None, help="plants tracked at once, each in a process of its own")
-    help_scheduler = "work on a Dask cluster instead: the scheduler's address, or its file"
-    parser.add_argument("--scheduler", type=str | None, help=help_scheduler)
-    parser.add_argument("--quiet", action="store_true", help="no progress bars")
-    verbs.add_subcommand("track", parser, help="the same leaf over days")
+    add_shared(parser, "scheduler", "quiet")
 
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
     from mvseg.batch.track_plants import PlantResults, list_plants, track_plants  # keeps --help quick
 
-    if args.scheduler is not None and args.num_workers is not None:
-        raise InputError("--num_workers has no effect with --scheduler, expected one of the two")
+    num_workers = read_workers(args)
     results, times = args.results, args.times
     if times is None:
         if len(results) > 1:
@@ -54,7 +48,7 @@ def run(args: Namespace) -> int:
         plants,
         args.out,
         corrections=args.corrections,
-        num_workers=1 if args.num_workers is None else args.num_workers,
+        num_workers=num_workers,
         scheduler=args.scheduler,
         report=args.report,
         quiet=args.quiet,

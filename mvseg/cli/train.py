@@ -1,10 +1,9 @@
-"""`mvseg train`: fine-tune a Mask R-CNN."""
+"""Fine-tune a Mask R-CNN; see configs/train/."""
 
 from __future__ import annotations
 
 import logging
 import os
-from typing import Any
 
 from jsonargparse import ArgumentParser, Namespace
 
@@ -12,13 +11,11 @@ from mvseg.cli.options import CheckedConfig, build_options
 from mvseg.training.config import TrainConfig
 
 
-def add(verbs: Any) -> None:
-    """Add the verb to the parser's sub-commands."""
-    parser = ArgumentParser(exit_on_error=False, description="Fine-tune a Mask R-CNN; see configs/train/.")
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
     help_config = "YAML file with any of these options; train/rosettes.yaml and train/finetune-coco.yaml ship"
     parser.add_argument("--config", action=CheckedConfig, help=help_config)
     parser.add_class_arguments(TrainConfig)
-    verbs.add_subcommand("train", parser, help="fine-tune a Mask R-CNN")
 
 
 def run(args: Namespace) -> int:

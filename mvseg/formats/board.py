@@ -50,20 +50,17 @@ class BoardConfig:
 
     def corners(self) -> Floats:
         """(P, 3) inner corners of the squares, by OpenCV's numbers, in the unit of `square`."""
-        return _from_opencv(np.array(self.opencv().getChessboardCorners(), float), self)
+        # OpenCV's y runs down the board and its z into it: turned about x, with the origin at the bottom left
+        corners = np.array(self.opencv().getChessboardCorners(), float)
+        return np.asarray(corners * [1, -1, -1] + [0, self.rows * self.square, 0])
 
     def opencv(self) -> cv2.aruco.CharucoBoard:
-        dictionary = cv2.aruco.getPredefinedDictionary(opencv_dictionary(self.family))
+        dictionary = marker_dictionary(self.family)
         board = cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
         board.setLegacyPattern(self.legacy)
         return board
 
 
-def _from_opencv(points: Floats, board: BoardConfig) -> Floats:
-    """OpenCV's y runs down the board and its z into it: turned about x, with the origin at the bottom left."""
-    return points * [1, -1, -1] + [0, board.rows * board.square, 0]
-
-
-def opencv_dictionary(family: Family) -> int:
-    """OpenCV's number of a family."""
-    return int(getattr(cv2.aruco, f"DICT_{family}"))
+def marker_dictionary(family: Family) -> cv2.aruco.Dictionary:
+    """OpenCV's markers of a family."""
+    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, f"DICT_{family}"))

@@ -42,7 +42,8 @@ def read_bop(path: Path) -> Scene:
     for number, camera in sorted(cameras.items()):
         if camera.cam_R_w2c is None or camera.cam_t_w2c is None:
             raise InputError(f"{path}: image {number} has no cam_R_w2c or cam_t_w2c, expected the pose of each camera")
-        file = _find_file(path.parent, number)
+        files = [f"{place}/{number:06d}{suffix}" for place in ("rgb", "gray") for suffix in PHOTO_SUFFIXES]
+        file = next((file for file in files if (path.parent / file).is_file()), f"rgb/{number:06d}.png")
         with faults_of(f"{path}: image {number} ({file})"):
             width, height = size_of_photo(path.parent, file)
         K = np.array(camera.cam_K).reshape(3, 3)
@@ -50,8 +51,3 @@ def read_bop(path: Path) -> Scene:
         R, t = np.array(camera.cam_R_w2c).reshape(3, 3), np.array(camera.cam_t_w2c)
         photos.append(Photo(file=file, width=width, height=height, K=K, R=R, t=t))
     return build_scene(path.parent, photos, unit="mm", source=path)
-
-
-def _find_file(folder: Path, number: int) -> str:
-    names = [f"{place}/{number:06d}{suffix}" for place in ("rgb", "gray") for suffix in PHOTO_SUFFIXES]
-    return next((name for name in names if (folder / name).is_file()), f"rgb/{number:06d}.png")

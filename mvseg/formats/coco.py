@@ -6,7 +6,6 @@ The only codec of COCO masks: any file gives a mask of the image's size, or an e
 from __future__ import annotations
 
 import json
-import warnings
 from collections import Counter
 from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
@@ -16,9 +15,9 @@ import numpy as np
 from pycocotools import mask as coco_mask
 from pydantic import BaseModel, FiniteFloat, NonNegativeInt, RootModel, TypeAdapter, ValidationError
 
-from mvseg.errors import InputError, InputWarning, faults_of
+from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.find_views import base_name, find_views, list_some
-from mvseg.formats.json_file import Int64, Items, read_json
+from mvseg.formats.json_file import Int64, Items, check_content, load_json
 from mvseg.formats.masks.found_mask import check_categories
 from mvseg.formats.photos import describe_turn
 from mvseg.scene import Scene
@@ -126,34 +125,26 @@ def read_coco(
         chosen[view].append((place, annotation))
     if num_crowds:
         what = "taken as masks (--coco_crowd ignore leaves them out)" if crowd == "mask" else "left out"
-        warnings.warn(f"{path}: {num_crowds} annotations with iscrowd are {what}", InputWarning, stacklevel=4)
+        warn(f"{path}: {num_crowds} annotations with iscrowd are {what}")
     if num_boxes:
-        message = f"{num_boxes} annotations have no mask (a box at most) and are left out"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
+        warn(f"{path}: {num_boxes} annotations have no mask (a box at most) and are left out")
     check_categories(counts, categories, known=names.values(), source=path)
     sizes = scene.cameras.sizes.tolist()
-    return [
-        _decode_all(path, of_view, (width, height), has_ids=has_ids)
-        for of_view, (width, height) in zip(chosen, sizes, strict=True)
-    ]
+    return [_decode_all(path, each, size, has_ids=has_ids) for each, size in zip(chosen, sizes, strict=True)]
 
 
 def _read_file(path: Path, scene: Scene) -> _MaskFile:
     """The file; a list of results gets the images that it refers to."""
-    try:
-        with path.open("rb") as file:
-            is_list = file.read(100).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"[")
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    if not is_list:
+    content = load_json(path)
+    if not isinstance(content, list):
         try:
-            return read_json(path, _MaskFile)
+            return check_content(path, content, _MaskFile)
         except InputError:
             if any(mark in path.read_bytes() for mark in VIA_MARKS):
                 expected = "expected its COCO export (Annotation > Export Annotations (COCO format))"
                 raise InputError(f"{path}: is a project or the annotations of VIA, {expected}") from None
             raise
-    results = read_json(path, _Results).root
+    results = check_content(path, content, _Results).root
     stems = [base_name(view.name) for view in scene.views]
     by_number = {int(stem): view.name for stem, view in zip(stems, scene.views, strict=True) if stem.isdecimal()}
     if len(by_number) < len(stems):  # not every photo has a number of its own
@@ -162,9 +153,6 @@ def _read_file(path: Path, scene: Scene) -> _MaskFile:
     for image_id in dict.fromkeys(result.image_id for result in results):
         name = by_number.get(image_id, str(image_id)) if isinstance(image_id, int) else image_id
         images.append(CocoImage(id=image_id, file_name=name, width=0, height=0))
-    views = find_views([image.file_name for image in images], scene, source=path)
-    for image, view in zip(images, views, strict=True):
-        image.width, image.height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
     return _MaskFile(images=images, annotations=results)
 
 
@@ -190,12 +178,10 @@ def _merge(parts: list[tuple[Path, _MaskFile]]) -> _MaskFile:
 def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | None]:
     """{image id as text: view, or None}, checked."""
     image_ids = {str(image.id) for image in coco.images}
-    orphans = [place for place, one in enumerate(coco.annotations, start=1) if str(one.image_id) not in image_ids]
+    listed = enumerate(coco.annotations, start=1)
+    orphans = [place if one.id is None else one.id for place, one in listed if str(one.image_id) not in image_ids]
     if orphans:
-        first = coco.annotations[orphans[0] - 1].id
-        where = f"annotation {orphans[0] if first is None else first}"
-        message = f"{len(orphans)} annotations refer to no image in the file, the first is {where}"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=5)
+        warn(f"{path}: {len(orphans)} annotations refer to no image in the file, the first is annotation {orphans[0]}")
     if len(image_ids) < len(coco.images):
         raise InputError(f"{path}: {len(coco.images)} images have {len(image_ids)} ids, expected one each")
     names = [image.file_name for image in coco.images]
@@ -207,25 +193,23 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
     if missing:
         first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
         message = f"{len(missing)} views have no entry among the images and no masks, the first is {first_view}"
-        warnings.warn(f"{path}: {message}; the file holds {list_some(names)}", InputWarning, stacklevel=5)
+        warn(f"{path}: {message}; the file holds {list_some(names)}")
     for image, view in zip(coco.images, views, strict=True):
-        width, height = (image.width, image.height) if view is None else scene.cameras.sizes[view].tolist()
-        if (image.width, image.height) != (width, height):
-            turn = "" if view is None else describe_turn(scene.views[view].path)
-            raise InputError(
-                f"{path}: image {image.file_name} is {image.width} x {image.height}, "
-                f"its camera says {width} x {height}{turn and '; ' + turn}"
-            )
+        width, height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
+        if view is not None and (image.width, image.height) not in ((0, 0), (width, height)):  # 0 x 0: not known
+            found = f"image {image.file_name} is {image.width} x {image.height}, its camera says {width} x {height}"
+            raise InputError(f"{path}: {found}{describe_turn(scene.views[view].path)}")
     return {str(image.id): view for image, view in zip(coco.images, views, strict=True)}
 
 
 def _decode_all(
-    path: Path, annotations: list[tuple[int, CocoAnnotation]], size: tuple[int, int], *, has_ids: bool
+    path: Path, annotations: list[tuple[int, CocoAnnotation]], size: list[int], *, has_ids: bool
 ) -> Iterator[tuple[int, np.ndarray]]:
     """The masks of annotations, each with its place in the file; `size` is the width and height of their image."""
+    width, height = size
     for place, annotation in annotations:
         with faults_of(f"{path}: annotation {place if annotation.id is None else annotation.id}"):
-            mask = decode_segmentation(annotation.segmentation, *size)
+            mask = decode_segmentation(annotation.segmentation, width, height)
         yield annotation.id if has_ids and isinstance(annotation.id, int) else place, mask
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import mmap
 import struct
-import warnings
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 
-from mvseg.errors import InputError, InputWarning, faults_of
+from mvseg.errors import InputError, faults_of, warn
+from mvseg.formats.find_views import natural_order
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.photos import Photo, build_scene
 from mvseg.scene import Scene
@@ -32,22 +32,16 @@ def find_colmap_model(folder: Path) -> Path | None:
     for place in (folder / "sparse", folder / "colmap" / "sparse"):
         if is_colmap_model(place):
             return place
-        models = [path for path in sorted(place.glob("*"), key=_by_number) if is_colmap_model(path)]
-        if not models:
-            continue
-        counts = [_count_photos(model) for model in models]
-        best = models[counts.index(max(counts))]
-        if len(models) > 1:
-            shown = ", ".join(f"{model.name} with {count} photos" for model, count in zip(models, counts, strict=True))
-            message = f"there are {len(models)} models ({shown}); {best.name} is taken, the others have no common world"
-            warnings.warn(f"{place}: {message}", InputWarning, stacklevel=3)
-        return best
+        models = sorted(filter(is_colmap_model, place.glob("*")), key=lambda path: natural_order(path.name))
+        counts = {model: _count_photos(model) for model in models}
+        if counts:
+            best = max(counts, key=counts.__getitem__)
+            if len(counts) > 1:
+                shown = ", ".join(f"{model.name} with {count} photos" for model, count in counts.items())
+                taken = f"{best.name} is taken, the others have no common world"
+                warn(f"{place}: there are {len(counts)} models ({shown}); {taken}")
+            return best
     return None
-
-
-def _by_number(path: Path) -> tuple[bool, int, str]:
-    is_number = path.name.isdecimal()
-    return not is_number, int(path.name) if is_number else 0, path.name
 
 
 def _count_photos(model: Path) -> int:
@@ -80,12 +74,14 @@ def read_colmap(model: Path, folder: Path) -> Scene:
     except (RuntimeError, ValueError, IndexError, OSError, MemoryError) as error:
         reason = " ".join(str(error).split())
         raise InputError(f"{model}: cannot be read as a COLMAP model ({reason})") from None
-    photos = []
-    for image in images:
-        if image.has_pose:
-            photos.append(_photo(model, image, reconstruction.cameras[image.camera_id]))
+    photos = [_photo(model, image, reconstruction.cameras[image.camera_id]) for image in images if image.has_pose]
     scene = build_scene(folder, photos, unit="", source=model)
-    _warn_of_photos_without_pose(model, folder / "images", {view.path for view in scene.views})
+    registered, images_folder = {view.path for view in scene.views}, folder / "images"
+    files = [path for path in sorted(images_folder.rglob("*.*")) if path.name.lower().endswith(PHOTO_SUFFIXES)]
+    left_out = [path.relative_to(images_folder).as_posix() for path in files if path not in registered]
+    if left_out:
+        what = f"{len(left_out)} photos in images/ have no pose in the model and are left out"
+        warn(f"{model}: {what}, the first is {left_out[0]}")
     return scene
 
 
@@ -102,16 +98,6 @@ def _photo(model: Path, image: pycolmap.Image, lens: pycolmap.Camera) -> Photo:
         t=np.array(cam_from_world.translation),
         lens=None if lens.is_perspective_pinhole() and lens.is_undistorted() else lens,
     )
-
-
-def _warn_of_photos_without_pose(model: Path, images: Path, registered: set[Path]) -> None:
-    files = [path for path in sorted(images.rglob("*.*")) if path.name.lower().endswith(PHOTO_SUFFIXES)]
-    left_out = [path.relative_to(images).as_posix() for path in files if path not in registered]
-    if left_out:
-        message = (
-            f"{len(left_out)} photos in images/ have no pose in the model and are left out, the first is {left_out[0]}"
-        )
-        warnings.warn(f"{model}: {message}", InputWarning, stacklevel=4)
 
 
 def _check_binary_model(model: Path) -> None:

@@ -81,7 +81,11 @@ def read_card_file(path: Path) -> list[tuple[CardEntry, list[Floats]]]:
                 what = "no colour card of 24 patches is found, expected one that fills a tenth of the photo or more"
                 raise InputError(f"{file}: {what}, or its 'corners' in a card file")
         else:
-            patches = [_patches_at(file, photo, np.array(entry.corners))]
+            corners = np.array(entry.corners)
+            if not _is_inside(corners, photo) or cv2.contourArea(corners.astype(np.float32)) < ROWS * COLUMNS:
+                size = f"{photo.shape[1]} x {photo.shape[0]} pixels"
+                raise InputError(f"{file}: the 'corners' of its colour card span no card within the photo of {size}")
+            patches = [look_at_patches(photo, corners)]
         found.append((entry, patches))
     return found
 
@@ -132,14 +136,6 @@ def look_at_patches(photo: NDArray[np.uint8], corners: Floats) -> Floats:
     height, width = photo.shape[:2]
     looked_at = photo[np.clip(y, 0, height - 1), np.clip(x, 0, width - 1)]
     return np.median(looked_at.reshape(len(CENTERS), len(INSIDE), 3).astype(float), axis=1)
-
-
-def _patches_at(file: Path, photo: NDArray[np.uint8], corners: Floats) -> Floats:
-    if not _is_inside(corners, photo) or cv2.contourArea(corners.astype(np.float32)) < ROWS * COLUMNS:
-        height, width = photo.shape[:2]
-        what = f"the 'corners' of its colour card span no card within the photo of {width} x {height} pixels"
-        raise InputError(f"{file}: {what}")
-    return look_at_patches(photo, corners)
 
 
 def _is_inside(corners: Floats, photo: NDArray[np.uint8]) -> bool:

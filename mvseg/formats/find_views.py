@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
 from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
 from mvseg.scene import Scene
 
@@ -49,7 +48,7 @@ def find_views(names: Sequence[str], scene: Scene, *, source: Path, warn_of_loos
     if first_of and warn_of_loose:
         view, name = next(iter(first_of.items()))
         message = f"{len(first_of)} names fit a photo by the base name only, the first is {name} for "
-        warnings.warn(f"{source}: {message}{scene.views[view].name}", InputWarning, stacklevel=4)
+        warn(f"{source}: {message}{scene.views[view].name}")
     return found
 
 
@@ -67,6 +66,12 @@ def list_some(names: Sequence[str]) -> str:
     distinct = list(dict.fromkeys(names))
     more = f" and {len(distinct) - SHOWN} more" if len(distinct) > SHOWN else ""
     return ", ".join(distinct[:SHOWN]) + more if distinct else "nothing"
+
+
+def natural_order(name: str) -> list[tuple[int, int | str]]:
+    """A key for natural sorting: 2.jpg before 10.jpg."""
+    parts = re.split(r"(\d+)", name.lower())
+    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
 
 
 def _exact_views(names: Sequence[str], scene: Scene, source: Path) -> list[int | None]:

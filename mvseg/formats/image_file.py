@@ -10,11 +10,12 @@ from __future__ import annotations
 import os
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
-from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -73,27 +74,17 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
         InputError: the file cannot be opened, is no such image, is cut short or damaged, or has more than 2^28 pixels.
             The message is a reason, without the file's name.
     """
-    try:
+    with _any_fault():
         data = path.read_bytes()
-    except OSError as error:
-        raise InputError(error.strerror or "no such file") from None
-    reader = next((reader for start, reader in READERS if data.startswith(start)), None)
-    if reader is None:
-        raise InputError(no_image_message(data[:16]))
-    if reader is PngImageFile and not _has_sound_chunks(data):
-        raise InputError("it is cut short, or a checksum is wrong")
-    try:
+        reader = _find_reader(data)
+        if reader is PngImageFile and not _has_sound_chunks(data):
+            raise InputError("it is cut short, or a checksum is wrong")
         image = reader(BytesIO(data))
-        is_too_large = image.width * image.height > MAX_PIXELS
-        is_of_size = size is None or sorted(image.size) == sorted(size)  # a TIFF may be turned when it is decoded
-        if is_of_size and not is_too_large:
-            _load(image)
-    except Exception as error:  # Pillow raises almost anything on a damaged file
-        raise InputError(" ".join(str(error).split()) or type(error).__name__) from None
-    if not is_of_size:
-        raise WrongSize(image.width, image.height)
-    if is_too_large:
-        raise InputError(f"it is {image.width} x {image.height} pixels, expected at most {MAX_PIXELS} in all")
+        if size is not None and sorted(image.size) != sorted(size):  # a TIFF may be turned when it is decoded
+            raise WrongSize(image.width, image.height)
+        if image.width * image.height > MAX_PIXELS:
+            raise InputError(f"it is {image.width} x {image.height} pixels, expected at most {MAX_PIXELS} in all")
+        _load(image)
     return image
 
 
@@ -103,28 +94,34 @@ def read_image_size(path: Path) -> tuple[int, int]:
     Raises:
         InputError: as `read_image`, as far as the header shows.
     """
-    try:
-        with path.open("rb") as file:
-            start = file.read(16)
-            reader = next((reader for magic, reader in READERS if start.startswith(magic)), None)
-            if reader is None:
-                raise InputError(no_image_message(start))
-            file.seek(0)
-            width, height = reader(file).size
-    except OSError as error:
-        raise InputError(error.strerror or "no such file") from None
-    except InputError:
-        raise
-    except Exception as error:  # Pillow raises almost anything on a damaged file
-        raise InputError(" ".join(str(error).split()) or type(error).__name__) from None
+    with _any_fault(), path.open("rb") as file:
+        reader = _find_reader(file.read(16))
+        file.seek(0)
+        width, height = reader(file).size
     return width, height
 
 
-def no_image_message(start: bytes) -> str:
-    """Why a file is not a supported image, from its first bytes."""
+@contextmanager
+def _any_fault() -> Iterator[None]:
+    """Pillow raises almost anything on a damaged file: InputError of it, with a reason."""
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:
+        reason = getattr(error, "strerror", None) or " ".join(str(error).split())
+        raise InputError(reason or type(error).__name__) from None
+
+
+def _find_reader(start: bytes) -> type[ImageFile]:
+    """Pillow's reader for a file with these first bytes."""
     if start[4:8] == b"ftyp" and start[8:12] in (b"heic", b"heix", b"mif1", b"msf1", b"hevc", b"heim", b"avif"):
-        return "it is a HEIC file, expected JPEG, PNG, TIFF, BMP or WebP: convert it without turning or scaling it"
-    return "it is not a JPEG, PNG, TIFF, BMP or WebP file"
+        expected = "expected JPEG, PNG, TIFF, BMP or WebP: convert it without turning or scaling it"
+        raise InputError(f"it is a HEIC file, {expected}")
+    for magic, reader in READERS:
+        if start.startswith(magic):
+            return reader
+    raise InputError("it is not a JPEG, PNG, TIFF, BMP or WebP file")
 
 
 def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) -> np.ndarray:
@@ -161,25 +158,9 @@ def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) 
 def sensor_bits(path: Path, size: tuple[int, int] | None = None) -> int:
     """How many bits the numbers of an image use: 8, or 10, 12, 14 or 16 in a file of 16 bits.
 
-    8-bit files are recognised by their headers; others are decoded. For `size` see `read_image`.
-
-    Raises:
-        InputError: see `read_image`.
+    8 also for a file that cannot be read or has another size (see `read_image`). Only files of 16 bits are decoded; the
+    answer is cached until the file changes.
     """
-    with path.open("rb") as file:
-        head = file.read(26)
-        if head.startswith((b"II", b"MM")):
-            is_deep = _tiff_bits(file) == 16
-        else:
-            is_deep = head.startswith(PNG_START) and head[24:25] == b"\x10"
-    if not is_deep:
-        return 8
-    deep = _read_deep(path, read_image(path, size))
-    return 8 if deep is None else _bits_of(deep)
-
-
-def known_bits(path: Path, size: tuple[int, int] | None = None) -> int:
-    """As `sensor_bits`, cached until the file changes; 8 for one that cannot be read or has another size."""
     try:
         facts = path.stat()
         return _bits_of_file(path, size, facts.st_mtime_ns, facts.st_size)
@@ -189,21 +170,25 @@ def known_bits(path: Path, size: tuple[int, int] | None = None) -> int:
 
 @lru_cache(maxsize=4096)
 def _bits_of_file(path: Path, size: tuple[int, int] | None, modified_ns: int, num_bytes: int) -> int:
-    return sensor_bits(path, size)
-
-
-def _tiff_bits(file: BinaryIO) -> int:
-    """Bits of a TIFF file's first channel, from its header; 8 if unknown."""
-    file.seek(0)
-    try:
-        return int(TiffImageFile(file).tag_v2.get(BITS_PER_SAMPLE, (8,))[0])
-    except Exception:  # Pillow raises almost anything on a damaged file
-        return 8
+    with _any_fault(), path.open("rb") as file:
+        head = file.read(26)
+        file.seek(0)
+        if not _is_deep(head, _find_reader(head)(file)):
+            return 8
+    deep = _read_deep(path, read_image(path, size))
+    return 8 if deep is None else _bits_of(deep)
 
 
 def _bits_of(deep: np.ndarray) -> int:
     highest = int(deep.max(initial=0))
     return next(bits for bits in (10, 12, 14, 16) if highest < 1 << bits)
+
+
+def _is_deep(head: bytes, image: Image.Image) -> bool:
+    """Whether a file, of which these are the first bytes, has 16 bits per channel; Pillow's modes do not tell."""
+    if isinstance(image, TiffImageFile):
+        return bool(image.tag_v2.get(BITS_PER_SAMPLE, (8,))[0] == 16)
+    return isinstance(image, PngImageFile) and head[24:25] == b"\x10"
 
 
 def _read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
@@ -214,11 +199,7 @@ def _read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
     if image.mode not in ("RGB", "RGBA", "LA") or not isinstance(image, (PngImageFile, TiffImageFile)):
         return None
     data = path.read_bytes()
-    if isinstance(image, PngImageFile):
-        is_deep = data[24:25] == b"\x10"
-    else:
-        is_deep = image.tag_v2.get(BITS_PER_SAMPLE, (8,))[0] == 16
-    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if is_deep else None
+    pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED) if _is_deep(data, image) else None
     if pixels is None or pixels.dtype != np.uint16 or pixels.shape[:2] != (image.height, image.width):
         return None
     return pixels if pixels.ndim == 2 else np.ascontiguousarray(pixels[..., 2::-1])
@@ -232,9 +213,9 @@ def is_grey(pixels: np.ndarray) -> bool:
 def is_turned(path: Path) -> bool:
     """Whether EXIF asks viewers to rotate or mirror a JPEG; other formats rarely do, and are not checked."""
     try:
-        with path.open("rb") as file:
+        with _any_fault(), path.open("rb") as file:
             return JpegImageFile(file).getexif().get(ORIENTATION, 1) != 1
-    except Exception:  # no JPEG, or a damaged EXIF block: it says nothing
+    except InputError:  # no JPEG, or a damaged EXIF block: it says nothing
         return False
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, FailFast, Field, FiniteFloat, ValidationError
 
@@ -34,16 +34,34 @@ def read_json(path: Path, model: type[Model]) -> Model:
     Raises:
         InputError: the file is missing, is not JSON, or does not fit the model; names the file and the key.
     """
+    return check_content(path, load_json(path), model)
+
+
+def load_json(path: Path) -> Any:
+    """What a JSON file holds, unchecked.
+
+    Raises:
+        InputError: the file is missing or is not JSON.
+    """
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))  # Windows editors write a byte order mark
+        return json.loads(path.read_text(encoding="utf-8-sig"))  # Windows editors write a byte order mark
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, numbers of thousands of digits
         raise InputError(f"{path}: not a whole JSON file ({error})") from None
+
+
+def check_content(path: Path, content: Any, model: type[Model], *, expected: str = "") -> Model:
+    """What a file holds, as `model`.
+
+    Raises:
+        InputError: it does not fit; names the file, the key, and what was expected.
+    """
     try:
         return model.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         key = "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in first["loc"]).lstrip(".")
         message = first["msg"].partition(" or instance of ")[0]  # of a class that users never see
-        raise InputError(f"{path}: {key + ': ' if key else ''}{message}") from None
+        end = f", expected {expected}" if expected else ""
+        raise InputError(f"{path}: {key + ': ' if key else ''}{message}{end}") from None

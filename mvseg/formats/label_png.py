@@ -34,15 +34,11 @@ def read_labels(path: Path) -> np.ndarray:
         InputError: the file is missing, cannot be decoded, is a JPEG, has colour channels, or does not hold
             unsigned numbers of at most 16 bits.
     """
-    return labels_of(open_labels(path, None), path)
+    return labels_of(open_labels(path), path)
 
 
-def open_labels(path: Path, size: tuple[int, int] | None) -> Image.Image:
-    """The decoded image of a label file.
-
-    Args:
-        path: the file.
-        size: width and height that its camera states; an image of another size is not decoded.
+def open_labels(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
+    """The decoded image of a label file; one of another size (width, height) than its camera states is not decoded.
 
     Raises:
         InputError: it is missing, cannot be decoded, is a JPEG, or is of another size.

@@ -42,17 +42,17 @@ def opencv_lens(
     return pycolmap.Camera(model=model, width=width, height=height, params=params)
 
 
-def opencv_distortion(lens: pycolmap.Camera) -> list[float] | None:
-    """OpenCV's coefficients of a lens, as a rig file holds them; None of a lens that OpenCV does not have.
-
-    An empty list stands for a pinhole.
-    """
-    numbers = [float(number) for number in lens.params]
-    if lens.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
+def opencv_distortion(lens: pycolmap.Camera | None) -> list[float] | None:
+    """OpenCV's coefficients of a lens, as a rig file holds them: an empty list for a pinhole, None for a lens that
+    OpenCV does not have."""
+    if lens is None or lens.model_name in ("SIMPLE_PINHOLE", "PINHOLE"):
         return []
+    numbers = [float(number) for number in lens.params]
     if lens.model_name in ("SIMPLE_RADIAL", "RADIAL"):
         return [*numbers[3:], 0.0, 0.0, 0.0, 0.0][:5]
-    return numbers[4:] if lens.model_name in ("OPENCV", "FULL_OPENCV") else None
+    if lens.model_name not in ("OPENCV", "FULL_OPENCV"):
+        return None
+    return numbers[4:] if any(numbers[9:]) else numbers[4:9]
 
 
 def photo_from_pinhole(lens: pycolmap.Camera, K: np.ndarray, xy: np.ndarray) -> np.ndarray:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from mvseg.formats.board import FAMILIES, BoardConfig, Family, opencv_dictionary
+from mvseg.formats.board import FAMILIES, BoardConfig, Family, marker_dictionary
 from mvseg.formats.photos import read_photo
 from mvseg.scene import Scene
 
@@ -21,17 +21,13 @@ Seen = dict[Corner, list[tuple[int, Floats]]]  # {corner: (view, (2,) pixels) wh
 
 
 def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
-    """Markers of a family in one photo.
-
-    Args:
-        photo: (H, W) uint8, without lens distortion.
-        family: of the markers.
+    """Markers of a family in one photo (H, W) uint8 without lens distortion.
 
     Returns:
         {number of the marker: (4, 2) corners in pixels, clockwise from its top left}; a marker that appears twice is
         ambiguous and left out.
     """
-    dictionary = cv2.aruco.getPredefinedDictionary(opencv_dictionary(family))
+    dictionary = marker_dictionary(family)
     if cv2.aruco.ArucoDetector(dictionary).detectMarkers(photo)[1] is None:  # quick, where there is none
         return {}
     parameters = cv2.aruco.DetectorParameters()
@@ -52,12 +48,17 @@ def find_scene_markers(scene: Scene, *, progress: bool = False) -> dict[Family, 
     """
     found: dict[Family, Seen] = {family: {} for family in FAMILIES}
     for view in tqdm(range(len(scene.views)), desc="markers", unit="photo", disable=not progress):
-        photo = np.asarray(cv2.cvtColor(read_photo(scene, view), cv2.COLOR_RGB2GRAY), np.uint8)
+        photo = read_grey(scene, view)
         for family, seen in found.items():
             for marker, quad in find_markers(photo, family).items():
                 for corner, px in enumerate(quad):
                     seen.setdefault((marker, corner), []).append((view, px))
     return found
+
+
+def read_grey(scene: Scene, view: int) -> Grey:
+    """(H, W) uint8: the photo of a view without colours and lens distortion, see `read_photo`."""
+    return np.asarray(cv2.cvtColor(read_photo(scene, view), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def find_board(photo: Grey, board: BoardConfig) -> tuple[NDArray[np.int64], Floats]:

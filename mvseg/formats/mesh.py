@@ -14,11 +14,8 @@ ROOT = "plant"  # the node above all others in a GLB
 
 
 def simplify_mesh(mesh: trimesh.Trimesh, max_faces: int) -> trimesh.Trimesh:
-    """Simplify a closed mesh to at most `max_faces` triangles, by quadric decimation; smaller ones are returned as they
-    are.
-
-    The boundary of an open mesh may be damaged.
-    """
+    """A closed mesh with at most `max_faces` triangles, by quadric decimation, which may damage the boundary of an open
+    one; smaller meshes are returned as they are."""
     return mesh if len(mesh.faces) <= max_faces else mesh.simplify_quadric_decimation(face_count=max_faces)
 
 
@@ -27,7 +24,8 @@ def write_ply(path: Path, mesh: trimesh.Trimesh, color: tuple[int, int, int], *,
 
     Every vertex has the RGB colour (0 to 255), and the id as its property `instance_id`.
     """
-    colored = _colored(mesh, color)
+    colors = np.tile(np.array([*color, 255], np.uint8), (len(mesh.vertices), 1))
+    colored = trimesh.Trimesh(mesh.vertices, mesh.faces, vertex_colors=colors, process=False)
     colored.vertex_attributes["instance_id"] = np.full(len(mesh.vertices), instance_id, np.int32)
     path.write_bytes(trimesh.exchange.ply.export_ply(colored, vertex_normal=True))
 
@@ -86,8 +84,3 @@ def _linear(color: tuple[int, int, int]) -> list[int]:
     share = np.array(color) / 255
     light = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
     return [round(float(255 * value)) for value in light]
-
-
-def _colored(mesh: trimesh.Trimesh, color: tuple[int, int, int]) -> trimesh.Trimesh:
-    visual = trimesh.visual.ColorVisuals(vertex_colors=[[*color, 255]] * len(mesh.vertices))
-    return trimesh.Trimesh(mesh.vertices, mesh.faces, visual=visual, process=False)

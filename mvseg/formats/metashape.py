@@ -12,13 +12,12 @@ with the corner of the top-left pixel at (0, 0). p1 and p2 are OpenCV's p2 and p
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 
-from mvseg.errors import InputError, InputWarning, faults_of
+from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.image_file import MAX_SIDE
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, find_photo
@@ -27,7 +26,9 @@ from mvseg.scene import Scene
 
 MAX_BYTES = 1 << 26
 GEOCENTRIC = 1e5  # metres from the origin, beyond which float32 does not resolve millimetres
-NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "k4", "p1", "p2", "p3", "p4")
+CAMERAS = "cameras//camera"  # those in groups, too; not the photos of a project's frames
+NAMES = ("f", "cx", "cy", "b1", "b2", "k1", "k2", "k3", "p1", "p2")
+UNKNOWN_NAMES = ("k4", "p3", "p4")  # numbers of the lens that OpenCV's model does not have
 
 
 def find_metashape(folder: Path) -> Path | None:
@@ -58,7 +59,7 @@ def read_metashape(path: Path) -> Scene:
     with faults_of(path):
         world_from_chunk = _find_transform(path, chunk)
     photos, num_left_out = [], 0
-    for index, camera in enumerate(_list_cameras(chunk)):
+    for index, camera in enumerate(chunk.iterfind(CAMERAS)):
         text = camera.findtext("transform")
         if text is None or camera.get("enabled") in ("0", "false"):
             num_left_out += 1
@@ -68,8 +69,7 @@ def read_metashape(path: Path) -> Scene:
             sensor = sensors.get(camera.get("sensor_id"))
             photos.append(_photo(path.parent, label, sensor, transform=text, world_from_chunk=world_from_chunk))
     if num_left_out:
-        message = f"{num_left_out} cameras are not aligned or not enabled and are left out"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=3)
+        warn(f"{path}: {num_left_out} cameras are not aligned or not enabled and are left out")
     unit = "" if world_from_chunk is None else "m"
     return build_scene(path.parent, photos, unit=unit, source=path)
 
@@ -88,15 +88,10 @@ def _read_chunk(path: Path) -> ElementTree.Element:
     return chunks[0]
 
 
-def _list_cameras(chunk: ElementTree.Element) -> list[ElementTree.Element]:
-    """Those in groups, too; not the photos of a project's frames."""
-    return chunk.findall("cameras//camera")
-
-
 def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray, np.ndarray, float] | None:
     """R, T and scale of world_from_chunk: X = scale R x + T; None if the chunk has no scale of its own."""
     components = chunk.findall("components/component")
-    used = {camera.get("component_id") for camera in _list_cameras(chunk) if camera.find("transform") is not None}
+    used = {camera.get("component_id") for camera in chunk.iterfind(CAMERAS) if camera.find("transform") is not None}
     if len(used) > 1:
         raise InputError(f"the cameras belong to {len(used)} components, expected one")
     owners = [each for each in components if each.get("id") in used] or [chunk]
@@ -110,7 +105,7 @@ def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray,
         raise InputError(f"the scale of the chunk is {scale:g}, expected a positive number")
     if np.abs(T).max() > GEOCENTRIC:
         message = f"the world is {np.linalg.norm(T):.3g} m from the origin (geocentric); its translation is left out"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
+        warn(f"{path}: {message}")
         T = np.zeros(3)
     return R, T, scale
 
@@ -126,15 +121,9 @@ def _photo(
     if sensor is None:
         raise InputError("its sensor is not in the file")
     width, height, values = _read_sensor(sensor)
-    K = np.array(
-        [
-            [values["f"] + values["b1"], values["b2"], width / 2 + values["cx"]],
-            [0, values["f"], height / 2 + values["cy"]],
-            [0, 0, 1],
-        ]
-    )
-    distortion = [values[name] for name in ("k1", "k2", "p2", "p1", "k3")]
-    lens = opencv_lens(K, distortion, width=width, height=height)
+    f, cx, cy, b1, b2, k1, k2, k3, p1, p2 = (values[name] for name in NAMES)
+    K = np.array([[f + b1, b2, width / 2 + cx], [0, f, height / 2 + cy], [0, 0, 1]])
+    lens = opencv_lens(K, [k1, k2, p2, p1, k3], width=width, height=height)
     chunk_from_cam = _numbers(transform, 16).reshape(4, 4)
     if chunk_from_cam[3].tolist() != [0, 0, 0, 1]:
         raise InputError("the last row of its transform is not 0, 0, 0, 1")
@@ -164,8 +153,8 @@ def _read_sensor(sensor: ElementTree.Element) -> tuple[int, int, dict[str, float
     width, height = (_numbers(size.get(side, ""), 1)[0] for side in ("width", "height"))
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise InputError(f"the resolution of its sensor is {width:g} x {height:g}")
-    values = {name: float(_numbers(calibration.findtext(name, "0"), 1)[0]) for name in NAMES}
-    for name in ("k4", "p3", "p4"):
+    values = {name: float(_numbers(calibration.findtext(name, "0"), 1)[0]) for name in (*NAMES, *UNKNOWN_NAMES)}
+    for name in UNKNOWN_NAMES:
         if values[name]:
             advice = f"expected 0: optimise the cameras without {name}"
             raise InputError(f"its sensor has {name} = {values[name]:g}, {advice}")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import posixpath
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -13,18 +12,18 @@ import numpy as np
 import pycolmap
 import torch
 
-from mvseg.errors import InputError, InputWarning, faults_of
+from mvseg.errors import InputError, faults_of, warn
+from mvseg.formats.find_views import list_some
 from mvseg.formats.image_file import (
     MAX_PIXELS,
-    MAX_SIDE,
     PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
     WrongSize,
     file_name_problem,
     is_turned,
-    known_bits,
     read_image_size,
     read_rgb,
+    sensor_bits,
 )
 from mvseg.formats.lens import undistort
 from mvseg.scene import Cameras, Scene, View, camera_problem
@@ -68,19 +67,19 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         InputError: fewer than two views, two views with the same name, a file name that leads out of the folder, a
             camera that is not sound. The message names the view's index and its photo.
     """
-    if not photos:
-        raise InputError(f"{source}: there are no views, expected at least two")
     if len(photos) < 2:
-        raise InputError(f"{source}: there is a single view, expected at least two")
+        there = "is a single view" if photos else "are no views"
+        raise InputError(f"{source}: there {there}, expected at least two")
     files = [find_photo(folder, photo.file) for photo in photos]
+    moved = []
     for index, (photo, file) in enumerate(zip(photos, files, strict=True)):
         problem = _problem(photo, file)
         if problem:
             raise InputError(f"{source}: view {index} ({photo.file}): {problem}")
-    moved = [(photo.file, file) for photo, file in zip(photos, files, strict=True) if is_elsewhere(photo.file, file)]
+        if posixpath.dirname(posixpath.normpath(photo.file)) != posixpath.dirname(posixpath.normpath(file)):
+            moved.append(f"{file} for {photo.file}")
     if moved:
-        message = f"{len(moved)} photos are matched by their names alone, the first is {moved[0][1]} for {moved[0][0]}"
-        warnings.warn(f"{source}: {message}", InputWarning, stacklevel=4)
+        warn(f"{source}: {len(moved)} photos are matched by their names alone, the first is {moved[0]}")
     named = zip(view_names(files), files, photos, strict=True)
     views = tuple(View(name, folder / file, photo.lens) for name, file, photo in named)
     cameras = Cameras(
@@ -135,11 +134,6 @@ def size_of_photo(folder: Path, file: str) -> tuple[int, int]:
         return read_image_size(photo)
 
 
-def is_elsewhere(file: str, found: str) -> bool:
-    """Whether a photo was found in another folder than the camera file says."""
-    return os.path.dirname(os.path.normpath(file)) != os.path.dirname(os.path.normpath(found))
-
-
 def _list_photos(folder: Path, pattern: str) -> list[Path]:
     try:
         return sorted(path for path in folder.glob(pattern) if path.suffix.lower() in PHOTO_SUFFIXES and path.is_file())
@@ -163,9 +157,7 @@ def _problem(photo: Photo, file: str) -> str | None:
     problem = file_name_problem(file)
     if problem:
         return problem
-    if max(photo.width, photo.height) > MAX_SIDE:
-        return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_SIDE} pixels a side"
-    if photo.width * photo.height > MAX_PIXELS:
+    if max(photo.width, photo.height, photo.width * photo.height) > MAX_PIXELS:
         return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_PIXELS} pixels in all"
     size = torch.tensor([photo.width, photo.height])
     return camera_problem(torch.as_tensor(photo.K), torch.as_tensor(photo.R), torch.as_tensor(photo.t), size=size)
@@ -183,30 +175,28 @@ def check_photos(scene: Scene) -> None:
     """
     paths = [view.path for view in scene.views]
     present = [path.is_file() for path in paths]
-    if not any(present):
-        beside = describe_folder(paths[0].parent)
-        if beside:
-            message = f"{paths[0]}: this photo and all others are missing; {beside}"
-            warnings.warn(message, InputWarning, stacklevel=2)
-        return
     if not all(present):
         missing = present.index(False)
         beside = describe_folder(paths[missing].parent)
-        raise InputError(f"{paths[missing]}: the image of view {missing} is missing{beside and '; ' + beside}")
+        if any(present):
+            raise InputError(f"{paths[missing]}: the image of view {missing} is missing{beside}")
+        if beside:
+            warn(f"{paths[0]}: this photo and all others are missing{beside}")
+        return
     turned = [path for path in paths if is_turned(path)]
     if turned:
         message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
-        warnings.warn(f"{turned[0]}: {message}", InputWarning, stacklevel=2)
+        warn(f"{turned[0]}: {message}")
     known = _bits_of_views(scene)
     if 8 < max(known) < 16:
         deep = [path for path, bits in zip(paths, known, strict=True) if bits > 8]
         message = f"{len(deep)} photos of 16 bits hold numbers of {max(known)} bits at most: they are brightened alike"
-        warnings.warn(f"{deep[0]}: {message}", InputWarning, stacklevel=2)
+        warn(f"{deep[0]}: {message}")
 
 
 def describe_turn(path: Path) -> str:
-    """That EXIF turns a photo, for a message about sizes that do not fit; "" if it does not."""
-    return f"EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
+    """That EXIF turns a photo, as the end of a sentence about sizes that do not fit; "" if it does not."""
+    return f"; EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
 
 
 def describe_folder(folder: Path) -> str:
@@ -217,30 +207,29 @@ def describe_folder(folder: Path) -> str:
         return ""
     phone = [name for name in names if name.lower().endswith(PHONE_SUFFIXES)]
     if phone:
-        return f"{phone[0]} is a HEIC file: convert it to JPEG or PNG without turning or scaling it"
+        return f"; {phone[0]} is a HEIC file: convert it to JPEG or PNG without turning or scaling it"
     pictures = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
-    more = f" and {len(pictures) - 3} more" if len(pictures) > 3 else ""
-    return f"found {', '.join(pictures[:3])}{more}" if pictures else ""
+    return f"; found {list_some(pictures)}" if pictures else ""
 
 
 def require_photos(scene: Scene, folder: Path) -> None:
     """Raises InputError: a scene folder without masks has no photos either."""
-    if not scene.views[0].path.is_file():
-        beside = describe_folder(scene.views[0].path.parent)
-        end = f"; {beside}" if beside else ""
-        raise InputError(f"{folder}: there are neither photos nor masks (--masks), expected one of them{end}")
+    photo = scene.views[0].path
+    if not photo.is_file():
+        missing = "there are neither photos nor masks (--masks), expected one of them"
+        raise InputError(f"{folder}: {missing}{describe_folder(photo.parent)}")
 
 
 def photo_bits(scene: Scene, view: int) -> int:
     """How many bits the photo of a view is taken to use: 8 or, for a 16-bit file, the most that any photo of the scene
     uses, so that all are brightened by the same factor."""
-    own = known_bits(scene.views[view].path, tuple(scene.cameras.sizes[view].tolist()))
+    own = sensor_bits(scene.views[view].path, tuple(scene.cameras.sizes[view].tolist()))
     return own if own in (8, 16) else max(_bits_of_views(scene))
 
 
 def _bits_of_views(scene: Scene) -> list[int]:
     sizes = [(width, height) for width, height in scene.cameras.sizes.tolist()]
-    return [known_bits(view.path, size) for view, size in zip(scene.views, sizes, strict=True)]
+    return [sensor_bits(view.path, size) for view, size in zip(scene.views, sizes, strict=True)]
 
 
 def load_photos(scene: Scene) -> list[torch.Tensor]:

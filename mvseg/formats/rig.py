@@ -12,7 +12,6 @@ are not known. `"calibration": "camera.yaml"` stands for K, distortion and size 
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -21,10 +20,10 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, FiniteFloat
 
-from mvseg.errors import InputError, InputWarning, faults_of
-from mvseg.formats.json_file import Items, Matrix3, Pixels, Vector3, read_json
-from mvseg.formats.lens import opencv_lens
-from mvseg.formats.opencv_yaml import calibration_lens, read_calibration
+from mvseg.errors import InputError, faults_of, warn
+from mvseg.formats.json_file import Items, Matrix3, Pixels, Vector3, load_json, read_json
+from mvseg.formats.lens import opencv_distortion, opencv_lens
+from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
 from mvseg.scene import Scene
 
@@ -61,8 +60,8 @@ def is_rig(path: Path) -> bool:
     """Whether a cameras.json is meant as a rig file, valid or not; other programs (3D Gaussian splatting) use this
     name, too."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8-sig"))
-    except (OSError, ValueError, RecursionError):
+        content = load_json(path)
+    except InputError:
         return True  # `read_rig` says what is wrong
     return isinstance(content, dict) and ("views" in content or str(content.get("format")).startswith("mvseg"))
 
@@ -89,16 +88,11 @@ def warn_of_unknown_keys(path: Path, entries: Iterable[tuple[str, BaseModel]]) -
     """Say (InputWarning) which keys of the named entries of a file are not used."""
     for owner, entry in entries:
         for key in list(entry.model_extra or {})[:MANY]:
-            warnings.warn(f"{path}: key '{key}' of {owner} is not known and not used", InputWarning, stacklevel=3)
+            warn(f"{path}: key '{key}' of {owner} is not known and not used")
 
 
 def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
-    """A photo with its camera, complete.
-
-    Args:
-        folder: the scene; the photo and the calibration are looked for there.
-        file: of the photo, relative to the scene.
-        camera: as it stands in the file.
+    """A photo with its camera, complete: `folder` is the scene, where the photo and a calibration are looked for.
 
     Raises:
         InputError: there is not exactly one of K and a calibration, the calibration cannot be read or is of another
@@ -121,7 +115,7 @@ def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
         width, height = _complete_size(known, folder, file)
         if any(given not in (None, found) for given, found in zip(size, (width, height), strict=True)):
             raise InputError(f"the calibration is of {width} x {height} pixels, the camera says {size[0]} x {size[1]}")
-        K, lens = calibration.K, calibration_lens(calibration, width, height)
+        K, lens = calibration.K, calibration.lens(width, height)
     R, t = np.array(camera.R), np.array(camera.t)
     return Photo(file=file, width=width, height=height, K=K, R=R, t=t, lens=lens)
 
@@ -131,24 +125,21 @@ def _complete_size(size: tuple[int | None, int | None], folder: Path, file: str)
     return size_of_photo(folder, file) if width is None or height is None else (width, height)
 
 
-def write_rig(
-    path: Path, scene: Scene, files: list[str], *, distortion: list[list[float] | None] | None = None
-) -> None:
+def write_rig(path: Path, scene: Scene, files: list[str]) -> None:
     """Write a rig file.
 
     Args:
         path: where; its folder must exist.
-        scene: gives the cameras, the unit and the direction that points up.
+        scene: gives the cameras with their lenses (which must be OpenCV's), the unit and the direction that points up.
         files: V photo paths relative to the folder of `path`.
-        distortion: V lists of OpenCV coefficients, or None for pinholes.
     """
     cameras, views = scene.cameras, []
     for index, file in enumerate(files):
         width, height = cameras.sizes[index].tolist()
         view = {"file": file, "width": width, "height": height}
         view |= {name: getattr(cameras, name)[index].tolist() for name in ("K", "R", "t")}
-        if distortion and distortion[index]:
-            view["distortion"] = distortion[index]
+        if distortion := opencv_distortion(scene.views[index].lens):
+            view["distortion"] = distortion
         views.append(view)
     world = {"unit": scene.unit} | ({} if scene.up is None else {"up": scene.up})
     path.write_text(json.dumps({"format": RIG_FORMAT, **world, "views": views}, indent=1) + "\n")

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
 from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
@@ -26,7 +25,14 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 EXPECTED = "expected cameras.json, a COLMAP model in sparse/, transforms.json, or another kind of docs/formats.md"
-TRANSFORMS = ("transforms.json", "transforms_train.json")  # Blender's scenes of NeRF have train, val and test
+# In the order in which they are looked for; Blender's scenes of NeRF have train, val and test.
+READERS: dict[str, Callable[[Path], Scene]] = {
+    "transforms.json": read_transforms,
+    "transforms_train.json": read_transforms,
+    "turntable.json": read_turntable,
+    "*.xml": read_metashape,
+    "scene_camera.json": read_bop,
+}
 BINARY = 255  # written by segmenters that only separate leaf from background
 
 
@@ -51,8 +57,7 @@ def load_scene(folder: Path | str) -> Scene:
     scene = None if is_own else _read_others(folder)
     if scene is not None:
         if rig.is_file():
-            message = f"is not a rig file, and not used; the cameras are those of {scene.source}"
-            warnings.warn(f"{rig}: {message}", InputWarning, stacklevel=2)
+            warn(f"{rig}: is not a rig file, and not used; the cameras are those of {scene.source}")
         return scene
     if rig.is_file():
         return read_rig(rig)  # also another program's: it says what is missing
@@ -64,31 +69,24 @@ def _read_others(folder: Path) -> Scene | None:
     model = find_colmap_model(folder)
     if model is not None:
         return read_colmap(model, folder)
-    for name in TRANSFORMS:
-        if (folder / name).is_file():
-            return read_transforms(folder / name)
-    if (folder / "turntable.json").is_file():
-        return read_turntable(folder / "turntable.json")
-    metashape = find_metashape(folder)
-    if metashape is not None:
-        return read_metashape(metashape)
-    if (folder / "scene_camera.json").is_file():
-        return read_bop(folder / "scene_camera.json")
+    for name, read in READERS.items():
+        path = find_metashape(folder) if name == "*.xml" else folder / name
+        if path is not None and path.is_file():
+            return read(path)
     return None
 
 
 def _describe(folder: Path) -> str:
     """What a folder without cameras holds, and what to do with it, as the end of a sentence."""
-    files = sorted(folder.rglob("*"))
-    photos = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
+    names = [path.relative_to(folder).as_posix() for path in sorted(folder.rglob("*"))]
+    photos = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
     if photos:
         return f"found {len(photos)} photos ({photos[0]}, ...): mvseg pose {folder} --out SCENE estimates their cameras"
-    phone = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHONE_SUFFIXES]
+    phone = [name for name in names if name.lower().endswith(PHONE_SUFFIXES)]
     if phone:
         next_step = "convert them to JPEG; mvseg pose estimates the cameras of photos"
         return f"found {len(phone)} HEIC files ({phone[0]}, ...): {next_step}"
-    names = sorted(path.name for path in folder.iterdir())
-    return f"found {list_some(names)}"
+    return f"found {list_some(sorted(path.name for path in folder.iterdir()))}"
 
 
 def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", categories: Collection[str] = ()) -> Regions:
@@ -124,8 +122,7 @@ def read_masks(scene: Scene, found: MaskFiles, *, crowd: Crowd = "mask", categor
         return stack_views(views, scene, source=path)
     regions = stack_views(read_views(scene, found, wanted=categories), scene, source=found.source)
     if found.kind == "label images" and len(regions) and bool((regions.labels == BINARY).all()):
-        message = "holds 0 and 255 only, so that each photo shows one instance; leaves need a number each"
-        warnings.warn(f"{found.source}: {message}", InputWarning, stacklevel=3)
+        warn(f"{found.source}: holds 0 and 255 only, so that each photo shows one instance; leaves need a number each")
     elif found.kind in ("label images", "NumPy arrays"):
         check_numbers(regions, source=found.source)
     return regions

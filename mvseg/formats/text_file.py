@@ -1,24 +1,16 @@
-"""Text files that people write, read whole; each fault is one sentence."""
+"""Text and YAML files that people write, read whole; each fault is one sentence."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import yaml  # type: ignore[import-untyped]
 
 from mvseg.errors import InputError
 
 MAX_BYTES = 1 << 20
-
-
-def read_text(path: Path, expected: str, *, most: int = MAX_BYTES) -> str:
-    """The text of a file, without the byte order mark that Windows editors write.
-
-    Raises:
-        InputError: it cannot be read, has more than `most` bytes, or is not UTF-8; names the path and what is expected.
-    """
-    try:
-        return read_bytes(path, expected, most=most).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected {expected}") from None
+MAX_DEPTH, MAX_DIGITS = 32, 400  # of YAML: PyYAML recurses as deep as Python's stack
 
 
 def read_bytes(path: Path, expected: str, *, most: int = MAX_BYTES) -> bytes:
@@ -35,3 +27,49 @@ def read_bytes(path: Path, expected: str, *, most: int = MAX_BYTES) -> bytes:
     if len(data) > most:
         raise InputError(f"{path}: is larger than {most} bytes, expected {expected}")
     return data
+
+
+def read_text(path: Path, expected: str, *, most: int = MAX_BYTES) -> str:
+    """The text of a file, without the byte order mark that Windows editors write.
+
+    Raises:
+        InputError: as `read_bytes`, or it is not UTF-8.
+    """
+    try:
+        return read_bytes(path, expected, most=most).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: byte {error.start} is not UTF-8, expected {expected}") from None
+
+
+def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:
+    """What a YAML file holds; a line of OpenCV, "%YAML:1.0", is left out.
+
+    Raises:
+        InputError: as `read_text`, or it is not YAML, is nested more than 32 deep, uses aliases (nested ones expand 300
+            bytes into billions of values), or holds a number of more than 400 digits.
+    """
+    lines = read_text(path, expected).split("\n")
+    text = "\n".join("" if line.startswith("%YAML:") else line for line in lines)
+    try:
+        _check_events(path, text)
+        return yaml.load(text, loader)
+    except InputError:
+        raise
+    except Exception as error:  # yaml raises its own kinds, and those of what it builds
+        raise InputError(f"{path}: is not a YAML file ({' '.join(str(error).split())}), expected {expected}") from None
+
+
+def _check_events(path: Path, text: str) -> None:
+    depth = 0
+    for event in yaml.parse(text, Loader=yaml.SafeLoader):  # event by event: nothing is built
+        line = event.start_mark.line + 1
+        if isinstance(event, yaml.AliasEvent):
+            raise InputError(f"{path}: line {line} has the alias *{event.anchor}, expected plain values")
+        if isinstance(event, yaml.CollectionStartEvent):
+            depth += 1
+            if depth > MAX_DEPTH:
+                raise InputError(f"{path}: line {line} is nested more than {MAX_DEPTH} deep, expected plain values")
+        elif isinstance(event, yaml.CollectionEndEvent):
+            depth -= 1
+        elif isinstance(event, yaml.ScalarEvent) and len(event.value) > MAX_DIGITS and event.value[1:].isdigit():
+            raise InputError(f"{path}: line {line} holds a number of {len(event.value)} digits")

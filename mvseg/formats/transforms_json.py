@@ -6,8 +6,8 @@ turned and scaled it (COLMAP's). Its `mask_path` marks what to train on and does
 
 from __future__ import annotations
 
+import itertools
 import math
-import warnings
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +15,7 @@ import numpy as np
 import pycolmap
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
 
-from mvseg.errors import InputError, InputWarning, faults_of
+from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.json_file import Items, Pixels, read_json
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
@@ -47,6 +47,11 @@ class _Intrinsics(BaseModel):
     p1: FiniteFloat | None = None
     p2: FiniteFloat | None = None
 
+    @property
+    def intrinsics(self) -> dict[str, Any]:
+        """Those that the file states."""
+        return self.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
+
 
 class _Frame(_Intrinsics):
     file_path: str
@@ -72,18 +77,18 @@ def read_transforms(path: Path) -> Scene:
             transform is not a similarity, or a camera is unsound; see `build_scene`.
     """
     transforms = read_json(path, _Transforms)
-    shared = transforms.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
+    shared = transforms.intrinsics
     undo = _undo_applied(path, transforms)
-    _check_lens_keys(path, transforms)
+    for entry, key in itertools.product((transforms, *transforms.frames), OTHER_LENSES):
+        if (entry.model_extra or {}).get(key):
+            raise InputError(f"{path}: the lens is of instant-ngp's kind '{key}', expected OpenCV's or its fisheye")
     photos = []
     for index, frame in enumerate(transforms.frames):
-        of_frame = frame.model_dump(include=set(_Intrinsics.model_fields), exclude_none=True)
         with faults_of(f"{path}: frame {index} ({frame.file_path})"):
-            photos.append(_photo(path.parent, frame, shared | of_frame, undo=undo))
+            photos.append(_photo(path.parent, frame, shared | frame.intrinsics, undo=undo))
     num_masks = sum(frame.mask_path is not None for frame in transforms.frames)
     if num_masks:
-        message = f"the mask_path of {num_masks} frames is not used: it does not tell leaves apart, as --masks does"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=3)
+        warn(f"{path}: the mask_path of {num_masks} frames is not used: it does not tell leaves apart, as --masks does")
     return build_scene(path.parent, photos, unit="", source=path)
 
 
@@ -97,13 +102,6 @@ def _undo_applied(path: Path, transforms: _Transforms) -> tuple[np.ndarray, floa
     if np.abs(R @ R.T - np.eye(3)).max() > ROTATION_TOLERANCE or np.linalg.det(R) < 0:
         raise InputError(f"{path}: applied_transform is not a rotation with a translation, so it cannot be undone")
     return np.linalg.inv(applied), transforms.applied_scale
-
-
-def _check_lens_keys(path: Path, transforms: _Transforms) -> None:
-    for entry in (transforms, *transforms.frames):
-        for key in OTHER_LENSES:
-            if (entry.model_extra or {}).get(key):
-                raise InputError(f"{path}: the lens is of instant-ngp's kind '{key}', expected OpenCV's or its fisheye")
 
 
 def _photo(folder: Path, frame: _Frame, given: dict[str, Any], *, undo: tuple[np.ndarray, float]) -> Photo:

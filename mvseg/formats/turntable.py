@@ -62,22 +62,27 @@ def read_turntable(path: Path) -> Scene:
         InputError: the file is missing, broken or of another format, a view names no camera of the file, the axis has
             no direction, or a camera is unsound; see `photo_of` and `build_scene`.
     """
-    table = read_json(path, _Turntable)
+    table = _read_table(path)
     owners = [("the turntable", table), *((f"camera {name}", each) for name, each in table.cameras.items())]
     warn_of_unknown_keys(path, [*owners, *((f"view {index}", view) for index, view in enumerate(table.views))])
     if not any(table.axis.direction):
         raise InputError(f"{path}: the direction of the axis is 0, 0, 0, expected a vector along the axis")
     photos = []
     for index, view in enumerate(table.views):
-        where = f"{path}: view {index} ({view.file})"
-        if view.camera not in table.cameras:
-            names = ", ".join(table.cameras)
-            raise InputError(f"{where}: there is no camera '{view.camera}', expected of these: {names}")
-        with faults_of(where):
+        with faults_of(f"{path}: view {index} ({view.file})"):
             photo = photo_of(path.parent, view.file, table.cameras[view.camera])
         turn, shift = turn_about(np.array(table.axis.point), np.array(table.axis.direction), view.angle)
         photos.append(dataclasses.replace(photo, R=photo.R @ turn, t=photo.R @ shift + photo.t))
     return build_scene(path.parent, photos, unit=table.unit, source=path)
+
+
+def _read_table(path: Path) -> _Turntable:
+    table = read_json(path, _Turntable)
+    for index, view in enumerate(table.views):
+        if view.camera not in table.cameras:
+            there = f"there is no camera '{view.camera}', expected of these: {', '.join(table.cameras)}"
+            raise InputError(f"{path}: view {index} ({view.file}): {there}")
+    return table
 
 
 def read_turntable_parts(path: Path) -> tuple[dict[str, dict[str, Any]], list[tuple[str, float]], str]:
@@ -88,7 +93,7 @@ def read_turntable_parts(path: Path) -> tuple[dict[str, dict[str, Any]], list[tu
         InputError: the file cannot be read, has no camera or another axis, a view names no camera of it, or a camera
             has no K and size, or a distortion of more than five numbers.
     """
-    table = read_json(path, _Turntable)
+    table = _read_table(path)
     axis = table.axis
     if not table.cameras or (*axis.point, *axis.direction) != (0.0, 0.0, 0.0, 0.0, 0.0, 1.0):
         raise InputError(f"{path}: expected cameras and the axis 0 0 1 at 0 0 0, as mvseg pose writes it")
@@ -99,9 +104,6 @@ def read_turntable_parts(path: Path) -> tuple[dict[str, dict[str, Any]], list[tu
             raise InputError(f"{path}: {message}, expected a file of mvseg pose --turntable")
         if len(camera.get("distortion", [])) > 5:
             raise InputError(f"{path}: the distortion of camera {name} is not k1, k2, p1, p2, k3")
-    unknown = next((view.camera for view in table.views if view.camera not in cameras), None)
-    if unknown is not None:
-        raise InputError(f"{path}: there is no camera '{unknown}', expected of these: {', '.join(cameras)}")
     return cameras, [(view.camera, view.angle) for view in table.views], table.unit
 
 

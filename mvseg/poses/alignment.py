@@ -82,8 +82,8 @@ def fit_similarity(source: Floats, target: Floats) -> pycolmap.Sim3d:
     if is_one_line(source) or is_one_line(target):
         raise InputError("the known points lie on one line, expected some off it: the rotation about it is free")
     fits = [(_fit(each, target), each) for each in (source, source * MIRROR)]
-    misses = [float(np.linalg.norm(_residuals(fit, each, target))) / np.sqrt(len(source)) for fit, each in fits]
-    _refuse_mirror(source, target, misses)
+    residuals = [float(np.linalg.norm(_residuals(fit, each, target))) / np.sqrt(len(source)) for fit, each in fits]
+    _refuse_mirror(source, target, residuals)
     return fits[0][0]
 
 
@@ -96,11 +96,11 @@ def _fit(source: Floats, target: Floats) -> pycolmap.Sim3d:
     return pycolmap.Sim3d(scale, pycolmap.Rotation3d(turn.as_matrix()), shift)
 
 
-def _refuse_mirror(source: Floats, target: Floats, misses: list[float]) -> None:
-    """Raise InputError if the targets are fitted far better by the mirror image of the sources: `misses` are the
-    residuals of both. In one plane a mirror image is as good as a rotation, and small residuals differ by noise."""
+def _refuse_mirror(source: Floats, target: Floats, residuals: list[float]) -> None:
+    """Raise InputError if the targets are fitted far better by the mirror image of the sources: `residuals` are of the
+    sources and of their image. In one plane both are as good, and small residuals differ by noise."""
     is_flat = any(off <= FLAT * across for _, across, off in (spreads(source), spreads(target)))
-    if not is_flat and misses[1] < MIRRORED * misses[0] and misses[0] > FLAT * spreads(target)[0]:
+    if not is_flat and residuals[1] < MIRRORED * residuals[0] and residuals[0] > FLAT * spreads(target)[0]:
         raise InputError("the known points are mirrored, expected right-handed axes: reverse one axis")
 
 

@@ -7,16 +7,17 @@ angles. All are refined together for the least reprojection error, with all phot
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import pycolmap
 from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.markers import Grey, find_board
-from mvseg.poses.table_fit import HALF, Floats, Sightings, TableCamera, fit_table, turn_z
+from mvseg.poses.table_fit import HALF, Floats, Sightings, TableCamera, fit_table
 
 LEAST_PHOTOS = 4
 LEAST_CORNERS = 6  # of a photo
@@ -24,7 +25,7 @@ LEAST_TURN = 10.0  # degrees, of all photos together
 FLAT = 0.7  # cosine between the axis and the normal of a board that lies, more or less, flat
 MOST_RESIDUAL = 0.005  # in widths of the photo, above which the motion was not a pure rotation
 
-Poses = dict[int, tuple[Rotation, Floats]]  # {place of the angle: cam_from_board}
+Poses = dict[int, pycolmap.Rigid3d]  # {place of the angle: cam_from_board}
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,34 +74,25 @@ def calibrate_turntable(photos: Mapping[str, Sequence[Grey]], board: BoardConfig
     for name, found in seen.items():
         lenses[name], poses[name] = _calibrate_camera(found, board, size=photos[name][0].shape[::-1])
     corners = np.concatenate([board.corners()[numbers] for found in seen.values() for numbers, _ in found.values()])
-    cameras, angles, shape_pose = _start(lenses, poses, middle=corners.mean(0))
+    cameras, angles, world_from_board = _initialise(lenses, poses, middle=corners.mean(0))
     used = sorted(angles)
-    place = {angle: index for index, angle in enumerate(used)}
     rows = [
-        (np.full(len(px), index), np.full(len(px), place[angle]), board.corners()[numbers], px)
+        (np.full(len(px), index), np.full(len(px), used.index(angle)), board.corners()[numbers], px)
         for index, name in enumerate(cameras)
         for angle, (numbers, px) in seen[name].items()
     ]
     camera, angle, point, px = (np.concatenate(column) for column in zip(*rows, strict=True))
-    fit = fit_table(
-        list(cameras.values()),
-        np.array([angles[each] for each in used]),
-        shape_pose,
-        sightings=Sightings(camera=camera, angle=angle, point=point, px=px),
-        fixed_angle=0,
-        has_free_lenses=True,
-    )
-    residual = float(np.sqrt((fit.residuals**2).sum(1).mean()))
-    if residual > MOST_RESIDUAL * max(each.size[0] for each in fit.cameras):
+    sightings = Sightings(camera=camera, angle=angle, point=point, px=px)
+    given = np.array([angles[each] for each in used])
+    fitted, turned, residuals = fit_table(list(cameras.values()), given, world_from_board, sightings=sightings)
+    residual = float(np.sqrt((residuals**2).sum(1).mean()))
+    if residual > MOST_RESIDUAL * max(each.size[0] for each in fitted):
         message = f"one axis of rotation explains the board to {residual:.1f} px only"
         raise InputError(f"{message}: did a camera move, or the board on the table?")
     all_angles = np.full(num_angles, np.nan)
-    all_angles[used] = fit.angles
+    all_angles[used] = turned
     return TurntableCalibration(
-        cameras=dict(zip(cameras, fit.cameras, strict=True)),
-        angles=all_angles,
-        residual_px=residual,
-        num_corners=len(px),
+        cameras=dict(zip(cameras, fitted, strict=True)), angles=all_angles, residual_px=residual, num_corners=len(px)
     )
 
 
@@ -129,105 +121,95 @@ def _calibrate_camera(
     guess = np.array([[1.2 * max(size), 0, width / 2], [0, 1.2 * max(size), height / 2], [0, 0, 1]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
     _, K, distortion, turns, shifts = cv2.calibrateCamera(world, image, (width, height), guess, None, flags=flags)
-    found = zip(seen, turns, shifts, strict=True)
     poses = {
-        angle: (Rotation.from_rotvec(np.asarray(turn, float).ravel()), np.asarray(shift, float).ravel())
-        for angle, turn, shift in found
+        angle: _rigid(Rotation.from_rotvec(np.ravel(turn)), np.ravel(shift))
+        for angle, turn, shift in zip(seen, turns, shifts, strict=True)
     }
     matrix: Floats = np.array(K, dtype=np.float64) + [[0, 0, HALF], [0, 0, HALF], [0, 0, 0]]
-    coefficients: Floats = np.array(distortion, dtype=np.float64).ravel()[:5]
-    return TableCamera(K=matrix, distortion=coefficients, R=np.eye(3), t=np.zeros(3), size=(width, height)), poses
+    lens = np.array(distortion, dtype=np.float64).ravel()[:5]
+    return TableCamera(K=matrix, distortion=lens, R=np.eye(3), t=np.zeros(3), size=(width, height)), poses
 
 
-def _start(
+def _initialise(
     lenses: Mapping[str, TableCamera], poses: Mapping[str, Poses], *, middle: Floats
-) -> tuple[dict[str, TableCamera], dict[int, float], tuple[Rotation, Floats]]:
+) -> tuple[dict[str, TableCamera], dict[int, float], pycolmap.Rigid3d]:
     """Cameras in one world, {place of the angle: degrees} and world_from_board, from the poses of the boards alone.
 
     The camera that sees the board most often gives axis and world; each of the others joins through an angle that is
     known by then.
     """
     first = max(poses, key=lambda name: len(poses[name]))
-    cam_from_world, angles, world_from_board = _start_world(poses[first], middle)
+    cam_from_world, angles, world_from_board = _initial_world(poses[first], middle)
     found = {first: cam_from_world}
     while len(found) < len(poses):
         name = max(poses.keys() - found.keys(), key=lambda name: (len(poses[name].keys() & angles.keys()), name))
         common = sorted(poses[name].keys() & angles.keys())
         if not common:
             raise InputError(f"camera {name}: it sees the board at no angle at which another camera does")
-        board_at = _join((turn_z(angles[common[0]]), np.zeros(3)), world_from_board)
-        found[name] = _join(poses[name][common[0]], _invert(board_at))
+        found[name] = poses[name][common[0]] * (_turn_z(angles[common[0]]) * world_from_board).inverse()
         for place, pose in poses[name].items():
-            turned = _invert(found[name])[0] * pose[0] * world_from_board[0].inv()
-            angles.setdefault(place, float(np.degrees(turned.as_rotvec()[2])))
+            turned = found[name].inverse() * pose * world_from_board.inverse()
+            angles.setdefault(place, float(np.degrees(_rotation(turned).as_rotvec()[2])))
     zero = angles[min(angles)]
-    turned = {name: (turn * turn_z(zero), shift) for name, (turn, shift) in found.items()}
+    at_zero = {name: cam_from_world * _turn_z(zero) for name, cam_from_world in found.items()}
     cameras = {
-        name: TableCamera(
-            K=lens.K, distortion=lens.distortion, R=turned[name][0].as_matrix(), t=turned[name][1], size=lens.size
-        )
+        name: replace(lens, R=at_zero[name].rotation.matrix(), t=at_zero[name].translation)
         for name, lens in lenses.items()
     }
     return cameras, {place: angle - zero for place, angle in angles.items()}, world_from_board
 
 
-def _start_world(
-    poses: Poses, middle: Floats
-) -> tuple[tuple[Rotation, Floats], dict[int, float], tuple[Rotation, Floats]]:
+def _initial_world(poses: Poses, middle: Floats) -> tuple[pycolmap.Rigid3d, dict[int, float], pycolmap.Rigid3d]:
     """The table as one camera sees it: z along the axis, the board's middle (3,) at height 0, angle 0 at first.
 
     Returns:
         cam_from_world, the angles in degrees, and world_from_board.
     """
-    direction, point, turns = find_axis(list(poses.values()))
+    direction, point, turns = _find_axis(list(poses.values()))
     if np.ptp(turns) < LEAST_TURN:
         raise InputError(f"the board turned by {np.ptp(turns):.1f} degrees in all, expected a table that turns")
-    board_turn, board_shift = next(iter(poses.values()))
-    board_middle = board_turn.apply(middle) + board_shift
-    normal = board_turn.as_matrix()[:, 2]
+    cam_from_board = next(iter(poses.values()))
+    normal = cam_from_board.rotation.matrix()[:, 2]
     upwards = normal if abs(normal @ direction) > FLAT else np.array([0.0, -1, 0])  # of a standing board: the camera's
     if upwards @ direction < 0:
         direction, turns = -direction, -turns
-    point = point + ((board_middle - point) @ direction) * direction
-    cam_from_world = axes_about(direction), point
-    return (
-        cam_from_world,
-        dict(zip(poses, turns.tolist(), strict=True)),
-        _join(_invert(cam_from_world), (board_turn, board_shift)),
-    )
+    point = point + ((cam_from_board * middle - point) @ direction) * direction
+    cam_from_world = _rigid(_axes_about(direction), point)
+    angles = dict(zip(poses, turns.tolist(), strict=True))
+    return cam_from_world, angles, cam_from_world.inverse() * cam_from_board
 
 
-def find_axis(poses: Sequence[tuple[Rotation, Floats]]) -> tuple[Floats, Floats, Floats]:
-    """The axis about which a shape turns, from its A poses in the frame of a camera (or of anything that stands still).
+def _find_axis(poses: Sequence[pycolmap.Rigid3d]) -> tuple[Floats, Floats, Floats]:
+    """The axis about which the board turns, from its A poses in the frame of a camera.
 
     Returns:
         Its direction (3,) and a point on it (3,), and the angles (A,) in degrees from the first pose.
     """
-    first, first_shift = poses[0]
-    turns = [turn * first.inv() for turn, _ in poses]
-    vectors = np.array([turn.as_rotvec() for turn in turns])
-    _, _, axes = np.linalg.svd(vectors)
-    direction = axes[0]
-    # Along the axis, the positions of any point of the board do not change: these turns by more than half a circle too.
+    motions = [pose * poses[0].inverse() for pose in poses]
+    vectors = np.array([_rotation(motion).as_rotvec() for motion in motions])
+    direction = np.linalg.svd(vectors)[2][0]
     angles = np.degrees(vectors @ direction)
-    # The point: c with R_i c + (t_i - R_i t_0) = c for the motion of every photo against the first.
-    rows = np.concatenate([turn.as_matrix() - np.eye(3) for turn in turns] + [direction[None]])
-    shifts = [turn.apply(first_shift) - t for turn, (_, t) in zip(turns, poses, strict=True)]
-    point = np.linalg.lstsq(rows, np.concatenate([*shifts, np.zeros(1)]), rcond=None)[0]
-    return direction, point, angles
+    # The point that no motion moves, and that has no component along the axis.
+    rows = np.concatenate([*(motion.rotation.matrix() - np.eye(3) for motion in motions), direction[None]])
+    shifts = np.concatenate([*(-motion.translation for motion in motions), np.zeros(1)])
+    return direction, np.linalg.lstsq(rows, shifts, rcond=None)[0], angles
 
 
-def axes_about(direction: Floats) -> Rotation:
+def _axes_about(direction: Floats) -> Rotation:
     """A turn of the z axis into a direction (3,)."""
     side = np.cross(direction, [1.0, 0, 0] if abs(direction[0]) < 0.9 else [0, 1.0, 0])
     side /= np.linalg.norm(side)
     return Rotation.from_matrix(np.column_stack([side, np.cross(direction, side), direction]))
 
 
-def _join(a_from_b: tuple[Rotation, Floats], b_from_c: tuple[Rotation, Floats]) -> tuple[Rotation, Floats]:
-    return a_from_b[0] * b_from_c[0], a_from_b[0].apply(b_from_c[1]) + a_from_b[1]
+def _turn_z(angle_deg: float) -> pycolmap.Rigid3d:
+    """The turn of the table."""
+    return _rigid(Rotation.from_euler("z", angle_deg, degrees=True), np.zeros(3))
 
 
-def _invert(a_from_b: tuple[Rotation, Floats]) -> tuple[Rotation, Floats]:
-    turn = a_from_b[0].inv()
-    return turn, -turn.apply(a_from_b[1])
+def _rigid(turn: Rotation, shift: Floats) -> pycolmap.Rigid3d:
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(turn.as_matrix()), shift)
+
+
+def _rotation(rigid: pycolmap.Rigid3d) -> Rotation:
+    return Rotation.from_matrix(rigid.rotation.matrix())

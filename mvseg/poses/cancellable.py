@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from threading import Event, Thread
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import pycolmap
 
@@ -14,10 +13,10 @@ WAIT = 0.1  # seconds until a signal is handled, at the latest
 ERRORS_ONLY = 2  # of COLMAP's log
 
 
-def run_cancellable(call: Callable[[pycolmap.CancellationToken], Answer]) -> Answer:
-    """Run a call of pycolmap, which gets a token and returns soon after it was cancelled.
+def run_cancellable(call: Callable[..., Answer], *args: Any, **options: Any) -> Answer:
+    """Run a function of pycolmap; it gets a `cancellation_token` and returns soon after that was cancelled.
 
-    Python handles signals between bytecodes only, and a call of pycolmap takes seconds to minutes.
+    Python handles signals between bytecodes only, and such a call takes seconds to minutes.
 
     Raises:
         BaseException: what the call raises; or what a signal raises meanwhile, once the call has returned.
@@ -27,33 +26,23 @@ def run_cancellable(call: Callable[[pycolmap.CancellationToken], Answer]) -> Ans
     def run() -> None:
         try:
             if not token.is_cancelled:
-                answers.append(call(token))
+                answers.append(call(*args, cancellation_token=token, **options))
         except BaseException as error:
             errors.append(error)
         finally:
             done.set()
 
-    thread = Thread(target=run)
-    with _quiet():
-        try:
-            thread.start()
-            while not done.wait(WAIT):  # not `join`: in Python 3.11 an exception in it takes the thread for ended
-                pass
-        finally:  # files that the call still writes are about to be deleted
-            token.cancel()
-            if thread.ident is not None:
-                done.wait()
+    thread, loglevel = Thread(target=run), pycolmap.logging.minloglevel
+    pycolmap.logging.minloglevel = max(loglevel, ERRORS_ONLY)  # the log is for COLMAP's developers
+    try:
+        thread.start()
+        while not done.wait(WAIT):  # not `join`: in Python 3.11 an exception in it takes the thread for ended
+            pass
+    finally:  # files that the call still writes are about to be deleted
+        token.cancel()
+        if thread.ident is not None:
+            done.wait()
+        pycolmap.logging.minloglevel = loglevel
     if errors:
         raise errors[0]
     return answers[0]
-
-
-@contextmanager
-def _quiet() -> Iterator[None]:
-    """Suppress COLMAP's log, which is for its developers."""
-    earlier = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = max(earlier, ERRORS_ONLY)
-    try:
-        yield
-    finally:
-        pycolmap.logging.minloglevel = earlier

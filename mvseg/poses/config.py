@@ -9,8 +9,8 @@ from typing import Literal
 
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
-from mvseg.poses.pairs import Pairs
 
+Pairs = Literal["exhaustive", "sequential"]
 # Lenses that a rig file can hold.
 CameraModel = Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV"]
 LEAST_SHARE = 0.6  # of the photos must register, unless min_registered says otherwise

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from mvseg.errors import InputError, InputWarning, faults_of
+from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.find_views import find_views, list_some
-from mvseg.formats.markers import Corner, find_board, find_scene_markers
-from mvseg.formats.photos import read_photo
+from mvseg.formats.markers import Corner, find_board, find_scene_markers, read_grey
 from mvseg.formats.positions import read_positions
 from mvseg.poses.alignment import align, is_one_line, scale_by, spreads
 from mvseg.poses.config import Known
@@ -65,10 +62,7 @@ def place(scene: Scene, known: Known, *, progress: bool = False) -> Placement:
 
     Warns (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line.
 
-    Args:
-        scene: cameras up to a similarity, with photos.
-        known: see `Known`; without a length the scene stays as it is.
-        progress: show a progress bar.
+    Without a length the scene stays as it is.
 
     Raises:
         InputError: the markers or photos named are not seen, the positions do not fit the photos or are mirrored.
@@ -87,8 +81,7 @@ def place(scene: Scene, known: Known, *, progress: bool = False) -> Placement:
 def _by_board(scene: Scene, board: BoardConfig, unit: str, *, progress: bool) -> Placement:
     seen: dict[int, list[tuple[int, Floats]]] = {}
     for view in tqdm(range(len(scene.views)), desc="board", unit="photo", disable=not progress):
-        photo = np.asarray(cv2.cvtColor(read_photo(scene, view), cv2.COLOR_RGB2GRAY), np.uint8)
-        for number, px in zip(*find_board(photo, board), strict=True):
+        for number, px in zip(*find_board(read_grey(scene, view), board), strict=True):
             seen.setdefault(int(number), []).append((view, px))
     points = triangulate_points(scene.cameras, seen)
     try:
@@ -114,7 +107,7 @@ def _by_markers(scene: Scene, side: float, unit: str, *, progress: bool) -> Plac
     odd = int((np.abs(sides / middle - 1) > SPREAD).sum())
     if odd:
         message = f"{odd} of {len(sides)} markers differ in size by more than {SPREAD:.0%}: expected prints of one size"
-        warnings.warn(message, InputWarning, stacklevel=3)
+        warn(message)
     residual = float(np.sqrt(((sides / middle - 1) ** 2).mean())) * side
     return Placement(
         similarity=scale_by(side / middle),
@@ -173,28 +166,26 @@ def _point(scene: Scene, name: str, corners: dict[Corner, Floats]) -> Floats:
 def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:
     positions = read_positions(path)
     views = find_views(positions.names, scene, source=path)
-    used = [index for index, view in enumerate(views) if view is not None]
+    used = [(index, view) for index, view in enumerate(views) if view is not None]
     if len(used) < 2:
         found = f"{len(used)} of its photos are registered ({list_some(positions.names)})"
         raise InputError(f"{path}: {found}, expected three or more")
     unit = unit or positions.unit
-    centers = scene.cameras.centers.cpu().numpy()[[view for view in views if view is not None]]
-    target = positions.xyz[used]
+    rows, seen = np.array(used).T
+    centers, target = scene.cameras.centers.cpu().numpy()[seen], positions.xyz[rows]
     if is_one_line(target):
         return _by_positions_on_a_line(centers, target, path=path, unit=unit)
     with faults_of(path):
         alignment = align(centers, target)
-    wrong = [positions.names[used[index]] for index in np.flatnonzero(~alignment.is_inlier)]
-    if alignment.rms > MISFIT * spreads(target)[0]:
-        share = alignment.rms / spreads(target)[0]
-        message = f"the positions hardly fit the photos (residual {share:.0%} of their spread): do the names match?"
-        warnings.warn(f"{path}: {message}", InputWarning, stacklevel=4)
+    share = alignment.rms / spreads(target)[0]
+    if share > MISFIT:
+        warn(f"{path}: the positions hardly fit the photos (residual {share:.0%} of their spread): do the names match?")
     return Placement(
         similarity=alignment.similarity,
         unit=unit,
         source=f"{int(alignment.is_inlier.sum())} positions of {path.name}",
         residual=alignment.rms,
-        left_out=tuple(wrong),
+        left_out=tuple(positions.names[row] for row in rows[~alignment.is_inlier]),
     )
 
 
@@ -205,8 +196,7 @@ def _by_positions_on_a_line(centers: Floats, target: Floats, *, path: Path, unit
     ratios = [np.linalg.norm(target[i] - target[j]) / np.linalg.norm(centers[i] - centers[j]) for i, j in pairs]
     if not ratios:
         raise InputError(f"{path}: all positions are at one place, expected where the camera stood")
-    message = "the positions lie on one line, which gives a scale but no axes: the scene keeps its own"
-    warnings.warn(f"{path}: {message}", InputWarning, stacklevel=5)
+    warn(f"{path}: the positions lie on one line, which gives a scale but no axes: the scene keeps its own")
     return Placement(
         similarity=scale_by(float(np.median(ratios))),
         unit=unit,

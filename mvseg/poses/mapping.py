@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -11,11 +11,10 @@ import pycolmap
 from tqdm import tqdm
 
 from mvseg.errors import InputError
-from mvseg.formats.opencv_yaml import Calibration, calibration_lens
+from mvseg.formats.opencv_yaml import Calibration
 from mvseg.poses.cancellable import run_cancellable
 from mvseg.poses.config import LEAST, LEAST_SHARE, PoseConfig
-from mvseg.poses.features import SEED, extract_features, match_features, number_photos
-from mvseg.poses.pairs import choose_pairs
+from mvseg.poses.features import SEED, choose_pairs, extract_features, match_features, number_photos
 from mvseg.poses.photo_files import PhotoFile
 
 FEW_FEATURES = 300  # of a photo, below which it has too little texture
@@ -81,11 +80,11 @@ def find_structure(
     models: list[pycolmap.Reconstruction] = []
     with tempfile.TemporaryDirectory(dir=work, prefix="colmap-") as folder:
         database, numbered = Path(folder) / "features.db", Path(folder) / "photos"
-        names = number_photos(images, photos, numbered)
-        extract_features(database, numbered, names, photos=photos, config=config, lens=lens, progress=progress)
-        plain = _photos_with_few_features(database, names, photos)
+        photo_of = number_photos(images, photos, numbered)
+        extract_features(database, numbered, photo_of, config=config, lens=lens, progress=progress)
+        plain = _photos_with_few_features(database, photo_of)
         pairs = choose_pairs([photo.name for photo in photos], config.pairs)
-        match_features(database, names, pairs, progress=progress)
+        match_features(database, list(photo_of), pairs, progress=progress)
         for few in (False, True):  # strict first: it is right where it succeeds
             options = _mapping_options(fix_lens=lens is not None, few_matches=few)
             models = [*models, *_map(database, numbered, options, num_photos=len(photos), progress=progress)]
@@ -96,28 +95,22 @@ def find_structure(
     least = config.min_registered or max(LEAST, round(LEAST_SHARE * len(photos)))
     if found < min(least, len(photos)):
         raise InputError(_too_few(found, len(photos), least, plain=plain, given=config.min_registered is not None))
-    model, photo_of = models[0], dict(zip(names, photos, strict=True))
+    model = models[0]
     for image in list(model.images.values()):
         image.name = photo_of[image.name].name
     registered = {image.name for image in model.images.values() if image.has_pose}
+    known: set[int] = set()
+    counts = []  # of the photos of each model that none before it holds
+    for each in models:
+        counts.append(len(set(each.reg_image_ids()) - known))
+        known |= set(each.reg_image_ids())
     return Structure(
         model=model,
         registered=tuple(photo.name for photo in photos if photo.name in registered),
         left_out=tuple(photo.name for photo in photos if photo.name not in registered),
         plain=plain,
-        other_models=_count_new(models),
+        other_models=tuple(count for count in counts[1:] if count),
     )
-
-
-def _count_new(models: Sequence[pycolmap.Reconstruction]) -> tuple[int, ...]:
-    """How many photos the models after the first hold that none before them does; models without any are left out."""
-    known: set[int] = set()
-    counts = []
-    for model in models:
-        new = set(model.reg_image_ids()) - known
-        known |= new
-        counts.append(len(new))
-    return tuple(count for count in counts[1:] if count)
 
 
 def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.IncrementalPipelineOptions:
@@ -137,12 +130,7 @@ def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.Increment
 
 
 def _map(
-    database: Path,
-    folder: Path,
-    options: pycolmap.IncrementalPipelineOptions,
-    *,
-    num_photos: int,
-    progress: bool,
+    database: Path, folder: Path, options: pycolmap.IncrementalPipelineOptions, *, num_photos: int, progress: bool
 ) -> list[pycolmap.Reconstruction]:
     """All models, each in a frame of its own."""
     with tqdm(total=num_photos, desc="mapping", unit="photo", disable=not progress) as bar:
@@ -151,24 +139,21 @@ def _map(
             bar.update(min(photos, num_photos - bar.n))
 
         models = run_cancellable(
-            lambda token: pycolmap.incremental_mapping(
-                database,
-                folder,
-                database.parent,
-                options,
-                initial_image_pair_callback=lambda: count(2),
-                next_image_callback=lambda: count(1),
-                cancellation_token=token,
-            )
+            pycolmap.incremental_mapping,
+            database,
+            folder,
+            database.parent,
+            options,
+            initial_image_pair_callback=lambda: count(2),
+            next_image_callback=lambda: count(1),
         )
     return list(models.values())
 
 
-def _photos_with_few_features(database: Path, names: Sequence[str], photos: Sequence[PhotoFile]) -> tuple[str, ...]:
+def _photos_with_few_features(database: Path, photo_of: Mapping[str, PhotoFile]) -> tuple[str, ...]:
     with pycolmap.Database.open(database) as opened:
-        ids = {image.name: image.image_id for image in opened.read_all_images()}
-        numbers = [opened.num_keypoints_for_image(ids[name]) for name in names]
-    return tuple(photo.name for photo, number in zip(photos, numbers, strict=True) if number < FEW_FEATURES)
+        counts = {image.name: opened.num_keypoints_for_image(image.image_id) for image in opened.read_all_images()}
+    return tuple(photo.name for name, photo in photo_of.items() if counts[name] < FEW_FEATURES)
 
 
 def _too_few(found: int, num_photos: int, least: int, *, plain: Sequence[str], given: bool) -> str:
@@ -183,15 +168,12 @@ def _too_few(found: int, num_photos: int, least: int, *, plain: Sequence[str], g
 def _fixed_lens(calibration: Calibration, photos: Sequence[PhotoFile]) -> pycolmap.Camera:
     """The calibrated camera of all photos."""
     size = (calibration.width or photos[0].width, calibration.height or photos[0].height)
-    other = next((photo for photo in photos if (photo.width, photo.height) != size), None)
+    other = next((photo for photo in photos if photo.size != size), None)
     if other is not None:
         given = f"the calibration is of {size[0]} x {size[1]} pixels"
         raise InputError(f"{other.name}: {given}, the photo has {other.width} x {other.height}")
     if calibration.is_fisheye:
         raise InputError("the calibration is of a fisheye, expected one with k1, k2, p1, p2 (, k3)")
-    lens = calibration_lens(calibration, *size)
-    if lens is not None:
-        return lens
     K = calibration.K
-    params = [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-    return pycolmap.Camera(model="PINHOLE", width=size[0], height=size[1], params=params)
+    pinhole = {"model": "PINHOLE", "params": [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}
+    return calibration.lens(*size) or pycolmap.Camera(width=size[0], height=size[1], **pinhole)

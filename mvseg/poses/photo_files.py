@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import shutil
 from collections import defaultdict
 from collections.abc import Sequence
@@ -13,13 +12,15 @@ from PIL import Image, ImageOps
 from tqdm import tqdm
 
 from mvseg.errors import InputError, faults_of
+from mvseg.formats.find_views import natural_order
 from mvseg.formats.image_file import (
+    ORIENTATION,
     PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
     is_turned,
-    known_bits,
     read_image,
     read_rgb,
+    sensor_bits,
     write_png,
 )
 
@@ -48,6 +49,10 @@ class PhotoFile:
     @property
     def folder(self) -> str:
         return self.name.rpartition("/")[0]
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
 
 
 def list_photos(folder: Path) -> tuple[Path, list[str]]:
@@ -93,30 +98,18 @@ def _are_photos(files: Sequence[Path]) -> bool:
     return any(path.suffix.lower() in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES) for path in files)
 
 
-def natural_order(name: str) -> list[tuple[int, int | str]]:
-    """A key for natural sorting: 2.jpg before 10.jpg."""
-    parts = re.split(r"(\d+)", name.lower())
-    return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
-
-
 def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: bool = False) -> list[PhotoFile]:
-    """Copy photos into a scene's `images/`, as they are where that is possible.
+    """Copy photos, by their paths in `folder`, into a scene's new `images/`, as they are where that is possible.
 
     Photos that EXIF turns are written anew, upright; so are WebP files and those of 10, 12 or 14 bits in 16, which
     COLMAP cannot read, as 8-bit PNG, all brightened by the same factor.
-
-    Args:
-        folder: of the photos.
-        names: their paths in it.
-        images: made here.
-        progress: show a progress bar.
 
     Raises:
         InputError: a photo is broken or truncated; it is named.
         OSError: a photo cannot be copied.
     """
     photos = []
-    bits = max((known_bits(folder / name) for name in names), default=8)
+    bits = max((sensor_bits(folder / name) for name in names), default=8)
     for name in tqdm(names, desc="photos", unit="photo", disable=not progress):
         path = images / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -132,9 +125,9 @@ def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
     if turned:
         exif = image.getexif()
         image = ImageOps.exif_transpose(image)
-        exif[0x0112] = 1
+        exif[ORIENTATION] = 1
         image.convert("RGB").save(path, format="JPEG", quality=QUALITY, subsampling=0, exif=exif)
-    elif path.suffix.lower() == ".webp" or known_bits(source) not in (8, 16):
+    elif path.suffix.lower() == ".webp" or sensor_bits(source) not in (8, 16):
         path = path.with_suffix(".png")
         write_png(path, read_rgb(source, bits=bits))
     else:
@@ -168,14 +161,10 @@ def group_by_camera(photos: Sequence[PhotoFile], *, shared: bool | None = None) 
     for photo in photos:
         key = (photo.folder, photo.width, photo.height, photo.optics)
         groups["all" if shared else photo.name if shared is False else key].append(photo)
-    for group in groups.values():
-        first, other = group[0], next((each for each in group if _size(each) != _size(group[0])), None)
-        if other is not None:
-            sizes = f"{first.name} has {first.width} x {first.height} pixels, "
-            sizes += f"{other.name} {other.width} x {other.height}"
-            raise InputError(f"{sizes}: they cannot share one camera, expected --shared_camera false or none")
+    for first, *others in groups.values():
+        for other in others:
+            if other.size != first.size:
+                sizes = f"{first.name} has {first.width} x {first.height} pixels, "
+                sizes += f"{other.name} {other.width} x {other.height}"
+                raise InputError(f"{sizes}: they cannot share one camera, expected --shared_camera false or none")
     return list(groups.values())
-
-
-def _size(photo: PhotoFile) -> tuple[int, int]:
-    return photo.width, photo.height

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mvseg.errors import InputWarning
+from mvseg.errors import warn
 from mvseg.formats.lens import opencv_distortion
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching
@@ -79,7 +79,8 @@ def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
                 break
             refined = fit_poses(adjust(matching.masks, cameras)).to(cameras.device)
             before, matching = matching.masks, match(refined)
-            if _is_same(before, matching.masks):
+            same = torch.equal(before.regions.labels, matching.masks.regions.labels)
+            if same and torch.equal(before.instance_ids, matching.masks.instance_ids):
                 break
             residual_px = held_out_residuals(matching.masks, cameras)
     is_off = residual_px[0] >= LEAST_RESIDUAL
@@ -90,18 +91,11 @@ def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
 def refine_scene(scene: Scene, match: Match) -> tuple[Scene, RefinedPoses]:
     """A scene with refined poses, see `refine_poses`. Warns (InputWarning) of cameras that no rig file can hold."""
     poses = refine_poses(scene.cameras, match)
-    odd = [view.name for view in scene.views if view.lens is not None and opencv_distortion(view.lens) is None]
+    odd = [view.name for view in scene.views if opencv_distortion(view.lens) is None]
     if odd and poses.is_refined:
         message = f"the refined cameras are not written: view {odd[0]} has a lens that no rig file can hold"
-        warnings.warn(message, InputWarning, stacklevel=4)
+        warn(message)
     return replace(scene, cameras=poses.cameras), poses
-
-
-def _is_same(before: Masks, after: Masks) -> bool:
-    """Whether two matchings have the same masks with the same ids."""
-    return torch.equal(before.regions.labels, after.regions.labels) and torch.equal(
-        before.instance_ids, after.instance_ids
-    )
 
 
 def mean_score(matching: Matching) -> float:

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import pycolmap
 
 from mvseg.formats.colmap import read_colmap
-from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.rig import write_rig
 from mvseg.poses.mapping import Structure
 from mvseg.scene import Scene
@@ -17,12 +15,7 @@ IMAGES, MODEL = "images", "sparse/0"
 
 
 def write_structure(structure: Structure, folder: Path) -> Scene:
-    """Write the COLMAP model of a scene folder, take away the photos that have no pose, and read it as a scene.
-
-    Args:
-        structure: of the photos in the folder's `images/`.
-        folder: of the scene.
-    """
+    """Write the COLMAP model of a scene folder, take away the photos that have no pose, and read it as a scene."""
     for name in structure.left_out:
         (folder / IMAGES / name).unlink(missing_ok=True)
     model = folder / MODEL
@@ -38,12 +31,5 @@ def move_structure(structure: Structure, similarity: pycolmap.Sim3d, folder: Pat
 
 
 def write_cameras(scene: Scene, folder: Path) -> None:
-    """Write the rig file of a scene: what the COLMAP model says, with unit and up.
-
-    Args:
-        scene: its views have paths below `folder`, and lenses that OpenCV has.
-        folder: of the scene.
-    """
-    files = [view.path.relative_to(folder).as_posix() for view in scene.views]
-    distortion = [None if view.lens is None else opencv_distortion(view.lens) for view in scene.views]
-    write_rig(folder / "cameras.json", replace(scene, source=None), files, distortion=distortion)
+    """Write the rig file of a scene folder: what the COLMAP model says, with unit and up."""
+    write_rig(folder / "cameras.json", scene, [view.path.relative_to(folder).as_posix() for view in scene.views])

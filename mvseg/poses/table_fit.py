@@ -1,7 +1,7 @@
-"""Fits fixed cameras beside a turntable to their sightings of a known shape on it.
+"""Fits fixed cameras beside a turntable to their sightings of a board on it.
 
 The world is fixed to the table and turns with it; its z axis is that of the table, upwards. Unknown are the cameras,
-the shape's pose on the table and the angles. All cameras share axis and angles, and every photo is a turn about that
+the board's pose on the table and the angles. All cameras share axis and angles, and every photo is a turn about that
 axis.
 """
 
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+import pycolmap
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
@@ -20,7 +21,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 HALF = 0.5  # OpenCV's pixels start at -0.5
-NUM_LENS, NUM_CAMERA = 8, 14  # numbers of a camera: fx, fy, cx, cy, k1, k2, p1, p2, and with its pose
+NUM_CAMERA = 14  # numbers of a camera: fx, fy, cx, cy, k1, k2, p1, p2, and its pose
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,19 +42,15 @@ class TableCamera:
     t: Floats
     size: tuple[int, int]
 
-    def pose(self, angle_deg: float) -> tuple[Floats, Floats]:
-        """R (3, 3) and t (3,) of cam_from_world when the table has turned by an angle."""
-        return self.R @ turn_z(angle_deg).as_matrix(), self.t
-
 
 @dataclass(frozen=True, eq=False)
 class Sightings:
-    """P points of the shape in photos.
+    """P corners of the board in photos.
 
     Attributes:
         camera: (P,) int64, which camera saw it.
         angle: (P,) int64, at which of the angles.
-        point: (P, 3) float64, in the shape's own world.
+        point: (P, 3) float64, in the board's frame.
         px: (P, 2) float64, with lens distortion, pixel centres at half integers.
     """
 
@@ -63,67 +60,38 @@ class Sightings:
     px: Floats
 
 
-@dataclass(frozen=True, eq=False)
-class TableFit:
-    """What fits the sightings best: C cameras, (A,) angles in degrees, and residuals (P, 2) in pixels."""
-
-    cameras: list[TableCamera]
-    angles: Floats
-    residuals: Floats
-
-
 def fit_table(
-    cameras: Sequence[TableCamera],
-    angles: Floats,
-    shape_pose: tuple[Rotation, Floats],
-    *,
-    sightings: Sightings,
-    fixed_angle: int,
-    has_free_lenses: bool,
-) -> TableFit:
-    """Least squares over poses and angles, and over lenses if these are free (k3 never is).
+    cameras: Sequence[TableCamera], angles: Floats, world_from_board: pycolmap.Rigid3d, *, sightings: Sightings
+) -> tuple[list[TableCamera], Floats, Floats]:
+    """Least squares over cameras (but for k3), poses and angles.
 
     Args:
         cameras: C, initial values, nearly right.
-        angles: (A,) degrees, initial values.
-        shape_pose: world_from_shape, initial value. Its height is fixed: it and the fixed angle define the world.
-        sightings: of the shape, with every camera and every angle in it.
-        fixed_angle: which angle stays as it is.
-        has_free_lenses: false: lenses are fixed, and outliers are weighted down (soft L1, 1 pixel).
+        angles: (A,) degrees, initial values; the first stays as it is.
+        world_from_board: initial value. Its height is fixed: it and the first angle define the world.
+        sightings: of the board, with every camera and every angle in it.
+
+    Returns:
+        The C cameras, (A,) angles in degrees, and reprojection errors (P, 2) in pixels.
     """
-    turn, shift = shape_pose
-    # The cameras one after another, the pose of the shape without its height, and all angles.
-    start = np.concatenate([*map(_camera_numbers, cameras), turn.as_rotvec(), shift[:2], np.radians(angles)])
-    is_free = np.ones(len(start), bool)
-    is_free[NUM_CAMERA * len(cameras) + 5 + fixed_angle] = False
-    if not has_free_lenses:
-        is_free[: NUM_CAMERA * len(cameras)] = np.tile(np.arange(NUM_CAMERA) >= NUM_LENS, len(cameras))
+    turn, shift = Rotation.from_matrix(world_from_board.rotation.matrix()), world_from_board.translation
+    # The cameras one after another, the pose of the board without its height, and all angles but the first.
+    start = np.concatenate([*map(_camera_numbers, cameras), turn.as_rotvec(), shift[:2], np.radians(angles[1:])])
 
-    def residuals(free: Floats) -> Floats:
-        numbers = start.copy()
-        numbers[is_free] = free
-        return _residuals(numbers, sightings, num_cameras=len(cameras), height=shift[2])
+    def split(numbers: Floats) -> tuple[Floats, Floats, Floats]:
+        of_cameras, rest = np.split(numbers, [NUM_CAMERA * len(cameras)])
+        pose = np.append(rest[:5], shift[2])
+        return of_cameras.reshape(-1, NUM_CAMERA), pose, np.append(np.radians(angles[0]), rest[5:])
 
-    x0 = start[is_free]
     fit = least_squares(
-        lambda free: residuals(free).ravel(),
-        x0,
-        x_scale=np.maximum(np.abs(x0), 1e-2),
-        loss="linear" if has_free_lenses else "soft_l1",
+        lambda numbers: _residuals(*split(numbers), sightings).ravel(),
+        start,
+        x_scale=np.maximum(np.abs(start), 1e-2),
         max_nfev=200,
     )
-    found = start.copy()
-    found[is_free] = fit.x
-    fitted = [
-        _with_numbers(camera, found[NUM_CAMERA * index : NUM_CAMERA * (index + 1)])
-        for index, camera in enumerate(cameras)
-    ]
-    return TableFit(fitted, np.degrees(found[NUM_CAMERA * len(cameras) + 5 :]), residuals(fit.x))
-
-
-def turn_z(angle_deg: float) -> Rotation:
-    """The turn of the table."""
-    return Rotation.from_euler("z", angle_deg, degrees=True)
+    found, pose, turned = split(fit.x)
+    fitted = [_with_numbers(camera, each) for camera, each in zip(cameras, found, strict=True)]
+    return fitted, np.degrees(turned), _residuals(found, pose, turned, sightings)
 
 
 def _camera_numbers(camera: TableCamera) -> Floats:
@@ -143,13 +111,12 @@ def _with_numbers(camera: TableCamera, numbers: Floats) -> TableCamera:
     )
 
 
-def _residuals(numbers: Floats, sightings: Sightings, *, num_cameras: int, height: float) -> Floats:
-    """(P, 2) reprojection errors, pixels."""
-    cameras, rest = np.split(numbers, [NUM_CAMERA * num_cameras])
-    shape = Rotation.from_rotvec(rest[:3]).apply(sightings.point) + [*rest[3:5], height]
-    turned = Rotation.from_rotvec(rest[5:][sightings.angle][:, None] * [0, 0, 1.0]).apply(shape)
+def _residuals(cameras: Floats, pose: Floats, angles: Floats, sightings: Sightings) -> Floats:
+    """(P, 2) reprojection errors, pixels; cameras (C, 14), world_from_board (6,) and angles (A,) in radians."""
+    shape = Rotation.from_rotvec(pose[:3]).apply(sightings.point) + pose[3:]
+    turned = Rotation.from_rotvec(angles[sightings.angle][:, None] * [0, 0, 1.0]).apply(shape)
     residuals = np.zeros_like(sightings.px)
-    for index, camera in enumerate(cameras.reshape(num_cameras, NUM_CAMERA)):
+    for index, camera in enumerate(cameras):
         here = sightings.camera == index
         fx, fy, cx, cy = camera[:4]
         K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])

@@ -159,7 +159,5 @@ def write_refined(path: Path, scene: Scene) -> None:
     cannot hold one of the lenses."""
     paths = [str(view.path) for view in scene.views]
     root = os.path.commonpath(paths if scene.source is None else [str(scene.source), *paths])
-    distortion = [[] if view.lens is None else opencv_distortion(view.lens) for view in scene.views]
-    if None not in distortion:
-        files = [Path(os.path.relpath(photo, root)).as_posix() for photo in paths]
-        write_rig(path, scene, files, distortion=distortion)
+    if all(opencv_distortion(view.lens) is not None for view in scene.views):
+        write_rig(path, scene, [Path(os.path.relpath(photo, root)).as_posix() for photo in paths])

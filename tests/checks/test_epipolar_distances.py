@@ -45,16 +45,16 @@ def one_turned(cameras: Cameras) -> Cameras:
 
 
 def test_right_cameras_have_no_finding(shared: list[PhotoMatches], demo_scene: Scene) -> None:
-    assert sum(pair.is_telling for pair in shared) >= 8
+    assert sum(pair.is_significant for pair in shared) >= 8
     assert focal_factor(shared, demo_scene.cameras) == 1
     assert say(shared, demo_scene.cameras) == []
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.9, 1.1, 2.0])
 def test_a_wrong_focal_length_is_measured(factor: float, shared: list[PhotoMatches], demo_scene: Scene) -> None:
-    telling = [pair for pair in shared if pair.is_telling]
+    significant = [pair for pair in shared if pair.is_significant]
     cameras = scale_focal(demo_scene.cameras, factor)
-    assert focal_factor(telling, cameras) == pytest.approx(1 / factor, rel=0.04)
+    assert focal_factor(significant, cameras) == pytest.approx(1 / factor, rel=0.04)
     ((what, views),) = say(shared, cameras)
     assert "the focal lengths seem wrong" in what
     assert views == ()
@@ -104,7 +104,7 @@ def test_plain_photos_tell_nothing(demo_scene: Scene) -> None:
     black = np.zeros((480, 640, 3), np.uint8)
     assert find_features(black)[0].shape == (0, 2)
     shared = match_photos(lambda _: black, demo_scene.cameras)
-    assert not any(pair.is_telling for pair in shared)
+    assert not any(pair.is_significant for pair in shared)
     assert say(shared, scale_focal(demo_scene.cameras, 0.5)) == []
 
 
@@ -123,7 +123,7 @@ def test_features_that_fit_nothing_are_no_evidence() -> None:
     for num in (20, 40, 200):
         xy = random.uniform(0, 480, (2, num, 2))
         described = np.eye(num, 128 if num <= 128 else num, dtype=np.float32)
-        assert not _match((0, 1), (xy[0], described), (xy[1], described), unit_px=1.0).is_telling
+        assert not _match((0, 1), (xy[0], described), (xy[1], described), unit_px=1.0).is_significant
 
 
 def test_neighbours_are_near_and_few(demo_scene: Scene) -> None:

@@ -228,7 +228,6 @@ def test_a_bomb_is_never_decoded(bomb: Path, monkeypatch: pytest.MonkeyPatch) ->
     data = bomb.read_bytes()
     start = data[12:24] + b"\x10" + data[25:29]  # 16 bits, which are looked at before the photo is read
     path.write_bytes(data[:12] + start + zlib.crc32(start).to_bytes(4, "big") + data[33:])
-    with pytest.raises(image_file.WrongSize, match="it is 32000 x 32000"):
-        sensor_bits(path, (640, 480))
+    assert sensor_bits(path, (640, 480)) == 8
     with pytest.raises(InputError, match=r"bomb\.png: the mask is 32000 x 32000, its camera says 640 x 480"):
         read_label_png(bomb, 640, 480)

@@ -10,7 +10,7 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.formats.lens import photo_from_pinhole
-from mvseg.formats.opencv_yaml import calibration_lens, read_calibration
+from mvseg.formats.opencv_yaml import read_calibration
 
 MATRIX = np.array([[1234.5678901234567, 0, 640.25], [0, 1230.1, 355.75], [0, 0, 1]])
 DISTORTION = np.array([[-0.12, 0.034, 1.0e-05, -0.0021, 0.005]])
@@ -28,7 +28,7 @@ def write_opencv(path: Path, **entries: object) -> None:
 def project(folder: Path, file: str) -> np.ndarray:
     """Pixels of POINTS in this project's coordinates, lens included."""
     calibration = read_calibration(folder, file)
-    lens = calibration_lens(calibration, calibration.width or 1, calibration.height or 1)
+    lens = calibration.lens(calibration.width or 1, calibration.height or 1)
     pinhole = POINTS @ calibration.K.T
     xy = pinhole[:, :2] / pinhole[:, 2:]
     return xy if lens is None else photo_from_pinhole(lens, calibration.K, xy)
@@ -93,8 +93,8 @@ BAD = [
     ("[1", r"is not a YAML file"),
     ("a: !!python/object/apply:os.getcwd []", r"is not a YAML file"),
     (ROS.replace("camera_matrix", "camera_matirx"), "matrix: Field required, expected camera_matrix"),
-    (ROS.replace("1234.5678901234567", ".nan"), "matrix.data.0: Input should be a finite number"),
-    (ROS.replace("1234.5678901234567, ", ""), "the camera matrix has 8 numbers, expected 9"),
+    (ROS.replace("1234.5678901234567", ".nan"), r"matrix\[0\]: Input should be a finite number"),
+    (ROS.replace("1234.5678901234567, ", ""), "matrix: List should have at least 9 items"),
     (ROS.replace("-0.12, ", "-0.12, 1, "), "has 6 distortion coefficients, expected 4, 5 or 8"),
     (ROS.replace("[-0.12,", "[0, 0, 0, 0, 0, 0, -0.12,"), r"has a thin prism or a tilted sensor"),
     (ROS.replace("plumb_bob", "omni"), "the distortion model 'omni' is not known, expected plumb_bob or equidistant"),
@@ -115,4 +115,4 @@ def test_bad_files_are_named(text: str, message: str, tmp_path: Path) -> None:
 def test_skew_beside_distortion(tmp_path: Path) -> None:
     (tmp_path / "a.yaml").write_text(ROS.replace("0., 640.25", "3., 640.25"))
     with pytest.raises(InputError, match="K has skew together with distortion"):
-        calibration_lens(read_calibration(tmp_path, "a.yaml"), 1280, 720)
+        read_calibration(tmp_path, "a.yaml").lens(1280, 720)

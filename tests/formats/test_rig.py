@@ -61,8 +61,7 @@ def test_round_trip(tmp_path: Path) -> None:
     rig["views"][1]["distortion"] = DISTORTION
     scene = read(tmp_path, rig)
     files = [entry["file"] for entry in rig["views"]]
-    distortion = [entry.get("distortion") for entry in rig["views"]]
-    write_rig(tmp_path / "again.json", scene, files, distortion=distortion)
+    write_rig(tmp_path / "again.json", scene, files)
     assert json.loads((tmp_path / "again.json").read_text()) == rig
     again = read_rig(tmp_path / "again.json")
     assert again.unit == "mm"

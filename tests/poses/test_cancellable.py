@@ -12,9 +12,9 @@ from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
 
 def test_answers_and_errors_pass() -> None:
-    assert run_cancellable(lambda token: 3) == 3
+    assert run_cancellable(lambda number, cancellation_token: number, 3) == 3
     with pytest.raises(ZeroDivisionError):
-        run_cancellable(lambda token: 1 / 0)
+        run_cancellable(lambda cancellation_token: 1 / 0)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="SIGTERM of POSIX systems")
@@ -23,10 +23,10 @@ def test_answers_and_errors_pass() -> None:
 def test_a_signal_cancels_the_call_and_waits_for_its_end(number: int, error: type[BaseException], delay: float) -> None:
     ended = []
 
-    def call(token: pycolmap.CancellationToken) -> None:
+    def call(cancellation_token: pycolmap.CancellationToken) -> None:
         time.sleep(delay)
         os.kill(os.getpid(), number)
-        while not token.is_cancelled:
+        while not cancellation_token.is_cancelled:
             time.sleep(0.01)
         time.sleep(0.1)
         ended.append(True)

@@ -4,7 +4,7 @@ from itertools import combinations
 
 import pytest
 
-from mvseg.poses.pairs import FEW, OVERLAP, choose_pairs
+from mvseg.poses.features import FEW, OVERLAP, choose_pairs
 
 
 def names(num_photos: int, folder: str = "") -> list[str]:

@@ -8,8 +8,9 @@ import pytest
 from PIL import Image
 
 from mvseg.errors import InputError
+from mvseg.formats.find_views import natural_order
 from mvseg.formats.image_file import read_rgb
-from mvseg.poses.photo_files import PhotoFile, copy_photos, group_by_camera, list_photos, natural_order
+from mvseg.poses.photo_files import PhotoFile, copy_photos, group_by_camera, list_photos
 
 RAMP = np.linspace(0, 255, 60 * 40).reshape(40, 60).astype(np.uint8)
 

@@ -74,14 +74,13 @@ def with_instance_ids(views: Sequence[Any], regions: Regions, instance_ids: Tens
         InputError: the views are not those of the regions.
     """
     if len(views) != regions.num_views or len(instance_ids) != len(regions):
-        given_what = f"{len(views)} views and {len(instance_ids)} ids"
-        raise InputError(f"{given_what} for {regions.num_views} views and {len(regions)} regions, expected as many")
-    given = []
-    for index, view in enumerate(views):
-        members = regions.view_index == index
-        id_of = dict(zip(regions.labels[members].tolist(), instance_ids[members].tolist(), strict=True))
-        given.append(_give(view, id_of))
-    return given
+        given = f"{len(views)} views and {len(instance_ids)} ids"
+        raise InputError(f"{given} for {regions.num_views} views and {len(regions)} regions, expected as many")
+    ids_of: list[dict[int, int]] = [{} for _ in views]
+    columns = (regions.view_index.tolist(), regions.labels.tolist(), instance_ids.tolist())
+    for view, label, instance_id in zip(*columns, strict=True):
+        ids_of[view][label] = instance_id
+    return [_give(view, id_of) for view, id_of in zip(views, ids_of, strict=True)]
 
 
 def _give(view: Any, id_of: Mapping[int, int]) -> Any:
@@ -94,8 +93,9 @@ def _give(view: Any, id_of: Mapping[int, int]) -> Any:
             ids = _ids(len(view), id_of)
         return torch.from_numpy(ids).to(view.device) if isinstance(view, Tensor) else ids
     if isinstance(view, Mapping):
-        found = torch.from_numpy(_ids(len(view["masks"]), id_of))
-        return {**view, "instance_ids": found.to(view["masks"].device) if isinstance(view["masks"], Tensor) else found}
+        masks = view["masks"]
+        device = masks.device if isinstance(masks, Tensor) else "cpu"
+        return {**view, "instance_ids": torch.from_numpy(_ids(len(masks), id_of)).to(device)}
     if isinstance(view, Sequence):
         return [{**each, "instance_id": int(number)} for each, number in zip(view, _ids(len(view), id_of), strict=True)]
     return dataclasses.replace(view, tracker_id=_ids(len(view.xyxy), id_of))
@@ -109,12 +109,12 @@ def _ids(num_masks: int, id_of: Mapping[int, int]) -> np.ndarray:
 
 def _read(view: Any, size: tuple[int, ...] | None) -> ViewMasks:
     """The masks of one view, numbered from 1, or its labels."""
-    if isinstance(view, (np.ndarray, Tensor)) and view.ndim == 2:
-        return _check_size(_labels(_to_numpy(view)), size)
-    if isinstance(view, (np.ndarray, Tensor)):
-        stack = list(_stack(_to_numpy(view)))
-    elif isinstance(view, Mapping) and "masks" in view:
+    if isinstance(view, Mapping) and "masks" in view:
         stack = list(_stack(_to_numpy(view["masks"])))
+    elif isinstance(view, (np.ndarray, Tensor)):
+        if view.ndim == 2:
+            return _check_size(_labels(_to_numpy(view)), size)
+        stack = list(_stack(_to_numpy(view)))
     elif isinstance(view, Sequence) and all(isinstance(each, Mapping) and "segmentation" in each for each in view):
         stack = [_decode(each["segmentation"], size) for each in view]
     elif hasattr(view, "mask") and hasattr(view, "xyxy"):

@@ -3,14 +3,13 @@ apart."""
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
 from mvseg.regions import Regions
 
 SIDE = 256  # pixels: larger masks are scaled down to this
@@ -29,7 +28,7 @@ def check_numbers(regions: Regions, *, source: Path) -> None:
     Raises:
         InputError: most of the many numbers of a view have components far apart, as the grey values of a photo do.
     """
-    is_apart = [has_pieces_apart(regions.crop(index).numpy()) for index in range(len(regions))]
+    is_apart = [has_components_apart(regions.crop(index).numpy()) for index in range(len(regions))]
     in_view = Counter(view for view, apart in zip(regions.view_index.tolist(), is_apart, strict=True) if apart)
     for view, total in enumerate(regions.num_per_view.tolist()):
         if total > PHOTO and in_view[view] > MANY * total:
@@ -41,18 +40,18 @@ def check_numbers(regions: Regions, *, source: Path) -> None:
     if count > max(1, MANY * num_photos):
         message = f"the number {number} has parts far apart in {count} of {num_photos} photos, as a class does"
         advice = "export a number per leaf (VOC's SegmentationObject, not SegmentationClass), or COCO"
-        warnings.warn(f"{source}: {message}: {advice}", InputWarning, stacklevel=4)
+        warn(f"{source}: {message}: {advice}")
 
 
-def has_pieces_apart(mask: np.ndarray) -> bool:
+def has_components_apart(mask: np.ndarray) -> bool:
     """Whether (h, w) bool holds two components of comparable size with a gap between them."""
     scale = min(1.0, SIDE / max(mask.shape))
     size = (max(1, round(scale * mask.shape[1])), max(1, round(scale * mask.shape[0])))
     small = (cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0).astype(np.uint8)
-    _, pieces, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
+    _, components, stats, _ = cv2.connectedComponentsWithStats(small, connectivity=8)
     areas = stats[:, cv2.CC_STAT_AREA].copy()
     areas[0] = 0
     largest = int(areas.argmax())
-    distance = cv2.distanceTransform((pieces != largest).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
-    others = [piece for piece in np.flatnonzero(areas >= COMPARABLE * areas[largest]) if piece != largest]
-    return any(distance[pieces == piece].min() > FAR * areas[piece] ** 0.5 for piece in others[:SIDE])
+    distance = cv2.distanceTransform((components != largest).astype(np.uint8), cv2.DIST_L2, cv2.DIST_MASK_5)
+    others = [index for index in np.flatnonzero(areas >= COMPARABLE * areas[largest]) if index != largest]
+    return any(distance[components == index].min() > FAR * areas[index] ** 0.5 for index in others[:SIDE])

@@ -1,4 +1,4 @@
-"""Label images of every kind: one number, or one colour, per mask.
+"""Label images of every kind: one number, or one colour, per mask; and one image per mask.
 
 PNG or TIFF with a single channel of 8, 16 or 32 bits (numbers of cellpose and ImageJ, floats included), palette PNGs
 (the index counts), and colours (CVAT's and datumaro's VOC export): each colour is one mask, black is nothing.
@@ -6,6 +6,7 @@ PNG or TIFF with a single channel of 8, 16 or 32 bits (numbers of cellpose and I
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from PIL import Image
 
 from mvseg.errors import InputError
 from mvseg.formats.label_png import labels_of, open_labels
+from mvseg.formats.masks.found_mask import FoundMask
 from mvseg.regions import IGNORE_LABEL
 
 MAX_COLOURS = 1000  # more than leaves on a photo; photos and blurred masks have far more
@@ -76,3 +78,21 @@ def _number_colours(path: Path, image: Image.Image) -> np.ndarray:
     if image.mode == "RGBA":
         labels[channels[..., 3] == 0] = 0
     return labels
+
+
+def read_mask_images(paths: Sequence[Path], width: int, height: int) -> list[FoundMask]:
+    """The masks of one photo, an image each (of SAM's own script, BOP and many segmenters): whatever is not black.
+
+    They are numbered from 1 in the order of the paths, and may overlap.
+
+    Raises:
+        InputError: a file cannot be decoded, is a JPEG, or has another size.
+    """
+    masks = []
+    for number, path in enumerate(paths, start=1):
+        image = open_labels(path, (width, height))
+        pixels = np.atleast_3d(np.asarray(image))
+        has_alpha = image.mode in ("RGBA", "LA")
+        mask = pixels[..., :-1].any(2) & (pixels[..., -1] > 0) if has_alpha else pixels.any(2)
+        masks.append(FoundMask(number, np.asarray(mask)))
+    return masks

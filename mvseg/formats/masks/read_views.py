@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import warnings
 from collections import Counter
 from collections.abc import Collection, Iterator
 
 import numpy as np
 
-from mvseg.errors import InputError, InputWarning
-from mvseg.formats.masks.found_mask import FoundMask, check_categories, select_masks
-from mvseg.formats.masks.label_image import read_label_image
+from mvseg.errors import InputError, warn
+from mvseg.formats.masks.found_mask import FoundMask, check_categories
+from mvseg.formats.masks.label_image import read_label_image, read_mask_images
 from mvseg.formats.masks.labelme import read_labelme
-from mvseg.formats.masks.mask_images import read_mask_images
 from mvseg.formats.masks.npy_masks import read_npy
 from mvseg.formats.masks.recognise import MaskFiles
 from mvseg.formats.masks.sam import read_sam
@@ -37,17 +35,16 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
             content = _read_view(scene, view, found)
         except InputError as error:
             turn = describe_turn(scene.views[view].path)
-            raise InputError(f"{error} (view {view}{turn and '; ' + turn})") from None
+            raise InputError(f"{error} (view {view}{turn})") from None
         if isinstance(content, np.ndarray):
             yield content
             continue
-        masks, of_view = select_masks(content, wanted)
-        counts += of_view
-        num_boxes += len(content) - sum(of_view.values())
-        yield [(each.label, each.mask) for each in masks if each.mask is not None]
+        counts.update(each.category for each in content if each.mask is not None)
+        num_boxes += sum(each.mask is None for each in content)
+        taken = [each for each in content if not wanted or each.category in wanted]
+        yield [(each.label, each.mask) for each in taken if each.mask is not None]
     if num_boxes:
-        message = f"{num_boxes} entries are boxes, lines, points or to be ignored, and are left out"
-        warnings.warn(f"{found.source}: {message}", InputWarning, stacklevel=4)
+        warn(f"{found.source}: {num_boxes} entries are boxes, lines, points or to be ignored, and are left out")
     if any(map(bool, counts)) or wanted:
         check_categories(counts, wanted, source=found.source)
 

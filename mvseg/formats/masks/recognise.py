@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import filecmp
 import re
-import warnings
 from collections import defaultdict
 from dataclasses import dataclass
 from pathlib import Path
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
 from mvseg.formats.find_views import base_name, find_views, list_some
 from mvseg.scene import Scene
 
@@ -31,6 +30,7 @@ KINDS = ("NumPy arrays", "cellpose's label images", "cellpose", "JSON", "YOLO", 
 # In these kinds, a photo without leaves has a file, too.
 COMPLETE = ("NumPy arrays", "cellpose", "cellpose's label images", "label images")
 NUMBERED = re.compile(r"(?P<photo>.+?)[_-](?:mask[_-]?)?\d+$", re.IGNORECASE)
+Files = tuple[tuple[Path, ...], ...]  # of each view
 EXPECTED = "expected a folder of label PNGs or a COCO .json file, or another kind of docs/formats.md"
 
 
@@ -47,7 +47,7 @@ class MaskFiles:
 
     source: Path
     kind: str
-    files: tuple[tuple[Path, ...], ...]
+    files: Files
 
 
 def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
@@ -81,8 +81,7 @@ def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
     others = [f"{each} for {count}" for each, count in counts.items() if each != kind]
     others += [f"{each} ({reason})" for each, reason in unclear.items()]
     if others:
-        message = f"{kind} for {counts[kind]} photos are taken, and not {', '.join(others)}"
-        warnings.warn(f"{masks}: {message}", InputWarning, stacklevel=3)
+        warn(f"{masks}: {kind} for {counts[kind]} photos are taken, and not {', '.join(others)}")
     find_views([f"{name}.png" for name in groups[kind]], scene, source=folder, warn_of_loose=True)
     files = _complete(scene, folder, kind=kind, files=by_kind[kind])
     return MaskFiles(masks, _name_kind(kind, by_kind[kind]), files)
@@ -117,15 +116,14 @@ def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:
         stem = name[: -len(ending)]
         groups[ENDINGS[ending]][stem].append(path)
         if "label images" in ENDINGS[ending]:
-            numbered = NUMBERED.match(stem.rpartition("/")[2])
-            if "/" in stem:
-                groups[ONE_PER_MASK][stem.rpartition("/")[0]].append(path)
-            elif numbered:
-                groups[ONE_PER_MASK][numbered["photo"]].append(path)
+            numbered = NUMBERED.match(stem)
+            photo = stem.rpartition("/")[0] or (numbered and numbered["photo"])
+            if photo:
+                groups[ONE_PER_MASK][photo].append(path)
     return groups
 
 
-def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str) -> tuple[tuple[Path, ...], ...]:
+def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str) -> Files:
     """The files of each view.
 
     Raises:
@@ -154,23 +152,19 @@ def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str)
     return tuple(map(tuple, files))
 
 
-def _complete(
-    scene: Scene, folder: Path, *, kind: str, files: tuple[tuple[Path, ...], ...]
-) -> tuple[tuple[Path, ...], ...]:
+def _complete(scene: Scene, folder: Path, *, kind: str, files: Files) -> Files:
     """Complete photos without a file: where each photo must have one, the reader will report it; elsewhere they have no
     masks."""
-    missing = [view for view, paths in enumerate(files) if not paths]
-    if missing and kind in COMPLETE:
+    if kind in COMPLETE:
         ending = next(ending for ending, each in ENDINGS.items() if each == kind)
         return tuple(paths or (folder / f"{scene.views[view].name}{ending}",) for view, paths in enumerate(files))
+    missing = [f"view {view} ({scene.views[view].name})" for view, paths in enumerate(files) if not paths]
     if missing:
-        first = f"view {missing[0]} ({scene.views[missing[0]].name})"
-        message = f"{len(missing)} photos have no file and no masks, the first is {first}"
-        warnings.warn(f"{folder}: {message}", InputWarning, stacklevel=4)
+        warn(f"{folder}: {len(missing)} photos have no file and no masks, the first is {missing[0]}")
     return files
 
 
-def _name_kind(kind: str, files: tuple[tuple[Path, ...], ...]) -> str:
+def _name_kind(kind: str, files: Files) -> str:
     """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not."""
     if kind != "JSON":
         return "label images" if kind == "cellpose's label images" else kind
@@ -189,13 +183,12 @@ def _lone_coco(scene: Scene, masks: Path, paths: list[Path], *, unclear: tuple[s
         return MaskFiles(masks, "COCO", (tuple(jsons),) * len(scene.views))
     if unclear:
         raise InputError(f"{masks}: {unclear[0]}")
+    found = list_some([path.relative_to(masks).as_posix() for path in jsons or paths])
     if jsons:
-        found = list_some([path.relative_to(masks).as_posix() for path in jsons])
         message = f"holds {len(jsons)} JSON files ({found}), none of them named after a photo"
         raise InputError(f"{masks}: {message}; expected the path of the COCO file")
-    jpegs = [path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")]
-    if jpegs:
-        raise InputError(f"{jpegs[0]}: is a JPEG, which blurs the numbers of masks: export PNG instead")
-    found = list_some([path.relative_to(masks).as_posix() for path in paths])
+    jpeg = next((path for path in paths if path.suffix.lower() in (".jpg", ".jpeg")), None)
+    if jpeg is not None:
+        raise InputError(f"{jpeg}: is a JPEG, which blurs the numbers of masks: export PNG instead")
     expected = f"masks named {scene.views[0].name}.png or {scene.views[0].name}.json"
     raise InputError(f"{masks}: fits no photo of the scene, expected {expected}, found {found}")

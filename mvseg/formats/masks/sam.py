@@ -4,18 +4,11 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
-
-from pydantic import RootModel
 
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import decode_segmentation
-from mvseg.formats.json_file import read_json
+from mvseg.formats.json_file import load_json
 from mvseg.formats.masks.found_mask import FoundMask
-
-
-class _SamFile(RootModel[Any]):
-    """A file in either form; `read_sam` checks it."""
 
 
 def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
@@ -24,8 +17,8 @@ def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
     Raises:
         InputError: the file is of another form, or a mask is broken or of another size.
     """
-    root = read_json(path, _SamFile).root
-    entries = root.get("annotations") if isinstance(root, dict) else root
+    content = load_json(path)
+    entries = content.get("annotations") if isinstance(content, dict) else content
     if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
         expected = "expected labelme's (shapes) or Segment Anything's (annotations, or a list of masks)"
         raise InputError(f"{path}: is JSON of another form, {expected}")
@@ -33,7 +26,6 @@ def read_sam(path: Path, width: int, height: int) -> list[FoundMask]:
     for number, entry in enumerate(entries, start=1):
         segmentation = entry.get("segmentation")
         with faults_of(f"{path}: mask {number}"):
-            is_empty = segmentation in (None, [])
-            mask = None if is_empty else decode_segmentation(segmentation, width, height)
+            mask = None if segmentation in (None, []) else decode_segmentation(segmentation, width, height)
         masks.append(FoundMask(number, mask))
     return masks

@@ -13,8 +13,7 @@ import numpy as np
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.masks.found_mask import FoundMask
-from mvseg.formats.text_file import read_text
-from mvseg.formats.yaml_file import read_yaml
+from mvseg.formats.text_file import read_text, read_yaml
 
 NAME_FILES = ("classes.txt", "obj.names", "data.yaml", "dataset.yaml")
 MAX_BYTES = 1 << 28  # of a photo
@@ -23,11 +22,7 @@ MAX_BYTES = 1 << 28  # of a photo
 def read_yolo(path: Path, width: int, height: int, *, names: dict[int, str]) -> list[FoundMask]:
     """The masks of a photo, numbered by their lines from 1; boxes (4 numbers) have no mask.
 
-    Args:
-        path: the .txt file.
-        width: of the photo, pixels.
-        height: of the photo, pixels.
-        names: of the classes, see `read_class_names`; others go by their numbers.
+    Classes without a name in `names` (see `read_class_names`) go by their numbers.
 
     Raises:
         InputError: the file cannot be read, a line is not as above, or a polygon leaves the photo by far.
@@ -64,15 +59,10 @@ def read_class_names(folder: Path) -> dict[int, str]:
     Raises:
         InputError: a file of names cannot be read.
     """
-    for place in (folder, folder.parent):
-        for name in NAME_FILES:
-            path = place / name
-            if path.is_file():
-                return _read_names(path)
-    return {}
-
-
-def _read_names(path: Path) -> dict[int, str]:
+    paths = [place / name for place in (folder, folder.parent) for name in NAME_FILES]
+    path = next((path for path in paths if path.is_file()), None)
+    if path is None:
+        return {}
     is_yaml, expected = path.suffix == ".yaml", "names of classes"
     content = read_yaml(path, expected) if is_yaml else {"names": read_text(path, expected).split("\n")}
     try:

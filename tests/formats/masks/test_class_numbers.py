@@ -9,7 +9,7 @@ import pytest
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.label_png import write_label_png
-from mvseg.formats.masks.class_numbers import has_pieces_apart
+from mvseg.formats.masks.class_numbers import has_components_apart
 from mvseg.formats.scene_folder import load_masks, load_scene
 from scene_folders import HEIGHT, WIDTH, write_image, write_scene
 
@@ -54,8 +54,8 @@ def pieces(*boxes: tuple[int, int, int, int], scale: int = 1) -> np.ndarray:
 
 @pytest.mark.parametrize("scale", [1, 7])
 def test_pieces_that_lie_apart(scale: int) -> None:
-    assert has_pieces_apart(pieces((0, 0, 40, 40), (160, 0, 200, 40), scale=scale))
-    assert not has_pieces_apart(pieces((0, 0, 40, 40), (46, 0, 86, 40), scale=scale))  # a stem in front
-    assert not has_pieces_apart(pieces((0, 0, 40, 40), (190, 0, 200, 10), scale=scale))  # a crumb
-    assert not has_pieces_apart(pieces((0, 0, 200, 3), scale=scale))
-    assert not has_pieces_apart(np.ones((1, 1), bool))
+    assert has_components_apart(pieces((0, 0, 40, 40), (160, 0, 200, 40), scale=scale))
+    assert not has_components_apart(pieces((0, 0, 40, 40), (46, 0, 86, 40), scale=scale))  # a stem in front
+    assert not has_components_apart(pieces((0, 0, 40, 40), (190, 0, 200, 10), scale=scale))  # a crumb
+    assert not has_components_apart(pieces((0, 0, 200, 3), scale=scale))
+    assert not has_components_apart(np.ones((1, 1), bool))

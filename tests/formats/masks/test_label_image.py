@@ -10,8 +10,7 @@ from PIL import Image
 
 from mvseg.errors import InputError
 from mvseg.formats.label_png import read_label_png
-from mvseg.formats.masks.label_image import read_label_image
-from mvseg.formats.masks.mask_images import read_mask_images
+from mvseg.formats.masks.label_image import read_label_image, read_mask_images
 from mvseg.regions import IGNORE_LABEL
 
 

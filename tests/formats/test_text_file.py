@@ -1,4 +1,4 @@
-"""YAML files of options: what a parser must not be given is one sentence."""
+"""YAML files: what a parser must not be given is one sentence."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.formats.yaml_file import check_yaml
+from mvseg.formats.text_file import read_yaml
 
 BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
 
@@ -29,15 +29,15 @@ def test_files_that_are_not_parsed(content: bytes, message: str, tmp_path: Path)
     path = tmp_path / "run.yaml"
     path.write_bytes(content)
     with pytest.raises(InputError, match=rf"run\.yaml: {message}"):
-        check_yaml(path)
+        read_yaml(path, "options")
 
 
 def test_a_folder_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
-        check_yaml(tmp_path)
+        read_yaml(tmp_path, "options")
 
 
 @pytest.mark.parametrize("text", ["", "masks: masks\nmatch: {num_points: 3, search_range: [2, 5]}\n# Blätter\n"])
 def test_options_are_fine(text: str, tmp_path: Path) -> None:
     (tmp_path / "run.yaml").write_text(text, encoding="utf-8")
-    check_yaml(tmp_path / "run.yaml")
+    read_yaml(tmp_path / "run.yaml", "options")
