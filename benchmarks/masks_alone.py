@@ -34,4 +34,4 @@ def change_masks_alone(masks: Masks, edits: Sequence[Edit], scene: Scene) -> Mas
             leaves = second if is_cut and area[second] < area[first] else first
             ids[leaves] = new[leaves]
     scores = torch.where(row > 0, masks.match_scores[(row - 1).clamp(min=0)], 0.0)
-    return apply_everywhere(changed, replace(changed.masks, instance_ids=ids, match_scores=scores))
+    return apply_everywhere(changed, replace(changed.masks, instance_ids=ids, match_scores=scores))[0]

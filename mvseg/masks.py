@@ -19,6 +19,7 @@ from mvseg.regions import Regions, stack_regions
 T = TypeVar("T")
 
 SURE = 0.5  # match score from which a mask counts for its instance's support
+COLUMNS = ("instance_ids", "match_scores", "detection_scores", "classes", "origin", "second_ids")  # that are tensors
 
 
 class Origin(IntEnum):
@@ -78,7 +79,7 @@ class Masks:
     second_parts: tuple[Tensor | None, ...]
 
     def __post_init__(self) -> None:
-        lengths = [*(len(column) for column in self._columns().values()), len(self.second_parts)]
+        lengths = [len(getattr(self, name)) for name in (*COLUMNS, "second_parts")]
         if lengths != [len(self.regions)] * len(lengths):
             raise InputError(f"{len(self.regions)} regions with columns of {lengths} rows, expected one row each")
 
@@ -127,12 +128,8 @@ class Masks:
     @property
     def merged(self) -> tuple[MergedMask, ...]:
         """The masks that seem to show two instances, by row."""
-        ids, others = self.instance_ids.tolist(), self.second_ids.tolist()
-        return tuple(
-            MergedMask(region=row, own=ids[row], other=others[row], part=part)
-            for row, part in enumerate(self.second_parts)
-            if part is not None
-        )
+        rows = enumerate(zip(self.instance_ids.tolist(), self.second_ids.tolist(), self.second_parts, strict=True))
+        return tuple(MergedMask(row, own, other, part) for row, (own, other, part) in rows if part is not None)
 
     def with_merged(self, found: Iterable[MergedMask]) -> Masks:
         """The same masks, of which those `found`, and no others, seem to show two instances."""
@@ -142,13 +139,13 @@ class Masks:
         return replace(self, second_ids=ids, second_parts=tuple(parts))
 
     def to(self, device: torch.device | str) -> Masks:
-        columns: dict[str, Any] = {name: column.to(device) for name, column in self._columns().items()}
+        columns: dict[str, Any] = {name: getattr(self, name).to(device) for name in COLUMNS}
         return replace(self, regions=self.regions.to(device), **columns)
 
     def select(self, index: Tensor) -> Masks:
         """The rows at an int64 index or a bool mask, in that order; ids stay what they are."""
         keep = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-        columns: dict[str, Any] = {name: column[keep] for name, column in self._columns().items()}
+        columns: dict[str, Any] = {name: getattr(self, name)[keep] for name in COLUMNS}
         parts = tuple(self.second_parts[row] for row in keep.tolist())
         return replace(self, regions=self.regions.select(index), second_parts=parts, **columns)
 
@@ -162,8 +159,8 @@ class Masks:
         Raises:
             InputError: any other numbers.
         """
-        kept = int((numbers > 0).sum())
-        if sorted(numbers.tolist()) != [-1] * (len(numbers) - kept) + list(range(1, kept + 1)):
+        num_left = int((numbers > 0).sum())
+        if sorted(numbers.tolist()) != [-1] * (len(numbers) - num_left) + list(range(1, num_left + 1)):
             raise InputError(f"instances get the numbers {numbers.tolist()}, expected 1, 2, ... once each, or -1")
         if len(numbers) < self.num_instances:
             raise InputError(f"{self.num_instances} instances get {len(numbers)} numbers, expected one each")
@@ -172,16 +169,12 @@ class Masks:
         def renumber(ids: Tensor) -> Tensor:
             return lookup[torch.where(ids > 0, ids - 1, len(numbers))]
 
-        ids, second_ids = renumber(self.instance_ids), renumber(self.second_ids)
-        second_ids = torch.where(ids > 0, second_ids, -1)
-        parts = zip(self.second_parts, (second_ids > 0).tolist(), strict=True)
-        return replace(
-            self,
-            instance_ids=ids,
-            match_scores=self.match_scores * (ids > 0),
-            second_ids=second_ids,
-            second_parts=tuple(part if stays else None for part, stays in parts),
-        )
+        ids = renumber(self.instance_ids)
+        others = torch.where(ids > 0, renumber(self.second_ids), -1)
+        pairs = zip(self.second_parts, (others > 0).tolist(), strict=True)
+        parts = tuple(part if stays else None for part, stays in pairs)
+        scores = self.match_scores * (ids > 0)
+        return replace(self, instance_ids=ids, match_scores=scores, second_ids=others, second_parts=parts)
 
     def close_gaps(self) -> Masks:
         """The ids as 1, 2, ... without gaps, in the order that they have."""
@@ -203,20 +196,16 @@ class Masks:
         """
         shifted, largest = [], 0
         for part in parts:
-            columns = {
-                name: torch.where(column > 0, column + largest, -1)
-                for name, column in (("instance_ids", part.instance_ids), ("second_ids", part.second_ids))
-            }
-            shifted.append(replace(part, **columns))  # type: ignore[arg-type]
+            ids, others = (torch.where(each > 0, each + largest, -1) for each in (part.instance_ids, part.second_ids))
+            shifted.append(replace(part, instance_ids=ids, second_ids=others))
             largest += part.num_instances
-        regions, names = [part.regions for part in parts], ("view_index", "boxes", "crops", "labels")
-        fields: dict[str, Any] = {name: torch.cat([getattr(each, name) for each in regions]) for name in names}
-        columns = {name: torch.cat([part._columns()[name] for part in shifted]) for name in shifted[0]._columns()}
-        return Masks(
-            regions=replace(regions[0], **fields),
-            second_parts=sum((part.second_parts for part in parts), ()),
-            **columns,
-        )
+
+        def join(tables: Sequence[Any], names: Sequence[str]) -> dict[str, Any]:
+            return {name: torch.cat([getattr(each, name) for each in tables]) for name in names}
+
+        joined = join([part.regions for part in parts], ("view_index", "boxes", "crops", "labels"))
+        second_parts = sum((part.second_parts for part in parts), ())
+        return Masks(replace(parts[0].regions, **joined), second_parts=second_parts, **join(shifted, COLUMNS))
 
     def count_sure_views(self) -> Tensor:
         """(K,) int64: in how many views a mask of each instance has a match score of at least 0.5."""
@@ -224,11 +213,6 @@ class Masks:
         seen = torch.zeros(self.num_instances, self.regions.num_views, dtype=torch.int64, device=self.view_index.device)
         seen[self.instance_ids[is_sure] - 1, self.view_index[is_sure]] = 1
         return seen.sum(1)
-
-    def _columns(self) -> dict[str, Tensor]:
-        """The columns that are tensors."""
-        names = ("instance_ids", "match_scores", "detection_scores", "classes", "origin", "second_ids")
-        return {name: getattr(self, name) for name in names}
 
 
 def replace_crops(masks: Masks, boxes: Sequence[tuple[int, int, int, int]], crops: Sequence[Tensor]) -> Masks:
@@ -239,11 +223,7 @@ def replace_crops(masks: Masks, boxes: Sequence[tuple[int, int, int, int]], crop
         boxes: D boxes, xyxy, half-open.
         crops: D times (h, w) bool, the pixels in the box.
     """
-    regions = stack_regions(
-        masks.view_index.tolist(),
-        boxes,
-        [crop.flatten() for crop in crops],
-        labels=masks.regions.labels.tolist(),
-        num_views=masks.regions.num_views,
-    )
+    labels, num_views = masks.regions.labels.tolist(), masks.regions.num_views
+    pixels = [crop.flatten() for crop in crops]
+    regions = stack_regions(masks.view_index.tolist(), boxes, pixels, labels=labels, num_views=num_views)
     return replace(masks.to("cpu"), regions=regions)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import apply, apply_everywhere, fates_everywhere
+from mvseg.corrections.apply import apply, apply_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
@@ -30,7 +30,7 @@ from mvseg.poses.refine_poses import refine_scene
 from mvseg.regions import stack_regions
 from mvseg.results.result import Instances, Result
 from mvseg.scene import Cameras
-from mvseg.traits.world_frame import place_scene
+from mvseg.traits.up import place_scene
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
@@ -217,12 +217,11 @@ def correct_instances(state: State) -> State:
     Warns (InputWarning) of each earlier edit that one of them contradicts.
     """
     assert state.corrected is not None
-    before = state.masks.to("cpu")
-    corrected = replace(state.corrected, fates=fates_everywhere(state.corrected, before))
+    masks, corrected = apply_everywhere(state.corrected, state.masks.to("cpu"))
     for message in corrected.messages:
         if message not in state.corrected.messages:
             warnings.warn(message, InputWarning, stacklevel=3)
-    return replace(state.with_masks(apply_everywhere(corrected, before)), corrected=corrected)
+    return replace(state.with_masks(masks), corrected=corrected)
 
 
 def split(state: State) -> State:

@@ -53,7 +53,7 @@ def middle(opened: OpenResult, row: int) -> tuple[str, list[float]]:
     rows, columns = np.nonzero(regions.crop(row).numpy())
     x, y = regions.boxes[row, :2].tolist()
     at = [float(x + columns[len(rows) // 2] + 0.5), float(y + rows[len(rows) // 2] + 0.5)]
-    return opened.view_names[int(regions.view_index[row])], at
+    return opened.found.scene.views[int(regions.view_index[row])].name, at
 
 
 def test_an_edit_is_saved_computed_and_shown(served: CorrectionServer, folder: Path) -> None:
@@ -230,7 +230,8 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(InputError, match="not a whole JSON file"):
         OpenResult(tmp_path)
-    (tmp_path / "run.json").write_text(json.dumps(run | {"code": "other", "mvseg": "0.0"}))
+    earlier = run["config"] | {"corrections": "corrections.json"}  # a run with corrections can be corrected again
+    (tmp_path / "run.json").write_text(json.dumps(run | {"code": "other", "mvseg": "0.0", "config": earlier}))
     assert OpenResult(tmp_path).notice == "mvseg 0.0 made this result; what you see is computed anew."
     assert OpenResult(folder).config.match == MatchConfig()
 
@@ -247,7 +248,7 @@ def test_a_folder_that_cannot_be_written_to(
 def test_saved_corrections_that_are_broken_are_not_written_over(folder: Path) -> None:
     path = folder / "corrections.json"
     path.write_text('{"format": "mvseg-corrections/1", "edits": [NaN]}', encoding="utf-8")
-    with pytest.raises(InputError, match="edit 1: is nan"):
+    with pytest.raises(InputError, match="edit 1: Input should be a valid dictionary"):
         Corrector(OpenResult(folder))
     assert "NaN" in path.read_text(encoding="utf-8")
     path.unlink()

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 
 import numpy as np
 import torch
@@ -19,6 +20,7 @@ from mvseg.corrections.edited_mask import EditedMask, as_table, cut_out, hang_to
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.find_views import find_views
 from mvseg.formats.lens import pinhole_from_photo, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
@@ -114,57 +116,54 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         alive = [(number, mask) for number, mask in outlines if mask in work.masks]
         work.links += [(number, True, alive[0][1], mask) for number, mask in alive[1:]]
     order = sorted(work.masks, key=lambda mask: mask.view)
-    place = {id(mask): n for n, mask in enumerate(order)}
-    must, cannot = _agreeing_links(work, place)
-    links = Links.of(must, cannot)
+    place = {mask: n for n, mask in enumerate(order)}
+    links = _agreeing_links(work, place)
     table = as_table(masks, order)
-    if must:
-        component = torch.from_numpy(links.components(len(order)))
-        _tell_of_parts(work, order, component.tolist())
-        first = torch.tensor([int((component == number).nonzero()[0, 0]) for number in component.tolist()])
-        table = replace(table, classes=table.classes[first])  # masks of different classes are never matched
-    everywhere = tuple((n, place[id(mask)], rejects) for n, mask, rejects in work.everywhere if id(mask) in place)
+    if len(links.must):
+        component = links.components(len(order))
+        _tell_of_parts(work, place, component)
+        first = np.unique(component, return_index=True)[1]
+        table = replace(table, classes=table.classes[first[component]])  # those of different classes are never matched
+    everywhere = tuple((n, place[mask], rejects) for n, mask, rejects in work.everywhere if mask in place)
     last_edits = torch.tensor([max(mask.edits, default=0) for mask in order], dtype=torch.int64)
     return Corrected(table, links, last_edits, everywhere, tuple(work.fates.values()))
 
 
-def apply_everywhere(corrected: Corrected, matched: Masks) -> Masks:
+def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:
     """Edits about whole instances, once these are known, in the order of the list.
 
-    `matched`: the corrected masks with ids, in their order. The masks of a rejected instance go, but for those that
-    later edits drew, cut or confirmed; those of a confirmed one are confirmed. Ids are without gaps.
+    Args:
+        corrected: what came of all other edits.
+        matched: its masks with ids, in their order.
+
+    Returns:
+        The masks, with ids without gaps: those of a rejected instance go, but for those that later edits drew, cut or
+        confirmed; those of a confirmed one are confirmed. And the same with the final fates: such an edit contradicts
+        earlier ones that drew, cut or confirmed masks that now go, or that rejected what it confirms.
     """
-    goes, confirmed, _ = _decide_everywhere(corrected, matched)
-    origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
-    return replace(matched, origin=origin).select(goes == 0).close_gaps()
-
-
-def fates_everywhere(corrected: Corrected, matched: Masks) -> tuple[Fate, ...]:
-    """The fates of all edits, once instances are known: an edit about a whole instance contradicts earlier ones that
-    drew, cut or confirmed its masks and now are rejected with it, or that rejected what it confirms."""
-    goes, _, undone = _decide_everywhere(corrected, matched)
-    rows = zip(corrected.last_edits.tolist(), goes.tolist(), strict=True)
-    undone |= {last: number for last, number in rows if 0 < last < number}
-    overridden = {edit: CONTRADICTED.format(number) for edit, number in undone.items()}
-    return tuple(replace(f, fate=overridden.get(f.edit, f.fate)) if f.fate == APPLIED else f for f in corrected.fates)
-
-
-def _decide_everywhere(corrected: Corrected, matched: Masks) -> tuple[Tensor, Tensor, dict[int, int]]:
-    """(D,) int64, the edit by which each mask goes, 0 for none; (D,) bool, those of confirmed instances; and {edit that
-    rejects an instance: the later one that confirms it}."""
-    ids, goes = matched.instance_ids, torch.zeros(len(matched), dtype=torch.int64)
-    confirmed = torch.zeros(len(matched), dtype=torch.bool)
-    undone: dict[int, int] = {}
+    ids, goes = matched.instance_ids, torch.zeros(len(matched), dtype=torch.int64)  # the edit by which each mask goes
+    confirmed, last_edits = torch.zeros(len(matched), dtype=torch.bool), corrected.last_edits
+    overridden: dict[int, int] = {}
     for number, row, rejects in corrected.everywhere:
         own = (ids == ids[row]) if ids[row] > 0 else torch.zeros_like(confirmed)
         own[row] = True
         if rejects:
-            goes[own & (corrected.last_edits < number)] = number
+            goes[own & (last_edits < number)] = number
         else:
-            undone |= dict.fromkeys(goes[own & (goes > 0)].tolist(), number)
+            overridden |= dict.fromkeys(goes[own & (goes > 0)].tolist(), number)
             goes[own] = 0
             confirmed |= own
-    return goes, confirmed, undone
+    rows = zip(last_edits.tolist(), goes.tolist(), strict=True)
+    overridden |= {last: number for last, number in rows if 0 < last < number}
+    fates = tuple(
+        replace(each, fate=CONTRADICTED.format(overridden[each.edit]))
+        if each.fate == APPLIED and each.edit in overridden
+        else each
+        for each in corrected.fates
+    )
+    origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
+    masks = replace(matched, origin=origin).select(goes == 0).close_gaps()
+    return masks, replace(corrected, fates=fates)
 
 
 def _apply_one(work: _Work, number: int, edit: Edit) -> None:
@@ -236,7 +235,7 @@ def _split(work: _Work, number: int, edit: Split) -> None:
 
 def _link(work: _Work, number: int, edit: Link) -> None:
     found = [_mask_at(work, place) for place in edit.at]
-    masks = list({id(mask): mask for mask in found}.values())
+    masks = list(dict.fromkeys(found))
     if edit.op == "same":
         work.links += [(number, True, masks[0], mask) for mask in masks[1:]]
     elif len(masks) < len(found):
@@ -245,66 +244,51 @@ def _link(work: _Work, number: int, edit: Link) -> None:
         work.links += [(number, False, one, other) for n, one in enumerate(masks) for other in masks[:n]]
 
 
-def _tell_of_parts(work: _Work, order: Sequence[EditedMask], component: Sequence[int]) -> None:
+def _tell_of_parts(work: _Work, place: dict[EditedMask, int], component: NDArray[np.int64]) -> None:
     """Masks of one photo that edits say are one leaf, but do not touch: the last of these edits says so."""
-    place = {id(mask): row for row, mask in enumerate(order)}
     groups: dict[tuple[int, int], list[EditedMask]] = {}
-    for mask, number in zip(order, component, strict=True):
-        groups.setdefault((number, mask.view), []).append(mask)
+    for mask, row in place.items():
+        groups.setdefault((int(component[row]), mask.view), []).append(mask)
     for (group, view), masks in groups.items():
-        edits = [n for n, m, a, _ in work.links if m and id(a) in place and component[place[id(a)]] == group]
+        edits = [n for n, m, a, _ in work.links if m and a in place and component[place[a]] == group]
         if edits and not hang_together(masks):
             message = f"a contradiction: its masks in view {work.scene.views[view].name} do not touch"
             work.fates[max(edits)] = replace(work.fates[max(edits)], problem=message)
 
 
-def _agreeing_links(work: _Work, place: dict[int, int]) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """The links that hold, as rows: the latest first, and none that contradicts those; the edit of one that does not
-    hold has that fate."""
-    rows = [(m, place.get(id(a)), place.get(id(b))) for _, m, a, b in work.links]
-    known = [(m, a, b) for m, a, b in rows if a is not None and b is not None]
-    must, cannot = [(a, b) for m, a, b in known if m], [(a, b) for m, a, b in known if not m]
-    with suppress(InputError):
-        Links.of(must, cannot).components(len(place))
-        return must, cannot
-    must, cannot = [], []
+def _agreeing_links(work: _Work, place: dict[EditedMask, int]) -> Links:
+    """The links that hold, of rows: the latest first, and none that contradicts those. The edit of one that does not
+    hold is contradicted by the latest edit without which it would; or by itself."""
+    rows = [(n, m, place[a], place[b]) for n, m, a, b in work.links if a in place and b in place]
+
+    def links_of(edits: Collection[int]) -> Links | None:
+        must, cannot = ([(a, b) for n, m, a, b in rows if n in edits and m is kind] for kind in (True, False))
+        links = Links.of(must, cannot)
+        with suppress(InputError):
+            links.components(len(place))
+            return links
+        return None
+
+    edits = sorted({number for number, *_ in rows}, reverse=True)
+    if (links := links_of(edits)) is not None:
+        return links
     held: list[int] = []
-    for number in sorted({each[0] for each in work.links}, reverse=True):
-        own = [(m, place.get(id(a)), place.get(id(b))) for n, m, a, b in work.links if n == number]
-        pairs = [(is_must, a, b) for is_must, a, b in own if a is not None and b is not None]
-        more_must = [(a, b) for is_must, a, b in pairs if is_must]
-        more_cannot = [(a, b) for is_must, a, b in pairs if not is_must]
-        try:
-            Links.of(must + more_must, cannot + more_cannot).components(len(place))
-        except InputError:
-            _contradict(work, _culprit(work, place, number, held), [number])
-            continue
-        must, cannot = must + more_must, cannot + more_cannot
-        held.append(number)
-    return must[::-1], cannot[::-1]
-
-
-def _culprit(work: _Work, place: dict[int, int], number: int, held: Sequence[int]) -> int:
-    """The latest edit without which the links of edit `number` would agree with the later ones; itself, if its own
-    links contradict each other."""
-
-    def agree(edits: Collection[int]) -> bool:
-        rows = [(m, place.get(id(a), -1), place.get(id(b), -1)) for n, m, a, b in work.links if n in edits]
-        must, cannot = ([(a, b) for m, a, b in rows if m == kind and min(a, b) >= 0] for kind in (True, False))
-        try:
-            Links.of(must, cannot).components(len(place))
-        except InputError:
-            return False
-        return True
-
-    if not agree({number}):
-        return number
-    return next((later for later in held if agree({number, *held} - {later})), max(held))
+    links = Links.of()
+    for number in edits:
+        agreeing = links_of([*held, number])
+        if agreeing is not None:
+            links, held = agreeing, [*held, number]
+        elif links_of([number]) is None:
+            _contradict(work, number, [number])
+        else:
+            culprits = (later for later in held if links_of({number, *held} - {later}) is not None)
+            _contradict(work, next(culprits, max(held)), [number])
+    return links
 
 
 def _remove(work: _Work, number: int, mask: EditedMask) -> None:
     """Take a mask away; the edits that made it, or linked it, are contradicted."""
-    work.masks = [other for other in work.masks if other is not mask]
+    work.masks.remove(mask)
     linked = [n for n, _, a, b in work.links if mask in (a, b)] + [n for n, m, _ in work.everywhere if m is mask]
     _contradict(work, number, [*mask.edits, *linked])
 
@@ -326,15 +310,11 @@ def _mask_at(work: _Work, place: Place) -> EditedMask:
 
 
 def _view(scene: Scene, name: str) -> int:
-    """The index of a view by its name, with or without the suffix of its photo, or the end of its path."""
-    for fits in (
-        [view.name == name for view in scene.views],
-        [view.name + view.path.suffix == name for view in scene.views],
-        [f"/{view.path.as_posix()}".endswith(f"/{name}") for view in scene.views],
-        [view.path.stem == name for view in scene.views],
-    ):
-        if sum(fits) == 1:
-            return fits.index(True)
+    """The index of the view that a name refers to, see `find_views`."""
+    with suppress(InputError):  # it fits several
+        (view,) = find_views([name], scene, source=Path("corrections"))
+        if view is not None:
+            return view
     raise _Lost(f"there is no view {name[:60]!r}")
 
 

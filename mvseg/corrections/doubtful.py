@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import cv2
@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
+from mvseg.verification.checked_ids import match_surfaces
 from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
 
 Bools = NDArray[np.bool_]
@@ -71,8 +72,12 @@ def list_doubts(masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cam
     masks, known = masks.to("cpu"), surfaces or {}
     found = _doubt_matches(masks)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
-    for view in range(len(cameras) if known else 0):
-        found += _doubt_view(masks, known, should, view=view, cameras=cameras)
+    if known:
+        ious, _ = match_surfaces(masks.regions, known, cameras=cameras)
+        for view, size in enumerate(cameras.sizes.tolist()):
+            taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
+            leaves = visible_leaves(known, cameras, view)
+            found += _doubt_view(masks, leaves, should, view=view, taken=taken, ious=ious)
     found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
@@ -82,7 +87,10 @@ def list_doubts(masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cam
         if each.doubt >= LEAST_DOUBT and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
             asked.add(name)
             queue.append(each)
-    return queue[:MOST_DOUBTS]
+    return [
+        each if each.instance < 0 else replace(each, other=best_mask(masks, each.instance, but=each.view))
+        for each in queue[:MOST_DOUBTS]
+    ]
 
 
 def best_mask(masks: Masks, instance: int, *, but: int) -> int:
@@ -103,8 +111,7 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
     found = []
     for row, score in enumerate(masks.match_scores.tolist()):
         if ids[row] > 0:
-            other = best_mask(masks, ids[row], but=views[row])
-            found.append(Doubt("match", 1 - score, views[row], ids[row], region=row, other=other))
+            found.append(Doubt("match", 1 - score, views[row], ids[row], region=row))
         elif areas[row] > 0:
             doubt = LONE * min(1.0, float(areas[row]) / max(usual, 1.0))
             found.append(Doubt("unmatched", doubt, views[row], -1, region=row))
@@ -112,51 +119,36 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
 
 
 def _doubt_view(
-    masks: Masks, surfaces: Mapping[int, LeafSurface], should: Bools, *, view: int, cameras: Cameras
+    masks: Masks, leaves: Iterable[VisibleLeaf], should: Bools, *, view: int, taken: Bools, ious: NDArray[np.float64]
 ) -> list[Doubt]:
-    """What one view should show and does not. `should` (K + 1, V) gets True where it should show an instance."""
-    width, height = cameras.sizes[view].tolist()
+    """What one view should show of leaves and does not.
+
+    `should` (K + 1, V) gets True where it should show one; `taken` (H, W) is True in masks, `ious` as from
+    `match_surfaces`.
+    """
     members = ((masks.view_index == view) & (masks.regions.areas > 0)).nonzero()[:, 0].tolist()
-    taken = np.zeros((height, width), bool)
-    for row in members:
-        x1, y1, x2, y2 = masks.regions.boxes[row].tolist()
-        taken[y1:y2, x1:x2] |= masks.regions.crop(row).numpy()
     here = {int(masks.instance_ids[row]) for row in members}
     found = []
-    for leaf in visible_leaves(surfaces, cameras, view):
+    for leaf in leaves:
         if leaf.share < OPEN or leaf.mask.sum() < OPEN_PIXELS or leaf.instance >= len(should):
             continue
         should[leaf.instance, view] = True
         if leaf.instance in here:
             continue
-        other = best_mask(masks, leaf.instance, but=view)
         x1, y1, x2, y2 = leaf.box
         empty = float((leaf.mask & ~taken[y1:y2, x1:x2]).sum() / leaf.mask.sum())
-        ious = {row: _iou(masks, row, leaf) for row in members}
-        nearest = max(ious, key=lambda row: ious[row], default=-1)
-        if nearest >= 0 and ious[nearest] >= SIMILAR:
-            doubt = COVERED * min(1.0, ious[nearest] / 0.8)
-            found.append(Doubt("covered", doubt, view, leaf.instance, region=nearest, other=other))
+        nearest = max(members, key=lambda row: ious[row, leaf.instance], default=-1)
+        if nearest >= 0 and ious[nearest, leaf.instance] >= SIMILAR:
+            doubt = COVERED * min(1.0, float(ious[nearest, leaf.instance]) / 0.8)
+            found.append(Doubt("covered", doubt, view, leaf.instance, region=nearest))
         elif empty >= EMPTY:
             doubt = MISSING * empty * leaf.share
-            found.append(Doubt("missing", doubt, view, leaf.instance, other=other, outline=_outline(leaf)))
+            found.append(Doubt("missing", doubt, view, leaf.instance, outline=_outline(leaf)))
     return found
 
 
-def _iou(masks: Masks, row: int, leaf: VisibleLeaf) -> float:
-    """Of a mask with what its view shows of a surface."""
-    x1, y1, x2, y2 = masks.regions.boxes[row].tolist()
-    left, top, right, bottom = leaf.box
-    low_x, low_y, high_x, high_y = max(x1, left), max(y1, top), min(x2, right), min(y2, bottom)
-    if low_x >= high_x or low_y >= high_y:
-        return 0.0
-    crop = masks.regions.crop(row).numpy()[low_y - y1 : high_y - y1, low_x - x1 : high_x - x1]
-    common = int((crop & leaf.mask[low_y - top : high_y - top, low_x - left : high_x - left]).sum())
-    return common / (int(masks.regions.areas[row]) + int(leaf.mask.sum()) - common)
-
-
 def _outline(leaf: VisibleLeaf) -> NDArray[np.float64]:
-    """(P, 2) the largest piece of what is seen of a surface, as a polygon; pixels."""
+    """(P, 2) the largest component of what is seen of a surface, as a polygon; pixels."""
     lines, _ = cv2.findContours(leaf.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(lines, key=cv2.contourArea)
     points = cv2.approxPolyDP(longest, SMOOTH, True)[:, 0]
@@ -174,8 +166,7 @@ def _doubt_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[D
         rows = ((masks.instance_ids == instance) & (masks.view_index == view)).nonzero()[:, 0]
         if len(rows):
             row = int(rows[masks.regions.areas[rows].argmax()])
-            other = best_mask(masks, instance, but=view)
-            found.append(Doubt("surface", doubt, view, instance, region=row, other=other))
+            found.append(Doubt("surface", doubt, view, instance, region=row))
     return found
 
 
@@ -187,10 +178,8 @@ def _doubt_rare(masks: Masks, should: Bools) -> list[Doubt]:
         if best < 0:
             continue
         views = set(masks.view_index[masks.instance_ids == instance].tolist())
-        expected = set(np.flatnonzero(should[instance]).tolist()) | views if should[instance].any() else None
-        number = masks.regions.num_views if expected is None else len(expected)
+        expected = views | set(np.flatnonzero(should[instance]).tolist())
+        number = len(expected) if should[instance].any() else masks.regions.num_views
         doubt, view = 1 - len(views) / number, int(masks.view_index[best])
-        other = best_mask(masks, instance, but=view)
-        seen = len(views)
-        found.append(Doubt("few", doubt, view, instance, region=best, other=other, found=seen, expected=number))
+        found.append(Doubt("few", doubt, view, instance, region=best, found=len(views), expected=number))
     return found

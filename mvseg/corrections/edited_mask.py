@@ -9,13 +9,14 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from mvseg.masks import Masks, Origin
 from mvseg.regions import mask_box, stack_regions
 
 FINE = 4  # bits of a pixel's fraction, along a cut
-TOUCHES_PX = 2  # between pieces of one leaf in one photo
+TOUCHES_PX = 2  # between masks of one leaf in one photo
 
 
 @dataclass(eq=False)
@@ -53,24 +54,19 @@ def side_of(line: NDArray[np.float64], mask: EditedMask) -> Tensor:
 
 def hang_together(masks: Sequence[EditedMask]) -> bool:
     """Do masks of one view touch, or nearly, so that one can go from each to all others?"""
-    reached, left = list(masks[:1]), list(masks[1:])
-    for mask in reached:
-        reached += [other for other in left if touch(mask, other)]
-        left = [other for other in left if other not in reached]
-    return not left
+    touching = np.array([[touch(mask, other) for other in masks] for mask in masks])
+    return connected_components(touching, directed=False)[0] == 1
 
 
 def touch(one: EditedMask, other: EditedMask) -> bool:
     """Do two masks of one view touch, or nearly?"""
     x1, y1 = (min(one.box[axis], other.box[axis]) - TOUCHES_PX for axis in (0, 1))
     x2, y2 = (max(one.box[axis], other.box[axis]) + TOUCHES_PX for axis in (2, 3))
-    frames: list[NDArray[np.uint8]] = []
-    for mask in (one, other):
-        frame = np.zeros((y2 - y1, x2 - x1), np.uint8)
+    frames = np.zeros((2, y2 - y1, x2 - x1), np.uint8)
+    for mask, frame in zip((one, other), frames, strict=True):
         frame[mask.box[1] - y1 : mask.box[3] - y1, mask.box[0] - x1 : mask.box[2] - x1] = mask.crop.numpy()
-        frames.append(frame)
-    size = 2 * TOUCHES_PX + 1
-    return bool((np.asarray(cv2.dilate(frames[0], np.ones((size, size), np.uint8))) > 0)[frames[1] > 0].any())
+    near = cv2.dilate(frames[0], np.ones((2 * TOUCHES_PX + 1, 2 * TOUCHES_PX + 1), np.uint8))
+    return bool((near & frames[1]).any())
 
 
 def cut_out(part: Tensor, corner: Sequence[int]) -> tuple[tuple[int, int, int, int], Tensor]:

@@ -92,17 +92,13 @@ class TrackLink(_Edit):
     at: Annotated[tuple[DatedPlace, ...], Field(min_length=2, max_length=MOST_POINTS)]
 
 
-Edit = Outline | Reject | Confirm | Split | Link | TrackLink
-EDITS: dict[str, type[Edit]] = {
-    "outline": Outline,
-    "reject": Reject,
-    "same": Link,
-    "different": Link,
-    "split": Split,
-    "confirm": Confirm,
-    "same_track": TrackLink,
-    "different_track": TrackLink,
-}
+Edit = Annotated[Outline | Reject | Confirm | Split | Link | TrackLink, Field(discriminator="op")]
+
+
+class _File(BaseModel):
+    model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
+    format: Literal["mvseg-corrections/1"]
+    edits: Annotated[tuple[Edit, ...], Field(max_length=MOST_EDITS)]
 
 
 @dataclass(frozen=True)
@@ -128,10 +124,10 @@ def load_corrections(path: Path) -> Corrections:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: has {path.stat().st_size} bytes, expected at most {MOST_BYTES}")
         data = json.loads(path.read_text(encoding="utf-8-sig"))
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except InputError:
         raise
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
     except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, numbers of thousands of digits
         raise InputError(f"{path}: not a whole JSON file ({error})") from None
     return parse_corrections(data, source=path)
@@ -148,38 +144,16 @@ def parse_corrections(data: Any, source: Path | None = None) -> Corrections:
         InputError: another format, an unknown operation or key, a number that is not finite, too many edits or points.
             The message names the file and the edit, counted from 1.
     """
-    where = source or "corrections"
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        found = data.get("format") if isinstance(data, dict) else None
-        raise InputError(f'{where}: the format is {_short(found)}, expected "format": "{FORMAT}"')
-    unknown = sorted(set(data) - {"format", "edits"})
-    if unknown:
-        raise InputError(f"{where}: the key {_short(unknown[0])} is not known, expected format and edits")
-    edits = data.get("edits")
-    if not isinstance(edits, list):
-        raise InputError(f'{where}: edits is {_short(edits)}, expected a list: "edits": [...]')
-    if len(edits) > MOST_EDITS:
-        raise InputError(f"{where}: has {len(edits)} edits, expected at most {MOST_EDITS}")
-    return Corrections(tuple(_parse(edit, f"{where}: edit {n}") for n, edit in enumerate(edits, start=1)), source)
-
-
-def _parse(edit: Any, where: str) -> Edit:
-    """One edit; `where` begins the message."""
-    if not isinstance(edit, dict):
-        raise InputError(f'{where}: is {_short(edit)}, expected {{"op": ..., ...}}')
-    op = edit.get("op")
-    model = EDITS.get(op) if isinstance(op, str) else None
-    if model is None:
-        raise InputError(f"{where}: op is {_short(op)}, expected one of {', '.join(EDITS)}")
     try:
-        return model.model_validate(edit)
+        return Corrections(_File.model_validate(data).edits, source)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
-        key = "".join(f"[{part}]" if isinstance(part, int) else f".{_plain(part)}" for part in first["loc"]).lstrip(".")
-        if first["type"] == "extra_forbidden":
-            keys = ", ".join(name for name in model.model_fields if name != "op")
-            raise InputError(f"{where} ({op}): the key {key} is not known, expected {keys}") from None
-        raise InputError(f"{where} ({op}): {key}: {first['msg']}") from None
+    place, edit = first["loc"], ""
+    if place[:1] == ("edits",) and len(place) > 1:
+        edit, place = f"edit {int(place[1]) + 1}{f' ({place[2]})' if len(place) > 2 else ''}", place[3:]
+    key = "".join(f"[{part}]" if isinstance(part, int) else f".{_plain(part)}" for part in place).lstrip(".")
+    parts = (str(source or "corrections"), edit, key, _plain(first["msg"], most=150))
+    raise InputError(": ".join(filter(None, parts)))
 
 
 def write_corrections(path: Path, corrections: Corrections) -> None:
@@ -199,11 +173,7 @@ def name_edits(edits: Sequence[Edit]) -> str:
     return hashlib.sha256(json.dumps(dump_edits(edits)).encode()).hexdigest()[:16]
 
 
-def _short(value: Any) -> str:
-    return _plain(repr(value))
-
-
-def _plain(text: object) -> str:
+def _plain(text: object, most: int = 60) -> str:
     """Text of a user for a message: one line, not long."""
     line = str(text).encode("unicode_escape").decode()
-    return line if len(line) <= 60 else f"{line[:57]}..."
+    return line if len(line) <= most else f"{line[: most - 3]}..."

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError
 
-LONGEST = 480  # pixels of the part that is looked at
-AROUND = 0.35  # of the rough outline's size, that is looked at beside it
+LONGEST = 480  # pixels of the part that is segmented
+AROUND = 0.35  # of the rough outline's size, that is segmented beside it
 ROUNDS = 5
 LEAST = 0.05  # of the rough outline's pixels, that the leaf must have
 TOLERANCE = 1.0  # pixels of the part, of the outline

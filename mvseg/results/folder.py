@@ -33,14 +33,7 @@ CAMERAS_FILE = "cameras.json"
 CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED: "confirm"}  # the edit that made a mask
 
 
-def save_result(
-    result: Result,
-    out: Path,
-    run: dict[str, Any],
-    *,
-    progress: bool = False,
-    report: bool = True,
-) -> None:
+def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False, report: bool = True) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
     The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.

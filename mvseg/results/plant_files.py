@@ -1,34 +1,42 @@
 """The files of a plant in 3D: a mesh for every leaf, the scene, the table of traits.
 
-A separate file, because a run that only matches does not need the libraries that it imports.
+A separate file, because a run that only matches does not need the libraries that it imports. glTF is in metres, and +y
+is up; a scene whose cameras do not state unit or up keeps its own.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
 
 from mvseg.formats.mesh import simplify_mesh, write_glb, write_ply
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.results.gltf import describe_world, gltf_from_world, leaf_extras
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
-from mvseg.traits.table import write_long, write_wide
+from mvseg.scene import Scene
+from mvseg.traits.measure import Traits
+from mvseg.traits.table import format_number, write_long, write_wide
+from mvseg.traits.up import level_frame
 
 MAX_FACES = 4000  # triangles of a leaf in scene.glb; its own file has all of them
+METRES = {
+    "m": 1.0, "dm": 1e-1, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6,
+    **{f"{prefix}met{end}": power for prefix, power in (("", 1.0), ("centi", 1e-2), ("milli", 1e-3))
+       for end in ("re", "res", "er", "ers")},
+    "in": 0.0254, "inch": 0.0254, "inches": 0.0254, "ft": 0.3048, "foot": 0.3048, "feet": 0.3048,
+}  # fmt: skip
 
 
 def write_plant(result: Result, folder: Path) -> None:
-    """Write leaves/*.ply, scene.glb and, where traits were measured, traits.csv and traits_wide.csv."""
-    _write_shapes(result, folder)
-    if result.traits is not None:
-        write_long(folder / "traits.csv", result.traits)
-        write_wide(folder / "traits_wide.csv", result.traits)
+    """Write leaves/*.ply, scene.glb and, where traits were measured, traits.csv and traits_wide.csv.
 
-
-def _write_shapes(result: Result, folder: Path) -> None:
-    """leaves/*.ply and scene.glb: credible surfaces, for other instances voxels. The voxels of a leaf that has both get
-    a file of their own."""
+    Meshes are of credible surfaces, for other instances of voxels. The voxels of a leaf that has both get a file of
+    their own.
+    """
     (folder / "leaves").mkdir()
     meshes, colors = {}, {}
     for instance in range(1, result.matching.num_instances + 1):
@@ -42,3 +50,47 @@ def _write_shapes(result: Result, folder: Path) -> None:
             write_ply(folder / "leaves" / f"{name}_voxels.ply", voxels, color, instance_id=instance)
     about, extras = describe_world(result.scene), leaf_extras(result.traits)
     write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)
+    if result.traits is not None:
+        write_long(folder / "traits.csv", result.traits)
+        write_wide(folder / "traits_wide.csv", result.traits)
+
+
+def gltf_from_world(scene: Scene) -> NDArray[np.float64]:
+    """(4, 4) that rotates up to +y and east to +x (`level_frame`) if up is known, and scales lengths to metres if the
+    unit is known."""
+    matrix = np.eye(4)
+    if scene.up is not None:
+        east, north, up = level_frame(scene.up)
+        matrix[:3, :3] = np.stack([east, up, -north])
+    matrix[:3, :3] *= METRES.get(scene.unit.strip().lower(), 1.0)
+    return matrix
+
+
+def describe_world(scene: Scene) -> dict[str, Any]:
+    """The extras of the node above all leaves: the unit and the up of the meshes' own coordinates, None where unknown,
+    and whether the node brings them to glTF's."""
+    is_known = scene.unit.strip().lower() in METRES
+    up = None if scene.up is None else list(scene.up)
+    placed = {"is_in_metres": is_known, "is_y_up": up is not None}
+    return {"plant": scene.name, "unit": scene.unit or None, "up": up, **placed}
+
+
+def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
+    """{name of a leaf's node: its extras}: id, unit, method, quality, and its existing numbers with standard
+    deviations."""
+    found: dict[str, dict[str, Any]] = {}
+    for leaf in () if traits is None else traits.leaves:
+        numbers = {name: number for name, number in leaf.numbers.items() if number.exists}
+        found[f"leaf_{leaf.leaf:03d}"] = {
+            "leaf": leaf.leaf,
+            "unit": traits.unit or None,
+            "method": leaf.method,
+            "quality": "; ".join(leaf.reasons) or "good",
+            "traits": {name: _rounded(number.value) for name, number in numbers.items()},
+            "sd": {name: _rounded(number.sd) for name, number in numbers.items() if np.isfinite(number.sd)},
+        }
+    return found
+
+
+def _rounded(value: float) -> float:
+    return float(format_number(value))

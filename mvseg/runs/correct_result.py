@@ -1,4 +1,4 @@
-"""A result that a person corrects: the outcome of a run is kept in memory, and each edit reruns only what it
+"""A result that a person corrects: the outcome of a run is cached, and each edit reruns only what it
 affects."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, fields, replace
+from dataclasses import asdict, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -21,17 +21,15 @@ from pydantic import TypeAdapter, ValidationError
 
 from mvseg._version import code_hash
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import APPLIED, PASSED
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.pipeline import Stage, State, detect, list_stages, load, reconstruct
 from mvseg.reconstruction.shapes import Surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.earlier import RUN_FILE
+from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Instances, Result
-from mvseg.scene import Scene
 from mvseg.system.atomic import lock_folder
 from mvseg.verification.other_views import colors_of_leaves, fit_roughly, verify_masks
 
@@ -51,6 +49,7 @@ class OpenResult:
         run: what its run.json says.
         notice: what a person should know of it; "" for nothing.
         config: the options of its run.
+        found: the masks, not matched yet, or how to find them.
     """
 
     def __init__(self, folder: Path, *, workers: ProcessPoolExecutor | None = None) -> None:
@@ -69,25 +68,10 @@ class OpenResult:
         state = load(scene, masks, self.config, workers=workers)
         if not state.photos.exist:
             raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
-        self._found = state if masks is not None else detect(state)
+        self.found = state if masks is not None else detect(state)
         self._fitted: dict[str, LeafSurface] = {}
         self._rough: dict[str, LeafSurface] = {}  # that masks are verified with
         self.has_masks = masks is not None
-
-    @property
-    def scene(self) -> Scene:
-        """The scene."""
-        return self._found.scene
-
-    @property
-    def photos(self) -> Photos:
-        """Its photos."""
-        return self._found.photos
-
-    @property
-    def view_names(self) -> list[str]:
-        """The names of its views."""
-        return [view.name for view in self.scene.views]
 
     def saved_corrections(self) -> Corrections:
         """What was saved into the result folder before; none without the file."""
@@ -96,7 +80,7 @@ class OpenResult:
 
     def matched(self) -> Result:
         """The masks with the ids that matching alone gives them, within a moment: for the page to begin with."""
-        return list_stages(self.config, has_masks=self.has_masks)["match"](self._found).result()
+        return list_stages(self.config, has_masks=self.has_masks)["match"](self.found).result()
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
@@ -105,15 +89,11 @@ class OpenResult:
         A surface is fitted anew only if its instance's masks differ from those in all results before. (A run from
         the command line fits all of them: each surface also depends a little on the masks that may hide it.)
 
-        Args:
-            corrections: all edits.
-            is_old: asked between the stages.
-
         Raises:
-            Superseded: `is_old` said so.
+            Superseded: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        state = replace(self._found, corrections=corrections, colors=self._colors)
+        state = replace(self.found, corrections=corrections, colors=self._colors)
         messages: list[str] = []
         for stage in self._stages(has_edits=len(corrections.edits) > 0):
             if is_old():
@@ -122,22 +102,18 @@ class OpenResult:
                 warnings.simplefilter("always", InputWarning)
                 state = stage(state)
             messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
-        corrected = state.corrected
-        fates = () if corrected is None else corrected.fates
-        fine = (APPLIED, PASSED)
-        outcomes = [fate.problem if fate.fate in fine else f"{fate.fate} {fate.problem}".strip() for fate in fates]
-        told = () if corrected is None else corrected.messages
+        told = () if state.corrected is None else state.corrected.messages
+        outcomes = [describe_fate(fate) for fate in state.fates]
         return state.result(), outcomes, [text for text in dict.fromkeys(messages) if text not in told]
 
     @cached_property
     def _colors(self) -> NDArray[np.bool_]:
         """The colours of leaves before all edits: they stay, so that an edit changes no mask of other leaves."""
-        return colors_of_leaves(self.matched().masks.to("cpu"), self.photos)
+        return colors_of_leaves(self.matched().masks.to("cpu"), self.found.photos)
 
     def _stages(self, *, has_edits: bool) -> list[Stage]:
-        named = list_stages(self.config, has_masks=self.has_masks, has_edits=has_edits)
         stages: list[Stage] = []
-        for name, stage in named.items():
+        for name, stage in list_stages(self.config, has_masks=self.has_masks, has_edits=has_edits).items():
             if name in ("check_ids", "reconstruct"):
                 stages.append(self._fit)
             if name not in NOT_AGAIN:
@@ -156,13 +132,13 @@ class OpenResult:
 
     def _verify(self, state: State) -> State:
         """As the stage of that name, with surfaces that are known."""
-        cameras = self.scene.cameras
+        cameras = state.scene.cameras
 
         def fit(masks: Masks) -> dict[int, LeafSurface]:
             again = partial(fit_roughly, masks, cameras, workers=state.workers)
             return dict(_fit_unknown(masks, self._rough, lambda known: again(known=known)) or {})
 
-        masks, starts = verify_masks(state.masks, cameras=cameras, photos=self.photos, colors=state.colors, fit=fit)
+        masks, starts = verify_masks(state.masks, cameras=cameras, photos=state.photos, colors=state.colors, fit=fit)
         return replace(state, instances=Instances(starts=starts)).with_masks(masks)
 
 
@@ -170,7 +146,7 @@ def _fit_unknown(
     masks: Masks, before: dict[str, LeafSurface], fit: Callable[[dict[int, LeafSurface]], Surfaces | None]
 ) -> Surfaces | None:
     """The surfaces of all instances: those of `before` by the names of their masks, and what `fit` makes of the others,
-    which is kept there."""
+    which is cached there."""
     ids = masks.instance_ids[masks.instance_ids > 0].unique().tolist()
     names = {instance: name_masks(masks, instance) for instance in ids}
     known = {instance: before[name] for instance, name in names.items() if name in before}
@@ -236,14 +212,13 @@ def _read_run(folder: Path) -> dict[str, Any]:
 
 def _read_options(folder: Path, run: dict[str, Any]) -> tuple[RunConfig, Path, Path | None]:
     """The options, the scene folder and the masks of a result."""
-    options = {name: value for name, value in run["config"].items() if name not in ("scene", "out", "masks")}
+    paths = ("scene", "out", "masks", "corrections")
+    options = {name: value for name, value in run["config"].items() if name not in paths}
     known = asdict(RunConfig())
-    unknown = sorted(set(options) - {field.name for field in fields(RunConfig)}) + sorted(
-        f"{stage}.{name}"
-        for stage, inside in options.items()
-        if isinstance(inside, dict) and isinstance(known.get(stage), dict)
-        for name in set(inside) - set(known[stage])
-    )
+    unknown = [name for name in options if name not in known]
+    for stage, inside in options.items():
+        if isinstance(inside, dict) and isinstance(known.get(stage), dict):
+            unknown += [f"{stage}.{name}" for name in inside if name not in known[stage]]
     try:
         if unknown:
             raise InputError(f"unknown option {unknown[0]}")
@@ -253,9 +228,10 @@ def _read_options(folder: Path, run: dict[str, Any]) -> tuple[RunConfig, Path, P
         made = str(run.get("mvseg"))[:60]
         message = f"mvseg {made} made this result, with options that this version does not have ({problem})"
         raise InputError(f"{folder}: {message}; expected one made by this version") from None
-    scene, masks = Path(str(run["config"]["scene"])), run["config"].get("masks")
+    scene, given = Path(str(run["config"]["scene"])), run["config"].get("masks")
+    masks = None if given is None else Path(str(given))
     if not scene.exists():
         raise InputError(f"{scene}: the scene of this result is gone, expected it there")
-    if masks is not None and not Path(str(masks)).exists():
+    if masks is not None and not masks.exists():
         raise InputError(f"{masks}: the masks of this result are gone, expected them there")
-    return config, scene, None if masks is None else Path(str(masks))
+    return config, scene, masks

@@ -11,16 +11,17 @@ import json
 import re
 import secrets
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Annotated, Any
 from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
+from pydantic import BaseModel, Field
 
-from mvseg.corrections.file import MOST_BYTES, Corrections, name_edits, parse_corrections, write_corrections
+from mvseg.corrections.file import MOST_BYTES, Corrections, Point, name_edits, parse_corrections, write_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.errors import InputError
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
@@ -41,6 +42,11 @@ class Refused(Exception):
         self.status = status
 
 
+class _Rough(BaseModel):
+    view: str
+    polygon: Annotated[list[Point], Field(min_length=3, max_length=MOST_CORNERS)]
+
+
 class Corrector:
     """One open result, its newest edits, and a thread that computes their consequences; the newest edits win."""
 
@@ -49,10 +55,10 @@ class Corrector:
         self.opened = opened
         self.corrections = opened.saved_corrections()
         self.shown = opened.matched()
-        views = range(len(opened.view_names))
-        self.pictures = [draw_picture(opened.photos(view), self.shown.masks, view=view) for view in views]
+        photos, views = opened.found.photos, range(len(opened.found.scene.views))
+        self.pictures = [draw_picture(photos(view), self.shown.masks, view=view) for view in views]
         self.news = threading.Condition()
-        self.wanted, self.computed, self.number = 1, 0, 0
+        self.wanted, self.computed = 1, 0
         self.problem, self.outcomes = opened.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
         self.revision = name_edits(self.corrections.edits)
@@ -65,14 +71,8 @@ class Corrector:
         return build_page(shown, pictures, run=self.opened.run, is_served=True).encode()
 
     def save(self, text: bytes, base: str) -> dict[str, Any]:
-        """Write a list of edits to the result folder and have it computed.
-
-        Args:
-            text: of a corrections.json.
-            base: the `name_edits` of the list that this one was made from.
-
-        Returns:
-            How many edits there are, and their `name_edits`, the next one's base.
+        """Write the edits of a corrections.json to the result folder and have them computed; returns their number and
+        `name_edits`. `base`: the `name_edits` of the list that this one was made from.
 
         Raises:
             InputError: this is no list of edits.
@@ -80,11 +80,10 @@ class Corrector:
             OSError: the file cannot be written.
         """
         try:
-            corrections = parse_corrections(json.loads(text))
-        except InputError:
-            raise
+            content = json.loads(text)
         except (ValueError, RecursionError):
             raise InputError("the edits are not whole JSON") from None
+        corrections = parse_corrections(content)
         name = name_edits(corrections.edits)
         with self.news:  # one after another, in the order in which they are wanted
             if name_edits(self.corrections.edits) not in (base, name):  # the same again: its answer was lost
@@ -106,18 +105,17 @@ class Corrector:
             self._compute_once(wanted, corrections)
 
     def _compute_once(self, wanted: int, corrections: Corrections) -> None:
-        problem, outcomes = "", [""] * len(corrections.edits)
-        update: dict[str, Any] | None = None
-        shown, pictures = self.shown, self.pictures
+        outcomes, news = [""] * len(corrections.edits), (self.shown, self.pictures, self.update)
         try:
-            is_old: Callable[[], bool] = lambda: self.is_closing or self.wanted > wanted  # noqa: E731
-            shown, outcomes, messages = self.opened.recompute(corrections, is_old)
+            shown, outcomes, messages = self.opened.recompute(
+                corrections, lambda: self.is_closing or self.wanted > wanted
+            )
             sizes = shown.scene.cameras.sizes.tolist()
             pictures = [
                 picture.with_masks(shown.masks, view=view, size=tuple(sizes[view]))
-                for view, picture in enumerate(pictures)
+                for view, picture in enumerate(self.pictures)
             ]
-            update = describe_update(shown, pictures)
+            news = shown, pictures, describe_update(shown, pictures)
             problem = " ".join([self.opened.notice, *messages]).strip()
         except Superseded:
             return
@@ -126,11 +124,9 @@ class Corrector:
         except Exception as error:  # the person must not lose the page over what one list of edits does
             problem = f"This could not be computed ({type(error).__name__}: {error}); your edits are saved."
         with self.news:
-            self.problem, self.outcomes = problem, outcomes
-            if update is not None:
-                self.shown, self.pictures, self.update = shown, pictures, update
+            self.shown, self.pictures, self.update = news
+            self.problem, self.outcomes, self.computed = problem, outcomes, wanted
             self.revision = name_edits(corrections.edits)
-            self.computed, self.number = wanted, self.number + 1
             self.news.notify_all()
 
     def state(self, after: int) -> dict[str, Any]:
@@ -138,14 +134,14 @@ class Corrector:
         there is something newer."""
         with self.news:
             if after >= 0:
-                self.news.wait_for(lambda: self.is_closing or self.number > after, WAIT_SECONDS)
+                self.news.wait_for(lambda: self.is_closing or self.computed > after, WAIT_SECONDS)
             return {
-                "number": self.number,
+                "number": self.computed,
                 "revision": self.revision,
                 "isComputing": self.wanted > self.computed,
                 "problem": self.problem,
                 "outcomes": self.outcomes,
-                "update": self.update if self.number > after else None,
+                "update": self.update if self.computed > after else None,
             }
 
     def outline(self, text: bytes) -> dict[str, Any]:
@@ -154,13 +150,19 @@ class Corrector:
         Raises:
             InputError: a request of another form, no such view, or nothing to outline.
         """
-        view, rough = _read_rough(text, self.opened.view_names)
-        scene = self.opened.scene
+        scene = self.opened.found.scene
+        try:
+            asked = _Rough.model_validate_json(text)
+            view = [each.name for each in scene.views].index(asked.view)
+        except ValueError:
+            what = '{"view": name of a photo, "polygon": [[x, y], ...]}'
+            raise InputError(f"expected {what}, 3 to {MOST_CORNERS} points in the photo") from None
+        rough = np.array(asked.polygon)
         lens, K = scene.views[view].lens, scene.cameras.K[view].cpu().numpy()
         straight = rough if lens is None else pinhole_from_photo(lens, K, rough)
         if not np.isfinite(straight).all():
             raise InputError("the rough outline leaves what the lens shows")
-        found = refine_outline(self.opened.photos(view), straight)
+        found = refine_outline(self.opened.found.photos(view), straight)
         placed = found if lens is None else photo_from_pinhole(lens, K, found)
         return {"polygon": np.round(placed, 2).tolist()}
 
@@ -169,19 +171,6 @@ class Corrector:
         with self.news:
             self.is_closing = True
             self.news.notify_all()
-
-
-def _read_rough(text: bytes, names: Sequence[str]) -> tuple[int, np.ndarray]:
-    """The view and the corners (P, 2) of a request for an outline."""
-    try:
-        content = json.loads(text)
-        view = names.index(content["view"])
-        rough = np.array(content["polygon"], dtype=np.float64)
-    except (ValueError, KeyError, TypeError, RecursionError):
-        raise InputError('expected {"view": name of a photo, "polygon": [[x, y], ...]}') from None
-    if rough.ndim != 2 or rough.shape[1] != 2 or not 3 <= len(rough) <= MOST_CORNERS or not (abs(rough) < 1e6).all():
-        raise InputError("the rough outline is no polygon, expected 3 points or more in the photo")
-    return view, rough
 
 
 class CorrectionServer(ThreadingHTTPServer):
@@ -209,7 +198,13 @@ class _Handler(BaseHTTPRequestHandler):
     timeout = 60
 
     def do_GET(self) -> None:
-        self._answer({"": self._page, "state": self._state})
+        corrector, is_number = self.server.corrector, re.compile("[0-9]{1,15}").fullmatch
+
+        def state() -> None:
+            asked = self._asked("after")
+            self._json(corrector.state(int(asked) if is_number(asked) else -1))
+
+        self._answer({"": lambda: self._send(corrector.page(), "text/html; charset=utf-8"), "state": state})
 
     def do_PUT(self) -> None:
         self._answer({"edits": lambda: self._json(self.server.corrector.save(self._body(), self._asked("base")))})
@@ -219,7 +214,9 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self, places: Mapping[str, Callable[[], None]]) -> None:
         try:
-            places.get(self._place(), self._nothing)()
+            if (place := self._place()) not in places:
+                raise Refused(HTTPStatus.NOT_FOUND, "There is nothing here.")
+            places[place]()
         except Refused as error:
             self._json({"problem": str(error)}, error.status)
         except InputError as error:
@@ -246,16 +243,6 @@ class _Handler(BaseHTTPRequestHandler):
             raise Refused(HTTPStatus.FORBIDDEN, "The token is missing or old: open what mvseg correct prints.")
         return place
 
-    def _nothing(self) -> None:
-        raise Refused(HTTPStatus.NOT_FOUND, "There is nothing here.")
-
-    def _page(self) -> None:
-        self._send(self.server.corrector.page(), "text/html; charset=utf-8")
-
-    def _state(self) -> None:
-        asked = self._asked("after")
-        self._json(self.server.corrector.state(int(asked) if re.fullmatch("[0-9]{1,15}", asked) else -1))
-
     def _asked(self, name: str) -> str:
         """What the address says after the question mark; "" for nothing."""
         return parse_qs(urlsplit(self.path).query).get(name, [""])[0]
@@ -278,9 +265,7 @@ class _Handler(BaseHTTPRequestHandler):
         headers = {"Content-Type": kind, "Content-Length": str(len(body)), "Cache-Control": "no-store",
                    "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer",
                    "Cross-Origin-Resource-Policy": "same-origin"}  # fmt: skip
-        if self.close_connection:
-            headers["Connection"] = "close"
-        for name, value in headers.items():
+        for name, value in (headers | ({"Connection": "close"} if self.close_connection else {})).items():
             self.send_header(name, value)
         self.end_headers()
         self.wfile.write(body)

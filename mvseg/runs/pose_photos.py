@@ -13,20 +13,22 @@ from typing import Any
 import pycolmap
 
 from mvseg._version import made_by
-from mvseg.errors import InputWarning
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.find_views import list_some
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.positions import read_positions
 from mvseg.poses.config import Known, PoseConfig
 from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
-from mvseg.poses.photo_files import PhotoFile, copy_photos
+from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
-from mvseg.results.earlier import replace_result
-from mvseg.runs.pose_folder import POSE_FILE, check_folders
+from mvseg.results.earlier import check_out, replace_result
 from mvseg.scene import Scene
+from mvseg.system.atomic import sweep_abandoned
 from mvseg.traits.config import Up
-from mvseg.traits.world_frame import place_scene
+from mvseg.traits.up import place_scene
+
+POSE_FILE = "pose.json"  # lists the files of mvseg in a scene folder
 
 
 def pose_photos(
@@ -79,6 +81,20 @@ def pose_photos(
     if not quiet:
         print(describe_result(out, structure, placement=placement, scene=scene))
     return scene
+
+
+def check_folders(photos: Path, out: Path) -> tuple[Path, list[str]]:
+    """The folder of the photos and their names, as from `list_photos`, after checking that `out` may be written.
+
+    Raises:
+        InputError: no photos, photos inside `out`, or `out` holds something other than an earlier scene of this kind.
+    """
+    sweep_abandoned(out)
+    check_out(out, POSE_FILE)
+    source, names = list_photos(photos)
+    if out.resolve() in (source.resolve(), *source.resolve().parents):
+        raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
+    return source, names
 
 
 def describe_poses(structure: Structure, placement: Placement, files: Sequence[PhotoFile]) -> dict[str, Any]:

@@ -24,7 +24,7 @@ from mvseg.poses.photo_files import PhotoFile, copy_photos
 from mvseg.poses.scene_files import IMAGES
 from mvseg.poses.table_fit import TableCamera
 from mvseg.results.earlier import replace_result
-from mvseg.runs.pose_folder import POSE_FILE, check_folders
+from mvseg.runs.pose_photos import POSE_FILE, check_folders
 from mvseg.scene import Scene
 
 TURNTABLE_FILE = "turntable.json"
@@ -124,10 +124,10 @@ def _camera_of(names: Sequence[str], cameras: Sequence[str], turntable: Path) ->
     if len(cameras) == 1:
         return [cameras[0]] * len(names)
     folders = [name.rpartition("/")[0] for name in names]
-    unknown = next((name for name, folder in zip(names, folders, strict=True) if folder not in cameras), None)
-    if unknown is not None:
-        message = f"{unknown} is in no folder of a camera"
-        raise InputError(f"{turntable}: {message}, expected folders of these names: {', '.join(cameras)}")
+    for name, folder in zip(names, folders, strict=True):
+        if folder not in cameras:
+            message = f"{name} is in no folder of a camera"
+            raise InputError(f"{turntable}: {message}, expected folders of these names: {', '.join(cameras)}")
     return folders
 
 
@@ -143,20 +143,20 @@ def _angles_of(
     if isinstance(angles, Path):
         listed = read_photo_angles(angles)
         found = [listed.get(name, listed.get(name.rpartition("/")[2])) for name in names]
-        missing = next((name for name, angle in zip(names, found, strict=True) if angle is None), None)
-        if missing is not None:
-            raise InputError(f"{angles}: there is no angle of photo {missing}")
+        for name, angle in zip(names, found, strict=True):
+            if angle is None:
+                raise InputError(f"{angles}: there is no angle of photo {name}")
         return [angle for angle in found if angle is not None]
     places = [camera_of[:index].count(camera) for index, camera in enumerate(camera_of)]
     if angles is not None:
         return [angles * place for place in places]
     counts = Counter(camera_of)
     of_camera = {camera: [angle for name, angle in known if name == camera] for camera in counts}
-    wrong = next((camera for camera, count in counts.items() if count != len(of_camera[camera])), None)
-    if wrong is not None:
-        of = f" of camera {wrong}" if len(counts) > 1 else ""
-        message = f"{len(of_camera[wrong])} views{of} for {counts[wrong]} photos"
-        raise InputError(f"{turntable}: {message}, expected one per photo, in the order of their names, or --angles")
+    for camera, count in counts.items():
+        if count != (num_views := len(of_camera[camera])):
+            of = f" of camera {camera}" if len(counts) > 1 else ""
+            problem = f"{turntable}: {num_views} views{of} for {count} photos"
+            raise InputError(f"{problem}, expected one per photo, in the order of their names, or --angles")
     return [of_camera[camera][place] for camera, place in zip(camera_of, places, strict=True)]
 
 

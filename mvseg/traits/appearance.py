@@ -43,7 +43,7 @@ def measure_appearance(
         surfaces: {instance id: surface that exists}.
         masks: D masks of the scene, with ids.
         cameras: V cameras.
-        photos: looked at, if they exist.
+        photos: used, if they exist.
         corrections: of the colours, one per view; where there is any, views without one have no part in the colours.
 
     Returns:

@@ -9,7 +9,7 @@ and the residual, see shares of light and no sums. Patches that the photo shows 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from fnmatch import fnmatchcase
 from pathlib import Path
 
@@ -87,20 +87,14 @@ def _find_cards(scene: Scene) -> list[ColorCorrection | None]:
         by_camera.setdefault(str(camera), []).append(index)
     found: list[ColorCorrection | None] = [None] * len(scene.views)
     for views in by_camera.values():
-        correction = _find_card(scene, views)
-        for index in views:
-            found[index] = correction
+        names = [scene.views[view].name for view in views]
+        for view, name in zip(views, names, strict=True):
+            fit = _best_fit(find_patches(read_photo(scene, view)))
+            if fit is not None and fit[1] < NO_CARD:
+                correction = ColorCorrection(", ".join(names), *fit, photo=name)
+                found = [correction if index in views else other for index, other in enumerate(found)]
+                break
     return found
-
-
-def _find_card(scene: Scene, views: Sequence[int]) -> ColorCorrection | None:
-    """The correction by the first photo of a camera that shows a card; None where none does."""
-    names = [scene.views[view].name for view in views]
-    for view, name in zip(views, names, strict=True):
-        fits = [fit for fit in map(_fit, find_patches(read_photo(scene, view))) if fit is not None]
-        if fits and (best := min(fits, key=_residual))[1] < NO_CARD:
-            return ColorCorrection(", ".join(names), *best, photo=name)
-    return None
 
 
 def correct_colors(correction: ColorCorrection, pixels: NDArray) -> Floats:
@@ -114,19 +108,20 @@ def fit_best(candidates: Sequence[Floats], *, views: str, photo: Path) -> ColorC
     Raises:
         InputError: none of them is a card, or the photo is overexposed.
     """
-    fits = [fit for fit in map(_fit, candidates) if fit is not None]
-    if not fits:
+    fit = _best_fit(candidates)
+    if fit is None:
         what = f"its colour card is overexposed, expected {FEWEST} patches or more below {BURNT}"
         raise InputError(f"{photo}: {what}")
-    matrix, delta_e = min(fits, key=_residual)
+    matrix, delta_e = fit
     if not delta_e < NO_CARD:
         what = f"its colour card differs by Delta E {delta_e:.0f} from the published colours after the correction"
         raise InputError(f"{photo}: {what}, expected less than {NO_CARD:g}: is it the card, are the corners in order?")
     return ColorCorrection(views, matrix, delta_e, photo.name)
 
 
-def _residual(fit: Fit) -> float:
-    return fit[1]
+def _best_fit(candidates: Iterable[Floats]) -> Fit | None:
+    fits = [fit for fit in map(_fit, candidates) if fit is not None]
+    return min(fits, key=lambda fit: fit[1], default=None)
 
 
 def _fit(patches: Floats) -> Fit | None:

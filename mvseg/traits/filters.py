@@ -18,6 +18,7 @@ from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.traits.config import TraitsConfig
 
 Floats = NDArray[np.float64]
+# The first ones are the gravest.
 Kind = Literal["few_sure_views", "low_quality", "hardly_visible", "stem", "floor", "beside_the_plant"]
 
 # Found on simulated plants with masks of stems and of a tape on the floor, and on a real basil; see docs/traits.md.
@@ -89,21 +90,19 @@ def find_rejected(
             surface.
 
     Returns:
-        {instance id: why}. One that several rules reject has the first of their reasons.
+        {instance id: why}: the gravest of several reasons, see `Kind`.
     """
+    ious = {instance: median_iou(shape) for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
+    share = "its masks cover a share of {:.2f} of its surface, asked for is {:g}"
+    limits: tuple[tuple[Kind, Mapping[int, float], float, str], ...] = (
+        ("hardly_visible", visible_shares, config.min_visible_share, share),
+        ("low_quality", ious, config.min_quality, "median IoU {:.2f} with its masks, asked for is {:g}"),
+        ("few_sure_views", sure_views, config.min_sure_views, "{} sure views, asked for are {}"),
+    )
     found: dict[int, Rejection] = {}
-    for instance, num_views in sure_views.items():
-        if num_views < config.min_sure_views:
-            reason = f"{num_views} sure views, asked for are {config.min_sure_views}"
-            found[instance] = Rejection("few_sure_views", reason)
-    for instance, shape in shapes.items():
-        if isinstance(shape, LeafSurface) and (iou := median_iou(shape)) < config.min_quality:
-            reason = f"median IoU {iou:.2f} with its masks, asked for is {config.min_quality:g}"
-            found.setdefault(instance, Rejection("low_quality", reason))
-    for instance, share in visible_shares.items():
-        if share < config.min_visible_share:
-            reason = f"its masks cover a share of {share:.2f} of its surface, asked for is {config.min_visible_share:g}"
-            found.setdefault(instance, Rejection("hardly_visible", reason))
+    for kind, values, least, reason in limits:
+        below = {instance: value for instance, value in values.items() if value < least}
+        found |= {instance: Rejection(kind, reason.format(value, least)) for instance, value in below.items()}
     if not config.leaves_only:
         return found
     bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in found}
@@ -159,11 +158,9 @@ def find_distant(bodies: Mapping[int, _Body]) -> dict[int, Rejection]:
     if sizes.max() <= len(bodies) / 2:
         return {}
     plant = group == sizes.argmax()
-    away = gaps[:, plant].min(1) / length
-    return {
-        instance: Rejection(
-            "beside_the_plant", f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
-        )
-        for instance, steps, is_plant in zip(bodies, away, plant, strict=True)
-        if not is_plant
-    }
+    away, found = gaps[:, plant].min(1) / length, {}
+    for instance, steps, is_plant in zip(bodies, away, plant, strict=True):
+        if not is_plant:
+            reason = f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
+            found[instance] = Rejection("beside_the_plant", reason)
+    return found

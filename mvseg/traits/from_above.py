@@ -66,7 +66,12 @@ def look_from_above(surfaces: Mapping[int, LeafSurface], frame: Floats) -> dict[
     low, high = level.reshape(-1, 2).min(0), level.reshape(-1, 2).max(0)
     pixel = max(float((high - low).max()), 1e-300) / (PICTURE - 1)
     px = (level - low) / pixel
-    top = _paint_cells(px, corners[..., 2].mean(-1))
+    picture = np.full((PICTURE, PICTURE), -1, np.int32)
+    quads = np.round(px.reshape(-1, 4, 2) * (1 << BITS)).astype(np.int32)
+    for cell in np.argsort(corners[..., 2].mean(-1), axis=None, kind="stable").tolist():  # higher ones over lower ones
+        cv2.fillConvexPoly(picture, quads[cell], cell, shift=BITS)
+    columns, rows = np.moveaxis(np.round(px.mean(-2)).astype(int), -1, 0)
+    top = picture[rows, columns]  # the cell that the centre of each cell shows; -1 where none was painted
     normals = np.stack([cell_normals(grid) for grid in grids])
     areas, covered = np.linalg.norm(normals, axis=-1), np.abs(normals[..., 2])
     # Which other cell of the same leaf is in the way, and which is only beside this one?
@@ -80,18 +85,3 @@ def look_from_above(surfaces: Mapping[int, LeafSurface], frame: Floats) -> dict[
         instance: Cells(area=areas[index], covered=covered[index], is_lit=is_lit[index])
         for index, instance in enumerate(surfaces)
     }
-
-
-def _paint_cells(px: Floats, heights: Floats) -> NDArray[np.int64]:
-    """The index of the cell that the centre of each cell shows; -1 where none was painted.
-
-    Args:
-        px: (N, rows, columns, 4, 2) corners in a picture of PICTURE pixels.
-        heights: (N, rows, columns): higher cells are painted over lower ones.
-    """
-    picture = np.full((PICTURE, PICTURE), -1, np.int32)
-    quads = np.round(px.reshape(-1, 4, 2) * (1 << BITS)).astype(np.int32)
-    for cell in np.argsort(heights, axis=None, kind="stable").tolist():
-        cv2.fillConvexPoly(picture, quads[cell], cell, shift=BITS)
-    columns, rows = np.moveaxis(np.round(px.mean(-2)).astype(int), -1, 0)
-    return picture[rows, columns].astype(np.int64)

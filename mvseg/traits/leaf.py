@@ -67,7 +67,8 @@ def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 
     coefficients = surface.coefficients.numpy()
     normals = cell_normals(patch_grid(*COARSE).points(coefficients))
     directions = _directions(coefficients, frame, normal=normals.sum((0, 1)))
-    angles = {name: _Angle.of(*pair, across=_north(name, frame)) for name, pair in directions.items()}
+    north = None if frame is None else frame[1]  # azimuths have a plane and a sense of their own
+    angles = {name: _Angle.of(*pair, across=north if name == "azimuth" else None) for name, pair in directions.items()}
 
     def measure(moved: Floats) -> Floats:
         points = patch_grid(*COARSE).points(moved)
@@ -117,7 +118,7 @@ def cell_normals(points: Floats) -> Floats:
 
 
 def measure_voxels(grid: VoxelGrid) -> dict[str, Measurement]:
-    """All of `VOXEL_TRAITS`: volume, the corners of the box along the world's axes, and the number of pieces."""
+    """All of `VOXEL_TRAITS`: volume, the corners of the box along the world's axes, and its components."""
     points, half = grid.points, grid.voxel_size / 2
     values = {"volume": grid.volume, "num_pieces": float(grid.num_pieces)}
     for end, corner in (("min", points.amin(0) - half), ("max", points.amax(0) + half)):
@@ -147,11 +148,6 @@ def _directions(coefficients: Floats, frame: Floats | None, *, normal: Floats) -
     return pairs | {
         "inclination": (up, normal), "insertion_angle": (up, base), "tip_angle": (up, tip), "azimuth": (east, level)
     }  # fmt: skip
-
-
-def _north(name: str, frame: Floats | None) -> Floats | None:
-    """Azimuths have a plane and a sense of their own."""
-    return frame[1] if frame is not None and name == "azimuth" else None
 
 
 @dataclass(frozen=True, eq=False)

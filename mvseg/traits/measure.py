@@ -9,7 +9,6 @@ from dataclasses import dataclass
 import torch
 
 from mvseg.formats.photos import Photos
-from mvseg.masks import Masks
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.shapes import Surfaces, Voxels, best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -100,15 +99,14 @@ def measure_plant(
     Raises:
         InputError: a photo is broken, or missing while others exist.
     """
-    instances = range(1, matching.num_instances + 1)
+    instances, masks = range(1, matching.num_instances + 1), matching.masks
     best = {instance: best_shape(instance, surfaces, voxels) for instance in instances}
     shapes = {instance: shape for instance, shape in best.items() if shape is not None}
     every = {instance: shape for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
     frame = None if scene.up is None else level_frame(scene.up)
     sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
-    appearance = measure_appearance(
-        every, matching.masks, scene.cameras, photos=photos or Photos(scene), corrections=corrections
-    )
+    photos = photos or Photos(scene)
+    appearance = measure_appearance(every, masks, scene.cameras, photos=photos, corrections=corrections)
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
     rejected = find_rejected(
         shapes, None if frame is None else frame[2], config=config, sure_views=sure_views, visible_shares=visible
@@ -120,7 +118,10 @@ def measure_plant(
         ground = min(float((surface.points().numpy() @ frame[2]).min()) for surface in blades.values())
     leaves = []
     for instance in instances:
-        numbers = _count(instance, matching.masks, sure_views=sure_views)
+        num_views = len(torch.unique(masks.view_index[masks.instance_ids == instance]))
+        numbers = {"num_views": Measurement(float(num_views), float("nan"), "masks"), "sure_views": NO_SURE_VIEWS}
+        if instance in sure_views:
+            numbers["sure_views"] = Measurement(float(sure_views[instance]), float("nan"), "matching")
         if instance in blades:
             lit = UP_UNKNOWN if frame is None else Measurement(cells[instance].lit_share, float("nan"), "surface")
             numbers |= measure_leaf(blades[instance], frame, ground=ground) | {"lit_share": lit} | appearance[instance]
@@ -142,19 +143,13 @@ def describe_leaf(
     fitted: LeafSurface | None,
     rejection: Rejection | None,
 ) -> LeafTraits:
-    """The leaf with all of its traits; those that are missing with the reason.
+    """The leaf with all of its traits, from the `numbers` that were measured; those that are missing with the reason.
 
-    Args:
-        instance: its id.
-        numbers: {trait: number} of what was measured.
-        shape: the one that stands for it.
-        fitted: its surface, credible or not; None where no surfaces were asked for.
-        rejection: why it does not count as a leaf.
+    `shape` stands for it; `fitted` is its surface, credible or not, None where no surfaces were asked for; `rejection`
+    says why it does not count as a leaf.
     """
-    if fitted is not None:
-        reasons = fitted.quality.reasons
-    else:
-        reasons = () if shape is not None else ("has no shape: seen in one view, or its masks agree on no point",)
+    no_shape = () if shape is not None else ("has no shape: seen in one view, or its masks agree on no point",)
+    reasons = no_shape if fitted is None else fitted.quality.reasons
     if rejection is not None:
         reasons = (f"rejected: {rejection.reason}", *reasons)
         why = reasons[0]
@@ -173,12 +168,3 @@ def describe_leaf(
         found["quality"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
     return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=rejection)
-
-
-def _count(instance: int, masks: Masks, *, sure_views: Mapping[int, int]) -> dict[str, Measurement]:
-    num_views = len(torch.unique(masks.view_index[masks.instance_ids == instance]))
-    sure = sure_views.get(instance)
-    return {
-        "num_views": Measurement(float(num_views), float("nan"), "masks"),
-        "sure_views": NO_SURE_VIEWS if sure is None else Measurement(float(sure), float("nan"), "matching"),
-    }

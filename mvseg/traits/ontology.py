@@ -65,7 +65,7 @@ VOXEL_TRAITS = (
         for end, word in (("min", "least"), ("max", "largest"))
         for axis in "xyz"
     ),
-    _counted("num_pieces", "pieces that the voxels fall into"),
+    _counted("num_pieces", "connected components of the voxels"),
 )
 COUNTED_TRAITS = (
     _counted("num_views", "views with a mask of the leaf"),

@@ -16,26 +16,24 @@ from mvseg.reconstruction.surface.leaf_patch import patch_grid
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.traits.from_above import Cells
 from mvseg.traits.leaf import UP_UNKNOWN, Measurement, cell_normals, missing
+from mvseg.traits.ontology import PLANT_TRAITS
 
 Floats = NDArray[np.float64]
 
 NO_LEAVES = missing("not measured: no leaf has a surface")
 FLAT = missing("not measured: the leaves span no volume")
 NEED_UP = ("height", "projected_area", "light_interception")
-DECILES = tuple(f"leaf_area_decile_{decile}" for decile in range(1, 10))
-FROM_SURFACES = ("total_leaf_area", "convex_hull_volume", *NEED_UP, *DECILES)
+FROM_SURFACES = [trait.name for trait in PLANT_TRAITS[1:]]
+DECILES = FROM_SURFACES[-9:]
 
 
 def measure_whole(
     surfaces: Mapping[int, LeafSurface], cells: Mapping[int, Cells], frame: Floats | None, *, num_leaves: int
 ) -> dict[str, Measurement]:
-    """All of `PLANT_TRAITS`.
+    """All of `PLANT_TRAITS`, from the credible surfaces of leaves, by instance id, and their cells (`look_from_above`).
 
-    Args:
-        surfaces: {instance id: credible surface} of the leaves that have one.
-        cells: {instance id: its cells}, from `look_from_above`; empty without `frame`.
-        frame: (3, 3) rows east, north, up; None: up is not known.
-        num_leaves: leaves, with or without a surface.
+    `frame` (3, 3) has the rows east, north, up, None where up is not known; `num_leaves` counts those without a
+    surface, too.
     """
     numbers = {"number_of_leaves": Measurement(float(num_leaves), float("nan"), "matching")}
     if not surfaces:

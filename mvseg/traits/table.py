@@ -8,18 +8,19 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from mvseg.traits.leaf import Measurement
-from mvseg.traits.measure import LeafTraits, Traits
+from mvseg.traits.measure import Traits
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology")
 FORMULA_STARTS = ("=", "+", "-", "@")
 NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
+WIDE_TRAITS = [trait for trait in LEAF_TRAITS if trait.name != "quality"]
 
 
 def write_long(path: Path, traits: Traits) -> None:
@@ -27,42 +28,34 @@ def write_long(path: Path, traits: Traits) -> None:
 
     In the row of a missing number, `method` is the reason. Leaves without voxels have no rows for these.
     """
-    rows = [_row(traits, name, number, leaf="") for name, number in traits.whole.items()]
-    for leaf in traits.leaves:
-        for name, number in leaf.numbers.items():
+    rows = []
+    for leaf, numbers in [("", traits.whole), *((leaf.leaf, leaf.numbers) for leaf in traits.leaves)]:
+        for name, number in numbers.items():
             if number.exists or name not in VOXEL_NAMES:
-                rows.append(_row(traits, name, number, leaf=leaf.leaf))
+                trait = DEFINITIONS[name]
+                about = unit_of(trait.kind, traits.unit), number.method, trait.ontology
+                rows.append(as_cells(traits.plant, leaf, name, number.value, number.sd, *about))
     write_csv(path, COLUMNS, rows)
 
 
 def write_wide(path: Path, traits: Traits) -> None:
     """One row per leaf: each trait, beside it its standard deviation, and in the end the unit of lengths, the method
     and the quality: "good", or the reasons to doubt the numbers."""
-    write_csv(path, wide_columns(), [_wide_row(traits, leaf) for leaf in traits.leaves])
+    rows = []
+    for leaf in traits.leaves:
+        numbers: list[float] = []
+        for trait in WIDE_TRAITS:
+            number = leaf.numbers[trait.name]
+            numbers += [number.value, number.sd] if trait.has_sd else [number.value]
+        texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or "good"
+        rows.append(as_cells(leaf.leaf, *numbers, leaf.numbers["quality"].value, *texts))
+    write_csv(path, wide_columns(), rows)
 
 
 def wide_columns() -> list[str]:
     """The columns of `write_wide`."""
-    columns = ["leaf"]
-    for trait in LEAF_TRAITS:
-        if trait.name != "quality":
-            columns += [trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name]
-    return [*columns, "iou", "unit", "method", "quality"]
-
-
-def _row(traits: Traits, name: str, number: Measurement, *, leaf: int | str) -> list[str | int]:
-    unit, ontology = unit_of(DEFINITIONS[name].kind, traits.unit), DEFINITIONS[name].ontology
-    return as_cells(traits.plant, leaf, name, number.value, number.sd, unit, number.method, ontology)
-
-
-def _wide_row(traits: Traits, leaf: LeafTraits) -> list[str | int]:
-    numbers: list[float] = []
-    for trait in LEAF_TRAITS:
-        if trait.name != "quality":
-            number = leaf.numbers[trait.name]
-            numbers += [number.value, number.sd] if trait.has_sd else [number.value]
-    texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or "good"
-    return as_cells(leaf.leaf, *numbers, leaf.numbers["quality"].value, *texts)
+    pairs = [[trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name] for trait in WIDE_TRAITS]
+    return ["leaf", *chain.from_iterable(pairs), "iou", "unit", "method", "quality"]
 
 
 def as_cells(*values: str | float | None) -> list[str | int]:

@@ -1,13 +1,16 @@
-"""Which way is up: as the user says, or as cameras or markers that lie flat show."""
+"""The world that the user asks for: the scale and the unit of its lengths, and which way is up: as the user says, or as
+cameras or markers that lie flat show.
+"""
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.markers import find_scene_markers
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Cameras, Scene
@@ -18,7 +21,40 @@ Floats = NDArray[np.float64]
 LEVEL = np.radians(2.0)  # how level cameras are at best
 MOST_TILT = np.radians(10.0)  # root mean square, of cameras that were held level
 MOST_DOUBT = np.radians(6.0)  # standard deviation of the answer
-MOST_BEND = 0.1  # smallest spread of the corners of markers over their middle one: they lie in one plane
+MOST_BEND = 0.1  # smallest standard deviation of markers' corners over the middle one: they lie in one plane
+
+
+def place_scene(scene: Scene, *, scale: float | None = None, unit: str | None = None, up: Up | None = None) -> Scene:
+    """The scene in the world that the user asks for; None leaves what the scene says.
+
+    Warns (InputWarning) of a unit that contradicts the scene's and comes without a scale, and of an up that the cameras
+    contradict (`Scene.seems_upside_down`).
+
+    Args:
+        scene: as it was loaded.
+        scale: its lengths are multiplied by this.
+        unit: name of the unit of the lengths after that.
+        up: see `find_up`.
+
+    Raises:
+        InputError: a scale of cameras that say their unit, without the unit of the lengths after it; up cannot be
+            found, see `find_up`.
+    """
+    if scale is not None:
+        if unit is None and scene.unit and scale != 1:
+            problem = f"scale is {scale:g} without a unit, but the cameras are in {scene.unit}"
+            raise InputError(f"{problem}: expected the unit of the scaled lengths, too, as in --unit {scene.unit}")
+        scene = replace(scene, cameras=scene.cameras.scale(scale))
+    if unit is not None:
+        if scene.unit not in ("", unit) and scale is None:
+            message = f"the cameras are in {scene.unit}: unit {unit} without a scale only renames it"
+            warnings.warn(message, InputWarning, stacklevel=4)
+        scene = replace(scene, unit=unit)
+    scene = find_up(scene, up)
+    if scene.seems_upside_down:
+        message = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
+        warnings.warn(message, InputWarning, stacklevel=4)
+    return scene
 
 
 def find_up(scene: Scene, up: Up | None) -> Scene:
@@ -68,8 +104,8 @@ def up_of_board(scene: Scene) -> Floats:
     if not len(corners):
         raise InputError("up is 'board', but no ArUco marker is seen in two photos, expected one that lies flat")
     middle = corners.mean(0)
-    _, spreads, axes = np.linalg.svd(corners - middle, full_matrices=False)
-    if spreads[2] > MOST_BEND * spreads[1]:
+    _, sizes, axes = np.linalg.svd(corners - middle, full_matrices=False)
+    if sizes[2] > MOST_BEND * sizes[1]:
         raise InputError(f"up is 'board', but the {len(corners)} corners of its markers lie in no one plane")
     towards = scene.cameras.centers.mean(0).cpu().numpy() - middle
     return axes[2] if axes[2] @ towards >= 0 else -axes[2]

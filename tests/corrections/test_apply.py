@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere, fates_everywhere
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
@@ -142,7 +142,7 @@ def test_whole_instances_once_they_are_known() -> None:
     def after(*edits: dict[str, Any]) -> Masks:
         corrected = correct(*edits)
         known = Masks.of(corrected.masks.regions, ids[: len(corrected.masks)], origin=Origin.DETECTED)
-        return apply_everywhere(corrected, known)
+        return apply_everywhere(corrected, known)[0]
 
     assert after(at("reject", 15, 15, everywhere=True)).regions.boxes.tolist() == [[*RIGHT], [*RIGHT]]
     assert after(at("reject", 15, 15, everywhere=True)).instance_ids.tolist() == [1, 1]
@@ -160,7 +160,7 @@ def test_an_edit_of_a_whole_instance_says_which_earlier_ones_it_overrides() -> N
     def told(*edits: dict[str, Any]) -> list[str]:
         corrected = correct(*edits)
         known = Masks.of(corrected.masks.regions, ids[: len(corrected.masks)], origin=Origin.DETECTED)
-        return [each.fate for each in fates_everywhere(corrected, known)]
+        return [each.fate for each in apply_everywhere(corrected, known)[1].fates]
 
     everywhere = at("reject", 15, 15, everywhere=True)
     assert told(at("confirm", 15, 15, "b"), everywhere) == ["contradicted by edit 2", "applied"]
@@ -176,7 +176,7 @@ def test_a_rejected_instance_may_be_drawn_anew() -> None:
     corrected = correct(at("reject", 15, 15, everywhere=True), drawn, at("confirm", 15, 15))
     assert fates(corrected) == ["applied"] * 3
     known = Masks.of(corrected.masks.regions, torch.tensor([1, 2, 1, 1, 2]), origin=Origin.DETECTED)
-    left = apply_everywhere(corrected, replace(known, origin=corrected.masks.origin))
+    left, _ = apply_everywhere(corrected, replace(known, origin=corrected.masks.origin))
     assert left.view_index.tolist() == [0, 0, 1]
     assert left.origin.tolist() == [Origin.DETECTED, Origin.CORRECTED, Origin.DETECTED]
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from blade_scene import ring_cameras
-from mvseg.results.gltf import describe_world, gltf_from_world, leaf_extras
+from mvseg.results.plant_files import describe_world, gltf_from_world, leaf_extras
 from mvseg.scene import Scene, View
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits

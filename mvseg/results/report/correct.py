@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,8 +14,7 @@ from mvseg.corrections.apply import APPLIED, PASSED, Fate
 from mvseg.corrections.doubtful import Doubt, list_doubts
 from mvseg.corrections.file import dump_edits, name_edits
 from mvseg.formats.lens import photo_from_pinhole
-from mvseg.results.report.outlines import UNITS
-from mvseg.results.report.pictures import Picture
+from mvseg.results.report.pictures import UNITS, Picture
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 
@@ -88,14 +88,6 @@ def _describe_doubt(doubt: Doubt, picture: Picture, size: list[int]) -> dict[str
     if doubt.outline is not None:
         left, top, right = (share * side for share, side in zip(picture.box[:3], [*size, size[0]], strict=True))
         outline = np.round((doubt.outline - (left, top)) * UNITS / (right - left)).astype(int).tolist()
-    return {
-        "kind": doubt.kind,
-        "doubt": round(doubt.doubt, 3),
-        "view": doubt.view,
-        "leaf": doubt.instance,
-        "region": doubt.region,
-        "other": doubt.other,
-        "found": doubt.found,
-        "expected": doubt.expected,
-        "outline": outline,
-    }
+    said = asdict(doubt) | {"doubt": round(doubt.doubt, 3), "leaf": doubt.instance, "outline": outline}
+    del said["instance"]
+    return said

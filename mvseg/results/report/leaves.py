@@ -10,7 +10,7 @@ import numpy as np
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
 from mvseg.traits.leaf import Measurement
-from mvseg.traits.measure import LeafTraits, Traits
+from mvseg.traits.measure import Traits
 from mvseg.traits.ontology import (
     COUNTED_TRAITS,
     LEAF_TRAITS,
@@ -26,7 +26,7 @@ from mvseg.traits.table import VOXEL_NAMES, format_number
 COLOURS = ("mean_red", "mean_green", "mean_blue")
 # The corners of boxes are in traits.csv; in a table they are of no interest.
 NO_COLUMNS = {*COLOURS, *(trait.name for trait in VOXEL_TRAITS if trait.name.endswith(("_min", "_max")))}
-SIGNS = {"^2": "²", "^3": "³"}
+UNITLESS = {"degree": "°", "1": ""}
 
 
 def describe_leaves(result: Result) -> list[dict[str, Any]]:
@@ -34,27 +34,14 @@ def describe_leaves(result: Result) -> list[dict[str, Any]]:
     measured = {} if result.traits is None else {leaf.leaf: leaf for leaf in result.traits.leaves}
     found = []
     for instance in range(1, result.matching.num_instances + 1):
-        red, green, blue = instance_color(instance)
-        about: dict[str, Any] = {"id": instance, "color": f"#{red:02x}{green:02x}{blue:02x}"}
-        leaf = measured.get(instance)
-        found.append(about | _describe_leaf(leaf) if leaf is not None else about)
+        about: dict[str, Any] = {"id": instance, "color": f"#{bytes(instance_color(instance)).hex()}"}
+        if (leaf := measured.get(instance)) is not None:
+            # as in traits.csv, traits of voxels are omitted if there are none
+            shown = [each for each in LEAF_TRAITS if leaf.numbers[each.name].exists or each.name not in VOXEL_NAMES]
+            about |= {"shape": leaf.method, "doubts": list(leaf.reasons), "isRejected": leaf.rejection is not None}
+            about["traits"] = describe_numbers(leaf.numbers, shown)
+        found.append(about)
     return found
-
-
-def _describe_leaf(leaf: LeafTraits) -> dict[str, Any]:
-    # as in traits.csv, traits of voxels are omitted if there are none
-    shown = [trait for trait in LEAF_TRAITS if leaf.numbers[trait.name].exists or trait.name not in VOXEL_NAMES]
-    return {
-        "shape": leaf.method,
-        "doubts": list(leaf.reasons),
-        "isRejected": leaf.rejection is not None,
-        "traits": describe_numbers(leaf.numbers, shown),
-    }
-
-
-def describe_plant(traits: Traits | None) -> dict[str, Any]:
-    """The plant's own numbers; none if no traits were measured."""
-    return {} if traits is None else describe_numbers(traits.whole, PLANT_TRAITS)
 
 
 def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Definition]) -> dict[str, Any]:
@@ -71,25 +58,22 @@ def describe_numbers(numbers: Mapping[str, Measurement], traits: Iterable[Defini
     return found
 
 
-def describe_traits(traits: Traits | None) -> list[dict[str, Any]]:
+def describe_traits(traits: Traits | None) -> dict[str, Any]:
     """The traits of leaves that at least one leaf has, in the order of the table: what they mean, in which unit, and
-    whether the table has a column for them."""
+    whether the table has a column for them; those of the plant, but the deciles of its leaves' areas; and its numbers.
+    """
     if traits is None:
-        return []
+        return {"traits": [], "plantTraits": [], "whole": {}}
     order = (*SURFACE_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS, *SEEN_TRAITS)
     shown = [trait for trait in order if any(leaf.numbers[trait.name].exists for leaf in traits.leaves)]
-    return [_describe_trait(trait, traits.unit) | {"isColumn": trait.name not in NO_COLUMNS} for trait in shown]
-
-
-def describe_plant_traits(traits: Traits | None) -> list[dict[str, Any]]:
-    """The traits of the plant, but the deciles of its leaves' areas."""
-    if traits is None:
-        return []
-    return [_describe_trait(trait, traits.unit) for trait in PLANT_TRAITS if "decile" not in trait.name]
+    of_plant = [trait for trait in PLANT_TRAITS if "decile" not in trait.name]
+    return {
+        "traits": [_describe_trait(trait, traits.unit) | {"isColumn": trait.name not in NO_COLUMNS} for trait in shown],
+        "plantTraits": [_describe_trait(trait, traits.unit) for trait in of_plant],
+        "whole": describe_numbers(traits.whole, PLANT_TRAITS),
+    }
 
 
 def _describe_trait(trait: Definition, unit: str) -> dict[str, Any]:
-    written = {"degree": "°", "1": ""}.get(trait.kind) if trait.kind in ("degree", "1") else unit_of(trait.kind, unit)
-    for power, sign in SIGNS.items():
-        written = (written or "").replace(power, sign)
+    written = UNITLESS.get(trait.kind, unit_of(trait.kind, unit)).replace("^2", "²").replace("^3", "³")
     return {"name": trait.name, "unit": written, "meaning": trait.meaning}

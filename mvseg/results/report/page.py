@@ -10,13 +10,14 @@ import html
 import json
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
 from string import Template
 from typing import Any
 
 from mvseg.results.report.correct import describe_correct, describe_doubts
-from mvseg.results.report.leaves import describe_leaves, describe_plant, describe_plant_traits, describe_traits
+from mvseg.results.report.leaves import describe_leaves, describe_traits
 from mvseg.results.report.pictures import Picture
 from mvseg.results.report.space import describe_space
 from mvseg.results.result import Result
@@ -72,9 +73,7 @@ def describe_result(result: Result, pictures: Sequence[Picture], *, run: Mapping
         "numMasks": len(result.regions),
         "views": [{"name": view.name} | picture.as_json() | {"masks": masks} for view, picture, masks in shown],
         "leaves": describe_leaves(result),
-        "traits": describe_traits(result.traits),
-        "plantTraits": describe_plant_traits(result.traits),
-        "whole": describe_plant(result.traits),
+        **describe_traits(result.traits),
         "space": describe_space(result),
         "correct": describe_correct(result, pictures, run=run),
         "run": {name: value for name, value in run.items() if name in RUN_FIELDS}
@@ -84,7 +83,7 @@ def describe_result(result: Result, pictures: Sequence[Picture], *, run: Mapping
 
 def describe_masks(result: Result, pictures: Sequence[Picture]) -> list[list[dict[str, Any]]]:
     """The outlined masks of each view."""
-    found = [[outline.as_json() for outline in picture.outlines] for picture in pictures]
+    found = [[asdict(outline) for outline in picture.outlines] for picture in pictures]
     scores = result.masks.detection_scores.tolist()
     for mask in (mask for masks in found for mask in masks):
         if not math.isnan(scores[mask["region"]]):

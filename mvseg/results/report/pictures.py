@@ -1,4 +1,6 @@
-"""What the page shows of a photo: its part with the plant, a thumbnail of the whole, and the outlines of the masks."""
+"""What the page shows of a photo: its part with the plant, a thumbnail of the whole, and the outlines of the masks, sharp
+at every size.
+"""
 
 from __future__ import annotations
 
@@ -9,16 +11,46 @@ from typing import Any
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from mvseg.formats.image_file import encode_jpeg
-from mvseg.masks import Masks
-from mvseg.results.overlay import find_plant
-from mvseg.results.report.outlines import Outline, outline_masks
+from mvseg.masks import SURE, Masks
+from mvseg.results.overlay import Box, find_plant, find_thickest
 
 LARGEST_WIDTH, LEAST_WIDTH = 1600, 200  # pixels of a picture
 ALL_PIXELS = 24_000_000  # of all pictures together: 4 to 9 MB, large enough to correct masks in
 THUMBNAIL_WIDTH = 320  # also shown around the picture of the plant
 QUALITY = 80  # of JPEGs
+UNITS = 2000  # across the picture of a view: the numbers of its outlines are whole ones
+TOLERANCE = 1.5  # units that an outline may differ from the mask
+LEAST_HEIGHT, LARGEST_HEIGHT = 36, 110  # units, of a number in the picture
+
+
+@dataclass(frozen=True)
+class Outline:
+    """One mask, in units of the picture, of which it is 2000 wide.
+
+    Attributes:
+        region: index of the mask.
+        leaf: id of its instance, -1 = matched to nothing.
+        path: of SVG; holes are paths of their own (even-odd rule).
+        box: xyxy, around all of it.
+        at: where its number goes: the middle of the thickest place.
+        height: of the number.
+        match_score: see `Matching`.
+        is_sure: whether that is at least 0.5.
+        other: id of a second instance that the mask seems to cover, None for most.
+    """
+
+    region: int
+    leaf: int
+    path: str
+    box: Box
+    at: tuple[int, int]
+    height: int
+    match_score: float
+    is_sure: bool
+    other: int | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,13 +87,8 @@ class Picture:
 
 
 def draw_picture(photo: np.ndarray, masks: Masks, *, view: int) -> Picture:
-    """The picture of one view; the more views there are, the smaller, so that a page of 60 views can still be sent.
-
-    Args:
-        photo: (H, W, 3) uint8 RGB, undistorted.
-        masks: D masks.
-        view: index of the view.
-    """
+    """The picture of one view, from its photo (H, W, 3) uint8 RGB, undistorted; the more views there are, the smaller,
+    so that a page of 60 views can still be sent."""
     height, width = photo.shape[:2]
     box = x1, y1, x2, y2 = find_plant(masks, view=view, size=(width, height))
     proportion = (y2 - y1) / (x2 - x1)
@@ -84,3 +111,60 @@ def picture_width(num_views: int, proportion: float) -> int:
 def _shrink(image: np.ndarray, width: int) -> bytes:
     height = max(1, round(width * image.shape[0] / image.shape[1]))
     return encode_jpeg(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), quality=QUALITY)
+
+
+def outline_masks(masks: Masks, *, view: int, box: Box) -> list[Outline]:
+    """The masks of one view, large ones first, so that small ones lie on top; those outside of the part of the photo
+    that the picture shows (`box`, xyxy, pixels) are left out."""
+    regions, others = masks.regions, masks.second_ids.tolist()
+    members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
+    members = members[regions.areas[members].argsort(descending=True, stable=True)]
+    found = []
+    for region in members.tolist():
+        mask = regions.crop(region).cpu().numpy().astype(np.uint8)
+        corner = np.array(regions.boxes[region, :2].tolist())
+        path, around = trace_mask(mask, corner, box=box)
+        height = round(UNITS * (box[3] - box[1]) / (box[2] - box[0]))
+        if around[2] <= 0 or around[3] <= 0 or around[0] >= UNITS or around[1] >= height:
+            continue
+        middle, radius = find_thickest(mask)
+        x, y = np.round(_place(np.array(middle) + corner + 0.5, box)).astype(int).tolist()
+        thickness = 2 * radius * UNITS / (box[2] - box[0])
+        score = float(masks.match_scores[region])
+        found.append(
+            Outline(
+                region=region,
+                leaf=int(masks.instance_ids[region]),
+                path=path,
+                box=around,
+                at=(x, y),
+                height=int(np.clip(thickness, LEAST_HEIGHT, LARGEST_HEIGHT)),
+                match_score=round(score, 4),
+                is_sure=score >= SURE,
+                other=others[region] if others[region] > 0 else None,
+            )
+        )
+    return found
+
+
+def trace_mask(mask: NDArray[np.uint8], corner: NDArray[np.int64], *, box: Box) -> tuple[str, Box]:
+    """The outline of a mask (h, w) of at least one pixel as a path of SVG, and the box around it.
+
+    `corner` (2,) is the column and row of its top-left pixel in the photo, `box` the part that is `UNITS` wide.
+    """
+    lines, _ = cv2.findContours(mask, cv2.RETR_CCOMP, cv2.CHAIN_APPROX_NONE)
+    parts, corners = [], []
+    for line in lines:
+        placed = _place(line[:, 0] + corner + 0.5, box).astype(np.float32)
+        points = np.round(cv2.approxPolyDP(placed, TOLERANCE, True)[:, 0]).astype(int)
+        steps = np.diff(points, axis=0).ravel().tolist()
+        parts.append(f"M{points[0, 0]} {points[0, 1]}l{' '.join(map(str, steps or [0, 0]))}z")
+        corners.append(points)
+    x1, y1 = np.concatenate(corners).min(0).tolist()
+    x2, y2 = np.concatenate(corners).max(0).tolist()
+    return "".join(parts), (x1, y1, x2, y2)
+
+
+def _place(xy: NDArray[Any], box: Box) -> NDArray[np.float64]:
+    """Pixel positions (..., 2) of the photo, in units of the picture."""
+    return np.asarray((xy - np.array(box[:2])) * UNITS / (box[2] - box[0]), dtype=np.float64)

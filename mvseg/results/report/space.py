@@ -107,7 +107,7 @@ def find_frame(scene: Scene, meshes: Mapping[int, trimesh.Trimesh]) -> Frame:
         middle = (points.min(0) + points.max(0)) / 2
         radius = float(np.linalg.norm(points - middle, axis=1).max())
     else:
-        target = _looked_at(cameras)
+        target = cameras.nearest_point(torch.arange(len(cameras)), cameras.R[:, 2]).numpy()  # looked at by all
         middle = rotation @ target
         radius = PLANT_SHARE * float(np.median(np.linalg.norm(cameras.centers.numpy() - target, axis=1)))
     return Frame(rotation=rotation, middle=middle, radius=max(radius, 1e-9), is_up_known=scene.up is not None)
@@ -134,11 +134,6 @@ def grid_step(radius: float) -> float:
     """Side of the squares of the grid: 1, 2 or 5 times a power of ten, a fifth to a half of the plant's radius."""
     power = 10 ** math.floor(math.log10(radius / 2))
     return max(step * power for step in GRID_STEPS if step * power <= radius / 2)
-
-
-def _looked_at(cameras: Cameras) -> Floats:
-    """(3,) the point nearest to all optical axes; they may be parallel."""
-    return np.asarray(cameras.nearest_point(torch.arange(len(cameras)), cameras.R[:, 2]).numpy())
 
 
 def _encode(points: Floats, mesh: trimesh.Trimesh) -> dict[str, str]:

@@ -5,13 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from mvseg.results.overlay import instance_color
-from mvseg.results.report.leaves import (
-    describe_leaves,
-    describe_numbers,
-    describe_plant,
-    describe_plant_traits,
-    describe_traits,
-)
+from mvseg.results.report.leaves import describe_leaves, describe_numbers, describe_traits
 from mvseg.results.result import Instances, Result
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.ontology import DEFINITIONS
@@ -38,16 +32,17 @@ def test_leaves_have_the_colours_of_the_overlays(balls: Result) -> None:
 
 
 def test_units_are_written_as_people_do_and_columns_chosen(balls: Result) -> None:
-    traits = {trait["name"]: trait for trait in describe_traits(balls.traits)}
+    described = describe_traits(balls.traits)
+    traits = {trait["name"]: trait for trait in described["traits"]}
     assert (traits["volume"]["unit"], traits["num_views"]["unit"], traits["x_min"]["unit"]) == ("mm³", "", "mm")
     assert (traits["volume"]["isColumn"], traits["x_min"]["isColumn"]) == (True, False)
     assert "area" not in traits  # no leaf has one
-    plant = {trait["name"]: trait["unit"] for trait in describe_plant_traits(balls.traits)}
+    plant = {trait["name"]: trait["unit"] for trait in described["plantTraits"]}
     assert (plant["total_leaf_area"], plant["number_of_leaves"]) == ("mm²", "")
-    assert describe_plant(balls.traits)["number_of_leaves"]["value"] == 3
+    assert described["whole"]["number_of_leaves"]["value"] == 3
 
 
 def test_ids_alone_have_no_numbers(balls: Result) -> None:
     ids = replace(balls, instances=Instances())
     assert [set(leaf) for leaf in describe_leaves(ids)] == [{"id", "color"}] * 3
-    assert (describe_traits(None), describe_plant_traits(None), describe_plant(None)) == ([], [], {})
+    assert describe_traits(None) == {"traits": [], "plantTraits": [], "whole": {}}

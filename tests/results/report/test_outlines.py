@@ -11,7 +11,7 @@ import torch
 
 from mvseg.masks import Masks, MergedMask
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.results.report.outlines import UNITS, outline_masks, trace_mask
+from mvseg.results.report.pictures import UNITS, outline_masks, trace_mask
 
 BOX = (40, 20, 240, 170)  # of the photo, 10 units a pixel
 
