@@ -17,6 +17,7 @@ from mvseg.detection.cached_detections import CachedDetections, delete_cached, r
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass, crop_cameras, place_crops
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+from mvseg.detectors.folded_norms import fold_norms
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.formats.photos import Photos
 from mvseg.matching.config import MatchConfig
@@ -53,7 +54,7 @@ def detect_scene(
     """
     detector = load_detector(config.weights, image_size=config.image_size, min_score=config.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
-    model = MultiViewMaskRCNN(detector, num_iterations=config.num_iterations, match=match).to(device)
+    model = MultiViewMaskRCNN(fold_norms(detector), num_iterations=config.num_iterations, match=match).to(device)
     cached = None if cache is None else CachedDetections(cache, describe_detector(config, model, device))
     found, names = _detect_photos(model, photos, cached=cached, progress=progress)
     # whole photos are matched here to find the plant, and not again by who asks for that

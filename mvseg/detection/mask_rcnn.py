@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import mvseg.detectors  # noqa: F401  # before torchvision, which it loads quickly
+
+# isort: split
 import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN

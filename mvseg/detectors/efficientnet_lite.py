@@ -36,11 +36,14 @@ class SameConv2d(nn.Conv2d):
     right and below."""
 
     def forward(self, input: Tensor) -> Tensor:
-        padding: list[int] = []
-        for size, kernel, stride in zip(input.shape[:1:-1], self.kernel_size[::-1], self.stride[::-1], strict=True):
+        before, after = [], []
+        for size, kernel, stride in zip(input.shape[2:], self.kernel_size, self.stride, strict=True):
             missing = max(0, (math.ceil(size / stride) - 1) * stride + kernel - size)
-            padding += [missing // 2, missing - missing // 2]
-        return super().forward(functional.pad(input, padding) if any(padding) else input)
+            before.append(missing // 2)
+            after.append(missing - missing // 2)
+        if before == after:  # no copy of the input
+            return functional.conv2d(input, self.weight, self.bias, self.stride, before, self.dilation, self.groups)
+        return super().forward(functional.pad(input, [before[1], after[1], before[0], after[0]]))
 
 
 class DepthwiseConv2d(SameConv2d):
