@@ -24,8 +24,7 @@ def export_batch(batch: Path, out: Path, *, miappe: bool, brapi: bool, factors: 
     Args:
         batch: the --out of `mvseg batch`.
         out: the folder.
-        miappe: write the tables of MIAPPE, see `describe_batch`.
-        brapi: write BrAPI observations, see `brapi_observations`.
+        miappe, brapi: which forms, see `describe_batch` and `brapi_observations`.
         factors: columns of the batch's table that are experimental factors in MIAPPE.
 
     Returns:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
-from mvseg.batch.status import TABLES
+from mvseg.batch.tables import read_table
 from mvseg.errors import InputError
 
 OWN_COLUMNS = ("leaf", "trait", "value", "sd", "unit", "method", "ontology")
@@ -60,25 +59,14 @@ def read_observations(batch: Path) -> list[Observation]:
     """All numbers of a batch that exist, in the order of its tables.
 
     Raises:
-        InputError: `batch` is not the --out of a finished batch, its table is broken, or there are no numbers.
+        InputError: see `read_table`; or there are no numbers.
     """
-    path = batch / TABLES / "traits.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file, restkey="", restval=""))
-    except OSError as error:
-        what = f"{path}: cannot be read ({error.strerror}), expected the table of a batch"
-        raise InputError(f"{what}: mvseg export takes the --out of mvseg batch") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: is not a CSV table ({error})") from None
-    missing = [name for name in ("scene", "plant", "time", *OWN_COLUMNS) if rows and name not in rows[0]]
-    if missing:
-        raise InputError(f"{path}: has no column '{missing[0]}', expected the table of a batch")
+    rows = read_table(batch, "traits.csv", ("scene", "plant", "time", *OWN_COLUMNS))
     found = [
         Observation({name: cell for name, cell in row.items() if name not in OWN_COLUMNS},
                     **{name: row[name] for name in OWN_COLUMNS})
         for row in rows if row["value"]
     ]  # fmt: skip
     if not found:
-        raise InputError(f"{path}: holds no numbers, expected the traits of one plant or more")
+        raise InputError(f"{batch}: holds no numbers, expected the traits of one plant or more")
     return found

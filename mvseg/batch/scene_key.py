@@ -23,13 +23,7 @@ def scene_key(scene: Scene, masks: Path | None, config: RunConfig, *, correction
 
     It covers the cameras as they were read; names, sizes and times of photos and masks, which reveal changes without
     reading gigabytes; without masks, the detector's weights; all options and mvseg's code; but not the paths of the
-    files. Hidden files are ignored.
-
-    Args:
-        scene: the scene.
-        masks: its masks; None where a detector finds them.
-        config: the options.
-        corrections: the file of a person's corrections; None: there are none.
+    files. Hidden files are ignored. Without `masks`, a detector finds them.
 
     Raises:
         InputError: a file cannot be read, or the weights are not there.

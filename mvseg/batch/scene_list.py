@@ -6,6 +6,7 @@ import csv
 import io
 import re
 import sys
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -82,15 +83,10 @@ def _list_folders(source: Path, out: Path, masks: Path | None) -> tuple[BatchSce
     if not folders:
         raise InputError(f"{source}: has no sub-folders, expected a scene in each, or a CSV table of scenes")
     return tuple(
-        BatchScene(
-            name=path.name,
-            folder=path.absolute(),
-            masks=masks,
-            beside=Path.cwd(),
-            carried={"plant": path.name, "time": ""},
-        )
+        BatchScene(name=path.name, folder=path.absolute(), masks=masks, beside=Path.cwd(),
+                   carried={"plant": path.name, "time": ""})
         for path in folders
-    )
+    )  # fmt: skip
 
 
 def _read_table(source: Path, masks: Path | None) -> tuple[BatchScene, ...]:
@@ -166,10 +162,10 @@ def _check_columns(source: Path, columns: Sequence[str]) -> None:
     if "scene" not in columns:
         shown = ", ".join(columns)[:200]
         raise InputError(f"{source}: has no column 'scene', found {shown}; expected the paths of scene folders there")
-    for column in columns:
-        if not column:
-            raise InputError(f"{source}: a column has no name")
-        if list(columns).count(column) > 1:
+    if "" in columns:
+        raise InputError(f"{source}: a column has no name")
+    for column, count in Counter(columns).items():
+        if count > 1:
             raise InputError(f"{source}: two columns are called '{column}', expected different names")
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mvseg.batch.scene_list import SUMMARY_COLUMNS, BatchScene
-from mvseg.batch.status import Status
+from mvseg.batch.status import TABLES, Status
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.system.atomic import folder_whole
@@ -21,11 +21,7 @@ def write_tables(
 ) -> None:
     """Write the folder of tables, whole or not at all; an earlier one is replaced, the user's files there stay.
 
-    Args:
-        folder: of the tables.
-        out: where the results of the scenes that are done lie.
-        scenes: all scenes with their outcomes, in the order of the rows.
-        run: what goes into run.json besides counts.
+    The results of the scenes that are done lie in `out`; `run` goes into run.json besides counts.
 
     Raises:
         InputError: a result cannot be read, or `folder` cannot be replaced (see `check_out`).
@@ -46,6 +42,26 @@ def write_tables(
         text = json.dumps({**run, "counts": counts, "files": list_files(partial)}, indent=1, default=str)
         (partial / RUN_FILE).write_text(text + "\n", encoding="utf-8")
         keep_user_files(folder, partial)
+
+
+def read_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str, str]]:
+    """The rows of a table of a finished batch, which has these columns and perhaps others.
+
+    Raises:
+        InputError: `batch` is not the --out of a finished batch, or its table is broken.
+    """
+    path = batch / TABLES / name
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = list(csv.DictReader(file, restkey="", restval=""))
+    except OSError as error:
+        raise InputError(f"{batch}: is not an output of mvseg batch ({TABLES}/{name}: {error.strerror})") from None
+    except (UnicodeDecodeError, csv.Error) as error:
+        raise InputError(f"{path}: is not a CSV table ({error})") from None
+    missing = [column for column in columns if rows and column not in rows[0]]
+    if missing:
+        raise InputError(f"{path}: has no column '{missing[0]}', expected the table of a batch")
+    return rows
 
 
 def _about(scene: BatchScene) -> list[str | int]:

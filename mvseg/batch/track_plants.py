@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import shutil
 from collections.abc import Callable, Iterator, Sequence
@@ -15,7 +14,7 @@ from typing import Any
 from tqdm import tqdm
 
 from mvseg._version import made_by
-from mvseg.batch.status import TABLES
+from mvseg.batch.tables import read_table
 from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import TrackLink
 from mvseg.errors import InputError
@@ -53,19 +52,12 @@ def list_plants(batch: Path) -> tuple[list[PlantResults], int]:
     """The plants of a batch with two finished dates or more, in the order of its table, and how many have fewer.
 
     Raises:
-        InputError: `batch` is not the output of a batch, or no plant has two dates.
+        InputError: see `read_table`; or no plant has two dates.
     """
-    path = batch / TABLES / "summary.csv"
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = [(row["scene"], row["plant"], row["time"]) for row in csv.DictReader(file) if row["state"] == "done"]
-    except OSError:
-        raise InputError(f"{batch}: is not an output of mvseg batch (tables/summary.csv is missing)") from None
-    except (KeyError, ValueError, csv.Error) as error:
-        raise InputError(f"{path}: is not a table of mvseg batch ({error})") from None
     scenes: dict[str, list[tuple[str, str]]] = {}
-    for scene, plant, time in rows:
-        scenes.setdefault(plant, []).append((scene, time))
+    for row in read_table(batch, "summary.csv", ("scene", "plant", "time", "state")):
+        if row["state"] == "done":
+            scenes.setdefault(row["plant"], []).append((row["scene"], row["time"]))
     plants = [
         PlantResults(plant, tuple(batch / scene for scene, _ in seen), tuple(time for _, time in seen))
         for plant, seen in scenes.items()

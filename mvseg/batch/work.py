@@ -37,12 +37,7 @@ class Finished:
 
 
 def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
-    """Work on one scene, on one thread, while no other process does.
-
-    Args:
-        out: folder of the results, absolute.
-        config: the options.
-        scene: the scene.
+    """Work on one scene, on one thread, while no other process does; `out` is the absolute folder of all results.
 
     Raises:
         OSError: the scene's status cannot be written.

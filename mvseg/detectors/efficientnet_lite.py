@@ -75,14 +75,8 @@ class InvertedResidual(nn.Module):
 
 
 def build_lite(arch: str) -> tuple[nn.Sequential, list[int]]:
-    """The network without its classifier, weights random.
-
-    Args:
-        arch: a key of `LITE_SCALES`.
-
-    Returns:
-        "stem", "stage0" ... "stage6", of which `LEVELS` names those to take features from; channels of these four.
-    """
+    """An architecture of `LITE_SCALES` without its classifier, weights random: "stem", "stage0" ... "stage6", of which
+    `LEVELS` names those to take features from; and the channels of these four."""
     width, depth = LITE_SCALES[arch]
     stem = conv_norm(SameConv2d(3, STEM_CHANNELS, 3, stride=2, bias=False))
     body: OrderedDict[str, nn.Module] = OrderedDict(stem=nn.Sequential(*stem, nn.ReLU6(inplace=True)))

@@ -28,8 +28,6 @@ def run_heads(
     *,
     nms_thresh: float | None = None,
     detections_per_img: int | None = None,
-    score_thresh: float | None = None,
-    transform: GeneralizedRCNNTransform | None = None,
 ) -> dict[str, Tensor]:
     """What a detector finds in one photo, before anything is scaled back to the photo.
 
@@ -41,8 +39,6 @@ def run_heads(
         photo: (3, H, W) float32 in [0, 1], on the model's device.
         nms_thresh: IoU above which a box suppresses another; None for the model's own.
         detections_per_img: so many of the best scores are kept; None for the model's own.
-        score_thresh: boxes that score less are discarded; None for the model's own.
-        transform: how the photo is scaled; None for the model's own.
 
     Returns:
         The D detections, best score of their boxes first: "boxes" (D, 4) xyxy in the frame of the model's transform,
@@ -50,11 +46,11 @@ def run_heads(
         scores are decided by `decide_masks`. And "frame" (2,) int64, width and height of the transform's frame.
     """
     heads = copy.copy(model.roi_heads)  # shares the weights; the model's own thresholds stay as they are
-    own = {"nms_thresh": nms_thresh, "detections_per_img": detections_per_img, "score_thresh": score_thresh}
-    for name, value in own.items():
-        if value is not None:
-            setattr(heads, name, value)
-    frame = copy.copy(transform or model.transform)
+    if nms_thresh is not None:
+        heads.nms_thresh = nms_thresh
+    if detections_per_img is not None:
+        heads.detections_per_img = detections_per_img
+    frame = copy.copy(model.transform)
     frame.normalize = partial(normalize, frame)
     resized, _ = frame([photo])
     features = model.backbone(resized.tensors)

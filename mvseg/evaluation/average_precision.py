@@ -26,13 +26,8 @@ Annotations = list[dict[str, Any]]
 
 
 def annotate_truth(labelled: LabelledPhoto, image_id: int, num_categories: int) -> Annotations:
-    """COCO annotations of a photo's instances, and, per category, one crowd that covers its ignored pixels.
-
-    Args:
-        labelled: the photo; its classes become the categories.
-        image_id: number of the photo, from 0 on.
-        num_categories: categories are 1..num_categories.
-    """
+    """COCO annotations of the instances of photo 0, 1, ..., and, per category 1..num_categories, one crowd that covers
+    its ignored pixels."""
     annotations = []
     for number, category in enumerate(labelled.classes.tolist(), start=1):
         mask = (labelled.layers == number).any(0)
@@ -44,12 +39,12 @@ def annotate_truth(labelled: LabelledPhoto, image_id: int, num_categories: int) 
 
 
 def annotate_detections(detections: dict[str, Tensor], masks: Iterable[Tensor], image_id: int) -> Annotations:
-    """COCO annotations of the detections in one photo.
+    """COCO annotations of the detections in photo 0, 1, ...
 
     Args:
         detections: "boxes" (D, 4) xyxy, "labels" (D,), "scores" (D,).
         masks: D masks (H, W) of probabilities, cut at 0.5 here, as torchvision's are by convention.
-        image_id: number of the photo, from 0 on.
+        image_id: number of the photo.
     """
     columns = (detections[key].tolist() for key in ("boxes", "labels", "scores"))
     return [

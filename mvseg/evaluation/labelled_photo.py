@@ -31,12 +31,8 @@ class LabelledPhoto:
 
 
 def label_photo(photo: np.ndarray, labels: np.ndarray) -> LabelledPhoto:
-    """A photo with the instances of a label map, in the order of their numbers, all of class 1.
-
-    Args:
-        photo: (H, W, 3) uint8 RGB.
-        labels: (H, W) uint16: 0 = nothing, 65535 = ignore, any other number = an instance.
-    """
+    """A photo (H, W, 3) uint8 RGB with the instances of a label map (H, W) uint16 (0 = nothing, 65535 = ignore), in the
+    order of their numbers, all of class 1."""
     ignore = labels == IGNORE_LABEL
     values, indices = np.unique(np.where(ignore, 0, labels), return_inverse=True)
     layer = indices.reshape(labels.shape) + (values[0] != 0)  # a map without background starts at instance 1

@@ -48,8 +48,9 @@ def arc_cameras(
         raise InputError(f"the arc spans {span_deg:g} degrees, expected more than 0 and at most 360")
     if not elevations_deg or max(abs(angle) for angle in elevations_deg) >= 90:
         raise InputError("the elevations must be one or more numbers between -90 and 90 degrees")
-    meshes = [*plant.leaves, *(part for part in plant.parts if part.material == "stem")]
-    points = np.concatenate([mesh.vertices for mesh in meshes])
+    meshes = [leaf.vertices for leaf in plant.leaves]
+    meshes += [part.vertices for part in plant.parts if part.material == "stem"]
+    points = np.concatenate(meshes)
     center = (points.min(0) + points.max(0)) / 2
     distance = DISTANCE * float(np.linalg.norm(points - center, axis=1).max())
     gaps = max(num_views - 1, 1) if span_deg < 360 else num_views

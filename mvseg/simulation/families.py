@@ -86,14 +86,7 @@ FAMILIES: dict[str, Family] = {
 
 
 def draw_blade(family: Family, rng: np.random.Generator, *, age: float, scale: float) -> Blade:
-    """A blade of the family; young ones are smaller and more folded, old ones droop more.
-
-    Args:
-        family: whose ranges are drawn from.
-        rng: the source of chance.
-        age: from 0 (youngest) to 1 (full-grown).
-        scale: size factor.
-    """
+    """A blade of the family; young ones (age 0) are smaller and more folded, full-grown ones (age 1) droop more."""
     length = scale * (0.4 + 0.6 * age) * rng.uniform(*family.length)
     return Blade(
         length=length,

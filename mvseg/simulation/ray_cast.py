@@ -96,16 +96,11 @@ def render_stage(stage: Stage, cameras: Cameras, view: int) -> Rendering:
     ids = np.where(hit, stage.mesh.owner[face], 0).astype(np.uint16).reshape(height, width)
     kinds = np.where(hit, stage.mesh.material[face], len(MATERIALS)).reshape(height, width)
 
-    borders = np.flatnonzero(border_pixels(ids.astype(np.int32) * (len(MATERIALS) + 1) + kinds))
+    borders = np.flatnonzero(find_boundaries(ids.astype(np.int32) * (len(MATERIALS) + 1) + kinds))
     quarters = [(dx, dy) for dx in (-0.25, 0.25) for dy in (-0.25, 0.25)]
     color[borders] = sum(look(centres[borders] + shift)[0] for shift in quarters) / 4
     rgb = develop(color.reshape(height, width, 3), stage.look, rng)
     return Rendering(rgb, ids, depth.reshape(height, width))
-
-
-def border_pixels(labels: NDArray[np.int32]) -> NDArray[np.bool_]:
-    """(H, W) pixels with another label among their four neighbours."""
-    return np.asarray(find_boundaries(labels))
 
 
 def trace(

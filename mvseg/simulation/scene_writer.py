@@ -33,9 +33,10 @@ from mvseg.simulation.ray_cast import build_stage, render_stage
 from mvseg.system.atomic import folder_whole, write_text_whole
 
 JPEG_QUALITY = 90
+MIN_PIXELS = 30  # a leaf with fewer visible pixels in a view is left out of that view's masks and truth
 
 
-def write_scene(folder: Path | str, plant: Plant, cameras: Cameras, *, seed: int, min_pixels: int = 30) -> None:
+def write_scene(folder: Path | str, plant: Plant, cameras: Cameras, *, seed: int) -> None:
     """Photograph a plant and write the scene folder described at the top of this module.
 
     Args:
@@ -43,7 +44,6 @@ def write_scene(folder: Path | str, plant: Plant, cameras: Cameras, *, seed: int
         plant: seen by the cameras in its own world units.
         cameras: V views of any sizes.
         seed: of light, materials, noise and of the numbers in `masks/`; the truth does not depend on it.
-        min_pixels: a leaf with fewer visible pixels in a view is left out of that view's masks and truth.
 
     Raises:
         InputError: the folder exists.
@@ -52,18 +52,18 @@ def write_scene(folder: Path | str, plant: Plant, cameras: Cameras, *, seed: int
     if folder.exists():
         raise InputError(f"{folder} exists already, expected a new folder for the scene")
     with folder_whole(folder) as partial:
-        write_views(partial, plant, cameras, seed=seed, min_pixels=min_pixels)
+        write_views(partial, plant, cameras, seed=seed)
         write_truth(partial / "truth", plant)
 
 
-def write_views(folder: Path, plant: Plant, cameras: Cameras, *, seed: int, min_pixels: int) -> None:
+def write_views(folder: Path, plant: Plant, cameras: Cameras, *, seed: int) -> None:
     """Write rig file, photos, masks and true label images."""
     (folder / "images").mkdir()
     stage = build_stage(plant, seed=seed)
     names = [f"{view:03d}" for view in range(len(cameras))]
     for view, name in enumerate(names):
         shot = render_stage(stage, cameras, view)
-        truth = drop_small(shot.ids, min_pixels)
+        truth = drop_small(shot.ids, MIN_PIXELS)
         write_jpeg(folder / "images" / f"{name}.jpg", shot.rgb)
         write_label_png(folder / "truth" / f"{name}.png", truth)
         write_label_png(folder / "masks" / f"{name}.png", shuffle_labels(truth, np.random.default_rng([seed, view])))

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -39,7 +39,8 @@ from mvseg.simulation.scene_writer import write_scene, write_table
 from mvseg.simulation.wild import hang, roll_up
 from mvseg.system.atomic import folder_whole
 
-SERIES_FILE, TRUTH_FILE, POTS_FILE = "series.csv", "truth.csv", "pots.csv"
+SERIES_FILE, TRUTH_FILE = "series.csv", "truth.csv"
+NUM_DATES = 8  # of the specs that are drawn
 EXPANSION = 14.0  # days from a leaf's first sight to its full size
 FIRST_SIZE = 0.15  # share of its full length at which a leaf is first seen
 YELLOWING = 6.0  # days from the first yellow to the fall
@@ -286,11 +287,11 @@ def series_cameras(spec: SeriesSpec, index: int, plant: Plant) -> Cameras:
 
 
 def write_series(folder: Path, specs: Sequence[SeriesSpec]) -> None:
-    """Write the scenes of plants over days, and three tables; the folder appears whole or not at all.
+    """Write the scenes of plants over days, and two tables; the folder appears whole or not at all.
 
     Every scene is one of `write_scene`; its truth has the same number for the same leaf on all dates. `series.csv` is a
-    table for `mvseg batch` (scene, name, plant, time), `truth.csv` has one row per leaf and date (area, length, width,
-    dryness), and `pots.csv` how the pot stands.
+    table for `mvseg batch` (scene, name, plant, time), and `truth.csv` has one row per leaf and date (area, length,
+    width, dryness).
 
     Raises:
         InputError: the folder exists, or two plants have one name.
@@ -299,32 +300,30 @@ def write_series(folder: Path, specs: Sequence[SeriesSpec]) -> None:
         raise InputError(f"{folder} exists already, expected a new folder for the series")
     if len({spec.name for spec in specs}) < len(specs):
         raise InputError("two plants of the series have one name")
-    scenes, truth, pots = [], [], []
+    scenes, truth = [], []
     with folder_whole(folder) as partial:
         for spec in specs:
-            for index, (plant, pot) in enumerate(zip(grow_series(spec), draw_pots(spec), strict=True)):
+            for index, plant in enumerate(grow_series(spec)):
                 name, time = f"{spec.name}_{index:02d}", f"{spec.times[index]:g}"
                 write_scene(partial / name, plant, series_cameras(spec, index, plant), seed=spec.seed)
                 scenes.append((name, name, spec.name, time))
-                pots.append((spec.name, time, *(f"{value:.4f}" for value in astuple(pot))))
                 for leaf in plant.leaves:
                     numbers = (leaf.area, leaf.length, leaf.width, leaf.dryness)
                     truth.append((spec.name, time, name, leaf.leaf_id, *(f"{number:.6g}" for number in numbers)))
         write_table(partial / SERIES_FILE, ["scene", "name", "plant", "time"], scenes)
         columns = ["plant", "time", "scene", "leaf", "area", "length", "width", "dryness"]
         write_table(partial / TRUTH_FILE, columns, truth)
-        write_table(partial / POTS_FILE, ["plant", "time", *(field.name for field in fields(PotPlace))], pots)
 
 
-def draw_specs(num_plants: int, *, seed: int = 0, num_dates: int = 8) -> list[SeriesSpec]:
+def draw_specs(num_plants: int, *, seed: int = 0) -> list[SeriesSpec]:
     """Plants of all families in turn, of 12 to 30 leaves, seen every one to three days; one in two wilts once."""
     families, specs = ("ovate", "lanceolate", "strap", "lobed", "compound", "rosette"), []
     for index in range(num_plants):
         rng = np.random.default_rng([seed, index, 3])
         first, new = int(rng.integers(9, 20)), int(rng.integers(3, 11))
-        times = np.round(np.cumsum(rng.uniform(1, 3, num_dates)) - 1, 1)
+        times = np.round(np.cumsum(rng.uniform(1, 3, NUM_DATES)) - 1, 1)
         family, own_seed = families[index % len(families)], int(rng.integers(1 << 30))
-        wilts = int(rng.integers(1, num_dates)) if rng.random() < 0.5 else None
+        wilts = int(rng.integers(1, NUM_DATES)) if rng.random() < 0.5 else None
         specs.append(
             SeriesSpec(name=f"{family}-{index:02d}", family=family, leaves=(first, new), times=tuple(times.tolist()),
                        seed=own_seed, wilts=wilts)

@@ -70,10 +70,6 @@ def sweep_folder(folder: Path) -> None:
 def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Keep other runs out of a folder in which files are added one by one; the lock ends with the process.
 
-    Args:
-        folder: must exist.
-        wait: wait until no other process works in it.
-
     Raises:
         InputError: another process works in it, and `wait` is not set.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 
@@ -23,11 +23,22 @@ def stopped_by_sigterm() -> Iterator[None]:
     the signal blocked, before ours is set. Ctrl-C is blocked, too: pycolmap would report that it is not installed.
     """
     earlier_hook = sys.unraisablehook
+
+    def insist(unraisable: sys.UnraisableHookArgs) -> None:
+        """Python swallows what is raised in a finaliser, or in the hooks around a fork (data loaders fork), and reports
+        it here: the signal is then raised again."""
+        how = unraisable.exc_type
+        if issubclass(how, (Terminated, KeyboardInterrupt)) and hasattr(signal, "setitimer"):
+            signal.signal(signal.SIGALRM, partial(_end, how))
+            signal.setitimer(signal.ITIMER_REAL, AGAIN)
+        else:
+            earlier_hook(unraisable)
+
     with held_back(signal.SIGTERM, signal.SIGINT):
         import pycolmap  # noqa: F401
 
         earlier = signal.signal(signal.SIGTERM, partial(_end, Terminated))
-        sys.unraisablehook = _Insist(earlier_hook)
+        sys.unraisablehook = insist
     try:
         if hasattr(signal, "pthread_sigmask"):
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})  # a worker is started with it blocked
@@ -53,19 +64,3 @@ def held_back(*signals: signal.Signals) -> Iterator[None]:
 
 def _end(how: type[BaseException], *_: object) -> None:
     raise how
-
-
-class _Insist:
-    """Python swallows what is raised in a finaliser, or in the hooks around a fork (data loaders fork), and reports it
-    here: the signal is then raised again."""
-
-    def __init__(self, report: Callable[[sys.UnraisableHookArgs], object]) -> None:
-        self.report = report
-
-    def __call__(self, unraisable: sys.UnraisableHookArgs) -> None:
-        how = unraisable.exc_type
-        if not issubclass(how, (Terminated, KeyboardInterrupt)) or not hasattr(signal, "setitimer"):
-            self.report(unraisable)
-            return
-        signal.signal(signal.SIGALRM, partial(_end, how))
-        signal.setitimer(signal.ITIMER_REAL, AGAIN)

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 
-from mvseg.tracking.costs import Leaves, pair_costs, typical_length
+from mvseg.tracking.costs import Pair, pair_costs
 from mvseg.tracking.dates import Floats
 
 NUM_REFINED = 20  # hypotheses, of those that look best
@@ -56,64 +56,59 @@ class Alignment:
         return not self.reason
 
 
-def align(first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Alignment:
-    """The best alignment of two dates, and whether it is sure.
-
-    Args:
-        first, second: N and M leaves, each in its date's frame.
-        days: between the dates.
-        knows_up: +z is up in both frames; else any rotation is looked at.
-    """
-    fewer = min(len(first), len(second))
-    if fewer < LEAST_PAIRS:
-        reason = f"{fewer or 'no'} {'leaf' if fewer == 1 else 'leaves'} cannot tell how the pot stands"
+def align(pair: Pair) -> Alignment:
+    """The best alignment of two dates, each in its own frame, and whether it is sure; where up is not known, of any
+    rotation."""
+    if pair.fewer < LEAST_PAIRS:
+        reason = f"{pair.fewer or 'no'} {'leaf' if pair.fewer == 1 else 'leaves'} cannot tell how the pot stands"
         return Alignment(np.eye(4), np.zeros((0, 2), int), reason=reason)
-    scale, middle = typical_length(first, second), first.midribs.mean((0, 1))
-    poses = np.concatenate([np.eye(4)[None], draw_poses(first, second, knows_up=knows_up)])
-    scores = alikeness(first, second, poses, scale=scale).sum(1)
+    poses = np.concatenate([np.eye(4)[None], draw_poses(pair)])
+    scores = alikeness(pair, poses).sum(1)
     scores[0] += 1e6  # always looked at
     found: list[Alignment] = []
     left = np.argsort(-scores, kind="stable")
     while len(left) and len(found) < NUM_REFINED:
-        found.append(refine(first, second, poses[left[0]], days=days, knows_up=knows_up))
-        left = left[pose_distances(poses[left[0]], poses[left], middle, scale=scale) > SAME]
+        found.append(refine(pair, poses[left[0]]))
+        left = left[pose_distances(pair, poses[left[0]], poses[left]) > SAME]
     every = np.stack([each.pose for each in found])
-    scores = np.array([each.gain - LARGE_NEW * _num_large_new(first, second, each.pairs) for each in found])
-    scores += WORLD_PRIOR * np.exp(-0.5 * pose_distances(np.eye(4), every, middle, scale=scale) ** 2)
+    scores = np.array([each.gain - LARGE_NEW * _num_large_new(pair, each.pairs) for each in found])
+    scores += WORLD_PRIOR * np.exp(-0.5 * pose_distances(pair, np.eye(4), every) ** 2)
     place = int(scores.argmax())
-    best, others = found[place], scores[pose_distances(every[place], every, middle, scale=scale) >= 1]
+    best, others = found[place], scores[pose_distances(pair, every[place], every) >= 1]
     margin, reason = float(scores[place] - others.max(initial=0.0)), ""
-    if len(best.pairs) < max(LEAST_PAIRS, 0.4 * fewer):
-        reason = f"only {len(best.pairs)} of {fewer} leaves are alike, however the pot is turned"
-    elif _num_large_new(first, second, best.pairs) > MOST_LARGE_NEW * len(second):
+    if len(best.pairs) < max(LEAST_PAIRS, 0.4 * pair.fewer):
+        reason = f"only {len(best.pairs)} of {pair.fewer} leaves are alike, however the pot is turned"
+    elif _num_large_new(pair, best.pairs) > MOST_LARGE_NEW * len(pair.second):
         reason = "leaves too large to be new would have appeared, however the pot is turned"
     elif margin < SURE_MARGIN:
         reason = TWO_WAYS
-    elif margin + PER_LEAF * best.gain / fewer < SURE_SUM:
+    elif margin + PER_LEAF * best.gain / pair.fewer < SURE_SUM:
         reason = "the leaves are not alike enough, however the pot is turned"
     return replace(best, margin=margin, reason=reason)
 
 
-def _num_large_new(first: Leaves, second: Leaves, pairs: np.ndarray) -> int:
+def _num_large_new(pair: Pair, pairs: np.ndarray) -> int:
     """How many leaves of the larger half are in no pair; 0 where nearly all leaves of the date with fewer are in one.
 
     A plant that is turned onto its own older leaves has many.
     """
-    is_new = np.ones(len(second), bool)
-    is_new[pairs[:, 1]] = False
-    is_large = second.lengths >= np.median(second.lengths)
-    return int((is_new & is_large).sum()) if len(pairs) < NEARLY_ALL * min(len(first), len(second)) else 0
+    if len(pairs) >= NEARLY_ALL * pair.fewer:
+        return 0
+    is_large = pair.second.lengths >= np.median(pair.second.lengths)
+    return int(np.delete(is_large, pairs[:, 1]).sum())
 
 
-def pose_distances(pose: Floats, others: Floats, middle: Floats, *, scale: float) -> Floats:
-    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of NEAR and NEAR_SHIFT; `middle` (3,) of the plant."""
+def pose_distances(pair: Pair, pose: Floats, others: Floats) -> Floats:
+    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of NEAR and, for the plant's middle, NEAR_SHIFT."""
+    middle = np.append(pair.first.midribs.mean((0, 1)), 1.0)
     turned = np.arccos(np.clip((np.einsum("ij,hij->h", pose[:3, :3], others[:, :3, :3]) - 1) / 2, -1, 1))
-    moved = np.linalg.norm((others - pose)[:, :3] @ np.append(middle, 1.0), axis=1)
-    return np.hypot(turned / NEAR, moved / (NEAR_SHIFT * scale))
+    moved = np.linalg.norm((others - pose)[:, :3] @ middle, axis=1)
+    return np.hypot(turned / NEAR, moved / (NEAR_SHIFT * pair.scale))
 
 
-def draw_poses(first: Leaves, second: Leaves, *, knows_up: bool) -> Floats:
+def draw_poses(pair: Pair) -> Floats:
     """(H, 4, 4) poses, one or more for every pair of leaves."""
+    first, second = pair.first, pair.second
     one, other = np.repeat(np.arange(len(first)), len(second)), np.tile(np.arange(len(second)), len(first))
     ratio = np.abs(np.log(second.lengths[other] / first.lengths[one]))
     one, other = one[ratio < 1.2], other[ratio < 1.2]
@@ -123,7 +118,7 @@ def draw_poses(first: Leaves, second: Leaves, *, knows_up: bool) -> Floats:
         i, j = one[keep], other[keep]
         start, end = second.midribs[j, ends[0]], second.midribs[j, ends[1]]
         ahead, before = end - start, first.midribs[i, -1] - first.midribs[i, 0]
-        if knows_up:
+        if pair.knows_up:
             turn = np.arctan2(ahead[:, 1], ahead[:, 0]) - np.arctan2(before[:, 1], before[:, 0])
             turned = [Rotation.from_rotvec(turn[:, None] * (0, 0, 1)).as_matrix()]
         else:
@@ -149,32 +144,32 @@ def make_poses(rotations: Floats, shifts: Floats) -> Floats:
     return poses
 
 
-def alikeness(first: Leaves, second: Leaves, poses: Floats, *, scale: float) -> Floats:
+def alikeness(pair: Pair, poses: Floats) -> Floats:
     """(H, N + M) in [0, 1] how alike the most alike leaf of the other date is under each of the poses (H, 4, 4)."""
+    first, second = pair.first, pair.second
     size = np.square(np.log(second.lengths[None] / first.lengths[:, None]) / COARSE[2])
     found = []
     for part in np.array_split(poses, 1 + len(poses) // 200):  # bounds the memory
         bases = np.einsum("hij,nj->hni", part[:, :3, :3], first.bases) + part[:, None, :3, 3]
         chords = np.einsum("hij,nj->hni", part[:, :3, :3], first.chords)
-        away = np.square(bases[:, :, None] - second.bases).sum(-1) / (COARSE[0] * scale) ** 2
+        away = np.square(bases[:, :, None] - second.bases).sum(-1) / (COARSE[0] * pair.scale) ** 2
         turn = 2 * (1 - np.einsum("hni,mi->hnm", chords, second.chords)) / COARSE[1] ** 2
         alike = np.exp(-0.25 * (away + turn + size))
         found.append(np.concatenate([alike.max(2), alike.max(1)], 1))
     return np.concatenate(found)
 
 
-def refine(first: Leaves, second: Leaves, pose: Floats, *, days: float, knows_up: bool) -> Alignment:
+def refine(pair: Pair, pose: Floats) -> Alignment:
     """From a pose (4, 4) that is nearly right: pair the leaves, fit it to the pairs, and again with stricter costs."""
-    scale = typical_length(first, second)
     for spread in ROUNDS:
-        costs = pair_costs(first.moved(pose), second, days=days, scale=scale, spread=spread)
+        costs = pair_costs(pair.moved(pose), spread=spread)
         pairs = best_pairs(costs)
         if not len(pairs):
             return Alignment(pose, pairs)
         if spread > ROUNDS[-1] or len(pairs) > 1:
             weights = np.minimum(-costs[pairs[:, 0], pairs[:, 1]], 6.0)
-            pose = _fit(first, second, pairs, weights, knows_up=knows_up, start=pose[:3, :3])
-    costs = pair_costs(first.moved(pose), second, days=days, scale=scale)
+            pose = _fit(pair, pairs, weights, start=pose[:3, :3])
+    costs = pair_costs(pair.moved(pose))
     pairs = best_pairs(costs)
     return Alignment(pose, pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
 
@@ -186,8 +181,9 @@ def best_pairs(costs: Floats) -> np.ndarray:
     return np.stack([rows[keep], columns[keep]], 1)
 
 
-def _fit(first: Leaves, second: Leaves, pairs: np.ndarray, weights: Floats, *, knows_up: bool, start: Floats) -> Floats:
+def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Floats:
     """(4, 4) pose (weighted least squares) from bases and blades of the pairs; up stays nearly up."""
+    first, second = pair.first, pair.second
     one, other = first.midribs[pairs[:, 0]], second.midribs[pairs[:, 1]].copy()
     reverse = np.linalg.norm(one @ start.T - other, axis=2).sum(1) > np.linalg.norm(
         one @ start.T - other[:, ::-1], axis=2).sum(1) + np.linalg.norm(other[:, 0] - other[:, -1], axis=1)  # fmt: skip
@@ -201,13 +197,13 @@ def _fit(first: Leaves, second: Leaves, pairs: np.ndarray, weights: Floats, *, k
     middle, aim = mass @ source, mass @ target
     source, target = source - middle, target - aim
     moment = (target * mass[:, None]).T @ source
-    if knows_up:
+    if pair.knows_up:
         up = [(0.0, 0.0, 1.0)]
         source, target = np.vstack([source, up]), np.vstack([target, up])
         mass = np.append(mass, UPRIGHT / max(len(pairs), 1) * np.linalg.norm(moment))
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # on one line, any of the best will do
         rotation = Rotation.align_vectors(target, source, mass)[0].as_matrix()
-    if knows_up and np.arccos(np.clip(rotation[2, 2], -1, 1)) > MOST_LEAN:
+    if pair.knows_up and np.arccos(np.clip(rotation[2, 2], -1, 1)) > MOST_LEAN:
         turn = np.arctan2(moment[1, 0] - moment[0, 1], moment[0, 0] + moment[1, 1])
         rotation = Rotation.from_rotvec((0, 0, turn)).as_matrix()
     return make_poses(rotation, aim - rotation @ middle)

@@ -9,7 +9,7 @@ is taken out of them, and their parts are joined anew, exactly (`linear_sum_assi
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -18,7 +18,7 @@ from scipy.special import expit
 
 from mvseg.errors import InputError
 from mvseg.tracking.align import Alignment, align, refine
-from mvseg.tracking.costs import ACROSS, Leaves, cloud_costs, pair_costs, typical_length
+from mvseg.tracking.costs import ACROSS, Leaves, Pair, cloud_costs, pair_costs
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.motions import Motion, find_motion, settle
 
@@ -69,30 +69,26 @@ def compare_dates(dates: Sequence[Leaves], times: Sequence[float], *, knows_up: 
     The surest alignments say how all dates stand; the others only refine that. So two dates that look alike in more
     than one way are settled by those in between.
     """
-    pairs = {(earlier, later): (dates[earlier], dates[later], times[later] - times[earlier])
-             for later in range(len(dates)) for earlier in range(max(later - MOST_GAP, 0), later)}  # fmt: skip
-    alone = {
-        pair: settle(one, other, align(one, other, days=days, knows_up=knows_up), days=days, knows_up=knows_up)
-        for pair, (one, other, days) in pairs.items()
-    }
+    pairs = {
+        (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)
+        for later in range(len(dates)) for n in range(max(later - MOST_GAP, 0), later)
+    }  # fmt: skip
+    alone = {place: settle(pair, align(pair)) for place, pair in pairs.items()}
     poses, roots = place_dates(len(dates), alone)
     costs: dict[tuple[int, int], Floats] = {}
     motions: dict[tuple[int, int], Motion] = {}
-    for earlier, later in sorted((pair for pair in pairs if roots[pair[0]] == roots[pair[1]]), key=np.ptp):
-        first, second, days = pairs[earlier, later]
-        pose = np.linalg.inv(poses[later]) @ poses[earlier]
-        alignment = refine(first, second, pose, days=days, knows_up=knows_up)
+    for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
+        pair = pairs[earlier, later]
+        alignment = refine(pair, np.linalg.inv(poses[later]) @ poses[earlier])
         if not len(alignment.pairs):
             continue
-        costs[earlier, later] = _bent_costs(first, second, alignment, days=days)
+        costs[earlier, later] = _bent_costs(pair, alignment)
         is_step = roots[later] not in roots[earlier + 1 : later]
         if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
-            motion = find_motion(first, second, alignment.pose, days=days, knows_up=knows_up)
+            motion = find_motion(pair, alignment.pose)
             if motion is not None:
                 motions[earlier, later] = motion
-                costs[earlier, later] = _parted_costs(
-                    first, second, motion, costs[earlier, later], days=days, knows_up=knows_up
-                )
+                costs[earlier, later] = _parted_costs(pair, motion, costs[earlier, later])
     reasons = tuple(alone[n, n + 1].reason for n in range(len(dates) - 1))
     return Comparison(costs, poses, roots, reasons, motions)
 
@@ -114,11 +110,10 @@ def place_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
     return poses, roots
 
 
-def _bent_costs(first: Leaves, second: Leaves, alignment: Alignment, *, days: float) -> Floats:
+def _bent_costs(pair: Pair, alignment: Alignment) -> Floats:
     """Costs after the plant was let bend and stretch: each leaf moves as the other pairs say, not as its own does."""
-    scale = typical_length(first, second)
+    first, second, scale, pairs = pair.first, pair.second, pair.scale, alignment.pairs
     moved = first.moved(alignment.pose)
-    pairs = alignment.pairs
     one, other = moved.bases[pairs[:, 0]], second.bases[pairs[:, 1]]
     middle = one.mean(0)
     terms = np.column_stack([np.ones(len(one)), (one - middle) / scale])
@@ -134,8 +129,8 @@ def _bent_costs(first: Leaves, second: Leaves, alignment: Alignment, *, days: fl
     bent = moved.shifted(everywhere)
     rest = np.linalg.norm((other - bent.bases[pairs[:, 0]])[:, :2], axis=1) / (1.18 * ACROSS * scale)
     spread = float(np.clip(np.median(rest), 0.7, 2.0))
-    costs = pair_costs(bent, second, days=days, scale=scale, spread=spread)
-    clouds = cloud_costs(bent, second, days=days, scale=scale, spread=spread)
+    in_place = replace(pair, first=bent)
+    costs, clouds = pair_costs(in_place, spread=spread), cloud_costs(in_place, spread=spread)
     both = first.is_surface[:, None] & second.is_surface[None]
     by_midrib = costs + CLOUD_COUNTS * np.minimum(clouds, 0.0)
     by_cloud = clouds + CLOUD_COUNTS * np.clip(costs, -MOST_HELP, MOST_HELP)
@@ -143,18 +138,16 @@ def _bent_costs(first: Leaves, second: Leaves, alignment: Alignment, *, days: fl
     return np.where(both, np.where(in_part, np.minimum(by_midrib, by_cloud), by_midrib), by_cloud)
 
 
-def _parted_costs(
-    first: Leaves, second: Leaves, motion: Motion, costs: Floats, *, days: float, knows_up: bool
-) -> Floats:
+def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:
     """The costs where the leaves of a second motion are linked with each other only, and only if it is sure."""
     rows, columns = motion.pairs.T
     parted = costs.copy()
     parted[rows], parted[:, columns] = np.maximum(parted[rows], UNLINKED), np.maximum(parted[:, columns], UNLINKED)
     if motion.is_sure:
-        one, other = first.take(rows), second.take(columns)
-        alignment = refine(one, other, motion.pose, days=days, knows_up=knows_up)
+        part = pair.take(rows, columns)
+        alignment = refine(part, motion.pose)
         if len(alignment.pairs):
-            parted[np.ix_(rows, columns)] = _bent_costs(one, other, alignment, days=days)
+            parted[np.ix_(rows, columns)] = _bent_costs(part, alignment)
     return parted
 
 

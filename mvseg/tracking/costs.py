@@ -25,7 +25,7 @@ FLIPPED = 0.5  # cost of a midrib that runs the other way on the other date
 PARTING = 9.0  # log of how much rarer a stranger's differences are in each place, see `pair_costs`
 CLOUDS = 0.04  # scale of the distance between the points of two sights, as ACROSS
 APART = 3.0  # as PARTING, of `cloud_costs`
-SPREAD = 0.6  # see `typical_length`
+SPREAD = 0.6  # see `Pair.of`
 MOST_SD = 0.5  # standard deviations of surfaces count up to this share of the median length
 
 
@@ -84,10 +84,6 @@ class Leaves:
         """Each leaf by its own of the shifts (N, 3)."""
         return replace(self, midribs=self.midribs + shifts[:, None], points=self.points + shifts[:, None])
 
-    def flipped(self) -> Leaves:
-        """Each midrib from its other end."""
-        return replace(self, midribs=self.midribs[:, ::-1])
-
 
 def leaves_of(date: PlantOnDate) -> Leaves:
     """The leaves of a date that have a shape."""
@@ -110,48 +106,69 @@ def leaves_of(date: PlantOnDate) -> Leaves:
     )
 
 
-def typical_length(*dates: Leaves) -> float:
-    """What places are measured in: the median length of the leaves of the date with the longest ones; for plants of
-    many small leaflets, a share of how far their bases are spread."""
-    found = [1e-9]
-    for leaves in dates:
-        if len(leaves):
-            spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
-            found += [float(np.median(leaves.lengths)), SPREAD * float(np.sqrt(np.mean(spread**2)))]
-    return max(found)
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """N leaves of one date and M leaves of a later one, which are compared.
 
-
-def pair_costs(first: Leaves, second: Leaves, *, days: float, scale: float, spread: float = 1.0) -> Floats:
-    """(N, M) costs of leaf i of the earlier and leaf j of the later date being the same.
-
-    Args:
-        first: N leaves, already moved into the frame of `second`, +z up where up is known.
-        second: M leaves.
+    Attributes:
+        first, second: each in its date's frame, until `moved`.
         days: between the dates, > 0.
-        scale: `typical_length`.
-        spread: factor on the scales of places and directions, for dates that differ more than usual.
-
-    Returns:
-        Below 0: likelier the same leaf than a stranger.
+        knows_up: +z is up in both frames.
+        scale: what places are measured in, see `Pair.of`.
     """
-    straight = _directed_costs(first, second, days=days, scale=scale, spread=spread)
-    turned = _directed_costs(first.flipped(), second, days=days, scale=scale, spread=spread)
-    return np.minimum(straight, turned + FLIPPED)
+
+    first: Leaves
+    second: Leaves
+    days: float
+    knows_up: bool
+    scale: float
+
+    @classmethod
+    def of(cls, first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Pair:
+        """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
+        small leaflets, a share of how far their bases are spread."""
+        found = [1e-9]
+        for leaves in (first, second):
+            if len(leaves):
+                spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
+                found += [float(np.median(leaves.lengths)), SPREAD * float(np.sqrt(np.mean(spread**2)))]
+        return cls(first, second, days, knows_up, scale=max(found))
+
+    @property
+    def fewer(self) -> int:
+        """Leaves of the date with fewer."""
+        return min(len(self.first), len(self.second))
+
+    def moved(self, pose: Floats) -> Pair:
+        """The earlier date in the frame of the later one, by its pose (4, 4)."""
+        return replace(self, first=self.first.moved(pose))
+
+    def take(self, rows: np.ndarray, columns: np.ndarray) -> Pair:
+        """Some leaves of either date, with a scale of their own."""
+        return Pair.of(self.first.take(rows), self.second.take(columns), days=self.days, knows_up=self.knows_up)
 
 
-def cloud_costs(first: Leaves, second: Leaves, *, days: float, scale: float, spread: float = 1.0) -> Floats:
+def pair_costs(pair: Pair, *, spread: float = 1.0) -> Floats:
+    """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
+    likelier than not. `spread` widens the scales of places and directions, for dates that differ more than usual."""
+    turned = replace(pair, first=replace(pair.first, midribs=pair.first.midribs[:, ::-1]))
+    return np.minimum(_directed_costs(pair, spread), _directed_costs(turned, spread) + FLIPPED)
+
+
+def cloud_costs(pair: Pair, *, spread: float = 1.0) -> Floats:
     """(N, M) costs as `pair_costs`, from where the leaves are alone: how far the points of one are from the other.
 
     It needs neither base nor tip, and forgives a leaf that is seen in part: the nearer way counts.
     """
-    apart = np.linalg.norm(first.points[:, None, :, None] - second.points[None, :, None], axis=-1)
+    apart = np.linalg.norm(pair.first.points[:, None, :, None] - pair.second.points[None, :, None], axis=-1)
     ways = apart.min(3).mean(2), apart.min(2).mean(2)
-    near, far = np.minimum(*ways) / scale, np.maximum(*ways) / scale
-    wide = CLOUDS * spread + RISE * days
+    near, far = np.minimum(*ways) / pair.scale, np.maximum(*ways) / pair.scale
+    wide = CLOUDS * spread + RISE * pair.days
     return 0.5 * (_tail(near / wide, 2) + _tail(far / (3 * wide), 1)) - APART
 
 
-def _directed_costs(first: Leaves, second: Leaves, *, days: float, scale: float, spread: float) -> Floats:
+def _directed_costs(pair: Pair, spread: float) -> Floats:
+    first, second, scale, days = pair.first, pair.second, pair.scale, pair.days
     apart, carried = _base_offsets(first, second)
     noise = np.clip(np.hypot(first.base_sd[:, None], second.base_sd[None]) / scale, 0, MOST_SD)
     across = np.linalg.norm(apart[..., :2], axis=-1) / scale / np.hypot(ACROSS * spread, noise)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import datetime
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -112,11 +113,7 @@ class _Run(BaseModel):
 
 
 def read_date(folder: Path, time: str | float) -> PlantOnDate:
-    """One date from a result folder.
-
-    Args:
-        folder: of `mvseg infer`, or of a scene of `mvseg batch`.
-        time: a number (days) or an ISO date.
+    """One date from a result folder of `mvseg infer` or `mvseg batch`; `time` as in `read_time`.
 
     Raises:
         InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
@@ -129,14 +126,14 @@ def read_date(folder: Path, time: str | float) -> PlantOnDate:
         raise InputError(f"{folder}: has ids but no surfaces, run mvseg infer or mvseg batch with these masks first")
     by_leaf, methods = _read_traits(folder / "traits.csv")
     frame, leaves = None if world.up is None else level_frame(world.up), []
-    for number, numbers in sorted(by_leaf.items()):
-        if number and not any(method.startswith(REJECTED) for method in methods[number].values()):
+    for number, method in sorted(methods.items()):
+        if number and not any(each.startswith(REJECTED) for each in method.values()):
             vertices = _read_vertices(folder / "leaves" / f"leaf_{number:03d}.ply")
-            is_oriented = BASE_UNKNOWN.method not in methods[number].get("azimuth", "")
-            leaves.append(_leaf_of(number, vertices, numbers, frame, is_oriented=is_oriented))
+            is_oriented = BASE_UNKNOWN.method not in method.get("azimuth", "")
+            leaves.append(_leaf_of(number, vertices, by_leaf[number], frame, is_oriented=is_oriented))
     return PlantOnDate(
         scene=folder.name, time=read_time(time), written=str(time).strip(), unit=world.unit or "",
-        knows_up=frame is not None, leaves=tuple(leaves), whole=by_leaf.get(0, {}), folder=folder,
+        knows_up=frame is not None, leaves=tuple(leaves), whole=by_leaf[0], folder=folder,
     )  # fmt: skip
 
 
@@ -236,16 +233,15 @@ def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
 
 def _read_traits(path: Path) -> tuple[dict[int, dict[str, Number]], dict[int, dict[str, str]]]:
     """{leaf: {trait: number}} and {leaf: {trait: method, or why there is no number}}; leaf 0 is the plant."""
-    numbers: dict[int, dict[str, Number]] = {}
-    methods: dict[int, dict[str, str]] = {}
+    numbers: dict[int, dict[str, Number]] = defaultdict(dict)
+    methods: dict[int, dict[str, str]] = defaultdict(dict)
     try:
         with path.open(newline="", encoding="utf-8") as file:
             for row in csv.DictReader(file):
                 leaf = int(row["leaf"] or 0)
-                methods.setdefault(leaf, {})[row["trait"]] = row["method"]
-                found = numbers.setdefault(leaf, {})
+                methods[leaf][row["trait"]] = row["method"]
                 if row["value"]:
-                    found[row["trait"]] = Number(float(row["value"]), float(row["sd"] or "nan"), row["unit"])
+                    numbers[leaf][row["trait"]] = Number(float(row["value"]), float(row["sd"] or "nan"), row["unit"])
     except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
         raise InputError(f"{path}: is no table of traits that mvseg wrote ({error})") from None
     return numbers, methods

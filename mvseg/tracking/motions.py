@@ -25,7 +25,7 @@ from mvseg.tracking.align import (
     pose_distances,
     refine,
 )
-from mvseg.tracking.costs import Leaves, pair_costs, typical_length
+from mvseg.tracking.costs import Pair, pair_costs
 from mvseg.tracking.dates import Floats
 
 TRIED = 8  # poses, of those that explain most of what the alignment does not
@@ -54,44 +54,37 @@ class Motion:
         return self.margin >= SURE_MARGIN
 
 
-def settle(first: Leaves, second: Leaves, alignment: Alignment, *, days: float, knows_up: bool) -> Alignment:
+def settle(pair: Pair, alignment: Alignment) -> Alignment:
     """The alignment, sure where it was not only because a second plant in the pot moved in the other way."""
     if alignment.reason == TWO_WAYS:
-        motion = find_motion(first, second, alignment.pose, days=days, knows_up=knows_up)
+        motion = find_motion(pair, alignment.pose)
         if motion is not None and motion.is_sure:
-            per_leaf = (alignment.gain + motion.gain) / min(len(first), len(second))
+            per_leaf = (alignment.gain + motion.gain) / pair.fewer
             if motion.margin + PER_LEAF * per_leaf >= SURE_SUM:
                 return replace(alignment, margin=SURE_MARGIN, reason="")
     return alignment
 
 
-def find_motion(first: Leaves, second: Leaves, pose: Floats, *, days: float, knows_up: bool) -> Motion | None:
-    """The best second motion; None where one is enough.
-
-    Args:
-        first, second: N and M leaves, each in its date's frame.
-        pose: (4, 4) of their alignment.
-        days, knows_up: see `align`.
-    """
-    if min(len(first), len(second)) < LEAST_PAIRS:
+def find_motion(pair: Pair, pose: Floats) -> Motion | None:
+    """The best second motion of dates that are aligned by a pose (4, 4); None where one is enough."""
+    if pair.fewer < LEAST_PAIRS:
         return None
-    scale, middle = typical_length(first, second), first.midribs.mean((0, 1))
-    poses = np.concatenate([pose[None], draw_poses(first, second, knows_up=knows_up)])
-    alike = alikeness(first, second, poses, scale=scale)[:, : len(first)]
+    poses = np.concatenate([pose[None], draw_poses(pair)])
+    alike = alikeness(pair, poses)[:, : len(pair.first)]
     better = np.maximum(alike - alike[0], 0).sum(1)
-    better[pose_distances(pose, poses, middle, scale=scale) < 1] = 0
-    costs = pair_costs(first.moved(pose), second, days=days, scale=scale)
+    better[pose_distances(pair, pose, poses) < 1] = 0
+    costs = pair_costs(pair.moved(pose))
     alone, found = _total(costs), []
     left = np.argsort(-better, kind="stable")
     for _ in range(TRIED):
         if not len(left) or not better[left[0]]:
             break
         at, own = poses[left[0]], np.flatnonzero(alike[left[0]] > alike[0])
-        left = left[pose_distances(at, poses[left], middle, scale=scale) > SAME]
-        refined = refine(first.take(own), second, at, days=days, knows_up=knows_up)
-        is_other = pose_distances(pose, refined.pose[None], middle, scale=scale)[0] >= 1
+        left = left[pose_distances(pair, at, poses[left]) > SAME]
+        refined = refine(pair.take(own, np.arange(len(pair.second))), at)
+        is_other = pose_distances(pair, pose, refined.pose[None])[0] >= 1
         if len(refined.pairs) >= LEAST_PAIRS and is_other:
-            others = pair_costs(first.moved(refined.pose), second, days=days, scale=scale)
+            others = pair_costs(pair.moved(refined.pose))
             rows, columns = best_pairs(np.minimum(costs, others)).T
             keep = others[rows, columns] < costs[rows, columns] - CLEARLY
             pairs = np.stack([rows[keep], columns[keep]], 1)

@@ -24,11 +24,8 @@ WORTHWHILE = 0.9  # of float32's time: bfloat16 must be faster than that to be w
 def choose_bf16(config: TrainConfig, model: nn.Module, *, photos: list[Tensor], targets: list[Target]) -> bool:
     """Whether the forward pass of a run is to be under bfloat16 autocast, see `TrainConfig.precision`.
 
-    Args:
-        config: of the run.
-        model: the detector in train mode, on the run's device; it and torch's generators stay as they are.
-        photos: of one forward pass of the run, on the CPU.
-        targets: theirs.
+    The detector, in train mode on the run's device, and torch's generators stay as they are; photos and targets are of
+    one forward pass, on the CPU.
     """
     device = next(model.parameters()).device
     if config.precision != "auto":

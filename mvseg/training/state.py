@@ -59,11 +59,7 @@ def start_state(
 ) -> TrainingState:
     """The state that a run begins with, or resumes from if `config.resume` is set and there is a checkpoint.
 
-    Args:
-        config: of the run.
-        samples: the training samples.
-        device: where to train.
-        model: a detector to train in place of `build_detector(config.arch, ...)`.
+    `model` is trained in place of `build_detector(config.arch, ...)`.
 
     Raises:
         InputError: a checkpoint without `resume`, a damaged one, or one of another config or of other samples; see

@@ -15,7 +15,7 @@ from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.growth import Plant, grow_plant
 from mvseg.simulation.look import draw_look
 from mvseg.simulation.pot import Part
-from mvseg.simulation.ray_cast import Rendering, border_pixels, build_stage, render_stage
+from mvseg.simulation.ray_cast import Rendering, build_stage, render_stage
 from mvseg.simulation.shading import sample_texture
 from rendered import render_view
 
@@ -185,11 +185,6 @@ def test_shadow_of_a_leaf_darkens_the_soil() -> None:
     ground = np.where(shot.ids == 0, shot.rgb.mean(-1), np.nan)
     shade = ground[max(int(row) - 12, 0) : int(row) + 12, max(int(column) - 12, 0) : int(column) + 12]
     assert np.nanmin(shade) < 0.8 * np.nanmedian(ground)
-
-
-def test_border_pixels_touch_another_label() -> None:
-    labels = np.array([[1, 1, 2], [1, 1, 2], [1, 1, 1]], np.int32)
-    assert border_pixels(labels).tolist() == [[False, True, True], [False, True, True], [False, False, True]]
 
 
 def test_texture_is_periodic_and_bilinear() -> None:

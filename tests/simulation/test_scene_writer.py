@@ -18,7 +18,7 @@ from mvseg.scene import Cameras
 from mvseg.simulation import scene_writer
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
-from mvseg.simulation.scene_writer import write_scene
+from mvseg.simulation.scene_writer import MIN_PIXELS, write_scene
 from rendered import render_view
 
 SIZE = 96
@@ -37,7 +37,7 @@ def cameras(plant: Plant) -> Cameras:
 @pytest.fixture(scope="module")
 def scene(plant: Plant, cameras: Cameras, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("scenes") / "basil"
-    write_scene(folder, plant, cameras, seed=5, min_pixels=20)
+    write_scene(folder, plant, cameras, seed=5)
     return folder
 
 
@@ -61,7 +61,7 @@ def test_truth_is_the_rendering_without_slivers(scene: Path, plant: Plant, camer
     ids = render_view(plant, cameras, view, seed=5).ids
     truth = read_labels(scene, "truth", view)
     numbers, counts = np.unique(ids, return_counts=True)
-    large = numbers[counts >= 20]
+    large = numbers[counts >= MIN_PIXELS]
     assert np.array_equal(truth, np.where(np.isin(ids, large), ids, 0))
 
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.tracking import see_series
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import align
-from mvseg.tracking.costs import leaves_of
+from mvseg.tracking.costs import Pair, leaves_of
 from tests.plants_over_days import grow_blades, grown, see
 
 
@@ -18,7 +18,7 @@ def test_a_pot_that_was_turned_moved_and_leans(turn: float, lean: float) -> None
     blades = grow_blades(9, 3)
     first, one = see(blades, 0)
     second, other = see(grown(blades, 1.1), 2, turn=turn, lean=lean, shift=(200, -80, 15))
-    alignment = align(leaves_of(first), leaves_of(second), days=2, knows_up=True)
+    alignment = align(Pair.of(leaves_of(first), leaves_of(second), days=2, knows_up=True))
     assert alignment.is_sure
     assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]
     assert len(alignment.pairs) == 9
@@ -31,7 +31,7 @@ def test_up_need_not_be_known() -> None:
     blades = grow_blades(9, 3)
     first, one = see(blades, 0)
     second, other = see(blades, 2, turn=40, lean=120, shift=(0, 0, 500))
-    alignment = align(leaves_of(first), leaves_of(second), days=2, knows_up=False)
+    alignment = align(Pair.of(leaves_of(first), leaves_of(second), days=2, knows_up=False))
     assert alignment.is_sure
     assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]
 
@@ -40,14 +40,14 @@ def test_up_need_not_be_known() -> None:
 def test_few_leaves_cannot_tell(count: int, said: str) -> None:
     blades = grow_blades(count, 3)
     first = leaves_of(see(grow_blades(5, 3), 0)[0])
-    alignment = align(first, leaves_of(see(blades, 1)[0]), days=1, knows_up=True)
+    alignment = align(Pair.of(first, leaves_of(see(blades, 1)[0]), days=1, knows_up=True))
     assert said in alignment.reason
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_another_plant_in_the_pot_is_not_aligned(seed: int) -> None:
     first, second = leaves_of(see(grow_blades(8, 3), 0)[0]), leaves_of(see(grow_blades(8, seed), 1)[0])
-    alignment = align(first, second, days=1, knows_up=True)
+    alignment = align(Pair.of(first, second, days=1, knows_up=True))
     assert not alignment.is_sure
     assert alignment.reason
 
@@ -56,7 +56,7 @@ def test_a_plant_that_looks_the_same_from_two_sides_is_not_aligned() -> None:
     half = grow_blades(4, 5)
     other = {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # the same, turned by half a turn
     first, second = leaves_of(see(half | other, 0)[0]), leaves_of(see(half | other, 1, turn=30)[0])
-    assert align(first, second, days=1, knows_up=True).reason == "the pot could be turned in more than one way"
+    assert align(Pair.of(first, second, days=1, knows_up=True)).reason == "the pot could be turned in more than one way"
 
 
 @pytest.mark.parametrize("pair", [(0, 2), (1, 3)])
@@ -65,7 +65,7 @@ def test_a_plant_is_not_aligned_with_its_own_older_leaves(pair: tuple[int, int])
     dates, truth = see_series(draw_specs(5, seed=3)[4])
     (one, true), (other, later) = ((leaves_of(dates[n]), truth[n]) for n in pair)
     days = dates[pair[1]].time - dates[pair[0]].time
-    alignment = align(one, other, days=days, knows_up=True)
+    alignment = align(Pair.of(one, other, days=days, knows_up=True))
     right = [true[one.index[i]] == later[other.index[j]] for i, j in alignment.pairs]
     assert not alignment.is_sure or np.mean(right) > 0.5
 
@@ -74,6 +74,6 @@ def test_leaves_that_were_missed_before_do_no_harm() -> None:
     plant = grow_blades(12, 3)
     first, one = see({leaf: plant[leaf] for leaf in (2, 4, 5, 7, 9, 11)}, 0)
     second, other = see(plant, 2, turn=75)
-    alignment = align(leaves_of(first), leaves_of(second), days=2, knows_up=True)
+    alignment = align(Pair.of(leaves_of(first), leaves_of(second), days=2, knows_up=True))
     assert alignment.is_sure
     assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]

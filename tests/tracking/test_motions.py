@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvseg.tracking.align import make_poses
-from mvseg.tracking.costs import Leaves, leaves_of
+from mvseg.tracking.costs import Leaves, Pair, leaves_of
 from mvseg.tracking.motions import Motion, find_motion
 from tests.plants_over_days import Blades, grow_blades, grown, see
 
@@ -19,7 +19,7 @@ POSE = make_poses(TURN, np.zeros(3))  # of the pot, where it is turned by 40 deg
 
 def motion_of(first: Blades, second: Blades) -> tuple[Motion | None, list[int], list[int]]:
     (one, truth), (other, later) = see(first, 0), see(second, 2, turn=40)
-    return find_motion(leaves_of(one), leaves_of(other), POSE, days=2, knows_up=True), truth, later
+    return find_motion(Pair.of(leaves_of(one), leaves_of(other), days=2, knows_up=True), POSE), truth, later
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
 from mvseg.tracking.align import TWO_WAYS, align
-from mvseg.tracking.costs import leaves_of
+from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import LeafLink, track_leaves
 from tests.plants_over_days import Blades, grow_blades, grown, see, true_tracks
@@ -99,7 +99,7 @@ def test_two_plants_of_one_size_are_aligned_although_each_moved_otherwise() -> N
     """Each of the two poses explains one of them: that is not one pot that could be turned in two ways."""
     dates, truths = two_in_a_pot(60, grow_blades(10, 66))
     one, other = (leaves_of(date) for date in dates)
-    assert align(one, other, days=1, knows_up=True).reason == TWO_WAYS
+    assert align(Pair.of(one, other, days=1, knows_up=True)).reason == TWO_WAYS
     assert all(len(leaves) == 1 for leaves in true_tracks(track_leaves(dates), truths).values())
     assert track_leaves(dates).num_tracks == 20
 
