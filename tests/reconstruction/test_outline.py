@@ -25,9 +25,11 @@ from mvseg.reconstruction.surface.patch_image import (
     DRAWN_TOO_FAR,
     NEAR_PX,
     SUPERSAMPLED,
+    cover_crops,
+    crop_ious,
     draw_patch,
     draw_polygons,
-    fill_grid,
+    fill_grids,
     grid_orientations,
     grid_quads,
     grow,
@@ -78,7 +80,7 @@ def test_a_patch_that_is_too_small_has_to_grow_by_the_difference() -> None:
     forth = distances.weight == 1
     angle = np.linspace(0, 2 * np.pi, 4000)
     rim = np.stack([np.cos(angle), 0.45 * np.sin(angle), 0 * angle], 1)
-    points = distances.basis[forth] @ small
+    points = GRID.outline_basis[distances.place[forth]] @ small
     for view in range(len(masks)):
         here = distances.stack[forth] == view
         true, seen = (project_points(masks.px_from_world[[view]], x[None]).px[0, 0] for x in (rim, points[here]))
@@ -94,15 +96,26 @@ def test_gradients_are_what_moving_the_patch_does() -> None:
     distances = outline_distances(masks, GRID, patch, reach=6.0, is_imaged=False)
     for sample in range(0, len(distances.px), 9):
         camera = masks.px_from_world[[distances.stack[sample]]]
-        point = distances.basis[sample] @ patch
+        point = GRID.outline_basis[distances.place[sample]] @ patch
         corners = np.stack([point + step * axis for axis in (*np.eye(3), *-np.eye(3))])
         px = project_points(camera, corners[None]).px[0, 0]
         change = (px[:3] - px[3:]).T / (2 * step)
         normal = np.linalg.lstsq(change.T, distances.gradient[sample], rcond=None)[0]
         assert np.linalg.norm(normal) == pytest.approx(1, abs=1e-5)
         assert normal @ change == pytest.approx(distances.gradient[sample], abs=1e-4)
-    row = distances.basis[5][:, None] * distances.gradient[5]
+    row = GRID.outline_basis[distances.place[5]][:, None] * distances.gradient[5]
     assert (distances.jacobian[5] == row.ravel()).all()
+
+
+def test_normal_equations_are_those_of_the_jacobian() -> None:
+    """Slow twin: the products of all samples. A folded blade has samples on its rim and on its folds."""
+    distances = outline_distances(stack(), GRID, bent_patch(0), reach=14.0, is_imaged=False)
+    assert (distances.place >= 2 * len(GRID.basis)).any()
+    weight = np.random.default_rng(0).random(len(distances.px))
+    matrix, right = distances.normal_equations(distances.px, weight)
+    weighted = distances.jacobian * weight[:, None]
+    assert matrix == pytest.approx(weighted.T @ distances.jacobian, rel=1e-9, abs=1e-6)
+    assert right == pytest.approx(weighted.T @ distances.px, rel=1e-9, abs=1e-6)
 
 
 def test_where_another_instance_hides_the_leaf_it_need_not_shrink() -> None:
@@ -174,7 +187,7 @@ def test_a_grid_is_drawn_as_its_quads_are() -> None:
     for seed in range(8):
         for px in project_points(masks.px_from_world, GRID.points(bent_patch(seed))).px:
             small = np.zeros((3 * SIZE, 3 * SIZE), np.uint8)
-            fill_grid(small, 3 * px)
+            fill_grids([small], 3 * px[None])
             slow = np.zeros_like(small)
             for quad in np.round((3 * grid_quads(px) - 0.5) * 16).astype(np.int32):
                 cv2.fillConvexPoly(slow, quad, 255, shift=4)
@@ -274,6 +287,24 @@ def test_a_patch_drawn_as_its_masks_are_has_no_distance() -> None:
     as_it_is = outline_distances(masks, GRID, ellipse(), reach=6.0, is_imaged=True)
     assert np.median(np.abs(alike.px)) < 0.3
     assert np.median(np.abs(as_it_is.px)) > 1.5
+
+
+def test_masks_made_smaller_by_their_offsets_are_as_large_as_the_patch() -> None:
+    """Slow twin: the masks before they were eroded and dilated by 2 px."""
+    true = blade_masks(EllipticBlade(), CAMERAS)
+    operations = (cv2.MORPH_ERODE, cv2.MORPH_DILATE) * 2
+    grown = [
+        cv2.morphologyEx(mask.astype(np.uint8), operation, disc(2)).astype(bool)
+        for mask, operation in zip(true, operations, strict=True)
+    ]
+    masks = stack_masks(grown, [NOTHING] * 4, range(4), px_from_world=matrices())
+    covered = cover_crops(masks, project_points(masks.px_from_world, GRID.points(ellipse()))) > 0
+    as_it_is = crop_ious(masks, covered)
+    assert (crop_ious(masks, covered, offsets=np.array([-2.0, 2.0, -2.0, 2.0])) > as_it_is + 0.03).all()
+    assert (crop_ious(masks, covered, offsets=np.zeros(4)) == as_it_is).all()
+    for index, (mask, offset) in enumerate(zip(true, (-2.0, 2.0, -2.0, 2.0), strict=True)):
+        shown = masks.depth_px[index] > offset
+        assert abs(int(shown.sum()) - int(mask.sum())) < 0.05 * mask.sum()
 
 
 def test_growing_and_shrinking_a_disc_changes_its_radius() -> None:

@@ -47,30 +47,25 @@ class PatchFit:
     residual_px: Floats
     offsets_px: Floats
 
-    @property
-    def rms_px(self) -> float:
-        """Median over the views; NaN when no outline meets a mask's edge."""
-        return float(np.nanmedian(self.residual_px)) if np.isfinite(self.residual_px).any() else float("nan")
 
-
-def approach_patch(masks: MaskStack, start: Floats, *, steps: range) -> Floats:
-    """A rough patch (26, 3), moved until its outlines are near those of the masks.
+def approach_patch(masks: MaskStack, start: Floats, *, steps: range) -> tuple[Floats, Floats]:
+    """A rough patch (26, 3), moved until its outlines are near those of the masks; by how much each is too large (S,).
 
     Args:
         steps: FIRST_HALF of the way, or the SECOND_HALF, from where the first one ends.
     """
     moved, coefficients = _to_unit_world(masks, start)
     grid = patch_grid(*(FAR_GRID if steps == FIRST_HALF else FIT_GRID))
+    offsets = np.zeros(len(masks))
     for step in steps:
         share = step / SECOND_HALF.stop
         reach = FAR_REACH + (NEAR_REACH - FAR_REACH) * share
         distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=False)
-        offsets = np.zeros(len(masks))
         if step >= OFFSET_FROM:
             offsets = _believe(per_view(distances.px, distances.stack, len(masks)), None)
         equations = _weigh(distances, offsets, scale_px=FAR_SCALE_PX + (LEAST_SCALE_PX - FAR_SCALE_PX) * share)
         coefficients = _step(coefficients, equations, FAR_STEP)
-    return _from_unit_world(coefficients, start)
+    return _from_unit_world(coefficients, start), offsets
 
 
 def fit_patch(
@@ -125,10 +120,11 @@ def _from_unit_world(coefficients: Floats, start: Floats) -> Floats:
 class _Equations:
     """What the outlines ask of the coefficients.
 
-    Jacobian (N, 78), distance (N,) in pixels, weight (N,), and by how much the masks are worse than clean ones (>= 1).
+    Where they are, distances (N,) without the offsets of masks, in pixels, weights (N,), and by how much the masks are
+    worse than clean ones (>= 1).
     """
 
-    jacobian: Floats
+    distances: Distances
     px: Floats
     weight: Floats
     noise: float
@@ -142,10 +138,11 @@ def _covariance(coefficients: Floats, equations: _Equations, stack: NDArray, *, 
     inverse = invert_normal(_normal_matrix(coefficients, equations)[0])
     weight, px = equations.weight, equations.px
     num_views = int(stack.max(initial=0)) + 1
+    jacobian = equations.distances.jacobian
     pulls = np.zeros((num_views, len(inverse)))
-    np.add.at(pulls, stack, equations.jacobian * (weight * px)[:, None])
+    np.add.at(pulls, stack, jacobian * (weight * px)[:, None])
     between = inverse @ pulls.T
-    growth = inverse @ (equations.jacobian.T @ weight)  # by which everything changes when all masks grow by a pixel
+    growth = inverse @ (jacobian.T @ weight)  # by which everything changes when all masks grow by a pixel
     rms = np.sqrt((weight * px**2).sum() / max(weight.sum(), 1e-12))
     few = num_views / max(num_views - 2, 0.5)
     shared = CENTRE_FACTOR * few * max(centre_sd, LEAST_CENTRE_SD)
@@ -175,7 +172,7 @@ def _weigh(distances: Distances, offsets: Floats, *, scale_px: float) -> _Equati
     weight = SAMPLE_WEIGHT * distances.weight / (1 + (px / scale) ** 2)
     weight = weight * _view_weights(px, distances.stack, len(offsets))[distances.stack]
     noise = max(1.0, 1.48 * spread / CLEAN_PX)
-    return _Equations(jacobian=distances.jacobian, px=px, weight=weight, noise=noise)
+    return _Equations(distances=distances, px=px, weight=weight, noise=noise)
 
 
 def _believe(measured: Floats, errors: MaskErrors | None) -> Floats:
@@ -220,9 +217,8 @@ def per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
 def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats, Floats]:
     """(78, 78) and (78,): outlines and prior together, about the present coefficients."""
     prior, target = patch_prior(coefficients, measure_patch(coefficients), noise=equations.noise)
-    weighted = equations.jacobian * equations.weight[:, None]
-    matrix = weighted.T @ equations.jacobian + prior.T @ prior
-    return matrix, weighted.T @ equations.px + prior.T @ (target - prior @ coefficients.ravel())
+    matrix, right = equations.distances.normal_equations(equations.px, equations.weight)
+    return matrix + prior.T @ prior, right + prior.T @ (target - prior @ coefficients.ravel())
 
 
 def _step(coefficients: Floats, equations: _Equations, damping_and_cap: tuple[float, float]) -> Floats:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -37,13 +37,16 @@ from mvseg.scene import Cameras
 from mvseg.system.worker_pool import spread
 
 NUM_FIRST_STEPS = 3  # of a fit that a second one follows
-GOOD_IOU = 0.93  # of a patch, longer than wide, after which no less likely start is tried
+GOOD_IOU = 0.93  # of a patch, after which no less likely start is tried
+FORGIVEN = 0.5  # of the IoU that masks as a whole too large or small cost: where they are faulty, less is good
 LEAST_GAIN = 0.03  # in IoU, for another start to be better
 AREA_COST = 0.1  # in IoU, of a surface e times as large: bulges can hide behind the outlines of a level leaf
 CLEAR_IOU = 0.75  # of a start that shows how the blade lies
 WIDE_COST = 0.1  # in IoU, of a patch that is wider than long
 UNCLEAR, MOST_STARTS = 0.05, 3  # starts worse by less than this are as likely, and so many are tried of each hull
 HOPELESS = 0.1  # half way, patches that are worse by more go no farther
+SAME = 0.01  # of the length, that two patches half way are apart by on average: they end as one
+SEARCHED_VIEWS = 12  # of a leaf, spread evenly, that starts are compared in
 WRONG_SHARE = 0.25  # of the median share of voxels in a mask: with less of them it is another leaf's
 MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
@@ -96,7 +99,7 @@ def fit_surfaces(
     stacks: dict[int, MaskStack] = {}
     fits: dict[int, PatchFit] = {}
     surfaces: dict[int, LeafSurface] = {}
-    unfitted: dict[int, _Unfitted] = {}
+    unfitted: dict[int, tuple[MaskStack, Floats | None]] = {}
     for instance in _ids(instance_ids):
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
@@ -112,16 +115,14 @@ def fit_surfaces(
             fits[instance] = fit_patch(stacks[instance], known[instance].coefficients.numpy(), num_steps=0)
             continue
         start = starts.get(instance)
-        unfitted[instance] = _Unfitted(
-            masks=stacks[instance],
-            start=start.coefficients.numpy() if start is not None and start.exists else None,
-        )
+        rough = start.coefficients.numpy() if start is not None and start.exists else None
+        unfitted[instance] = stacks[instance], rough
     answers = spread(_fit_first, unfitted.values(), workers)
     shown = tqdm(answers, "surfaces", len(unfitted), unit="instance", disable=not progress)
     for instance, (masks, fit) in zip(unfitted, shown, strict=True):
         stacks[instance] = masks
         if fit is None:
-            views = torch.from_numpy(unfitted[instance].masks.views)
+            views = torch.from_numpy(unfitted[instance][0].views)
             surfaces[instance] = LeafSurface.none(views, "its masks agree on no point")
         else:
             fits[instance] = fit
@@ -158,18 +159,9 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
     return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
 
 
-@dataclass(frozen=True, eq=False)
-class _Unfitted:
-    """An instance without a surface: its masks, a start that is nearly right, and the IoU of a fit after which no other
-    start is tried."""
-
-    masks: MaskStack
-    start: Floats | None
-
-
-def _fit_first(leaf: _Unfitted) -> tuple[MaskStack, PatchFit | None]:
-    """The first fit of an instance, and the masks it is to."""
-    masks, start = leaf.masks, leaf.start
+def _fit_first(asked: tuple[MaskStack, Floats | None]) -> tuple[MaskStack, PatchFit | None]:
+    """The first fit of an instance, from a start that is nearly right or from one that is looked for, and its masks."""
+    masks, start = asked
     if start is None:
         masks, start = _find_start(masks)
     return masks, None if start is None else fit_patch(masks, start, num_steps=NUM_FIRST_STEPS)
@@ -187,39 +179,70 @@ def _find_start(masks: MaskStack) -> tuple[MaskStack, Floats | None]:
         if not is_right.all():
             masks = masks.select(is_right)
             hull = carve_hull(masks)
-    best, best_score = None, -np.inf
-    for starts in _start_groups(masks, hull):
-        halfway = [approach_patch(masks, start, steps=FIRST_HALF) for start in starts]
-        scores = [_score(masks, patch) for patch in halfway]
-        for patch in (patch for patch, score in zip(halfway, scores, strict=True) if score > max(scores) - HOPELESS):
-            moved = approach_patch(masks, patch, steps=SECOND_HALF)
-            score = _score(masks, moved)
-            if score > best_score + LEAST_GAIN:
-                best, best_score = moved, score
-        if best is not None and _rank(masks, best) > GOOD_IOU:
-            break
-    return masks, best
+    few = masks.select(np.isin(masks.views, spread_views(torch.from_numpy(masks.views), SEARCHED_VIEWS)))
+    found = _Found()
+    for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
+        if not found.is_good:
+            for starts in _start_groups(few, replace(hull, voxels=hull.voxels[keep])):
+                found = found if found.is_good else _try_starts(few, starts, found)
+    return masks, found.patch
 
 
-def _score(masks: MaskStack, coefficients: Floats) -> float:
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """The best patch so far, its score, and is it good enough; and what was tried: scores and patches half way."""
+
+    patch: Floats | None = None
+    score: float = -np.inf
+    is_good: bool = False
+    tried: tuple[tuple[float, Floats], ...] = ()
+
+
+def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found:
+    """Starts moved half the way to the masks, and those of them all of the way that may become the best."""
+    tried = [*found.tried]
+    for start in starts:
+        patch, _ = approach_patch(masks, start, steps=FIRST_HALF)
+        score = _score(masks, patch)
+        if not any(score < other_score + LEAST_GAIN and is_same(patch, other) for other_score, other in tried):
+            tried.append((score, patch))
+    most = max(score for score, _ in tried)
+    for score, patch in tried[len(found.tried) :]:
+        if score > most - HOPELESS:
+            moved, offsets = approach_patch(masks, patch, steps=SECOND_HALF)
+            better = _score(masks, moved, offsets)
+            if better > found.score + LEAST_GAIN:
+                rank, plain = _rank(masks, moved, offsets), _rank(masks, moved)
+                found = _Found(moved, better, is_good=rank + FORGIVEN * max(0.0, rank - plain) > GOOD_IOU)
+    return replace(found, tried=tuple(tried))
+
+
+def is_same(first: Floats, second: Floats) -> bool:
+    """Are two patches one surface but for SAME of its length, whichever end and side each of them begins at?"""
+    here, there = (patch_grid(*FAR_GRID).points(patch) for patch in (first, second))
+    turned = (there, there[::-1], there[:, ::-1], there[::-1, ::-1])
+    gap = min(float(np.linalg.norm(here - other, axis=2).mean()) for other in turned)
+    return gap < SAME * measure_patch(first).length
+
+
+def _score(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None) -> float:
     """How well a patch explains the masks, and how much like a leaf it is."""
-    return _rank(masks, coefficients) - AREA_COST * float(np.log(measure_sizes(coefficients)[0]))
+    return _rank(masks, coefficients, offsets) - AREA_COST * float(np.log(measure_sizes(coefficients)[0]))
 
 
-def _start_groups(masks: MaskStack, hull: Hull) -> Iterator[list[Floats]]:
-    """Starts to compare with each other; later groups are for where the earlier ones end badly.
+def _start_groups(masks: MaskStack, hull: Hull) -> list[list[Floats]]:
+    """Starts to compare with each other; the second group is for where the first one ends badly.
 
     How well a start explains the masks, before any fit, tells how likely it is.
     """
-    for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
-        starts, others = start_in(replace(hull, voxels=hull.voxels[keep]))
-        ranks = [_rank(masks, start) for start in starts]
-        if ranks and max(ranks) < CLEAR_IOU:
-            starts += others
-            ranks += [_rank(masks, start) for start in others]
-        order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_STARTS]
-        likely = [index for index in order if ranks[index] > ranks[order[0]] - UNCLEAR]
-        yield from ([starts[index] for index in group] for group in (likely, order[len(likely) :]) if group)
+    starts, others = start_in(hull)
+    ranks = [_rank(masks, start) for start in starts]
+    if ranks and max(ranks) < CLEAR_IOU:
+        starts += others
+        ranks += [_rank(masks, start) for start in others]
+    order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_STARTS]
+    likely = [index for index in order if ranks[index] > ranks[order[0]] - UNCLEAR]
+    return [[starts[index] for index in group] for group in (likely, order[len(likely) :]) if group]
 
 
 def start_in(hull: Hull) -> tuple[list[Floats], list[Floats]]:
@@ -232,15 +255,12 @@ def start_in(hull: Hull) -> tuple[list[Floats], list[Floats]]:
     return starts
 
 
-def _rank(masks: MaskStack, coefficients: Floats) -> float:
-    size = measure_patch(coefficients)
-    return _iou(masks, coefficients) - (WIDE_COST if 2 * size.half_width > size.length else 0.0)
-
-
-def _iou(masks: MaskStack, coefficients: Floats) -> float:
-    """Median over the views, coarsely."""
+def _rank(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None) -> float:
+    """Median IoU over the views, coarsely; less for a patch that is wider than long."""
     covered = cover_crops(masks, project_points(masks.px_from_world, patch_grid(*FAR_GRID).points(coefficients))) > 0
-    return float(np.median(crop_ious(masks, covered)))
+    size = measure_patch(coefficients)
+    cost = WIDE_COST if 2 * size.half_width > size.length else 0.0
+    return float(np.median(crop_ious(masks, covered, offsets=offsets))) - cost
 
 
 def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:

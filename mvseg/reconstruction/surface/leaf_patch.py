@@ -10,7 +10,7 @@ about the midrib (and tells them apart), S curls them. m, Q, R and S are clamped
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,6 +71,17 @@ class PatchGrid:
     @property
     def shape(self) -> tuple[int, int]:
         return len(self.u), len(self.v)
+
+    @cached_property
+    def outline_basis(self) -> Floats:
+        """(3 * rows * columns, 26) where samples of an outline may lie: the points of the grid, row by row; the middles
+        between each of them and the next one of its column; and those between it and the next one of its row.
+
+        After the last one of a column or row there is none: these rows mean nothing.
+        """
+        grid = self.basis.reshape(*self.shape, -1)
+        middles = [(grid + np.roll(grid, -1, axis)) / 2 for axis in (0, 1)]
+        return np.concatenate([grid, *middles]).reshape(-1, NUM_COEFFICIENTS)
 
     def points(self, coefficients: Floats) -> Floats:
         """(rows, columns, 3) positions."""

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -53,6 +54,13 @@ class MaskStack:
 
     def __len__(self) -> int:
         return len(self.views)
+
+    @cached_property
+    def depth_px(self) -> NDArray[np.float32]:
+        """(S, H, W) how deep in the mask a pixel lies: its centre's distance from the edge, negative outside."""
+        inside = self.inside.astype(np.uint8)
+        away = [[cv2.distanceTransform(side, cv2.DIST_L2, 3) for side in (mask, 1 - mask)] for mask in inside]
+        return np.array([np.maximum(within - 0.5, 0) - np.maximum(beyond - 0.5, 0) for within, beyond in away])
 
     @property
     def size(self) -> tuple[int, int]:

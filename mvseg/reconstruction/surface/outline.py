@@ -8,7 +8,7 @@ rim: there the patch only has to cover the mask, and a negative distance does no
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -41,24 +41,18 @@ class OutlineSamples:
         stack: (K,) place in `MaskStack.views`.
         px: (K, 2).
         normals: (K, 2) unit, outwards.
-        basis: (K, 26) of the patch points.
+        place: (K,) int64, row of `PatchGrid.outline_basis`.
         depth: (K,).
     """
 
     stack: NDArray[np.int64]
     px: Floats
     normals: Floats
-    basis: Floats
+    place: NDArray[np.int64]
     depth: Floats
 
     def select(self, keep: NDArray) -> OutlineSamples:
-        return OutlineSamples(
-            stack=self.stack[keep],
-            px=self.px[keep],
-            normals=self.normals[keep],
-            basis=self.basis[keep],
-            depth=self.depth[keep],
-        )
+        return OutlineSamples(*(getattr(self, field.name)[keep] for field in fields(self)))
 
 
 def outline_samples(
@@ -75,13 +69,8 @@ def outline_samples(
 
 
 def _concatenate(first: OutlineSamples, second: OutlineSamples) -> OutlineSamples:
-    return OutlineSamples(
-        stack=np.concatenate([first.stack, second.stack]),
-        px=np.concatenate([first.px, second.px]),
-        normals=np.concatenate([first.normals, second.normals]),
-        basis=np.concatenate([first.basis, second.basis]),
-        depth=np.concatenate([first.depth, second.depth]),
-    )
+    names = [field.name for field in fields(first)]
+    return OutlineSamples(*(np.concatenate([getattr(first, name), getattr(second, name)]) for name in names))
 
 
 def _rim_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
@@ -101,7 +90,7 @@ def _rim_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
         stack=np.repeat(np.arange(num_views), count),
         px=px.reshape(-1, 2),
         normals=normals.reshape(-1, 2),
-        basis=np.tile(grid.basis[row * columns + column], (num_views, 1)),
+        place=np.tile(row * columns + column, num_views),
         depth=projection.depth[:, row, column].ravel(),
     )
 
@@ -113,7 +102,7 @@ def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     centres = (px[:, 1:, 1:] + px[:, :-1, :-1] + px[:, 1:, :-1] + px[:, :-1, 1:]) / 4
     columns = grid.shape[1]
     parts = []
-    for along_rows in (True, False):
+    for along_rows, first in ((True, px[0, ..., 0].size), (False, 2 * px[0, ..., 0].size)):
         if along_rows:  # edges from row to row, between quads side by side
             stack, row, column = np.nonzero(is_front[:, :, 1:] != is_front[:, :, :-1])
             a, b = (row, column + 1), (row + 1, column + 1)
@@ -128,7 +117,7 @@ def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
                 stack=stack,
                 px=middle,
                 normals=_outwards(px[stack, *b] - px[stack, *a], middle - inner),
-                basis=(grid.basis[a[0] * columns + a[1]] + grid.basis[b[0] * columns + b[1]]) / 2,
+                place=first + a[0] * columns + a[1],
                 depth=projection.depth[stack, *a],
             )
         )
@@ -149,21 +138,39 @@ class Distances:
     Attributes:
         stack: (N,) place in `MaskStack.views`.
         px: (N,) how far the patch has to move outwards, pixels.
-        basis: (N, 26) of the patch points.
+        place: (N,) row of `PatchGrid.outline_basis` of the patch point.
         gradient: (N, 3) change of the pixel position along the normal per world unit.
         weight: (N,).
+        grid: that the places are of.
     """
 
     stack: NDArray[np.int64]
     px: Floats
-    basis: Floats
+    place: NDArray[np.int64]
     gradient: Floats
     weight: Floats
+    grid: PatchGrid
 
     @property
     def jacobian(self) -> Floats:
         """(N, 78) change along the normal per coefficient."""
-        return (self.basis[:, :, None] * self.gradient[:, None, :]).reshape(len(self.px), 3 * self.basis.shape[1])
+        basis = self.grid.outline_basis[self.place]
+        return (basis[:, :, None] * self.gradient[:, None, :]).reshape(len(self.px), 3 * basis.shape[1])
+
+    def normal_equations(self, px: Floats, weight: Floats) -> tuple[Floats, Floats]:
+        """J' W J (78, 78) and J' W px (78,) of the jacobian J, for distances and weights (N,).
+
+        The same place is seen in many views: what these ask of it is added up before it is spread over coefficients.
+        """
+        places, index = np.unique(self.place, return_inverse=True)
+        basis = self.grid.outline_basis[places]
+        pulled = self.gradient * weight[:, None]
+        asked = np.concatenate([pulled * by[:, None] for by in (*self.gradient.T, px)], 1)
+        asked = np.stack([np.bincount(index, column, len(places)) for column in asked.T], 1)
+        size = basis.shape[1]
+        spread = (asked[:, :9, None] * basis[:, None]).reshape(len(places), 9 * size)
+        matrix = (basis.T @ spread).reshape(size, 3, 3, size).transpose(0, 1, 3, 2)
+        return matrix.reshape(3 * size, 3 * size), (basis.T @ asked[:, 9:]).ravel()
 
 
 def outline_distances(
@@ -204,9 +211,10 @@ def outline_distances(
     return Distances(
         stack=both.stack,
         px=np.concatenate([(to_edge - shift)[counts], back]),
-        basis=both.basis,
+        place=both.place,
         gradient=_gradients(masks.px_from_world[both.stack], both, normals),
         weight=np.concatenate([np.ones(len(forth.px)), np.full(len(reverse.px), REVERSE_WEIGHT)]),
+        grid=grid,
     )
 
 
@@ -261,10 +269,11 @@ def nearest_samples(
     """
     edge, own = _places(masks.edge_stack, len(masks)), _places(samples.stack, len(masks))
     there = _take(masks.edge_px, edge)
-    gap = there[:, :, None] - _take(samples.px, own)[:, None]
-    square = np.where((edge >= 0)[:, :, None] & (own >= 0)[:, None], (gap**2).sum(3), np.inf)
+    here = _take(samples.px, own)
+    square = (there**2).sum(2)[:, :, None] - 2 * there @ here.transpose(0, 2, 1) + (here**2).sum(2)[:, None]
     if not square.size:
         return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
+    square[(edge < 0)[:, :, None] | (own < 0)[:, None]] = np.inf
     straight = square.argmin(2)
     is_outside = _take(masks.look_up(covered, masks.edge_stack, masks.edge_px) == 0, edge)
     normals = _take(masks.edge_normals, edge)
@@ -274,7 +283,7 @@ def nearest_samples(
     nearest = np.where(pulls, straight, square.argmin(2))
     found = pulls | (np.take_along_axis(square, nearest[:, :, None], 2)[:, :, 0] < (2 * reach) ** 2)
     view, place = np.nonzero(found)
-    ahead = gap[view, place, straight[view, place]]
+    ahead = there[view, place] - here[view, straight[view, place]]
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     toward = np.where(pulls[view, place][:, None], ahead, normals[view, place])
     return own[view, nearest[view, place]], edge[view, place], toward

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -42,8 +43,7 @@ def cover_crops(masks: MaskStack, projection: Projection) -> NDArray[np.uint8]:
     last = projection.px.shape[1] - 1
     rows, every = (np.unique(np.r_[0:last:2, last]), 2) if last > 20 else (np.arange(last + 1), 1)
     covered = np.zeros((len(masks), *masks.size), np.uint8)
-    for canvas, px in zip(covered, projection.px[:, rows, ::every], strict=True):
-        fill_grid(canvas, px)
+    fill_grids(covered, projection.px[:, rows, ::every])
     return covered
 
 
@@ -56,10 +56,14 @@ def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats | None = None
     return crop_ious(masks, shares >= 0.5)
 
 
-def crop_ious(masks: MaskStack, covered: NDArray[np.bool_]) -> Floats:
-    """(S,) IoU of covered pixels (S, H, W) and the mask in each view, where nothing else hides them."""
+def crop_ious(masks: MaskStack, covered: NDArray[np.bool_], *, offsets: Floats | None = None) -> Floats:
+    """(S,) IoU of covered pixels (S, H, W) and the mask in each view, where nothing else hides them.
+
+    With `offsets` (S,), pixels, the masks are made as much smaller.
+    """
+    inside = masks.inside if offsets is None else masks.depth_px > offsets[:, None, None]
     covered = covered & (masks.others == 0)
-    common, either = covered & masks.inside, covered | masks.inside
+    common, either = covered & inside, covered | inside
     ious: Floats = common.sum((1, 2)) / np.maximum(either.sum((1, 2)), 1)
     return ious
 
@@ -73,19 +77,18 @@ def draw_patch(
     """
     drawn = np.zeros((len(masks), *masks.size), np.float32)
     beside = DRAWN_BESIDE if offsets is None else DRAWN_BESIDE + int(np.ceil(np.abs(offsets).max(initial=0)))
-    for index, px in enumerate(projection.px):
-        low = np.clip(np.floor(px.min((0, 1))) - beside, 0, masks.size[::-1]).astype(int)
-        high = np.clip(np.ceil(px.max((0, 1))) + beside, 0, masks.size[::-1]).astype(int)
-        width, height = (high - low).tolist()
-        if not width or not height:
+    low = np.clip(np.floor(projection.px.min((1, 2))) - beside, 0, masks.size[::-1]).astype(int)
+    high = np.clip(np.ceil(projection.px.max((1, 2))) + beside, 0, masks.size[::-1]).astype(int)
+    canvases = [np.zeros((height, width), np.uint8) for width, height in (SUPERSAMPLED * (high - low)).tolist()]
+    fill_grids(canvases, SUPERSAMPLED * (projection.px - low[:, None, None]))
+    for index, canvas in enumerate(canvases):
+        if not canvas.size:
             continue
-        canvas = np.zeros((height * SUPERSAMPLED, width * SUPERSAMPLED), np.uint8)
-        fill_grid(canvas, (px - low) * SUPERSAMPLED)
         if offsets is not None and abs(offsets[index]) > LEAST_GROWTH_PX:
             canvas = grow(canvas, SUPERSAMPLED * float(offsets[index]))
-        share = _shares(canvas, (width, height))
-        part = drawn[index, low[1] : high[1], low[0] : high[0]]
-        part[:] = cv2.GaussianBlur(share, (0, 0), blur_px) if blur_px else share
+        (left, top), (right, bottom) = low[index], high[index]
+        share = _shares(canvas, (right - left, bottom - top))
+        drawn[index, top:bottom, left:right] = cv2.GaussianBlur(share, (0, 0), blur_px) if blur_px else share
     return drawn
 
 
@@ -98,17 +101,21 @@ def grow(canvas: NDArray[np.uint8], px: float) -> NDArray[np.uint8]:
     return grown
 
 
-def fill_grid(canvas: NDArray[np.uint8], px: Floats) -> None:
-    """Set the pixels (H, W) that a projected grid (rows, columns, 2) covers to 255.
+def fill_grids(canvases: Sequence[NDArray[np.uint8]], px: Floats) -> None:
+    """Set the pixels of S canvases (H, W) that projected grids (S, rows, columns, 2) cover to 255.
 
     Its rim as one polygon has all pixels under an odd number of layers. Where there are two, one of them is seen from
     the other side: the quads of the side that shows fewer of them do the rest.
     """
-    cv2.fillPoly(canvas, [_fixed(np.concatenate([px[:, 0], px[-2:0:-1, -1]]))], 255, shift=SUB_PIXEL_BITS)
-    is_front = grid_orientations(px).ravel() > 0
-    is_rare = is_front if 2 * np.count_nonzero(is_front) < len(is_front) else ~is_front
-    if is_rare.any():
-        cv2.fillPoly(canvas, list(_fixed(grid_quads(px)[is_rare])), 255, shift=SUB_PIXEL_BITS)
+    corners = _fixed(px)
+    rims = np.ascontiguousarray(np.concatenate([corners[:, :, 0], corners[:, -2:0:-1, -1]], 1))
+    is_front = (grid_orientations(px) > 0).reshape(len(px), -1)
+    is_rare = is_front == (2 * np.count_nonzero(is_front, axis=1) < is_front.shape[1])[:, None]
+    for canvas, grid, rim, rare, folds in zip(canvases, corners, rims, is_rare, is_rare.any(1), strict=True):
+        if canvas.size:
+            cv2.fillPoly(canvas, [rim], 255, shift=SUB_PIXEL_BITS)
+        if canvas.size and folds:
+            cv2.fillPoly(canvas, list(grid_quads(grid)[rare]), 255, shift=SUB_PIXEL_BITS)
 
 
 def _fixed(px: Floats) -> NDArray[np.int32]:
@@ -178,7 +185,7 @@ def hiding_pixels(masks: MaskStack, points: Floats, others: dict[int, Floats], *
             if (px.max(0) < 0).any() or (px.min(0) > size).any():
                 continue
             canvas = np.zeros((size[1] * SUPERSAMPLED, size[0] * SUPERSAMPLED), np.uint8)
-            fill_grid(canvas, image.px[index] * SUPERSAMPLED)
+            fill_grids([canvas], image.px[index : index + 1] * SUPERSAMPLED)
             drawn = _shares(canvas, size) >= 0.5
             shows = crop == other
             row, column = np.nonzero(near & (shows | drawn & (crop == 0)))
