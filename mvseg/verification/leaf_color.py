@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 BINS = 16  # per channel
 BLUR = 1.0  # bins
+CHANNELS, RANGES = (0, 1, 2), (0, 256) * 3  # as OpenCV asks for them
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +35,8 @@ class ColorCounts:
 
 def count_colors(photo: np.ndarray, is_inside: np.ndarray) -> ColorCounts:
     """The colours of a photo (H, W, 3) uint8 RGB, inside and outside of a mask (H, W) bool."""
-    bins = _color_bins(photo)
-    inside, outside = (np.bincount(bins[part], minlength=BINS**3) for part in (is_inside, ~is_inside))
-    return ColorCounts(inside.reshape((BINS,) * 3), outside.reshape((BINS,) * 3))
+    inside, outside = (_count(photo, part) for part in (is_inside, ~is_inside))
+    return ColorCounts(inside, outside)
 
 
 def leaf_colors(counts: ColorCounts) -> np.ndarray:
@@ -53,10 +54,13 @@ def leaf_colors(counts: ColorCounts) -> np.ndarray:
 
 def has_leaf_color(photo: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """(H, W) bool, the pixels of a photo (H, W, 3) uint8 RGB whose colour is one of `leaf_colors`."""
-    return colors.ravel()[_color_bins(photo)]
+    share = cv2.Mat(colors.astype(np.float32), wrap_channels=False)
+    has: np.ndarray = cv2.calcBackProject([photo], CHANNELS, share, RANGES, scale=1) > 0
+    return has
 
 
-def _color_bins(photo: np.ndarray) -> np.ndarray:
-    red, green, blue = ((photo[..., channel] // (256 // BINS)).astype(np.uint16) for channel in range(3))
-    bins: np.ndarray = (red * BINS + green) * BINS + blue
-    return bins
+def _count(photo: np.ndarray, part: np.ndarray) -> np.ndarray:
+    """(BINS, BINS, BINS) int64 of the pixels in a part (H, W) bool; exact up to 16 million of one colour."""
+    pixels, mask = photo.reshape(-1, 1, 3), part.reshape(-1, 1).astype(np.uint8)
+    counted = cv2.calcHist([pixels], CHANNELS, mask, (BINS,) * 3, RANGES)
+    return counted.astype(np.int64)

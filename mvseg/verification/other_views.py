@@ -135,6 +135,7 @@ def fit_roughly(
             cameras,
             known=known,
             most_views=ROUGH_VIEWS,
+            is_rough=True,
             workers=workers,
             progress=progress,
         )

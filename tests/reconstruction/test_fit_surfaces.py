@@ -106,6 +106,16 @@ def test_a_known_start_saves_the_search_for_one(bent: LeafSurface, monkeypatch: 
     assert np.abs(errors(surface, BENT)).max() < 0.015
 
 
+def test_a_rough_fit_is_the_first_of_two_and_nearly_as_good(bent: LeafSurface, monkeypatch: pytest.MonkeyPatch) -> None:
+    regions, ids = as_regions(blade_masks(BENT, CAMERAS))
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces._fit_again", None)
+    rough = fit_surfaces(regions, ids, CAMERAS, is_rough=True)
+    assert rough[1].is_credible
+    assert rough[1].area == pytest.approx(bent.area, rel=0.02)
+    assert np.abs(errors(rough[1], BENT)).max() < 0.03
+    assert fit_surfaces(regions, ids, CAMERAS, known=rough, is_rough=True)[1] is rough[1]
+
+
 def test_known_surfaces_stay_and_the_others_are_fitted_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
     cameras, maps = CAMERAS[[0, 2, 4, 6, 8]], []
     leaves = {1: flat_leaf(length=1.4, half_width=0.3, at=(-0.7, -0.2, 0.3)),

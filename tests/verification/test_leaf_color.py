@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.verification.leaf_color import BINS, ColorCounts, count_colors, has_leaf_color, leaf_colors
 
 GREEN, DARK_GREEN, BROWN, WHITE = (60, 160, 40), (60, 150, 45), (120, 80, 40), (240, 240, 240)
 
@@ -32,6 +32,21 @@ def test_counts_of_photos_add_up() -> None:
     np.testing.assert_array_equal(added.outside, whole.outside)
     assert whole.inside.sum() == is_inside.sum()
     assert whole.outside.sum() == (~is_inside).sum()
+
+
+def test_counts_and_colours_are_those_of_pixels_one_by_one() -> None:
+    """Slow twin, on photos with each value of a channel."""
+    rng = np.random.default_rng(2)
+    photo = np.stack([rng.permutation(256) for _ in range(3)], -1).astype(np.uint8).reshape(16, 16, 3)
+    is_inside = rng.random((16, 16)) < 0.4
+    counts, colors = count_colors(photo, is_inside), rng.random((BINS,) * 3) < 0.3
+    expected = ColorCounts.none()
+    for row, column in np.ndindex(16, 16):
+        place = tuple(photo[row, column] // (256 // BINS))
+        (expected.inside if is_inside[row, column] else expected.outside)[place] += 1
+        assert has_leaf_color(photo, colors)[row, column] == colors[place]
+    np.testing.assert_array_equal(counts.inside, expected.inside)
+    np.testing.assert_array_equal(counts.outside, expected.outside)
 
 
 def test_how_often_photos_are_counted_does_not_matter() -> None:

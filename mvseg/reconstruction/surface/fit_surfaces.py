@@ -66,6 +66,7 @@ def fit_surfaces(
     starts: Mapping[int, LeafSurface] = MappingProxyType({}),
     known: Mapping[int, LeafSurface] = MappingProxyType({}),
     most_views: int = MOST_VIEWS,
+    is_rough: bool = False,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> dict[int, LeafSurface]:
@@ -81,6 +82,7 @@ def fit_surfaces(
         known: instance id -> a surface that is returned as it is. The others are fitted as if it had been fitted with
             them: it hides what lies behind it, and its masks tell how all masks err.
         most_views: at least 2.
+        is_rough: leave out the second fit, which knows what the leaves hide of each other, and how the masks err.
         workers: processes that instances are spread over, see `start_workers`; None: this one does it all.
         progress: show a progress bar over the instances.
 
@@ -103,7 +105,7 @@ def fit_surfaces(
     for instance in _ids(instance_ids):
         members = regions.select((instance_ids == instance) & (regions.areas > 0))
         views = members.view_index.unique()
-        if instance in known and not known[instance].exists:
+        if instance in known and (is_rough or not known[instance].exists):
             continue
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
@@ -127,15 +129,15 @@ def fit_surfaces(
         else:
             fits[instance] = fit
     fits = {instance: fits[instance] for instance in stacks if instance in fits}
-    offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
-    errors = learn_mask_errors([each for each in offsets if len(each) > 1])
-    first, fits = fits, {}
-    points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in first.items()}
-    again = [instance for instance in first if instance not in known]
-    refitted = spread(partial(_fit_again, points, errors), ((i, stacks[i], first[i]) for i in again), workers)
-    for instance, (masks, better) in zip(again, refitted, strict=True):
-        stacks[instance], fits[instance] = masks, better
-    surfaces |= {instance: _surface(stacks[instance], fit) for instance, fit in fits.items()}
+    unknown = [instance for instance in fits if instance not in known]
+    if not is_rough:
+        offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
+        errors = learn_mask_errors([each for each in offsets if len(each) > 1])
+        points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
+        refitted = spread(partial(_fit_again, points, errors), [(i, stacks[i], fits[i]) for i in unknown], workers)
+        for instance, (masks, better) in zip(unknown, refitted, strict=True):
+            stacks[instance], fits[instance] = masks, better
+    surfaces |= {instance: _surface(stacks[instance], fits[instance]) for instance in unknown}
     oriented = orient_surfaces(dict(sorted({**surfaces, **known}.items())), cameras)
     return {**oriented, **known}
 
