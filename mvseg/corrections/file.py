@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.types import StrictBool
 
 from mvseg.errors import InputError
+from mvseg.formats.json_file import Items
 from mvseg.system.atomic import write_text_whole
 
 FORMAT = "mvseg-corrections/1"
@@ -98,7 +99,7 @@ Edit = Annotated[Outline | Reject | Confirm | Split | Link | TrackLink, Field(di
 class _File(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
     format: Literal["mvseg-corrections/1"]
-    edits: Annotated[tuple[Edit, ...], Field(max_length=MOST_EDITS)]
+    edits: Annotated[Items[Edit], Field(max_length=MOST_EDITS)]
 
 
 @dataclass(frozen=True)
@@ -145,7 +146,7 @@ def parse_corrections(data: Any, source: Path | None = None) -> Corrections:
             The message names the file and the edit, counted from 1.
     """
     try:
-        return Corrections(_File.model_validate(data).edits, source)
+        return Corrections(tuple(_File.model_validate(data).edits), source)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
     place, edit = first["loc"], ""

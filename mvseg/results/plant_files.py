@@ -79,7 +79,9 @@ def leaf_extras(traits: Traits | None) -> dict[str, dict[str, Any]]:
     """{name of a leaf's node: its extras}: id, unit, method, quality, and its existing numbers with standard
     deviations."""
     found: dict[str, dict[str, Any]] = {}
-    for leaf in () if traits is None else traits.leaves:
+    if traits is None:
+        return found
+    for leaf in traits.leaves:
         numbers = {name: number for name, number in leaf.numbers.items() if number.exists}
         found[f"leaf_{leaf.leaf:03d}"] = {
             "leaf": leaf.leaf,

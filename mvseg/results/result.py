@@ -42,7 +42,8 @@ class Instances:
 
     def close_gaps(self, masks: Masks) -> Instances:
         """The shapes of the instances that have masks, by the ids that `masks.close_gaps()` gives them."""
-        surfaces, voxels = (each and masks.renumber(each) for each in (self.surfaces, self.voxels))
+        surfaces = None if self.surfaces is None else masks.renumber(self.surfaces)
+        voxels = None if self.voxels is None else masks.renumber(self.voxels)
         return Instances(starts=masks.renumber(self.starts), surfaces=surfaces, voxels=voxels)
 
 

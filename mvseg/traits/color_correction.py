@@ -81,18 +81,18 @@ def correct_views(scene: Scene, card: ColorCard | None) -> list[ColorCorrection 
 def _find_cards(scene: Scene) -> list[ColorCorrection | None]:
     """One entry per view, the same for all views of a camera."""
     by_camera: dict[str, list[int]] = {}
-    for index, view in enumerate(scene.views):
-        lens = None if view.lens is None else list(view.lens.params)
+    for index, each in enumerate(scene.views):
+        lens = None if each.lens is None else list(each.lens.params)
         camera = [scene.cameras.K[index].tolist(), scene.cameras.sizes[index].tolist(), lens]
         by_camera.setdefault(str(camera), []).append(index)
     found: list[ColorCorrection | None] = [None] * len(scene.views)
     for views in by_camera.values():
-        names = [scene.views[view].name for view in views]
-        for view, name in zip(views, names, strict=True):
-            fit = _best_fit(find_patches(read_photo(scene, view)))
+        names = [scene.views[index].name for index in views]
+        for index, name in zip(views, names, strict=True):
+            fit = _best_fit(find_patches(read_photo(scene, index)))
             if fit is not None and fit[1] < NO_CARD:
                 correction = ColorCorrection(", ".join(names), *fit, photo=name)
-                found = [correction if index in views else other for index, other in enumerate(found)]
+                found = [correction if view in views else other for view, other in enumerate(found)]
                 break
     return found
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
@@ -57,13 +57,14 @@ class _Body:
 
     @staticmethod
     def of(shape: LeafSurface | VoxelGrid) -> _Body:
-        is_surface = isinstance(shape, LeafSurface)
-        points = (shape.points().reshape(-1, 3) if is_surface else shape.points).cpu().numpy()
+        every = shape.points().reshape(-1, 3) if isinstance(shape, LeafSurface) else shape.points
+        points = every.cpu().numpy()
         variances, axes = np.linalg.eigh(np.cov(points.T, bias=True))
         deviations = np.sqrt(np.maximum(variances[::-1], 0))
-        area = shape.area if is_surface else 12 * float(deviations[0] * deviations[1])
         few = points[:: max(1, len(points) // NUM_POINTS)]
-        return _Body(few, deviations, axes[:, -1], area, iou=median_iou(shape) if is_surface else 0.0)
+        if isinstance(shape, LeafSurface):
+            return _Body(few, deviations, axes[:, -1], area=shape.area, iou=median_iou(shape))
+        return _Body(few, deviations, axes[:, -1], area=12 * float(deviations[0] * deviations[1]), iou=0.0)
 
     @property
     def length(self) -> float:
@@ -106,8 +107,10 @@ def find_rejected(
     if not config.leaves_only:
         return found
     bodies = {instance: _Body.of(shape) for instance, shape in shapes.items() if instance not in found}
-    rules = [] if up is None else [partial(find_stems, up=up), partial(find_floor, up=up)]
-    for rule in (*rules, find_distant):
+    rules: list[Callable[[dict[int, _Body]], dict[int, Rejection]]] = [find_distant]
+    if up is not None:
+        rules = [partial(find_stems, up=up), partial(find_floor, up=up), *rules]
+    for rule in rules:
         found |= rule({instance: body for instance, body in bodies.items() if instance not in found})
     return dict(sorted(found.items()))
 

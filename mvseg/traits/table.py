@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
+from mvseg.traits.leaf import Measurement
 from mvseg.traits.measure import Traits
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
@@ -29,7 +30,8 @@ def write_long(path: Path, traits: Traits) -> None:
     In the row of a missing number, `method` is the reason. Leaves without voxels have no rows for these.
     """
     rows = []
-    for leaf, numbers in [("", traits.whole), *((leaf.leaf, leaf.numbers) for leaf in traits.leaves)]:
+    tables: list[tuple[str | int, Mapping[str, Measurement]]] = [("", traits.whole)]
+    for leaf, numbers in [*tables, *((leaf.leaf, leaf.numbers) for leaf in traits.leaves)]:
         for name, number in numbers.items():
             if number.exists or name not in VOXEL_NAMES:
                 trait = DEFINITIONS[name]

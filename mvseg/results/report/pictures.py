@@ -1,6 +1,4 @@
-"""What the page shows of a photo: its part with the plant, a thumbnail of the whole, and the outlines of the masks, sharp
-at every size.
-"""
+"""What the page shows of a photo: its part with the plant, a thumbnail of the whole, and the outlines of the masks."""
 
 from __future__ import annotations
 
