@@ -106,8 +106,7 @@ def _by_markers(scene: Scene, side: float, unit: str, *, progress: bool) -> Plac
     middle = float(np.median(sides))
     odd = int((np.abs(sides / middle - 1) > SPREAD).sum())
     if odd:
-        message = f"{odd} of {len(sides)} markers differ in size by more than {SPREAD:.0%}: expected prints of one size"
-        warn(message)
+        warn(f"{odd} of {len(sides)} markers differ in size by more than {SPREAD:.0%}: expected prints of one size")
     residual = float(np.sqrt(((sides / middle - 1) ** 2).mean())) * side
     return Placement(
         similarity=scale_by(side / middle),

@@ -93,8 +93,7 @@ def refine_scene(scene: Scene, match: Match) -> tuple[Scene, RefinedPoses]:
     poses = refine_poses(scene.cameras, match)
     odd = [view.name for view in scene.views if opencv_distortion(view.lens) is None]
     if odd and poses.is_refined:
-        message = f"the refined cameras are not written: view {odd[0]} has a lens that no rig file can hold"
-        warn(message)
+        warn(f"the refined cameras are not written: view {odd[0]} has a lens that no rig file can hold")
     return replace(scene, cameras=poses.cameras), poses
 
 

@@ -332,6 +332,9 @@ def test_other_image_size(scene: Scene, tmp_path: Path) -> None:
     path.write_text(path.read_text().replace(f'"width": {WIDTH}', '"width": 61'))
     with pytest.raises(InputError, match=r"masks.json: image a.jpg is 61 x 40, its camera says 60 x 40"):
         read_all(path, scene)
+    unknown = path.read_text().replace('"width": 61', '"width": 0').replace(f'"height": {HEIGHT}', '"height": 0')
+    path.write_text(unknown)
+    assert read_all(path, scene) == [[], []]
 
 
 @pytest.mark.parametrize("length", [0, 1, 100, 200])
