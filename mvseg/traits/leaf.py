@@ -73,19 +73,19 @@ def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 
     def measure(moved: Floats) -> Floats:
         points = patch_grid(*COARSE).points(moved)
         normals = cell_normals(points)
-        area = np.linalg.norm(normals, axis=-1).sum()
-        length = np.linalg.norm(np.diff(points[:, COARSE[1] // 2], axis=0), axis=1).sum()
-        width = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(1).max()
-        pairs = _directions(moved, frame, normal=normals.sum((0, 1)))
+        area = np.linalg.norm(normals, axis=-1).sum((1, 2))
+        length = np.linalg.norm(np.diff(points[:, :, COARSE[1] // 2], axis=1), axis=2).sum(1)
+        width = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(2).max(1)
+        pairs = _directions(moved, frame, normal=normals.sum((1, 2)))
         turned = [angle.between(*pairs[name]) for name, angle in angles.items()]
-        return np.array([area, length, width, length / width, _base_height(moved, frame), *turned])
+        return np.stack([area, length, width, length / width, _base_height(moved, frame), *turned], 1)
 
     values = {
         "area": surface.area,
         "length": surface.length,
         "width": surface.width,
         "length_width_ratio": surface.length / surface.width,
-        "insertion_height": _base_height(coefficients, frame) - ground,
+        "insertion_height": float(_base_height(coefficients, frame)) - ground,
     }
     values |= {name: angle.degrees for name, angle in angles.items()}
     sds = dict(zip(values, surface.deviation(measure).tolist(), strict=True))
@@ -111,9 +111,9 @@ def wrap_azimuth(degrees: float) -> float:
 
 
 def cell_normals(points: Floats) -> Floats:
-    """(rows - 1, columns - 1, 3) normals of the cells of a grid (rows, columns, 3), as long as their areas."""
-    ax, ay, az = np.moveaxis(points[1:, 1:] - points[:-1, :-1], -1, 0)
-    bx, by, bz = np.moveaxis(points[1:, :-1] - points[:-1, 1:], -1, 0)
+    """(..., rows - 1, columns - 1, 3) normals of the cells of grids (..., rows, columns, 3), as long as their areas."""
+    ax, ay, az = np.moveaxis(points[..., 1:, 1:, :] - points[..., :-1, :-1, :], -1, 0)
+    bx, by, bz = np.moveaxis(points[..., 1:, :-1, :] - points[..., :-1, 1:, :], -1, 0)
     return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1) / 2  # np.cross is slow on few
 
 
@@ -132,19 +132,22 @@ _ENDS = patch_basis(np.array([0.0, END, 1 - END, 1.0]), np.zeros(4))
 _HALVES = np.stack([patch_basis(MIDDLE, np.full(len(MIDDLE), v)).mean(0) for v in (-1.0, 0.0, 1.0)])
 
 
-def _base_height(coefficients: Floats, frame: Floats | None) -> float:
-    return float("nan") if frame is None else float((_ENDS[0] @ coefficients) @ frame[2])
+def _base_height(coefficients: Floats, frame: Floats | None) -> Floats:
+    """(...) of leaves (..., 26, 3); NaN where up is not known."""
+    base = _ENDS[0] @ coefficients
+    return np.full(base.shape[:-1], np.nan) if frame is None else base @ frame[2]
 
 
 def _directions(coefficients: Floats, frame: Floats | None, *, normal: Floats) -> dict[str, tuple[Floats, Floats]]:
-    """{angle: the two directions, (3,) of any length, that it lies between}; `normal` (3,) is the mean one."""
-    ends, (left, middle, right) = _ENDS @ coefficients, _HALVES @ coefficients
-    base, ahead, tip = ends[1] - ends[0], ends[2] - ends[1], ends[3] - ends[2]
+    """{angle: the two directions (..., 3), of any length, that it lies between} of leaves (..., 26, 3), and their mean
+    normals (..., 3)."""
+    ends, (left, middle, right) = (np.moveaxis(rows @ coefficients, -2, 0) for rows in (_ENDS, _HALVES))
+    base, ahead, tip = ends[1:] - ends[:-1]
     pairs = {"curvature": (base, tip), "fold_angle": (left - middle, right - middle)}
     if frame is None:
         return pairs
     east, _, up = frame
-    level = ahead - (ahead @ up) * up
+    level = ahead - (ahead @ up)[..., None] * up
     return pairs | {
         "inclination": (up, normal), "insertion_angle": (up, base), "tip_angle": (up, tip), "azimuth": (east, level)
     }  # fmt: skip
@@ -180,8 +183,8 @@ class _Angle:
         angle = np.degrees(np.arctan2(sine, end @ ahead)) if size > 0 else np.nan
         return _Angle(ahead, across, float(angle))
 
-    def between(self, start: Floats, end: Floats) -> float:
-        """Degrees, within half a turn of the leaf as fitted."""
-        first, second = (complex(d @ self.ahead, d @ self.across) for d in (start, end))
+    def between(self, start: Floats, end: Floats) -> Floats:
+        """(M,) degrees between M pairs of directions (M, 3), or one (3,), within half a turn of the leaf as fitted."""
+        first, second = (d @ self.ahead + 1j * (d @ self.across) for d in (start, end))
         turned = second * first.conjugate() * np.exp(-1j * np.radians(self.degrees))
-        return self.degrees + float(np.degrees(np.angle(turned)))
+        return self.degrees + np.degrees(np.angle(turned))

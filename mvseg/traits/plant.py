@@ -51,19 +51,18 @@ def measure_whole(
 
     sds = []
     for index, (instance, surface) in enumerate(surfaces.items()):
-        is_lit = None if frame is None else cells[instance].is_lit
-
-        def measure(moved: Floats, index: int = index, is_lit: NDArray[np.bool_] | None = is_lit) -> Floats:
-            grid = patch_grid(*MESH_SHAPE).points(moved)
-            normals = cell_normals(grid)
-            area = np.linalg.norm(normals, axis=-1).sum()
-            parts = [area, *((slope[index] * grid).sum() for slope in slopes)]
-            if frame is not None and is_lit is not None:
-                shown = np.abs(normals[is_lit] @ frame[2]).sum()
-                parts += [shown, (shown - values["light_interception"] * area) / areas.sum()]
-            return np.array(parts)
-
-        sds.append(surface.deviation(measure))
+        normals = cell_normals(grids[index])
+        unit = normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-300)
+        by_area = slopes_of_grid(grids[index], unit)
+        by_point = [by_area, *(slope[index] for slope in slopes)]
+        if frame is not None:
+            is_lit, up = cells[instance].is_lit, frame[2]
+            by_shown = slopes_of_grid(grids[index], np.sign(normals @ up)[..., None] * is_lit[..., None] * up)
+            by_point += [by_shown, (by_shown - values["light_interception"] * by_area) / areas.sum()]
+        moves = np.stack(by_point).reshape(len(by_point), -1, 3)
+        by_coefficient = np.einsum("tpc,pb->tbc", moves, patch_grid(*MESH_SHAPE).basis).reshape(len(by_point), -1)
+        variance = np.einsum("ij,jk,ik->i", by_coefficient, surface.covariance.numpy(), by_coefficient)
+        sds.append(np.sqrt(np.maximum(variance, 0)))
     together = np.sqrt(np.square(sds).sum(0))
     method = "surface" if len(surfaces) == num_leaves else f"surface ({len(surfaces)} of {num_leaves} leaves)"
     for (name, value), sd in zip(values.items(), together.tolist(), strict=True):
@@ -73,6 +72,19 @@ def measure_whole(
     if frame is None:
         numbers |= dict.fromkeys(NEED_UP, UP_UNKNOWN)
     return numbers | area_deciles(areas, np.array(sds)[:, 0], method=method)
+
+
+def slopes_of_grid(points: Floats, by_normal: Floats) -> Floats:
+    """(rows, columns, 3) derivatives by the points of a grid, of what has the derivatives `by_normal` (rows - 1,
+    columns - 1, 3) by its `cell_normals`."""
+    along, across = points[1:, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, 1:]
+    by_along, by_across = np.cross(across, by_normal) / 2, np.cross(by_normal, along) / 2
+    slopes = np.zeros_like(points)
+    slopes[1:, 1:] += by_along
+    slopes[:-1, :-1] -= by_along
+    slopes[1:, :-1] += by_across
+    slopes[:-1, 1:] -= by_across
+    return slopes
 
 
 def area_deciles(areas: Floats, sds: Floats, *, method: str) -> dict[str, Measurement]:

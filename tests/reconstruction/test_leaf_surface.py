@@ -23,6 +23,10 @@ def random_covariance(sd: float) -> torch.Tensor:
     return torch.from_numpy(factors @ factors.T)
 
 
+def one_by_one(coefficients: np.ndarray) -> np.ndarray:
+    return np.stack([area_and_length(each) for each in coefficients])
+
+
 def test_deviations_are_those_of_samples() -> None:
     """The naive twin: measure leaves drawn from the covariance, whose errors are correlated."""
     coefficients = bent_blade().coefficients.numpy()
@@ -30,30 +34,33 @@ def test_deviations_are_those_of_samples() -> None:
     object.__setattr__(surface, "covariance", random_covariance(0.05))
     draws = np.random.default_rng(5).multivariate_normal(coefficients.ravel(), surface.covariance.numpy(), 4000)
     measured = np.stack([area_and_length(draw.reshape(-1, 3)) for draw in draws])
-    assert surface.deviation(area_and_length) == pytest.approx(measured.std(0), rel=0.06)
+    assert surface.deviation(one_by_one) == pytest.approx(measured.std(0), rel=0.06)
 
 
 def test_deviations_agree_with_analytic_slopes() -> None:
     surface = make_surface(fit_coefficients(flat_sheet, length=30, half_width=9) + 0.02 * np.arange(3), sd=0.03)
     slopes = measure_slopes(surface.coefficients.numpy())[:2]
     expected = 0.03 * np.linalg.norm(slopes, axis=1)
-    assert surface.deviation(area_and_length) == pytest.approx(expected, rel=0.02)
+    assert surface.deviation(one_by_one) == pytest.approx(expected, rel=0.02)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])
 def test_deviations_of_a_linear_measure_are_exact_in_any_unit(factor: float) -> None:
     surface = make_surface(factor * bent_blade().coefficients.numpy() + 1e3 * factor, sd=factor)
-    deviation = surface.deviation(lambda coefficients: coefficients.sum(0)[:1])
+    deviation = surface.deviation(lambda coefficients: coefficients.sum(1)[:, :1])
     assert deviation == pytest.approx([factor * NUM_COEFFICIENTS**0.5], rel=1e-6)
 
 
 def test_numbers_that_are_none_have_no_deviation() -> None:
     surface = bent_blade()
-    assert np.isfinite(surface.deviation(lambda c: np.array([c[0, 0], np.nan]))).tolist() == [True, False]
+    assert np.isfinite(surface.deviation(lambda c: np.stack([c[:, 0, 0], np.full(len(c), np.nan)], 1))).tolist() == [
+        True,
+        False,
+    ]
     nothing = LeafSurface.none(torch.tensor([0]), "seen in one view only")
     assert not nothing.is_credible
     assert surface.is_credible
-    assert np.isnan(nothing.deviation(area_and_length)).all()
+    assert np.isnan(nothing.deviation(one_by_one)).all()
 
 
 def test_parts_are_what_whole_frames_show() -> None:

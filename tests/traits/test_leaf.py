@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -38,6 +39,22 @@ def test_every_trait_is_measured_with_a_deviation() -> None:
     numbers = measure_leaf(bent_blade(), FRAME)
     assert numbers.keys() == {trait.name for trait in SURFACE_TRAITS}
     assert all(number.exists and number.sd > 0 and number.method == "surface" for number in numbers.values())
+
+
+@pytest.mark.parametrize("frame", [FRAME, None])
+def test_deviations_are_those_of_leaves_measured_one_by_one(
+    frame: np.ndarray | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Slow twin."""
+    together, deviation = measure_leaf(bent_blade(), frame), LeafSurface.deviation
+
+    def one_by_one(surface: LeafSurface, measure: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        return deviation(surface, lambda leaves: np.concatenate([measure(leaf[None]) for leaf in leaves]))
+
+    monkeypatch.setattr(LeafSurface, "deviation", one_by_one)
+    alone = measure_leaf(bent_blade(), frame)
+    sds = [[number.sd for number in numbers.values()] for numbers in (together, alone)]
+    assert sds[0] == pytest.approx(sds[1], rel=1e-6, nan_ok=True)
 
 
 def test_flat_ellipse() -> None:
@@ -142,7 +159,9 @@ def test_deviations_are_those_of_samples(monkeypatch: pytest.MonkeyPatch) -> Non
     numbers = measure_leaf(surface, FRAME)
     rng, drawn = np.random.default_rng(0), []
     center = surface.coefficients.numpy()
-    monkeypatch.setattr(LeafSurface, "deviation", lambda self, measure: measure(self.coefficients.numpy()))  # quick
+    monkeypatch.setattr(
+        LeafSurface, "deviation", lambda self, measure: measure(self.coefficients.numpy()[None])[0]
+    )
     for _ in range(500):
         drawn.append(measure(replace(surface, coefficients=torch.from_numpy(center + rng.normal(0, sd, center.shape)))))
     for name in ("area", "width", "inclination", "base_inclination", "azimuth", "insertion_height", "fold_angle"):

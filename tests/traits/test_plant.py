@@ -8,9 +8,9 @@ from scipy.spatial import ConvexHull
 from known_leaves import bent_blade, flat_leaf, move, turn_about
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.traits.from_above import look_from_above
-from mvseg.traits.leaf import Measurement, measure_leaf
+from mvseg.traits.leaf import Measurement, cell_normals, measure_leaf
 from mvseg.traits.ontology import PLANT_TRAITS
-from mvseg.traits.plant import NEED_UP, area_deciles, height_of, hull_volume, measure_whole
+from mvseg.traits.plant import NEED_UP, area_deciles, height_of, hull_volume, measure_whole, slopes_of_grid
 from mvseg.traits.up import level_frame
 
 FRAME = level_frame((0.0, 0.0, 1.0))
@@ -67,6 +67,14 @@ def test_slopes_of_hull_and_height_are_their_differences() -> None:
         assert (slopes * direction).sum() == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
         assert value > 0
     assert hull_volume(points)[0] == pytest.approx(ConvexHull(points.reshape(-1, 3)).volume)
+
+
+def test_slopes_of_a_grid_are_those_of_its_normals() -> None:
+    rng = np.random.default_rng(3)
+    points, direction = rng.normal(size=(6, 5, 3)), rng.normal(size=(6, 5, 3))
+    by_normal = rng.normal(size=(5, 4, 3))
+    ahead, behind = ((by_normal * cell_normals(points + sign * direction)).sum() for sign in (1, -1))
+    assert (slopes_of_grid(points, by_normal) * direction).sum() == pytest.approx((ahead - behind) / 2)  # a quadratic
 
 
 def test_one_flat_leaf_spans_no_volume() -> None:

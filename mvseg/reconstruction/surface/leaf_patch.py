@@ -84,8 +84,8 @@ class PatchGrid:
         return np.concatenate([grid, *middles]).reshape(-1, NUM_COEFFICIENTS)
 
     def points(self, coefficients: Floats) -> Floats:
-        """(rows, columns, 3) positions."""
-        return (self.basis @ coefficients).reshape(*self.shape, 3)
+        """(..., rows, columns, 3) positions, of coefficients (..., 26, 3)."""
+        return (self.basis @ coefficients).reshape(*coefficients.shape[:-2], *self.shape, 3)
 
 
 @cache

@@ -131,26 +131,20 @@ class LeafSurface:
         """Standard deviations of what is measured on the surface: those of the coefficients, propagated linearly.
 
         Args:
-            measure: from coefficients (26, 3) float64 to T numbers, (T,) float64. It is called 157 times and must be
+            measure: from coefficients of M leaves, (M, 26, 3) float64, to T numbers of each, (M, T) float64. It must be
                 smooth at `coefficients`: an angle must not jump by 360 degrees, nor be folded back where it meets 0.
 
         Returns:
             (T,) float64; NaN without a surface, and for numbers that are NaN.
         """
         center = self.coefficients.numpy()
+        step = STEP * float(np.linalg.norm(center.std(axis=0)))
+        moves = step * np.eye(center.size).reshape(-1, *center.shape)
         with np.errstate(all="ignore"):
-            numbers = np.asarray(measure(center), dtype=np.float64)
-            if not self.exists:
-                return np.full_like(numbers, np.nan)
-            step = STEP * float(np.linalg.norm(center.std(axis=0)))
-            slopes = np.empty((len(numbers), center.size))
-            for index in range(center.size):
-                moved = np.zeros(center.size)
-                moved[index] = step
-                ahead, behind = (measure(center + sign * moved.reshape(center.shape)) for sign in (1, -1))
-                slopes[:, index] = (ahead - behind) / (2 * step)
+            numbers, *moved = measure(np.concatenate((center[None], center + moves, center - moves)))
+            slopes = np.subtract(*np.split(np.array(moved), 2)).T / (2 * step)
             variance = np.einsum("ij,jk,ik->i", slopes, self.covariance.numpy(), slopes)
-            return np.where(np.isfinite(numbers), np.sqrt(np.maximum(variance, 0)), np.nan)
+            return np.where(np.isfinite(numbers) & self.exists, np.sqrt(np.maximum(variance, 0)), np.nan)
 
     @property
     def midrib(self) -> Tensor:
