@@ -96,7 +96,7 @@ def judge_scene(spec: SceneSpec, *, cache: Path, kind: str) -> tuple[int, int, l
     num_views = len(scene.cameras)
     regions, truth = scene.masks(kind)
     affinity, sweep = region_affinity(regions, scene.cameras), sweep_planes(regions, scene.cameras)
-    graph = ViewGraph(affinity.to_dense().double().numpy(), sweep.view_index, num_views)
+    graph = ViewGraph.of(affinity, regions.view_index, num_views)
     scores = ClusterScores(sweep, graph, NViewConfig().for_views(num_views))
     pairwise = renumber(separate_unmatched(one_per_view_clusters(affinity, regions.view_index, num_views).numpy()))
     matched = search(scores, pairwise)

@@ -9,7 +9,8 @@ seconds, which others on the machine change least; wall seconds are in the JSON.
 (pairs of views x labelled pixels) for the affinity, against log (masks x views) for the rest; 1 = grows in proportion.
 
 Threads: all stages of the base scene, and the commands on the shipped plant, with one and with two threads in turns.
-`--threads_only` measures nothing else, and leaves the growth as it stands.
+`--threads_only` measures nothing else, and leaves the growth as it stands. `--growth_only` prints the growth alone:
+`make bench PREVIOUS=DIR FULL="--growth_only --rounds 1"` says in one run how this version compares with another.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ import torch
 from benchmarks.faults import Faults, degrade_labels
 from benchmarks.label_maps import visible_ids
 from benchmarks.speed.rivals import measure_rivals
-from benchmarks.speed.write_up import write_all
+from benchmarks.speed.write_up import growth_lines, write_all
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.cameras import arc_cameras
@@ -76,8 +77,9 @@ def make_environment(checkout: Path, threads: int) -> dict[str, str]:
 
 
 def run_cell(scene: Path, checkout: Path, *, threads: int = 1, every: bool = False) -> dict[str, Any]:
-    """One run of stages.py with the mvseg of a checkout."""
-    command = [sys.executable, str(Path(__file__).with_name("stages.py")), str(scene), "--threads", str(threads)]
+    """One run of a checkout's own stages.py: what it imports changes its name from version to version."""
+    stages = checkout / "benchmarks" / "speed" / "stages.py"
+    command = [sys.executable, str(stages), str(scene), "--threads", str(threads)]
     command += ["--every"] if every else []
     environment = make_environment(checkout, threads)
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -151,6 +153,10 @@ def main() -> None:
     parser.add_argument("--full", action="store_true", help="5 to 80 views, 4 to 64 leaves, up to 24 megapixels")
     parser.add_argument("--previous", type=Path, help="another checkout of mvseg, which takes turns with this one")
     parser.add_argument("--threads_only", action="store_true", help="the base scene alone; the other table stays")
+    parser.add_argument("--growth_only", action="store_true", help="one thread, no commands; nothing is written")
+    parser.add_argument(
+        "--axes", nargs="+", choices=QUICK, default=list(QUICK), help="along which the growth is measured"
+    )
     parser.add_argument("--rounds", type=int, default=2, help="of all scenes; the figures are medians")
     parser.add_argument("--cache", type=Path, help="folder for the rendered scenes")
     parser.add_argument("--into", type=Path, default=Path("results/speed"), help="folder for what is written")
@@ -160,8 +166,13 @@ def main() -> None:
         cache = args.cache or Path(scratch)
         cache.mkdir(parents=True, exist_ok=True)
         versions = {"now": ROOT} | ({"previous": args.previous.resolve()} if args.previous else {})
-        cells = [] if args.threads_only else list_cells(FULL if args.full else QUICK)
+        values = FULL if args.full else QUICK
+        cells = list_cells({axis: values[axis] if axis in args.axes else () for axis in values})
+        cells = [] if args.threads_only else cells
         records = measure_growth(cells, versions, rounds=args.rounds, cache=cache)
+        if args.growth_only:
+            print("\n".join(growth_lines(records, {})))
+            return
         threads = measure_threads(versions, rounds=args.rounds, cache=cache)
         with np.load(make_scene(BASE, cache)) as saved:
             cameras = Cameras(**{name: torch.from_numpy(saved[name]) for name in ("K", "R", "t", "sizes")})

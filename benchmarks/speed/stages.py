@@ -1,6 +1,6 @@
 """The stages of one scene, timed in a process of its own: `python benchmarks/speed/stages.py SCENE.npz`
 
-Runs whatever `mvseg` PYTHONPATH leads to, an earlier one too, so in one thread it uses nothing but long-standing names.
+Runs the `mvseg` that PYTHONPATH leads to; each version of this file goes with the mvseg beside it.
 Prints JSON: {stage: [wall, CPU seconds]}, the counts that the cost grows with, the peak memory, and a hash of the ids.
 """
 
@@ -36,6 +36,7 @@ from mvseg.reconstruction.shapes import reconstruct_shapes
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
 from mvseg.scene import Cameras
+from mvseg.system.worker_pool import start_workers
 
 Value = TypeVar("Value")
 PROPOSALS = 100  # of each view, for the loop
@@ -74,8 +75,6 @@ def fit_shapes(regions: Regions, instance_ids: Tensor, cameras: Cameras, *, num_
     if num_workers == 1:
         reconstruct_shapes(regions, instance_ids, cameras, config=config)
         return
-    from mvseg.system.worker_pool import start_workers  # earlier versions have none
-
     with start_workers(num_workers) as workers:
         reconstruct_shapes(regions, instance_ids, cameras, config=config, workers=workers)
 

@@ -56,14 +56,14 @@ def region_affinity(
     senders = None if num_points is None else draw_points(view_samples(regions)[0], num_points, seed)
     edges = [torch.zeros(2, 0, dtype=torch.int64, device=regions.device)]
     weights = [torch.zeros(0, device=regions.device)]
-    for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):
-        i, j = pair.i, pair.j
-        j_from_i, i_from_j = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
-        mean = (j_from_i + i_from_j.T) / 2
-        first, second = mean.nonzero().unbind(1)
-        edges.append(torch.stack((members[i][first], members[j][second])))
-        weights.append(mean[first, second])
-    return Affinity(torch.cat(edges, 1).T.sort(1).values, torch.cat(weights), len(regions))
+    with torch.inference_mode():  # thousands of small operations: what autograd notes of each is a fifth of the time
+        for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):
+            j_from_i, i_from_j = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
+            mean = (j_from_i + i_from_j.T) / 2
+            first, second = mean.nonzero().unbind(1)
+            edges.append(torch.stack((members[pair.i][first], members[pair.j][second])))
+            weights.append(mean[first, second])
+    return Affinity(torch.stack(torch.aminmax(torch.cat(edges, 1), dim=0), 1), torch.cat(weights), len(regions))
 
 
 def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Tensor, Tensor]) -> tuple[Tensor, Tensor]:
@@ -88,7 +88,8 @@ def pairwise_affinity(bins: Bins, pixels: tuple[Tensor, Tensor], lines: tuple[Te
         else lines[side] @ dilate(pixels[1 - side], bins.half_line[1 - side]).T
         for side in (0, 1)
     )
-    num_pixels, num_lines = (tuple(each.sum(1).clamp(min=1) for each in counts) for counts in (pixels, lines))
+    num_pixels = [each.sum(1).clamp_(min=1) for each in pixels]
+    num_lines = num_pixels if lines is pixels else [each.sum(1).clamp_(min=1) for each in lines]
     j_from_i, i_from_j = (
         # shares of pixels in float32: their sums are 1 up to rounding where all of them are inside
         (inside[side] / num_pixels[1 - side] * (through[side] / num_lines[side][:, None])).clamp_(max=1)

@@ -72,6 +72,7 @@ class Spans:
         high: (S,) the largest; the same tensor for pixels.
         owner: (S,) int64 in [0, N).
         weight: (S,) float32, number of mask pixels.
+        num_pixels: sum of the weights.
         num_regions: N.
     """
 
@@ -79,6 +80,7 @@ class Spans:
     high: Tensor
     owner: Tensor
     weight: Tensor
+    num_pixels: float
     num_regions: int
 
 
@@ -90,14 +92,15 @@ def find_spans(pencil: Pencil, side: int, samples: Samples) -> Spans:
     if samples.last_xy is not None:
         first, last = low.split(len(owner))
         low, high = torch.minimum(first, last), torch.maximum(first, last)
-        is_wide = high - low > WIDE
-        if is_wide.any():
+        width = high - low
+        if float(width.max() if len(width) else 0) > WIDE:
+            is_wide = width > WIDE
             pixels = samples.pixels(is_wide)
             angles = pencil.angles(side, pixels.xy)
             low, high = (torch.cat((ends[~is_wide], angles)) for ends in (low, high))
             owner = torch.cat((owner[~is_wide], pixels.owner))
             weight = torch.cat((weight[~is_wide], pixels.weight))
-    return Spans(low=low, high=high, owner=owner, weight=weight, num_regions=samples.num_regions)
+    return Spans(low, high, owner, weight, samples.num_pixels, samples.num_regions)
 
 
 def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> Bins:
@@ -126,15 +129,6 @@ def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> 
     )
 
 
-def bin_histogram(bins: Bins, angles: Tensor, samples: Samples) -> Tensor:
-    """(N, B) float32: how many mask pixels of each region lie in each bin of half-planes.
-
-    Pixels whose half-plane lies outside the bins are left out.
-    """
-    spans = Spans(low=angles, high=angles, owner=samples.owner, weight=samples.weight, num_regions=samples.num_regions)
-    return span_histogram(bins, spans)
-
-
 def span_histogram(bins: Bins, spans: Spans) -> Tensor:
     """(N, B) float32: how many mask pixels of each region lie in each bin; those of a run are spread evenly over the
     bins between its ends. Whole numbers count shares of pixels, so that empty bins are exactly 0."""
@@ -145,12 +139,14 @@ def span_histogram(bins: Bins, spans: Spans) -> Tensor:
         counts = spans.weight.new_zeros(spans.num_regions * padded).scatter_add_(0, flat, spans.weight)
         return counts.reshape(spans.num_regions, padded)[:, 1:-1]
     low, high = bins.index(spans.low), bins.index(spans.high)
-    share = torch.div(SHARE * spans.weight, high - low + 1).round_().long()
+    # int32: half the memory traffic, as long as all pixels of a region may lie in one bin
+    kind = torch.int32 if SHARE * spans.num_pixels < 2**31 else torch.int64
+    share = torch.div(SHARE * spans.weight, high - low + 1).round_().to(kind)
     padded = bins.num_bins + 3  # a bin at either end collects what lies outside; one more where the last runs end
     start = spans.owner * padded + low + 1
     changes = share.new_zeros(spans.num_regions * padded)
     changes.index_add_(0, start, share).index_add_(0, start + (high - low + 1), share.neg())
-    counts = changes.reshape(spans.num_regions, padded).cumsum(1)
+    counts = changes.reshape(spans.num_regions, padded).cumsum(1, dtype=kind)
     return counts[:, 1:-2].float().mul_(1 / SHARE)
 
 
@@ -203,8 +199,7 @@ def binned_pairs(
         lines = pixels
         if senders is not None:
             first, second = (
-                bin_histogram(bins, pencil.angles(side, senders[view].xy), senders[view])
-                for side, view in enumerate((i, j))
+                span_histogram(bins, find_spans(pencil, side, senders[view])) for side, view in enumerate((i, j))
             )
             lines = first, second
         yield BinnedPair(i=i, j=j, pencil=pencil, bins=bins, pixels=pixels, lines=lines)
@@ -227,7 +222,7 @@ def _pair_pitches(
 
 def _thin(samples: Samples) -> Tensor:
     """Of many pixels, about PITCH_PIXELS on a square lattice: enough for a mean, whatever their order."""
-    step = int((float(samples.weight.sum()) / PITCH_PIXELS) ** 0.5)
+    step = int((samples.num_pixels / PITCH_PIXELS) ** 0.5)
     if step < 2:
         return samples.pixels().xy
     xy = samples.pixels(samples.xy[:, 1].int() % step == 0).xy
@@ -238,13 +233,8 @@ def _thin(samples: Samples) -> Tensor:
 
 def dilate(counts: Tensor, radius: int) -> Tensor:
     """(N, B) counts or bool -> (N, B) float32 of 0 and 1: bins within `radius` bins of one that is not 0."""
-    grown = torch.nn.functional.pad((counts if counts.is_floating_point() else counts.float()).sign(), (radius, radius))
-    reach, window = 1, 2 * radius + 1
-    while reach < window:  # the maximum over `reach` bins, doubled again and again
-        step = min(reach, window - reach)
-        grown = torch.maximum(grown[:, :-step], grown[:, step:])
-        reach += step
-    return grown
+    occupied = (counts if counts.is_floating_point() else counts.float()).sign()
+    return torch.nn.functional.max_pool1d(occupied[None], 2 * radius + 1, stride=1, padding=radius)[0]
 
 
 def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:
@@ -268,10 +258,10 @@ def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor)
         if skip[other] or not len(members):
             continue
         pencil = epipolar_pencil(cameras, other, view)
-        angles = pencil.angles(0, source.xy), pencil.angles(1, xy)
-        bins = choose_bins((pencil.pitch(0, source.xy), pencil.pitch(1, xy)), angles)
-        occupied = dilate(bin_histogram(bins, angles[0], source), bins.band_radius(0))
-        bands[members] = occupied[:, bins.index(angles[1]).clamp(0, bins.num_bins - 1)] > 0
+        spans, angles = find_spans(pencil, 0, source), pencil.angles(1, xy)
+        bins = choose_bins((pencil.pitch(0, source.xy), pencil.pitch(1, xy)), (spans.low, angles))
+        occupied = dilate(span_histogram(bins, spans), bins.band_radius(0))
+        bands[members] = occupied[:, bins.index(angles).clamp(0, bins.num_bins - 1)] > 0
     return bands
 
 

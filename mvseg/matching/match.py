@@ -79,8 +79,7 @@ def match_regions(
     if method == "one-per-view":
         ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
         if not links.agree(ids.cpu().numpy()):
-            weights, views = affinity.to_dense().cpu().double().numpy(), regions.view_index.cpu().numpy()
-            ids = cluster_graph(links.hold(ViewGraph(weights, views, len(cameras)))).to(ids)
+            ids = cluster_graph(links.hold(ViewGraph.of(affinity, regions.view_index, len(cameras)))).to(ids)
         return matching_of_ids(ids, regions, affinity, method=method)
     matching = match_graph(affinity, regions, config, method=method, progress=progress)
     if links.agree(matching.instance_ids.cpu().numpy()):

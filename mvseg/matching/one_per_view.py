@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.optimize import linear_sum_assignment
+from scipy.spatial.distance import squareform
 from torch import Tensor
 
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.partition import drop_singletons, number_instances, renumber
+from mvseg.matching.partition import drop_singletons, members_of, number_instances, renumber
 
 STOP = 0.2  # mean weight below which two clusters are not joined
 ALONE = 0.1  # gain of a region that stays alone, comparable to its mean weight to the V - 1 other views
@@ -46,11 +47,28 @@ class ViewGraph:
     node: Ints | None = None
     apart: NDArray[np.bool_] | None = None
 
+    @staticmethod
+    def of(affinity: Affinity, view_index: Tensor, num_views: int) -> ViewGraph:
+        """The graph of D regions, nothing known of them; `view_index` (D,) int64."""
+        weights = np.zeros((affinity.num_regions, affinity.num_regions))
+        first, second = affinity.edges.T.cpu().numpy()
+        weights[first, second] = weights[second, first] = affinity.weights.cpu().numpy()
+        return ViewGraph(weights, view_index.cpu().numpy(), num_views)
+
     def select(self, index: Ints) -> ViewGraph:
         """The graph of some regions."""
         node = None if self.node is None else self.node[index]
         apart = None if self.apart is None else self.apart[np.ix_(index, index)]
         return ViewGraph(self.weights[np.ix_(index, index)], self.view_index[index], self.num_views, node, apart)
+
+    def sum_partners(self, values: Floats, clusters: Ints) -> NDArray[np.float64]:
+        """(D,) sums of `values` (D, D) between each region and its partners: the members of its cluster (D,) in other
+        views; clusters in [0, K)."""
+        sums = np.zeros(len(clusters))
+        for members in members_of(clusters):
+            is_partner = self.view_index[members][:, None] != self.view_index[members]
+            sums[members] = (values[np.ix_(members, members)] * is_partner).sum(1)
+        return sums
 
     @property
     def is_linked(self) -> NDArray[np.bool_]:
@@ -127,8 +145,7 @@ def one_per_view_clusters(affinity: Affinity, view_index: Tensor, num_views: int
         (D,) int64 instance ids in [1, K], numbered in the order of their first region; -1 for a region that is alone in
         its cluster. The partition does not depend on the order of views and regions unless weights tie.
     """
-    weights = affinity.to_dense().cpu().double().numpy()
-    return cluster_graph(ViewGraph(weights, view_index.cpu().numpy(), num_views)).to(view_index.device)
+    return cluster_graph(ViewGraph.of(affinity, view_index, num_views)).to(view_index.device)
 
 
 def cluster_graph(graph: ViewGraph) -> Tensor:
@@ -152,13 +169,15 @@ def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
     """
     if len(graph.weights) < 2:
         return np.arange(len(graph.weights))
-    first, second = np.triu_indices(len(graph.weights), 1)
     farthest = graph.weights.max(initial=1.0)  # the distance between two regions without an edge
-    distance = farthest - graph.weights[first, second] + TIE * np.linspace(0, 1, len(first))
-    distance[graph.view_index[first] == graph.view_index[second]] = FORBIDDEN
-    if graph.node is not None and graph.apart is not None:
-        distance[graph.apart[first, second]] = FORBIDDEN
-        distance[graph.node[first] == graph.node[second]] = 0
+    distances = farthest - graph.weights
+    distances[graph.view_index[:, None] == graph.view_index] = FORBIDDEN
+    if graph.apart is not None:
+        distances[graph.apart] = FORBIDDEN
+    distance = squareform(distances, checks=False)
+    distance += TIE * np.linspace(0, 1, len(distance))
+    if graph.node is not None:
+        distance[squareform(graph.node[:, None] == graph.node, checks=False)] = 0
     cut = min(farthest - stop + TIE, np.nextafter(farthest, 0))
     return renumber(fcluster(linkage(distance, "average"), cut, "distance").astype(np.int64))
 
@@ -180,12 +199,15 @@ def power_iteration(graph: ViewGraph, clusters: Ints) -> Ints:
             movers = graph.movers(view)
             rest = clusters.copy()
             rest[movers.rows] = -1
-            numbers, rest[rest >= 0] = np.unique(rest[rest >= 0], return_inverse=True)
-            members = np.zeros((len(rest), len(numbers)))
-            members[rest >= 0, rest[rest >= 0]] = 1
-            gain = movers.total(graph.weights[movers.rows] @ members) / max(graph.num_views - 1, 1)
+            others = np.argsort(rest, kind="stable")[len(movers.rows) :]  # cluster by cluster
+            start = np.flatnonzero(np.diff(rest[others], prepend=-1))
+            numbers = rest[others[start]]
+            weights = np.add.reduceat(graph.weights[movers.rows].take(others, 1), start, 1)
+            gain = movers.total(weights) / max(graph.num_views - 1, 1)
             gain[graph.forbidden(movers, clusters, numbers)] = -np.inf
-            rest[movers.rows] = assign_one_to_one(gain, ALONE * movers.sizes)[movers.owner]
+            chosen = assign_one_to_one(gain, ALONE * movers.sizes)
+            fresh = clusters.max(initial=-1) + 1 + np.arange(movers.num)
+            rest[movers.rows] = np.append(numbers, fresh)[chosen][movers.owner]
             clusters = rest
         clusters = renumber(clusters)
         if (clusters == before).all():

@@ -6,6 +6,8 @@ tensor, so that 0 can mean "nothing" in a label image. In both, -1 is a region t
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -37,3 +39,12 @@ def separate_unmatched(clusters: Ints) -> Ints:
     """(D,) the same numbers, with an unused one of its own for every region that has a negative one."""
     fresh = int(clusters.max(initial=-1)) + 1 + np.arange(len(clusters))
     return np.where(clusters < 0, fresh, clusters)
+
+
+def members_of(clusters: Ints, num_clusters: int | None = None) -> list[Ints]:
+    """The members of clusters 0 .. K - 1 in ascending order; an unused number has none, -1 is left out. Without K, up
+    to the largest number."""
+    num_clusters = int(clusters.max(initial=-1)) + 1 if num_clusters is None else num_clusters
+    order = np.argsort(clusters, kind="stable")
+    starts = np.searchsorted(clusters[order], np.arange(num_clusters + 1))
+    return [order[start:stop] for start, stop in pairwise(starts)]

@@ -39,10 +39,9 @@ class Pencil:
         """
         x, y = self._plane(side, xy)
         angle = y / x.abs().add_(y.abs()).clamp_(min=torch.finfo(x.dtype).tiny)
-        is_left = x < 0
-        if not is_left.any():  # as in most pairs: the pencil faces where both cameras look
+        if not len(x) or float(x.min()) >= 0:  # as in most pairs: the pencil faces where both cameras look
             return angle
-        return torch.where(is_left, torch.where(y < 0, -2 - angle, 2 - angle), angle)
+        return torch.where(x < 0, torch.where(y < 0, -2 - angle, 2 - angle), angle)
 
     def pitch(self, side: int, xy: Tensor) -> float:
         """Mean change of the angle when a pixel moves by one pixel across its epipolar line; see `mean_pitches`."""

@@ -39,6 +39,11 @@ class Samples:
         """(2 P, 2) the first pixels of all runs, then the last ones; (P, 2) for pixels."""
         return self.xy if self.last_xy is None else torch.cat((self.xy.T, self.last_xy.T), 1).T
 
+    @cached_property
+    def num_pixels(self) -> float:
+        """Sum of the weights."""
+        return float(self.weight.sum())
+
     def pixels(self, keep: Tensor | None = None) -> Samples:
         """All pixels of the runs, or of those that are to be kept (P,) bool; samples of pixels as they are."""
         if self.last_xy is None or self.length is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from typing import Any
 
@@ -15,7 +16,7 @@ from mvseg.detection.assignment import ruzicka_similarity
 from mvseg.errors import InputError
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.epipolar import (
-    bin_histogram,
+    Spans,
     choose_bins,
     dilate,
     epipolar_bands,
@@ -187,10 +188,20 @@ def test_histograms_hold_every_pixel_once() -> None:
     angles = pencil.angles(0, samples[0].xy), pencil.angles(1, samples[2].xy)
     bins = choose_bins((pencil.pitch(0, samples[0].xy), pencil.pitch(1, samples[2].xy)), angles)
     for side, view in ((0, 0), (1, 2)):
-        counts = bin_histogram(bins, angles[side], samples[view])
+        spans = find_spans(pencil, side, samples[view])
+        counts = span_histogram(bins, spans)
         torch.testing.assert_close(counts.sum(1), scene.regions.areas[members[view]].float())
-        elsewhere = bin_histogram(bins, angles[side] + 10, samples[view])
-        assert elsewhere.sum() == 0
+        far = spans.low + 10
+        assert span_histogram(bins, dataclasses.replace(spans, low=far, high=far)).sum() == 0
+
+
+def test_histograms_of_very_many_pixels_count_in_wider_numbers() -> None:
+    """A mask of 40 megapixels in one bin."""
+    weight = torch.full((10,), 4e6)
+    angles, owner = torch.full((10,), 0.5), torch.zeros(10, dtype=torch.int64)
+    bins = choose_bins((0.01, 0.01), (torch.tensor([0.0, 1.0]),) * 2)
+    spans = Spans(angles, angles.clone(), owner, weight, num_pixels=4e7, num_regions=1)
+    assert span_histogram(bins, spans).sum() == 4e7
 
 
 @pytest.mark.parametrize("name", RIGS)
@@ -204,7 +215,7 @@ def test_runs_lie_in_the_bins_of_their_pixels(name: str) -> None:
         torch.testing.assert_close(runs[side].pixels().xy, pixels[side].xy)
         angles = pencil.angles(side, pixels[side].xy)
         bins = choose_bins((pencil.pitch(side, pixels[side].xy),) * 2, (angles, angles))
-        expected = bin_histogram(bins, angles, pixels[side])
+        expected = span_histogram(bins, find_spans(pencil, side, pixels[side]))
         counts = span_histogram(bins, find_spans(pencil, side, runs[side]))
         torch.testing.assert_close(counts.sum(1), expected.sum(1), rtol=1e-3, atol=0)
         occupied, shown = dilate(expected, 1), dilate(counts, 1)
@@ -225,7 +236,7 @@ def test_runs_across_the_jump_and_near_an_epipole_count_as_pixels() -> None:
     bins = choose_bins((pencil.pitch(0, pixels.xy),) * 2, (angles, angles))
     assert float((spans.high - spans.low).max()) <= 0.25
     assert (spans.high == spans.low).sum() > 50
-    far = (span_histogram(bins, spans) - bin_histogram(bins, angles, pixels)).cumsum(1).abs().max()
+    far = (span_histogram(bins, spans) - span_histogram(bins, find_spans(pencil, 0, pixels))).cumsum(1).abs().max()
     assert far < 0.02 * len(angles)
 
 

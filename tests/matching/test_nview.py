@@ -13,9 +13,9 @@ from sklearn.metrics import adjusted_rand_score
 from mvseg.errors import InputError
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
-from mvseg.matching.nview.cluster_scores import ClusterScores, members_of
+from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.hypothesis_index import index_hypotheses
+from mvseg.matching.nview.hypothesis_index import index_hypotheses, pack_views
 from mvseg.matching.nview.initialisation import em_affinities
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.nview.plane_sweep import (
@@ -29,7 +29,7 @@ from mvseg.matching.nview.plane_sweep import (
 )
 from mvseg.matching.nview.search import refine, search
 from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
-from mvseg.matching.partition import renumber
+from mvseg.matching.partition import members_of, renumber
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
@@ -204,9 +204,10 @@ def test_pixels_are_spread_evenly_and_never_more_than_asked(balls: BallScene) ->
 
 
 def test_members_are_in_rising_order_and_the_unmatched_are_left_out() -> None:
-    members = members_of(np.array([2, -1, 0, 2]), 4)
-    assert [cluster.tolist() for cluster in members] == [[2], [], [0, 3], []]
-    assert members_of(np.zeros(0, np.int64), 0) == []
+    members = members_of(np.array([2, -1, 0, 2]))
+    assert [cluster.tolist() for cluster in members] == [[2], [], [0, 3]]
+    assert [len(each) for each in members_of(np.array([0]), 2)] == [1, 0]
+    assert members_of(np.zeros(0, np.int64)) == []
 
 
 def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -244,8 +245,22 @@ def test_own_scores_are_kept_cluster_by_cluster(scores: ClusterScores) -> None:
 def test_hypotheses_are_found_by_the_regions_that_they_name(sweep: PlaneSweep) -> None:
     index = index_hypotheses(sweep.labels, len(sweep.view_index))
     members = [np.array([0, 9, 17]), np.zeros(0, np.int64)]
-    expected = [np.isin(sweep.labels, cluster).sum(1) for cluster in members]
-    np.testing.assert_array_equal(index.count(members), expected)
+    cluster, hypothesis, views = index.count(members)
+    counts = np.zeros((2, len(sweep.labels)))
+    counts[cluster, hypothesis] = views
+    np.testing.assert_array_equal(counts, [np.isin(sweep.labels, cluster).sum(1) for cluster in members])
+    assert views.min() == 1
+    assert (np.diff(cluster * len(sweep.labels) + hypothesis) > 0).all()
+    assert [len(each) for each in index.count([])] == [0, 0, 0]
+
+
+def test_sets_of_views_are_bits_in_words() -> None:
+    is_view = np.random.default_rng(0).random((7, 130)) < 0.5
+    words = pack_views(is_view)
+    assert words.shape == (3, 7)
+    np.testing.assert_array_equal(np.bitwise_count(words).sum(0), is_view.sum(1))
+    both = words[:, 0] & words[:, 1]
+    assert np.bitwise_count(both).sum() == (is_view[0] & is_view[1]).sum()
 
 
 def test_label_maps_that_grow_step_by_step_give_the_sweep_of_each_step(balls: BallScene) -> None:

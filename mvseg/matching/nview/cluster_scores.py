@@ -7,32 +7,29 @@ counts.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import pairwise
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.matching.nview.config import NViewConfig
-from mvseg.matching.nview.plane_sweep import EMPTY, PlaneSweep, blocks_of_runs, run_starts
+from mvseg.matching.nview.hypothesis_index import pack_views
+from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_of_runs, run_starts
 from mvseg.matching.one_per_view import ViewGraph
+from mvseg.matching.partition import members_of
 
 # Log-odds that two regions show one instance, by epipolar weight; measured on degraded masks of development plants.
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
 LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
 PRIOR, SPAN = 2.5, 6.0  # evidence = (log-odds + PRIOR) / SPAN
+SLACK = 1e-4  # of a score that is only to be bounded
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
-
-
-def members_of(clusters: Ints, num_clusters: int) -> list[Ints]:
-    """The members of clusters 0 .. K - 1 in ascending order; an unused number has none, -1 is left out."""
-    order = np.argsort(clusters, kind="stable")
-    starts = np.searchsorted(clusters[order], np.arange(num_clusters + 1))
-    return [order[start:stop] for start, stop in pairwise(starts)]
+Key = TypeVar("Key")
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +78,9 @@ class ClusterScores:
 
     @cached_property
     def evidence(self) -> Floats:
-        """(D, D) evidence for (> 0) or against (< 0) a pair of regions being one instance, from its epipolar weight."""
-        return (np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + PRIOR) / SPAN
+        """(D, D) float32 evidence for (> 0) or against (< 0) a pair of regions being one instance, from its epipolar
+        weight."""
+        return ((np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + PRIOR) / SPAN).astype(np.float32)
 
     def scores(self, view: int, clusters: Ints) -> Floats:
         """Leave-one-out scores of the regions of one view in clusters, S(n, c).
@@ -99,17 +97,10 @@ class ClusterScores:
         Returns:
             (N, K) float32 in [-hidden, 1].
         """
-        members = self._members_elsewhere(view, clusters)
-        keys = [(view, cluster.tobytes()) for cluster in members]
-        new = [k for k, key in enumerate(keys) if key not in self._scores]
-        if new:
-            fresh = self._score_clusters(view, [members[k] for k in new])
-            self._scores.update({keys[k]: fresh[:, column] for column, k in enumerate(new)})
-        regions = self.sweep.bounds.regions(view)
-        return np.stack([self._scores[key] for key in keys], 1) if keys else np.zeros((regions.stop - regions.start, 0))
+        return self._region_scores(view, self._members_elsewhere(view, clusters))
 
     def pixel_scores(self, view: int, clusters: Ints) -> Floats:
-        """(P, K) float32: the scores of the view's P sampled pixels, see `scores`."""
+        """(K, P) float32: the scores of the view's P sampled pixels, see `scores`."""
         return self._score_pixels(view, self._members_elsewhere(view, clusters))
 
     def coverages(self, clusters: Ints) -> Floats:
@@ -123,12 +114,9 @@ class ClusterScores:
             n. The best hypothesis is chosen without n's view; pixels whose best hypothesis scores below 0 do not count,
             and hypotheses that tie share the pixel.
         """
-        keys = [members.tobytes() for members in members_of(clusters, int(clusters.max(initial=-1)) + 1)]
-        new = np.array([k for k, key in enumerate(keys) if key not in self._coverages], np.int64)
-        if len(new):
-            fresh = self._cover(clusters, new)
-            self._coverages.update({keys[k]: fresh[n] for n, k in enumerate(new.tolist())})
-        return np.stack([self._coverages[key] for key in keys]) if keys else np.zeros((0, len(clusters)), np.float32)
+        keys = [members.tobytes() for members in members_of(clusters)]
+        found = _look_up(self._coverages, keys, lambda new: self._cover(clusters, np.array(new)))
+        return np.stack(found) if found else np.zeros((0, len(clusters)), np.float32)
 
     def covered_clusters(self) -> list[Ints]:
         """The members of every cluster whose coverages were asked for: all that a search has seen."""
@@ -136,22 +124,22 @@ class ClusterScores:
 
     def own(self, clusters: Ints) -> Floats:
         """(D,) score of each region in its own cluster, its own view left out; `clusters` (D,) in [0, K)."""
-        members = members_of(clusters, int(clusters.max(initial=-1)) + 1)
-        keys = [cluster.tobytes() for cluster in members]
-        new = np.array([k for k, key in enumerate(keys) if key not in self._own], np.int64)
-        if len(new):
-            fresh = self._score_own(clusters, new)
-            self._own.update({keys[k]: fresh[members[k]] for k in new.tolist()})
-        own = np.zeros(len(clusters))
-        for key, cluster in zip(keys, members, strict=True):
-            own[cluster] = self._own[key]
+        members = members_of(clusters)
+
+        def score(new: list[int]) -> list[Floats]:
+            fresh = self._score_own(clusters, np.array(new))
+            return [fresh[members[k]] for k in new]
+
+        own, found = np.zeros(len(clusters)), _look_up(self._own, [each.tobytes() for each in members], score)
+        for cluster, of_cluster in zip(members, found, strict=True):
+            own[cluster] = of_cluster
         return own
 
     def value(self, clusters: Ints) -> float:
         """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all
         pairs in one cluster; `clusters` (D,) in [0, K)."""
         is_alone = np.bincount(clusters)[clusters] < 2
-        pairs = self.pair_factor * float((self.evidence * self.together(clusters)).sum()) / 2
+        pairs = self.pair_factor * float(self.graph.sum_partners(self.evidence, clusters).sum()) / 2
         return float(self.own(clusters)[~is_alone].sum()) + pairs
 
     def explained(self, clusters: Ints) -> float:
@@ -174,165 +162,184 @@ class ClusterScores:
             clusters: (D,) cluster of each region in [0, K), -1 for regions to leave out.
             coverages: `coverages` of an earlier partition; newer clusters, which it does not have, cover nothing.
         """
-        here = self.sweep.bounds.regions(view)
-        is_other = (self.sweep.view_index != view) & (clusters >= 0)
-        numbers, inverse = np.unique(clusters[is_other], return_inverse=True)
-        compact = np.full(len(clusters), -1)
-        compact[is_other] = inverse
-        score = self.scores(view, compact)
+        here, members = self.sweep.bounds.regions(view), self._members_elsewhere(view, clusters)
+        sizes = np.array([len(each) for each in members], np.int64)
+        numbers = np.flatnonzero(sizes)
+        score = self._region_scores(view, [members[number] for number in numbers])
         coverage = np.zeros_like(score)
         has_coverage = numbers < len(coverages)
         coverage[:, has_coverage] = coverages[numbers[has_coverage], here].T
-        members = np.zeros((len(clusters), len(numbers) + 1))
-        members[np.arange(len(clusters)), compact] = 1  # the last column collects the view itself
-        pairs = self.pair_factor * (self.evidence[here] @ members[:, :-1])
-        return ViewGains(numbers, score, coverage, score + self.config.gains.coverage * coverage + pairs)
+        evidence = self.evidence[here].take(np.concatenate([*members, numbers[:0]]), 1)
+        pairs = np.add.reduceat(evidence, (sizes.cumsum() - sizes)[numbers], 1)
+        total = score + self.config.gains.coverage * coverage + self.pair_factor * pairs
+        return ViewGains(numbers, score, coverage, total)
 
     @property
     def pair_factor(self) -> float:
         """Gain per unit of epipolar evidence for a pair, in this number of views."""
         return self.config.gains.pair_factor(self.sweep.num_views)
 
-    def together(self, clusters: Ints) -> NDArray[np.bool_]:
-        """(D, D) whether two regions of different views are in one cluster."""
-        views = self.sweep.view_index
-        return (clusters[:, None] == clusters) & (views[:, None] != views)
-
     def _members_elsewhere(self, view: int, clusters: Ints) -> list[Ints]:
         """The members of clusters 0 .. K - 1 in other views."""
         elsewhere = np.where(self.sweep.view_index == view, -1, clusters)
         return members_of(elsewhere, int(clusters.max(initial=-1)) + 1)
 
+    def _region_scores(self, view: int, members: list[Ints]) -> Floats:
+        """(N, C) float32: the scores of the view's regions in C clusters, cached."""
+        keys, here = [(view, each.tobytes()) for each in members], self.sweep.bounds.regions(view)
+        found = _look_up(self._scores, keys, lambda new: self._score_clusters(view, [members[k] for k in new]))
+        return np.stack(found, 1) if found else np.zeros((here.stop - here.start, 0), np.float32)
+
     def _score_clusters(self, view: int, members: list[Ints]) -> Floats:
-        """(N, C) float32: the scores of the view's regions in C clusters."""
-        best = self._score_pixels(view, members)
+        """(C, N) float32: the scores of the view's regions in C clusters."""
         regions, pixels = self.sweep.bounds.regions(view), self.sweep.bounds.pixels(view)
         owner = self.sweep.pixel_region[pixels] - regions.start
         start = run_starts(owner)
-        score = np.full((regions.stop - regions.start, len(members)), -self.config.costs.hidden, np.float32)
+        score = np.full((len(members), regions.stop - regions.start), -self.config.costs.hidden, np.float32)
         if len(start):
-            counts = np.diff(np.append(start, len(best)))[:, None].astype(np.float32)
-            score[owner[start]] = np.add.reduceat(best, start, 0) / counts
+            counts = np.diff(start, append=len(owner)).astype(np.float32)
+            score[:, owner[start]] = np.add.reduceat(self._score_pixels(view, members), start, 1) / counts
         return score
 
     def _score_pixels(self, view: int, members: list[Ints]) -> Floats:
-        """(P, C) float32: the scores of the view's pixels in C clusters without members in this view."""
-        sweep, hidden, num_clusters = self.sweep, self.config.costs.hidden, len(members)
-        pixels, hypotheses = sweep.bounds.pixels(view), sweep.bounds.hypotheses(view)
-        best = np.full((pixels.stop - pixels.start, num_clusters), -hidden, np.float32)
-        start = run_starts(sweep.pixel[hypotheses])
-        if not len(start):
-            return best
-        score = sweep.hypotheses_of_regions(view).count(members)  # hypotheses vary fastest: the maximum runs over them
-        labels = sweep.labels[hypotheses]
-        is_empty = (labels == EMPTY).T
-        num_inside = (labels >= EMPTY).sum(1, dtype=np.float32)
-        shares = np.empty((len(is_empty) + 1, len(labels)), np.float32)  # of the views inside: each empty one, labelled
-        np.divide(is_empty, num_inside, out=shares[:-1])
-        shares[-1] = 1 - is_empty.sum(0) / num_inside
-        costs = np.pad(self._empty_costs(members), ((0, 0), (0, 1)), constant_values=hidden)
-        score *= np.float32(1 + hidden) / num_inside
-        score -= costs @ shares
-        pixel = sweep.pixel[hypotheses][start] - pixels.start
-        best[pixel] = np.maximum(np.maximum.reduceat(score, start, 1), np.float32(-hidden)).T
+        """(C, P) float32: the scores of the view's pixels in C clusters without members in this view.
+
+        Hypotheses that show no member are not looked at: no view costs less than a hidden one, so that they score no
+        more than the least that a pixel has.
+        """
+        pixels, here = self.sweep.bounds.pixels(view), self.sweep.bounds.hypotheses(view)
+        least = np.float32(-self.config.costs.hidden)
+        best = np.full((len(members), pixels.stop - pixels.start), least)
+        cluster, hypothesis, count = self.sweep.hypotheses_of_regions(view).count(members)
+        hypothesis += here.start
+        score = self._score_hypotheses(hypothesis, count, views=pack_views(self._has_region(members)).take(cluster, 1))
+        place = cluster * best.shape[1] + (self.sweep.pixel.take(hypothesis) - pixels.start)
+        start = run_starts(place)
+        best.ravel()[place[start]] = np.maximum(np.maximum.reduceat(score, start), least)
         return best
 
-    def _empty_costs(self, members: list[Ints]) -> Floats:
-        """(C, V) float32: what a view without a region costs each cluster."""
-        has_mask = np.zeros((len(members), self.sweep.num_views), bool)
+    def _score_hypotheses(self, hypotheses: Ints, count: Ints, *, views: NDArray[np.uint64]) -> Floats:
+        """(R,) float32: the scores of hypotheses (R,) that show members of a cluster in `count` (R,) views, where
+        `views` (W, R) has a bit for each view in which the cluster has a region."""
+        costs, empty_views = self.config.costs, self.sweep.empty_views
+        missing = np.zeros(len(hypotheses), np.float32)
+        for empty, shown in zip(empty_views, views, strict=True):
+            missing += np.bitwise_count(empty.take(hypotheses) & shown)
+        score = np.float32(1 + costs.hidden) * count.astype(np.float32)
+        score -= np.float32(costs.missing - costs.absent) * missing
+        score /= self.sweep.num_inside.take(hypotheses)
+        score -= self._costs_without_members.take(hypotheses)
+        return score
+
+    @cached_property
+    def _costs_without_members(self) -> Floats:
+        """(I,) float32: what each hypothesis costs a cluster that none of its views shows."""
+        costs = self.config.costs
+        share = np.bitwise_count(self.sweep.empty_views).sum(0, dtype=np.float32) / self.sweep.num_inside
+        return np.float32(costs.hidden) + np.float32(costs.absent - costs.hidden) * share
+
+    def _has_region(self, members: list[Ints]) -> NDArray[np.bool_]:
+        """(C, V): in which views clusters have a region."""
+        has_region = np.zeros((len(members), self.sweep.num_views), bool)
         for number, regions in enumerate(members):
-            has_mask[number, self.sweep.view_index[regions]] = True
-        return np.where(has_mask, self.config.costs.missing, self.config.costs.absent).astype(np.float32)
+            has_region[number, self.sweep.view_index[regions]] = True
+        return has_region
 
     def _cover(self, clusters: Ints, asked: Ints) -> Floats:
         """(C, D) float32: the coverages of the C clusters in `asked`."""
-        num_regions, num_views = len(clusters), self.sweep.num_views
+        sweep, costs, num_regions, num_views = self.sweep, self.config.costs, len(clusters), self.sweep.num_views
         index_of = np.full(int(clusters.max(initial=-1)) + 1, -1)
         index_of[asked] = np.arange(len(asked))
-        num_pixels = np.zeros((len(asked), num_views))
-        covered = np.zeros((len(asked), num_regions))
-        for block in self._hypothesis_gains(clusters, asked):
-            hypothesis, view, share = block.best_elsewhere(self.sweep.view_index[block.region])
-            cluster, label = index_of[clusters[block.region[hypothesis]]], block.labels[hypothesis, view]
+        has_region = self._has_region(members_of(clusters))
+        empty = np.where(has_region, np.float32(-costs.missing), np.float32(-costs.absent))
+        num_pixels, covered = np.zeros((len(asked), num_views)), np.zeros((len(asked), num_regions))
+        for hypotheses, score, is_own in self._own_hypotheses(clusters, asked):
+            keep = self._may_be_best(hypotheses, score)
+            pixel, labels = sweep.pixel[hypotheses[keep]], sweep.labels[hypotheses[keep]]
+            region = sweep.pixel_region[pixel]
+            gain = np.where(is_own[keep], np.float32(1), np.float32(-costs.hidden))
+            np.copyto(gain, empty[clusters[region]], where=labels == EMPTY)
+            np.copyto(gain, 0, where=labels == OUTSIDE)
+            hypothesis, view, share = best_elsewhere(gain, labels != OUTSIDE, pixel, own_view=sweep.view_index[region])
+            cluster, label = index_of[clusters[region[hypothesis]]], labels[hypothesis, view]
             num_pixels += np.bincount(cluster * num_views + view, share, num_pixels.size).reshape(num_pixels.shape)
             hit = label >= 0
-            covered += np.bincount(cluster[hit] * num_regions + label[hit], share[hit], covered.size).reshape(
-                covered.shape
-            )
-        return (covered / np.maximum(num_pixels, 1e-9)[:, self.sweep.view_index]).astype(np.float32)
+            place = cluster[hit] * num_regions + label[hit]
+            covered += np.bincount(place, share[hit], covered.size).reshape(covered.shape)
+        return (covered / np.maximum(num_pixels, 1e-9)[:, sweep.view_index]).astype(np.float32)
+
+    def _may_be_best(self, hypotheses: Ints, score: Floats) -> NDArray[np.bool_]:
+        """(R,) whether a hypothesis may be the best of its pixel when one view does not count: that view gives 1 at
+        most, and costs `missing` or `absent` at most."""
+        num_inside, pixel = self.sweep.num_inside[hypotheses], self.sweep.pixel[hypotheses]
+        total, others = score * num_inside, np.maximum(num_inside - 1, 1)
+        most = np.maximum(score, (total + max(self.config.costs.missing, self.config.costs.absent)) / others)
+        least, start = np.minimum(score, (total - 1) / others), run_starts(pixel)
+        best = np.maximum(np.maximum.reduceat(least, start), 0)
+        return most + SLACK >= np.repeat(best, np.diff(start, append=len(pixel)))
 
     def _score_own(self, clusters: Ints, asked: Ints) -> Floats:
         """(D,) score of each region in its own cluster, for those in the clusters `asked`."""
         sweep, hidden = self.sweep, self.config.costs.hidden
         best = np.full(len(sweep.pixel_region), -hidden)
-        for block in self._hypothesis_gains(clusters, asked):
-            score = block.gain.sum(1) / np.maximum(block.is_inside.sum(1), 1)
-            best[block.pixel[block.start]] = np.maximum(np.maximum.reduceat(score, block.start), -hidden)
+        for hypotheses, score, _ in self._own_hypotheses(clusters, asked):
+            pixel = sweep.pixel[hypotheses]
+            start = run_starts(pixel)
+            best[pixel[start]] = np.maximum(np.maximum.reduceat(score, start), -hidden)
         counts = np.bincount(sweep.pixel_region, minlength=len(clusters))
         return np.bincount(sweep.pixel_region, best, len(clusters)) / np.maximum(counts, 1)
 
-    def _hypothesis_gains(self, clusters: Ints, asked: Ints) -> Iterator[_HypothesisGains]:
-        """What each view adds to the score of the regions of the clusters `asked` in their own cluster, hypothesis by
-        hypothesis."""
-        sweep, hidden = self.sweep, np.float32(self.config.costs.hidden)
+    def _own_hypotheses(self, clusters: Ints, asked: Ints) -> Iterator[tuple[Ints, Floats, NDArray[np.bool_]]]:
+        """The hypotheses (R,) on rays of the regions of the clusters `asked`, some pixels at a time; their scores (R,)
+        in the region's own cluster, and (R, V) which views show it."""
+        sweep = self.sweep
         is_asked = np.zeros(int(clusters.max(initial=-1)) + 1, bool)
         is_asked[asked] = True
-        hypotheses = np.flatnonzero(is_asked[clusters][sweep.pixel_region][sweep.pixel])
-        cluster_of = np.append(clusters, [-1, -1]).astype(np.int32)  # the last two for EMPTY and OUTSIDE
-        empty = self._empty_costs(members_of(clusters, len(is_asked)))
-        for block in blocks_of_runs(run_starts(sweep.pixel[hypotheses]), len(hypotheses)):
-            pixel, labels = sweep.pixel[hypotheses[block]], sweep.labels.take(hypotheses[block], 0)
-            region = sweep.pixel_region[pixel]
-            own = cluster_of[region]
-            gain = np.where(cluster_of.take(labels) == own[:, None], np.float32(1), -hidden)
-            np.copyto(gain, -empty[own], where=labels == EMPTY)
-            is_inside = labels >= EMPTY
-            np.copyto(gain, 0, where=~is_inside)
-            yield _HypothesisGains(
-                labels=labels, pixel=pixel, region=region, start=run_starts(pixel), gain=gain, is_inside=is_inside
-            )
+        every = np.flatnonzero(is_asked[clusters][sweep.pixel_region][sweep.pixel])
+        kind = np.int16 if len(is_asked) < 2**15 else np.int32
+        cluster_of = np.append(clusters, [-1, -1]).astype(kind)  # the last two for EMPTY and OUTSIDE
+        views = pack_views(self._has_region(members_of(clusters)))
+        for block in blocks_of_runs(run_starts(sweep.pixel[every]), len(every)):
+            hypotheses = every[block]
+            own = cluster_of[sweep.pixel_region[sweep.pixel[hypotheses]]]
+            is_own = cluster_of.take(sweep.labels.take(hypotheses, 0)) == own[:, None]
+            yield hypotheses, self._score_hypotheses(hypotheses, is_own.sum(1), views=views.take(own, 1)), is_own
 
 
-@dataclass(frozen=True, eq=False)
-class _HypothesisGains:
-    """R whole runs of hypotheses, with what each view adds to the score of the region in its own cluster.
+def best_elsewhere(
+    gain: Floats, is_inside: NDArray[np.bool_], pixel: Ints, *, own_view: Ints
+) -> tuple[Ints, Ints, Floats]:
+    """The best hypotheses of each pixel when one view does not count.
 
-    Attributes:
-        labels: (R, V), the hypotheses.
-        pixel: (R,) int64, the pixel of each.
-        region: (R,) int64, the region of that.
-        start: where the hypotheses of a pixel start.
-        gain: (R, V) float32; the sum of the gains over the number of views that the point lies in is the score.
-        is_inside: (R, V) bool, whether the point lies in that view.
+    Args:
+        gain: (R, V) float32, what each view adds to the score of whole runs of hypotheses; their sum over the number of
+            views that the point lies in is the score.
+        is_inside: (R, V) whether the point lies in that view.
+        pixel: (R,) int64, the pixel of each, ascending.
+        own_view: (R,) int64, the view of that, for which there is no answer.
+
+    Returns:
+        Three arrays with one entry per best hypothesis: the hypothesis, the view left out, and the hypothesis's share
+        of the pixel: hypotheses that tie within 1e-6 share it. A pixel whose best hypothesis scores below 0 has none.
     """
+    start = run_starts(pixel)
+    lengths = np.diff(start, append=len(pixel))
+    score = gain.sum(1)[:, None] - gain
+    score /= np.maximum(is_inside.sum(1, dtype=np.float32)[:, None] - is_inside, np.float32(1))
+    best = np.maximum.reduceat(score, start, 0)
+    least = np.where(best >= 0, best - np.float32(1e-6), np.float32(np.inf))
+    is_best = score >= np.repeat(least, lengths, 0)
+    is_best[np.arange(len(score)), own_view] = False
+    hypothesis, view = is_best.nonzero()
+    tie = np.repeat(np.arange(len(lengths)), lengths)[hypothesis] * score.shape[1] + view
+    return hypothesis, view, 1 / np.bincount(tie)[tie]
 
-    labels: NDArray[np.integer]
-    pixel: Ints
-    region: Ints
-    start: Ints
-    gain: Floats
-    is_inside: NDArray[np.bool_]
 
-    def best_elsewhere(self, own_view: Ints) -> tuple[Ints, Ints, Floats]:
-        """The best hypotheses of each pixel when one view does not count.
-
-        Args:
-            own_view: (R,) int64, the view of each hypothesis's pixel, for which there is no answer.
-
-        Returns:
-            Three arrays with one entry per best hypothesis: the hypothesis, the view left out, and the hypothesis's
-            share of the pixel: hypotheses that tie within 1e-6 share it. A pixel whose best hypothesis scores below 0
-            has none.
-        """
-        total, count = self.gain.sum(1), self.is_inside.sum(1, dtype=np.float32)
-        score = total[:, None] - self.gain
-        score /= np.maximum(count[:, None] - self.is_inside, np.float32(1))
-        best = np.maximum.reduceat(score, self.start, 0)
-        lengths = np.diff(np.append(self.start, len(score)))
-        least = np.where(best >= 0, best - np.float32(1e-6), np.float32(np.inf))
-        is_best = score >= np.repeat(least, lengths, 0)
-        is_best[np.arange(len(score)), own_view] = False
-        hypothesis, view = is_best.nonzero()
-        run = np.repeat(np.arange(len(lengths)), lengths)[hypothesis]
-        tie = run * score.shape[1] + view
-        return hypothesis, view, 1 / np.bincount(tie)[tie]
+def _look_up(
+    cache: dict[Key, Floats], keys: list[Key], compute: Callable[[list[int]], Iterable[Floats]]
+) -> list[Floats]:
+    """What is cached for the keys; `compute` gives it for the places of those that are not there yet."""
+    new = [place for place, key in enumerate(keys) if key not in cache]
+    if new:
+        cache.update(zip((keys[place] for place in new), compute(new), strict=True))
+    return [cache[key] for key in keys]

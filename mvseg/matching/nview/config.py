@@ -15,7 +15,7 @@ class HypothesisCosts:
     Attributes:
         missing: cost of no region there, although the cluster has one in this view.
         absent: cost of no region there when the cluster has none in this view (its mask may be missed).
-        hidden: cost of a region of another cluster there; also the most that a pixel can cost.
+        hidden: cost of a region of another cluster there, no more than the others; also the most that a pixel can cost.
     """
 
     missing: float = 0.7
@@ -80,11 +80,5 @@ class NViewConfig:
         neighbour."""
         if num_views > 3:
             return self
-        fragment_coverage, fragment_score = (
-            max(self.thresholds.fragment_coverage, 0.1),
-            max(self.thresholds.fragment_score, 0.8),
-        )
-        return replace(
-            self,
-            thresholds=replace(self.thresholds, fragment_coverage=fragment_coverage, fragment_score=fragment_score),
-        )
+        coverage, score = max(self.thresholds.fragment_coverage, 0.1), max(self.thresholds.fragment_score, 0.8)
+        return replace(self, thresholds=replace(self.thresholds, fragment_coverage=coverage, fragment_score=score))

@@ -1,13 +1,13 @@
-"""Which hypotheses name which regions."""
+"""Which hypotheses name which regions, and sets of views as bits."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
-Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
@@ -17,28 +17,47 @@ class HypothesesOfRegions:
 
     Attributes:
         hypotheses: int32, the hypotheses of region 0, then those of region 1, ...
-        offsets: (D + 1,) int64: region d is named by `hypotheses[offsets[d]:offsets[d + 1]]`.
+        offsets: D + 1 numbers: region d is named by `hypotheses[offsets[d]:offsets[d + 1]]`.
         num_hypotheses: R.
     """
 
     hypotheses: NDArray[np.int32]
-    offsets: Ints
+    offsets: list[int]
     num_hypotheses: int
 
-    def count(self, clusters: list[Ints]) -> Floats:
-        """(C, R) float32: how many views show a member of each of C clusters in each hypothesis."""
-        counts = np.zeros((len(clusters), self.num_hypotheses), np.float32)
-        for number, members in enumerate(clusters):
-            parts = [self.hypotheses[self.offsets[region] : self.offsets[region + 1]] for region in members.tolist()]
-            if parts:
-                counts[number] = np.bincount(np.concatenate(parts), minlength=self.num_hypotheses)
-        return counts
+    def count(self, clusters: list[Ints]) -> tuple[Ints, Ints, Ints]:
+        """How many views show a member of each of C clusters, in the hypotheses in which any does.
+
+        Returns:
+            Three int64 arrays with an entry per cluster and hypothesis, in this order: cluster, hypothesis, views.
+        """
+        parts = [
+            [self.hypotheses[self.offsets[region] : self.offsets[region + 1]] for region in members.tolist()]
+            for members in clusters
+        ]
+        lengths = [sum(map(len, of_cluster)) for of_cluster in parts]
+        kind = np.int32 if len(clusters) * self.num_hypotheses < 2**31 else np.int64
+        first = np.arange(len(clusters), dtype=kind) * kind(self.num_hypotheses)  # of each cluster
+        cell = np.repeat(first, lengths)
+        if len(cell):
+            cell += np.concatenate(list(chain.from_iterable(parts)))
+        cell.sort()
+        start = np.flatnonzero(np.append(True, cell[1:] != cell[:-1])) if len(cell) else np.zeros(0, np.int64)
+        cell, views = cell[start], np.diff(start, append=len(cell))
+        cluster = np.repeat(np.arange(len(clusters)), np.diff(np.searchsorted(cell, first), append=len(cell)))
+        return cluster, cell - first[cluster], views
 
 
 def index_hypotheses(labels: NDArray[np.integer], num_regions: int) -> HypothesesOfRegions:
     """The index of R hypotheses (R, V) by the regions that they name."""
     flat = labels.ravel()
     order = np.argsort(flat, kind="stable")  # of int16, a radix sort
-    offsets = np.searchsorted(flat[order], np.arange(num_regions + 1))
+    offsets = np.searchsorted(flat[order], np.arange(num_regions + 1)).tolist()
     hypotheses = (order // max(labels.shape[1], 1)).astype(np.int32)
     return HypothesesOfRegions(hypotheses=hypotheses, offsets=offsets, num_hypotheses=len(labels))
+
+
+def pack_views(is_view: NDArray[np.bool_]) -> NDArray[np.uint64]:
+    """(W, N): sets of views (N, V) as bits, 64 of them in a word."""
+    packed = np.packbits(is_view, axis=1)
+    return np.pad(packed, ((0, 0), (0, -packed.shape[1] % 8))).view(np.uint64).T.copy()

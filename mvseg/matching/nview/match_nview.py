@@ -23,8 +23,8 @@ from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.plane_sweep import PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import search
-from mvseg.matching.one_per_view import ViewGraph, link_average, one_per_view_clusters, power_iteration
-from mvseg.matching.partition import drop_singletons, number_instances, renumber, separate_unmatched
+from mvseg.matching.one_per_view import ViewGraph, link_average, power_iteration
+from mvseg.matching.partition import drop_singletons, number_instances
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -64,18 +64,12 @@ def match_nview(
     """
     order = regions.view_index.argsort(stable=True)
     ordered = regions.select(order)
-    weights = affinity.to_dense()[order][:, order].cpu().double().numpy()
-    graph = ViewGraph(weights, ordered.view_index.cpu().numpy(), len(cameras))
-    pairwise_ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))[order].cpu().numpy()
-    pairwise = renumber(separate_unmatched(pairwise_ids))
-
-    found = find_clusters(
-        ordered, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
-    )
+    graph = ViewGraph.of(affinity, regions.view_index, len(cameras)).select(order.cpu().numpy())
+    found = find_clusters(ordered, cameras, graph, config=config, residual_px=residual_px, progress=progress)
     scores, clusters = found.scores, found.clusters
     if links is not None and not links.select(order).agree(clusters):
-        scores, clusters = search_again(found, graph, links.select(order), progress=progress)
-    evidence = collect_evidence(scores, clusters, pairwise)
+        scores, clusters = search_again(found, links.select(order), progress=progress)
+    evidence = collect_evidence(scores, clusters, found.pairwise)
     report = MatchReport(
         method=found.method,
         has_probabilities=True,
@@ -96,12 +90,14 @@ class FoundClusters:
 
     Attributes:
         clusters: (D,) int64 in [0, K), regions alone included.
+        pairwise: (D,) int64, likewise, from the weights alone.
         scores: of the hypotheses.
         residual_px: see `select_dilation`.
         method: "nview", or "one-per-view" where these are the pairwise clusters.
     """
 
     clusters: Ints
+    pairwise: Ints
     scores: ClusterScores
     residual_px: int
     method: str
@@ -112,7 +108,6 @@ def find_clusters(
     cameras: Cameras,
     graph: ViewGraph,
     *,
-    pairwise: Ints,
     config: NViewConfig = NViewConfig(),
     residual_px: int | None = None,
     progress: bool = False,
@@ -123,11 +118,11 @@ def find_clusters(
         regions: D regions, ordered by view.
         cameras: V cameras.
         graph: their epipolar weights.
-        pairwise: (D,) int64, clusters from the weights alone, in [0, K).
         config: costs, gains and thresholds.
         residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
         progress: show progress bars.
     """
+    pairwise = power_iteration(graph, link_average(graph))
     scores, residual_px = select_dilation(
         regions, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
     )
@@ -136,17 +131,15 @@ def find_clusters(
         searched = search(scores, pairwise, progress=progress)
         if scores.explained(searched) >= UNEXPLAINED:
             clusters, method = searched, "nview"
-    return FoundClusters(clusters=clusters, scores=scores, residual_px=residual_px, method=method)
+    return FoundClusters(clusters, pairwise, scores, residual_px, method)
 
 
-def search_again(
-    found: FoundClusters, graph: ViewGraph, links: Links, *, progress: bool = False
-) -> tuple[ClusterScores, Ints]:
+def search_again(found: FoundClusters, links: Links, *, progress: bool = False) -> tuple[ClusterScores, Ints]:
     """The clusters that explain all views best and agree with links; and their scores.
 
     What was found without links is one more start; but each node that links name begins by itself.
     """
-    linked = links.hold(graph)
+    linked = links.hold(found.scores.graph)
     scores, pairwise = found.scores.with_graph(linked), power_iteration(linked, link_average(linked))
     if found.method != "nview":
         return scores, pairwise

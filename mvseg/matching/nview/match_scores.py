@@ -73,20 +73,27 @@ def collect_evidence(scores: ClusterScores, clusters: Ints, pairwise: Ints) -> I
         own_gain[here] = (gains.total * is_own).sum(1)
         rival_gain[here] = np.where(is_own, alone, gains.total).max(1, initial=alone)
         coverage[here] = (gains.coverage * is_own).sum(1)
-    is_partner = scores.together(clusters)
-    is_same_view = sweep.view_index[:, None] == sweep.view_index
-    num_partners = is_partner.sum(1)
-    is_paired = scores.together(pairwise)
+    num_partners, num_fragments = _count_partners(clusters, sweep.view_index)
+    num_paired, _ = _count_partners(pairwise, sweep.view_index)
+    joint = np.unique(np.stack((clusters, pairwise)), axis=1, return_inverse=True)[1]
+    num_in_both, _ = _count_partners(joint, sweep.view_index)
     return IdEvidence(
         score=score,
         margin=own_gain - rival_gain,
         coverage=coverage,
-        weight=(scores.graph.weights * is_partner).sum(1) / np.maximum(num_partners, 1),
+        weight=scores.graph.sum_partners(scores.graph.weights, clusters) / np.maximum(num_partners, 1),
         num_partners=num_partners,
-        num_fragments=((clusters[:, None] == clusters) & is_same_view).sum(1),
-        agreement=(is_partner & is_paired).sum(1) / np.maximum((is_partner | is_paired).sum(1), 1),
+        num_fragments=num_fragments,
+        agreement=num_in_both / np.maximum(num_partners + num_paired - num_in_both, 1),
         num_views=sweep.num_views,
     )
+
+
+def _count_partners(clusters: Ints, view_index: Ints) -> tuple[Ints, Ints]:
+    """(D,) members of each region's cluster in other views; and in its own view, itself included."""
+    place = clusters * (int(view_index.max(initial=0)) + 1) + view_index
+    num_fragments = np.bincount(place)[place]
+    return np.bincount(clusters)[clusters] - num_fragments, num_fragments
 
 
 def features(evidence: IdEvidence) -> Floats:

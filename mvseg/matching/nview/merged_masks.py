@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.masks import MergedMask
-from mvseg.matching.nview.cluster_scores import ClusterScores, members_of
+from mvseg.matching.nview.cluster_scores import ClusterScores
+from mvseg.matching.partition import members_of
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]
@@ -62,15 +63,15 @@ def _shared_in_view(
     asked = np.union1d(np.flatnonzero(is_second[:, here].any(1)), clusters[shared])
     column = np.full(len(is_second), -1)
     column[asked] = np.arange(len(asked))
-    own, members = scores.own(clusters), members_of(clusters, len(is_second))
+    own, members = scores.own(clusters), members_of(clusters)
     median_score = np.array([np.median(own[members[number]]) for number in asked])
-    is_explained = scores.pixel_scores(view, column[clusters]) >= HALF_AS_GOOD * median_score
+    is_explained = scores.pixel_scores(view, column[clusters]) >= HALF_AS_GOOD * median_score[:, None]
     pixel_region = scores.sweep.pixel_region[scores.sweep.bounds.pixels(view)]
     pairs = []
     for region in shared.tolist():
         candidates = np.append(clusters[region], np.flatnonzero(is_second[:, region]))
-        part = is_explained[pixel_region == region][:, column[candidates]]
-        share = (part & ~part[:, :1]).mean(0)
+        part = is_explained[column[candidates]][:, pixel_region == region]
+        share = (part & ~part[0]).mean(1)
         best = int(share.argmax())
         if share[best] >= scores.config.thresholds.merged_share:
             pairs.append((region, int(candidates[best])))
@@ -99,9 +100,9 @@ def second_part(scores: ClusterScores, clusters: Ints, regions: Regions, *, regi
     if not is_here.any():
         return part
     pair = np.where(clusters == clusters[region], 0, np.where(clusters == second, 1, -1))
-    pixel_scores = scores.pixel_scores(view, pair)[is_here]
+    pixel_scores = scores.pixel_scores(view, pair)[:, is_here]
     sampled = torch.from_numpy(sweep.pixel_xy[pixels][is_here]) - regions.boxes[region, :2].cpu()
     nearest = torch.cdist(mask_pixels.flip(1) + 0.5, sampled).topk(min(NEIGHBOURS, len(sampled)), largest=False).indices
-    advantage = torch.from_numpy(pixel_scores[:, 1] - pixel_scores[:, 0])[nearest].mean(1)
+    advantage = torch.from_numpy(pixel_scores[1] - pixel_scores[0])[nearest].mean(1)
     part[mask_pixels[:, 0], mask_pixels[:, 1]] = advantage > 0
     return part

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 from tqdm import tqdm
 
-from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hypotheses
+from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hypotheses, pack_views
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -97,12 +97,21 @@ class PlaneSweep:
             hypothesis_starts=np.searchsorted(self.pixel, pixel_starts),
         )
 
+    @cached_property
+    def num_inside(self) -> Floats:
+        """(I,) float32, the number of views that the point of each hypothesis lies in; at least 1."""
+        return (self.labels >= EMPTY).sum(1, dtype=np.float32)
+
+    @cached_property
+    def empty_views(self) -> NDArray[np.uint64]:
+        """(W, I), which views show no region there, see `pack_views`."""
+        return pack_views(self.labels == EMPTY)
+
     def hypotheses_of_regions(self, view: int) -> HypothesesOfRegions:
         """Which hypotheses on rays of one view name which regions; cached for the next call."""
         if view not in self._hypotheses_of_regions:
-            self._hypotheses_of_regions[view] = index_hypotheses(
-                self.labels[self.bounds.hypotheses(view)], len(self.view_index)
-            )
+            labels = self.labels[self.bounds.hypotheses(view)]
+            self._hypotheses_of_regions[view] = index_hypotheses(labels, len(self.view_index))
         return self._hypotheses_of_regions[view]
 
 
@@ -150,6 +159,7 @@ def rays_per_region(num_views: int) -> int:
     return max(1, round(PIXELS * min(1, PLENTY / num_views)))
 
 
+@torch.inference_mode()
 def _sweep_views(label_maps: _LabelMaps, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> PlaneSweep:
     """The sweep of the rays through pixels `xy` (Q, 2) of `region` (Q,); a title shows a progress bar."""
     num_views = len(label_maps.maps)
