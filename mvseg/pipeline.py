@@ -257,7 +257,9 @@ def check_ids(state: State) -> State:
     held = None
     if state.corrected is not None and not state.corrected.everywhere:  # these edits change the rows that links name
         held = state.corrected.links.named(len(state.masks))
-    checked = checked_ids.check_ids(state.masks, state.surfaces or {}, cameras=state.scene.cameras, held=held)
+    checked = checked_ids.check_ids(
+        state.masks, state.surfaces or {}, cameras=state.scene.cameras, held=held, config=state.config.match
+    )
     num_moved = int((state.masks.instance_ids != checked.instance_ids).sum())
     return replace(state.with_masks(checked), num_moved=num_moved)
 

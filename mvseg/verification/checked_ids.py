@@ -21,10 +21,12 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from mvseg.masks import Masks, MergedMask
+from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.verification.rematched_masks import rematch_misfits
 from mvseg.verification.visible_leaves import visible_leaves
 
 Floats = NDArray[np.float64]
@@ -43,13 +45,20 @@ EACH, BOTH = 0.2, 0.7  # of a merged mask, that shows either of its two surfaces
 MOST = 0.5  # of what its view shows of the second one, that lies in the mask
 
 
-def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras, held: Tensor | None = None) -> Masks:
+def check_ids(
+    masks: Masks,
+    surfaces: Surfaces,
+    *,
+    cameras: Cameras,
+    held: Tensor | None = None,
+    config: MatchConfig = MatchConfig(),
+) -> Masks:
     """Move masks to the instances whose surfaces they show.
 
     First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
-    halves of leaves (`join_halves`). No mask loses its id without getting another; masks that fit nothing stay where
-    they are. An instance may have several masks in a view afterwards: they show it together. Last, the masks that show
-    two surfaces are marked as merged (`find_shared`).
+    halves of leaves (`join_halves`). What still lies outside its own surface is matched once more (`rematch_misfits`).
+    No mask loses its id without getting another. An instance may have several masks in a view afterwards: they show it
+    together. Last, the masks that show two surfaces are marked as merged (`find_shared`).
 
     Args:
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces.
@@ -57,18 +66,22 @@ def check_ids(masks: Masks, surfaces: Surfaces, *, cameras: Cameras, held: Tenso
         cameras: V cameras.
         held: (D,) bool, masks that keep their ids, and whose instances are joined with none: a person knows them.
             Those that a person corrected do so in any case.
+        config: that the masks were matched with.
 
     Returns:
-        The same masks. Those with a new id have the mean match score of those that had it before. Instances that lost
-        all their masks leave gaps between the ids.
+        The same masks. Those that moved to a surface have the mean match score of those that had its id before, those
+        that were matched once more have that score. Instances that lost all their masks leave gaps between the ids.
     """
     on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
     old = masks.instance_ids.cpu().numpy()
     is_held = _is_held(masks, held)
     ids, left = _move_to_surfaces(masks, surfaces, cameras=cameras, is_held=is_held)
-    known = {*old[is_held].tolist()}
-    ids = join_halves(on_cpu, ids, {k: each for k, each in left.items() if k not in known}, cameras=cameras)
+    certain = {*old[is_held].tolist()}
+    ids = join_halves(on_cpu, ids, {k: each for k, each in left.items() if k not in certain}, cameras=cameras)
     checked = _with_ids(masks, ids)
+    known = unchanged_surfaces(masks, checked, left)
+    checked = rematch_misfits(checked, known, cameras=cameras, held=torch.from_numpy(is_held), config=config)
+    ids = checked.instance_ids.cpu().numpy()
     merged = {each.region: each for each in checked.merged}
     shared = find_shared(on_cpu, ids, left, cameras=cameras, named=list(merged.values()))
     merged |= {each.region: each for each in shared}

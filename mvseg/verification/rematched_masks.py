@@ -1,0 +1,122 @@
+"""Masks that lie outside their own surface are matched once more, all others held. Not in the paper.
+
+Where leaves are dense, the masks of one leaf may be scattered: each went to a leaf that has no mask in its view, and
+along the rays it fits there. But the surface of that leaf lies elsewhere in its photo. Freed all at once, such masks
+find each other, or the leaf that they show.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from mvseg.errors import InputWarning
+from mvseg.masks import Masks
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.links import Links
+from mvseg.matching.match import match_masks
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+INSIDE = 0.4  # of a mask, within the outline of its surface: with less of it, it shows something else
+FITS = 0.5  # IoU of the surface, fitted to it and to others, from which it shows that surface all the same
+SURE = 0.9  # match score from which the other views know better
+
+
+def rematch_misfits(
+    masks: Masks,
+    surfaces: Mapping[int, LeafSurface],
+    *,
+    cameras: Cameras,
+    held: Tensor,
+    config: MatchConfig = MatchConfig(),
+) -> Masks:
+    """Take masks that do not show their own surface out of their instances, and match them and those without an id.
+
+    All other masks stay together as they are, instances stay apart, and no mask may go back to the instance it was taken
+    from (`Links`). So it joins another one, or several of them form a new one. What finds nothing else keeps its id.
+
+    Args:
+        masks: D masks, matched by the method "nview": with any other, they stay as they are.
+        surfaces: {instance id: surface} of the instances whose masks may be taken, fitted to just these masks.
+        cameras: V cameras.
+        held: (D,) bool, masks that keep their ids.
+        config: that the masks were matched with.
+
+    Returns:
+        The same masks. Those with another id have the score of the second matching, and are forgotten to be merged; new
+        instances have the highest ids.
+    """
+    is_misfit = find_misfits(masks, surfaces, cameras=cameras) & ~held.to(masks.view_index.device)
+    if config.resolved_method != "nview" or not is_misfit.any():
+        return masks
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)  # the first matching has said it
+        matching = match_masks(masks, cameras, config, links=_links(masks.instance_ids.cpu(), is_misfit.cpu()))
+    if matching.method != "nview":
+        return masks
+    return _with_found(masks, matching.masks, is_free=is_misfit | (masks.instance_ids < 0))
+
+
+def find_misfits(masks: Masks, surfaces: Mapping[int, LeafSurface], *, cameras: Cameras) -> Tensor:
+    """(D,) bool: masks that lie outside their own surface, that do not fit it either way, and that are not sure.
+
+    For the arguments see `rematch_misfits`. Nothing hides anything here: a mask of a leaf that is half hidden lies
+    within what can be seen of the leaf. The IoU is that of the fit (`LeafSurface.iou`), which knows of masks that are
+    drawn too large or too small; 0 in views that the fit left out.
+    """
+    regions, is_misfit = masks.regions.to("cpu"), torch.zeros(len(masks), dtype=torch.bool)
+    ids, views = masks.instance_ids.cpu(), regions.view_index
+    for instance, surface in surfaces.items():
+        if not surface.exists:
+            continue
+        ious = dict(zip(surface.views.tolist(), surface.iou.nan_to_num(0).tolist(), strict=True))
+        for row in ((ids == instance) & (masks.match_scores.cpu() < SURE)).nonzero()[:, 0].tolist():
+            if ious.get(int(views[row]), 0.0) < FITS:
+                is_misfit[row] = _share_inside(regions, row, surface, cameras) < INSIDE
+    return is_misfit.to(masks.view_index.device)
+
+
+def _share_inside(regions: Regions, row: int, surface: LeafSurface, cameras: Cameras) -> float:
+    """Of one mask, what lies in the surface as its view would show it if nothing hid it."""
+    (x1, y1, x2, y2), part = surface.project_parts(cameras[[int(regions.view_index[row])]].to("cpu"))[0]
+    left, top, right, bottom = regions.boxes[row].tolist()
+    low, high = (max(x1, left), max(y1, top)), (min(x2, right), min(y2, bottom))
+    if low[0] >= high[0] or low[1] >= high[1]:
+        return 0.0
+    covered = torch.from_numpy(part[low[1] - y1 : high[1] - y1, low[0] - x1 : high[0] - x1])
+    mask = regions.crop(row)[low[1] - top : high[1] - top, low[0] - left : high[0] - left]
+    return int((mask & covered).sum()) / max(int(regions.areas[row]), 1)
+
+
+def _links(ids: Tensor, is_misfit: Tensor) -> Links:
+    """What stays together and apart; `ids` and `is_misfit` (D,)."""
+    must, cannot, firsts = [], [], []
+    for instance in ids[ids > 0].unique().tolist():
+        first, *others = ((ids == instance) & ~is_misfit).nonzero()[:, 0].tolist() or [None]
+        if first is None:
+            continue
+        must += [(first, other) for other in others]
+        cannot += [(first, row) for row in ((ids == instance) & is_misfit).nonzero()[:, 0].tolist()]
+        cannot += [(first, earlier) for earlier in firsts]
+        firsts.append(first)
+    return Links.of(must, cannot)
+
+
+def _with_found(masks: Masks, found: Masks, *, is_free: Tensor) -> Masks:
+    """The masks (D,), those that are free with the instances that were found: the ones of the others, or new ones."""
+    ids, last = masks.instance_ids.clone(), masks.num_instances
+    for number in found.instance_ids[is_free & (found.instance_ids > 0)].unique().tolist():
+        together = found.instance_ids == number
+        kept = masks.instance_ids[together & ~is_free]
+        last += not len(kept)
+        ids[together & is_free] = kept[0] if len(kept) else last
+    is_moved = ids != masks.instance_ids
+    merged = [each for each in masks.merged if not is_moved[each.region] and (ids == each.other).any()]
+    scores = torch.where(is_moved, found.match_scores, masks.match_scores)
+    return replace(masks, instance_ids=ids, match_scores=scores).with_merged(merged)
