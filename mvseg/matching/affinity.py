@@ -56,7 +56,8 @@ def region_affinity(
     senders = None if num_points is None else draw_points(view_samples(regions)[0], num_points, seed)
     edges = [torch.zeros(2, 0, dtype=torch.int64, device=regions.device)]
     weights = [torch.zeros(0, device=regions.device)]
-    with torch.inference_mode():  # thousands of small operations: what autograd notes of each is a fifth of the time
+    # thousands of small operations: on a CPU, what autograd notes of each is a fifth of the time
+    with torch.inference_mode(regions.device.type == "cpu"):
         for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):
             j_from_i, i_from_j = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
             mean = (j_from_i + i_from_j.T) / 2
