@@ -38,8 +38,8 @@ def rematch_misfits(
 ) -> Masks:
     """Take masks that do not show their own surface out of their instances, and match them and those without an id.
 
-    All other masks stay together as they are, instances stay apart, and no mask may go back to the instance it was taken
-    from (`Links`). So it joins another one, or several of them form a new one. What finds nothing else keeps its id.
+    All other masks stay together as they are, instances stay apart, and no mask goes back to the instance that it was
+    taken from (`Links`): it joins another one, or several of them form a new one. What finds nothing keeps its id.
 
     Args:
         masks: D masks, matched by the method "nview": with any other, they stay as they are.
@@ -96,7 +96,9 @@ def _share_inside(regions: Regions, row: int, surface: LeafSurface, cameras: Cam
 
 def _links(ids: Tensor, is_misfit: Tensor) -> Links:
     """What stays together and apart; `ids` and `is_misfit` (D,)."""
-    must, cannot, firsts = [], [], []
+    must: list[tuple[int, int]] = []
+    cannot: list[tuple[int, int]] = []
+    firsts: list[int] = []
     for instance in ids[ids > 0].unique().tolist():
         first, *others = ((ids == instance) & ~is_misfit).nonzero()[:, 0].tolist() or [None]
         if first is None:
