@@ -297,7 +297,7 @@ class ClusterScores:
         is_asked[asked] = True
         every = np.flatnonzero(is_asked[clusters][sweep.pixel_region][sweep.pixel])
         kind = np.int16 if len(is_asked) < 2**15 else np.int32
-        cluster_of = np.append(clusters, [-1, -1]).astype(kind)  # the last two for EMPTY and OUTSIDE
+        cluster_of: Ints = np.append(clusters, [-1, -1]).astype(kind)  # the last two for EMPTY and OUTSIDE
         views = pack_views(self._has_region(members_of(clusters)))
         for block in blocks_of_runs(run_starts(sweep.pixel[every]), len(every)):
             hypotheses = every[block]

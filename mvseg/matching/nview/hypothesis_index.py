@@ -36,8 +36,8 @@ class HypothesesOfRegions:
             for members in clusters
         ]
         lengths = [sum(map(len, of_cluster)) for of_cluster in parts]
-        kind = np.int32 if len(clusters) * self.num_hypotheses < 2**31 else np.int64
-        first = np.arange(len(clusters), dtype=kind) * kind(self.num_hypotheses)  # of each cluster
+        kind: type[np.int32 | np.int64] = np.int32 if len(clusters) * self.num_hypotheses < 2**31 else np.int64
+        first = np.arange(len(clusters)).astype(kind) * self.num_hypotheses  # of each cluster
         cell = np.repeat(first, lengths)
         if len(cell):
             cell += np.concatenate(list(chain.from_iterable(parts)))

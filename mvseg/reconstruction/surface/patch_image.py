@@ -43,7 +43,7 @@ def cover_crops(masks: MaskStack, projection: Projection) -> NDArray[np.uint8]:
     last = projection.px.shape[1] - 1
     rows, every = (np.unique(np.r_[0:last:2, last]), 2) if last > 20 else (np.arange(last + 1), 1)
     covered = np.zeros((len(masks), *masks.size), np.uint8)
-    fill_grids(covered, projection.px[:, rows, ::every])
+    fill_grids(list(covered), projection.px[:, rows, ::every])
     return covered
 
 
