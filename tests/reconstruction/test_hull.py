@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -50,7 +52,7 @@ def test_hull_is_all_voxels_that_most_masks_show(num_views: int) -> None:
 
 def test_what_another_instance_may_hide_is_not_free() -> None:
     masks = stack(3)
-    hidden = masks.with_others(np.where(masks.inside, 0, 7).astype(np.int32))
+    hidden = replace(masks, others=np.where(masks.inside, 0, 7).astype(np.int32))
     points = carve_hull(masks).points
     inside, free = look_at(masks, points)
     assert (inside | free).all()

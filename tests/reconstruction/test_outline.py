@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import cv2
 import numpy as np
@@ -122,7 +122,7 @@ def test_where_another_instance_hides_the_leaf_it_need_not_shrink() -> None:
     other = NOTHING.copy()
     other[:, SIZE // 2 :] = 7
     hidden, bare = stack(others=[other] * 4), stack(others=[other] * 4)
-    bare = bare.with_others(np.zeros_like(bare.others))
+    bare = replace(bare, others=np.zeros_like(bare.others))
     with_rule = outline_distances(hidden, GRID, ellipse(), reach=14.0, is_imaged=False)
     without = outline_distances(bare, GRID, ellipse(), reach=14.0, is_imaged=False)
     assert (without.px < -5).sum() > 10

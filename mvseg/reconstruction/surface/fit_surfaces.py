@@ -205,17 +205,18 @@ def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found
     tried = [*found.tried]
     for start in starts:
         patch, _ = approach_patch(masks, start, steps=FIRST_HALF)
-        score = _score(masks, patch)
+        score = _rank(masks, patch) - _area_cost(patch)
         if not any(score < other_score + LEAST_GAIN and is_same(patch, other) for other_score, other in tried):
             tried.append((score, patch))
     most = max(score for score, _ in tried)
     for score, patch in tried[len(found.tried) :]:
         if score > most - HOPELESS:
             moved, offsets = approach_patch(masks, patch, steps=SECOND_HALF)
-            better = _score(masks, moved, offsets)
+            rank = _rank(masks, moved, offsets)
+            better = rank - _area_cost(moved)
             if better > found.score + LEAST_GAIN:
-                rank, plain = _rank(masks, moved, offsets), _rank(masks, moved)
-                found = _Found(moved, better, is_good=rank + FORGIVEN * max(0.0, rank - plain) > GOOD_IOU)
+                explained = max(0.0, rank - _rank(masks, moved))
+                found = _Found(moved, better, is_good=rank + FORGIVEN * explained > GOOD_IOU)
     return replace(found, tried=tuple(tried))
 
 
@@ -227,9 +228,9 @@ def is_same(first: Floats, second: Floats) -> bool:
     return gap < SAME * measure_patch(first).length
 
 
-def _score(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None) -> float:
-    """How well a patch explains the masks, and how much like a leaf it is."""
-    return _rank(masks, coefficients, offsets) - AREA_COST * float(np.log(measure_sizes(coefficients)[0]))
+def _area_cost(coefficients: Floats) -> float:
+    """What is taken off the rank of a patch before it is compared with others."""
+    return AREA_COST * float(np.log(measure_sizes(coefficients)[0]))
 
 
 def _start_groups(masks: MaskStack, hull: Hull) -> list[list[Floats]]:
@@ -300,7 +301,7 @@ def _fit_again(
     margin = BEHIND * measure_patch(fit.coefficients).length
     others = {other: grid for other, grid in points.items() if other != instance}
     hiding = hiding_pixels(masks, points[instance], others, margin=margin)
-    masks = masks.with_others(hiding)
+    masks = replace(masks, others=hiding)
     return masks, fit_patch(masks, fit.coefficients, errors=errors)
 
 

@@ -152,12 +152,6 @@ class LeafSurface:
         return self.points()[:, MESH_SHAPE[1] // 2]
 
     @property
-    def rim(self) -> Tensor:
-        """(P, 3) once around, closed: the last point is not the first."""
-        points = self.points()
-        return torch.cat((points[:, 0], points[1:-1, -1].flip(0)))
-
-    @property
     def normal(self) -> Tensor:
         """(3,) unit mean normal of the mesh, weighted by area."""
         mesh = self.mesh()

@@ -89,10 +89,10 @@ class MaskStack:
     def select(self, keep: NDArray[np.bool_]) -> MaskStack:
         """Only the views (S,) that are to be kept."""
         edges = keep[self.edge_stack]
-        return MaskStack(
+        return replace(
+            self,
             views=self.views[keep],
             px_from_world=self.px_from_world[keep],
-            pixel_size=self.pixel_size,
             blurred=self.blurred[keep],
             inside=self.inside[keep],
             others=self.others[keep],
@@ -100,10 +100,6 @@ class MaskStack:
             edge_normals=self.edge_normals[edges],
             edge_stack=(np.cumsum(keep) - 1)[self.edge_stack[edges]],
         )
-
-    def with_others(self, others: Labels) -> MaskStack:
-        """The same masks, with what hides the leaf as (S, H, W) int32."""
-        return replace(self, others=others)
 
     def move_world(self, centre: Floats, scale: float) -> MaskStack:
         """The same masks for world coordinates (x - centre) / scale; depths are divided by `scale`, too."""

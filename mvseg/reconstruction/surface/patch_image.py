@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import cv2
@@ -101,7 +101,7 @@ def grow(canvas: NDArray[np.uint8], px: float) -> NDArray[np.uint8]:
     return grown
 
 
-def fill_grids(canvases: Sequence[NDArray[np.uint8]], px: Floats) -> None:
+def fill_grids(canvases: Iterable[NDArray[np.uint8]], px: Floats) -> None:
     """Set the pixels of S canvases (H, W) that projected grids (S, rows, columns, 2) cover to 255.
 
     Its rim as one polygon has all pixels under an odd number of layers. Where there are two, one of them is seen from
