@@ -1033,7 +1033,7 @@ def test_interrupted(monkeypatch: pytest.MonkeyPatch, plant: Path, capsys: pytes
     def stop(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", stop)
+    monkeypatch.setattr("mvseg.runs.one_scene.run_one_scene", stop)
     assert main(["infer", str(plant)]) == 130
     assert capsys.readouterr().err == "mvseg: interrupted\n"
 
@@ -1047,10 +1047,10 @@ def test_an_interruption_that_a_library_makes_another_error_of(
         except KeyboardInterrupt as error:
             raise ImportError("cannot load C++") from error
 
-    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", stop)
+    monkeypatch.setattr("mvseg.runs.one_scene.run_one_scene", stop)
     assert main(["infer", str(plant)]) == 130
     assert capsys.readouterr().err == "mvseg: interrupted\n"
-    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", lambda *_, **__: 1 / 0)
+    monkeypatch.setattr("mvseg.runs.one_scene.run_one_scene", lambda *_, **__: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         main(["infer", str(plant)])
 
@@ -1089,7 +1089,7 @@ def test_a_warning_is_one_line(plant: Path, monkeypatch: pytest.MonkeyPatch) -> 
         warnings.warn("for developers", UserWarning, stacklevel=1)
 
     said = io.StringIO()
-    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", warn)
+    monkeypatch.setattr("mvseg.runs.one_scene.run_one_scene", warn)
     monkeypatch.setattr(sys, "stderr", said)
     with warnings.catch_warnings():
         warnings.simplefilter("default")
@@ -1119,7 +1119,7 @@ def test_infer_fits_in_so_many_processes(
     given: list[str], expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
-    monkeypatch.setattr("mvseg.cli.infer.run_one_scene", lambda *_, num_workers, **__: asked.append(num_workers))
+    monkeypatch.setattr("mvseg.runs.one_scene.run_one_scene", lambda *_, num_workers, **__: asked.append(num_workers))
     assert main(["infer", str(tmp_path), *given]) == 0
     assert asked == [expected]
 

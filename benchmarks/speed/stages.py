@@ -40,7 +40,7 @@ from mvseg.system.worker_pool import start_workers
 
 Value = TypeVar("Value")
 PROPOSALS = 100  # of each view, for the loop
-DETECTOR, PHOTO_SIDE = "leaf-slim", 800
+DETECTOR, PHOTO_SIDE = "leaf-lite", 800
 
 
 class Stopwatch:

@@ -234,7 +234,7 @@ def _thin(samples: Samples) -> Tensor:
 def dilate(counts: Tensor, radius: int) -> Tensor:
     """(N, B) counts or bool -> (N, B) float32 of 0 and 1: bins within `radius` bins of one that is not 0."""
     occupied = (counts if counts.is_floating_point() else counts.float()).sign()
-    return torch.nn.functional.max_pool1d(occupied[None], 2 * radius + 1, stride=1, padding=radius)[0]
+    return torch.nn.functional.max_pool1d(occupied[:, None], 2 * radius + 1, stride=1, padding=radius)[:, 0]
 
 
 def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:

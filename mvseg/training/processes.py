@@ -73,9 +73,10 @@ def join_processes(device: str) -> Iterator[Processes]:
         device: "cpu", "cuda" or "auto" (a GPU when there is one); with GPUs, each process of a machine takes its own.
 
     Raises:
-        InputError: an unknown device, or one that this machine does not have.
+        InputError: an unknown device, or one that this machine does not have; or environment variables of
+            torchrun that are not numbers.
     """
-    rank, count, local_rank = (int(os.environ.get(key, 0)) for key in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
+    rank, count, local_rank = (_read_number(key) for key in ("RANK", "WORLD_SIZE", "LOCAL_RANK"))
     kind = ("cuda" if torch.cuda.is_available() else "cpu") if device == "auto" else device
     if kind not in ("cpu", "cuda") or (kind == "cuda" and local_rank >= torch.cuda.device_count()):
         raise InputError(f"device '{device}' (process {local_rank}) is not available, expected cpu, cuda or auto")
@@ -88,3 +89,11 @@ def join_processes(device: str) -> Iterator[Processes]:
     dist.init_process_group("nccl" if kind == "cuda" else "gloo")
     yield Processes(rank, count, chosen)
     dist.destroy_process_group()  # not after an exception: it would wait for processes that wait for this one
+
+
+def _read_number(key: str) -> int:
+    """One of the numbers that torchrun gives its processes; 0 without torchrun."""
+    value = os.environ.get(key, "0")
+    if not (value.isascii() and value.isdigit() and len(value) < 10):
+        raise InputError(f"the environment variable {key} is '{value[:20]}', expected a number as torchrun sets it")
+    return int(value)

@@ -54,7 +54,7 @@ def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> No
     folder = write_scene(tmp_path / "plant")
     names = []
 
-    def note(made_by: str = "leaf-slim") -> None:
+    def note(made_by: str = "leaf-lite") -> None:
         names.append(CachedDetections(tmp_path / "kept", made_by).path(load_scene(folder), 1))
 
     note()

@@ -220,8 +220,8 @@ def test_a_folder_of_other_things_is_left_alone_and_a_failed_start_leaves_none(l
     with pytest.raises(InputError, match="holds files that no training run wrote"):
         train(make_config(leaves, tmp_path / "mine"), build_tiny())
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
-    with pytest.raises(InputError, match="leaf-slimm"):
-        train(make_config(leaves, tmp_path / "out", weights="leaf-slimm"))
+    with pytest.raises(InputError, match="leaf-litee"):
+        train(make_config(leaves, tmp_path / "out", weights="leaf-litee"))
     assert not (tmp_path / "out").exists()
 
 

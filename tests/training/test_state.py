@@ -125,13 +125,13 @@ def test_the_backbone_learns_at_its_own_rate(tmp_path: Path) -> None:
 
 def test_a_new_backbone_under_heads_that_have_learned(tmp_path: Path) -> None:
     photos, labels = write_photos(tmp_path / "data", 2)
-    config = make_config(tmp_path / "data", tmp_path / "out", arch="efficientnet_lite0", heads="leaf-slim")
+    config = make_config(tmp_path / "data", tmp_path / "out", arch="efficientnet_lite0", heads="leaf-lite")
     state = start_state(config, list_samples(photos, labels), device=torch.device("cpu")).model.state_dict()
-    shipped = load_detector("leaf-slim").state_dict()
+    shipped = load_detector("leaf-lite").state_dict()
     taken = {name for name, value in shipped.items() if name in state and torch.equal(state[name], value)}
     assert taken == {name for name in shipped if not name.startswith("backbone.")}
     other = dataclasses.replace(config, arch="maskrcnn_resnet50_fpn")
-    with pytest.raises(InputError, match=r"the heads of .*leaf-slim.* do not fit: "):
+    with pytest.raises(InputError, match=r"the heads of .*leaf-lite.* do not fit: "):
         start_state(other, list_samples(photos, labels), device=torch.device("cpu"))
 
 
