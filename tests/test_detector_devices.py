@@ -70,8 +70,8 @@ def test_each_small_detector(arch: str, device: torch.device) -> None:
     torch.manual_seed(0)
     model = build_detector(arch, 2, image_size=64).eval()
     photo = torch.rand((3, 48, 64), generator=torch.Generator().manual_seed(1))
-    limits = {"detections_per_img": 5, "score_thresh": 0.0}
-    check(run_heads(there(model, device), photo.to(device), **limits), run_heads(model, photo, **limits), device)
+    model.roi_heads.score_thresh, model.roi_heads.detections_per_img = 0.0, 5
+    check(run_heads(there(model, device), photo.to(device)), run_heads(model, photo), device)
 
 
 @torch.no_grad()
