@@ -17,9 +17,9 @@ from pydantic import BaseModel, FiniteFloat, NonNegativeInt, RootModel, TypeAdap
 
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.find_views import base_name, find_views, list_some
+from mvseg.formats.image_file import describe_turn
 from mvseg.formats.json_file import Int64, Items, check_content, load_json
 from mvseg.formats.masks.found_mask import check_categories
-from mvseg.formats.photos import describe_turn
 from mvseg.scene import Scene
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from mvseg.errors import InputError, faults_of, warn
+from mvseg.errors import InputError, warn
 from mvseg.formats.find_views import natural_order
 from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.photos import Photo, build_scene
@@ -112,15 +112,15 @@ def _check_binary_model(model: Path) -> None:
         if not path.is_file():
             continue
         try:
-            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data, faults_of(path):
+            with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
                 end = 8
                 for _ in range(_number(data, 0, "<Q")):
                     end = record_end(data, end)
                 is_whole = end == len(data)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-        except InputError:
-            raise
+        except KeyError as model:
+            raise InputError(f"{path}: camera model number {model} is not known") from None
         except (struct.error, ValueError, IndexError, OverflowError):  # beyond the end, or no byte at all
             is_whole = False
         if not is_whole:
@@ -136,7 +136,7 @@ def _camera_end(data: mmap.mmap, at: int) -> int:
     try:
         camera = pycolmap.Camera.create_from_model_id(0, pycolmap.CameraModelId(model), 1, 1, 1)
     except ValueError:
-        raise InputError(f"camera model number {model} is not known") from None
+        raise KeyError(model) from None
     return at + 24 + 8 * len(camera.params)
 
 

@@ -219,6 +219,11 @@ def is_turned(path: Path) -> bool:
         return False
 
 
+def describe_turn(path: Path) -> str:
+    """That EXIF turns a photo, as the end of a sentence about sizes that do not fit; "" if it does not."""
+    return f"; EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
+
+
 def file_name_problem(file: str, *, folder: str = "the scene folder") -> str | None:
     """What is wrong with an image's path relative to its folder, as the end of a sentence; None if it is valid."""
     path = os.path.normpath(file)

@@ -1,11 +1,15 @@
 """Label images: PNGs of 16 (or 8) bits with a single channel; 0 = nothing, 65535 = ignore, any other number = one mask.
 
 A palette PNG gives its indices, not its colours: the tools that write labels with a palette (as PASCAL VOC's are) mean
-the index. VOC's border of 255 around its numbers is ignored. `masks/label_image.py` reads more kinds of label images.
+the index. VOC's border of 255 around its numbers is ignored.
+
+Masks of other tools (`read_label_image`) may also be TIFF, have 32 bits (numbers of cellpose and ImageJ, floats
+included) or colours (CVAT's and datumaro's VOC export): each colour is one mask, black is nothing.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +17,12 @@ from PIL import Image
 
 from mvseg.errors import InputError
 from mvseg.formats.image_file import WrongSize, read_image, write_png
+from mvseg.formats.masks.found_mask import FoundMask
 from mvseg.regions import IGNORE_LABEL
 
+MAX_COLOURS = 1000  # more than leaves on a photo; photos and blurred masks have far more
 VOC_BORDER = 255  # index, in palette PNGs
+VOC_BORDER_COLOUR = (224 << 16) + (224 << 8) + 192  # of that index
 
 
 def read_label_png(path: Path, width: int, height: int) -> np.ndarray:
@@ -70,6 +77,83 @@ def labels_of(image: Image.Image, path: Path) -> np.ndarray:
     if image.mode == "P" and ((labels > 0) & (labels < VOC_BORDER)).any():
         labels[labels == VOC_BORDER] = IGNORE_LABEL
     return labels
+
+
+def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
+    """(height, width) uint16: 0 = nothing, 65535 = ignore, any other number = one mask of this photo.
+
+    Colours are numbered in the order red, green, blue; grey colours keep their value.
+
+    Raises:
+        InputError: the file cannot be decoded, is a JPEG, has several pages, another size, numbers that are no labels,
+            or too many colours.
+    """
+    image = open_labels(path, (width, height))
+    try:
+        num_pages = getattr(image, "n_frames", 1)
+    except Exception:  # Pillow raises almost anything on a damaged file
+        raise InputError(f"{path}: cannot be read, expected a whole image: its list of pages is damaged") from None
+    if num_pages > 1:
+        raise InputError(f"{path}: holds {num_pages} pages, expected a single label image")
+    if image.mode in ("RGB", "RGBA"):
+        return _number_colours(path, image)
+    if image.mode in ("I", "F"):
+        return labels_of_numbers(path, np.asarray(image))
+    return labels_of(image, path)
+
+
+def labels_of_numbers(path: Path, numbers: np.ndarray) -> np.ndarray:
+    """uint16 labels from an array of any number type, renumbered from 1 if its numbers go beyond 16 bits.
+
+    Raises:
+        InputError: negative numbers, fractions, or more different numbers than 16 bits hold.
+    """
+    if not np.issubdtype(numbers.dtype, np.number) or np.issubdtype(numbers.dtype, np.complexfloating):
+        raise InputError(f"{path}: holds {numbers.dtype}, expected whole numbers")
+    if not np.isfinite(numbers).all() or (numbers < 0).any() or (numbers != np.floor(numbers)).any():
+        raise InputError(f"{path}: holds numbers that are no labels, expected whole numbers from 0")
+    if numbers.max(initial=0) <= IGNORE_LABEL:
+        return numbers.astype(np.uint16)
+    distinct, indices = np.unique(numbers, return_inverse=True)
+    if len(distinct) >= IGNORE_LABEL:
+        raise InputError(f"{path}: holds {len(distinct)} different numbers, expected one per mask")
+    return (indices.reshape(numbers.shape) + (distinct[0] != 0)).astype(np.uint16)
+
+
+def _number_colours(path: Path, image: Image.Image) -> np.ndarray:
+    channels = np.asarray(image).astype(np.int64)
+    red, green, blue = channels[..., 0], channels[..., 1], channels[..., 2]
+    if ((red == green) & (green == blue)).all():
+        labels = red.astype(np.uint16)
+    else:
+        codes, indices = np.unique((red << 16) + (green << 8) + blue, return_inverse=True)
+        if len(codes) > MAX_COLOURS:
+            message = f"holds {len(codes)} colours, expected one per mask and at most {MAX_COLOURS}"
+            raise InputError(f"{path}: {message}; is it a photo, or a mask that was scaled or blurred?")
+        numbers = np.arange(len(codes)) + (codes[0] != 0)
+        numbers[codes == VOC_BORDER_COLOUR] = IGNORE_LABEL
+        labels = numbers[indices].reshape(red.shape).astype(np.uint16)
+    if image.mode == "RGBA":
+        labels[channels[..., 3] == 0] = 0
+    return labels
+
+
+def read_mask_images(paths: Sequence[Path], width: int, height: int) -> list[FoundMask]:
+    """The masks of one photo, an image each (of SAM's own script, BOP and many segmenters): whatever is not black.
+
+    They are numbered from 1 in the order of the paths, and may overlap.
+
+    Raises:
+        InputError: a file cannot be decoded, is a JPEG, or has another size.
+    """
+    masks = []
+    for number, path in enumerate(paths, start=1):
+        image = open_labels(path, (width, height))
+        pixels = np.atleast_3d(np.asarray(image))
+        has_alpha = image.mode in ("RGBA", "LA")
+        mask = pixels[..., :-1].any(2) & (pixels[..., -1] > 0) if has_alpha else pixels.any(2)
+        masks.append(FoundMask(number, np.asarray(mask)))
+    return masks
 
 
 def write_label_png(path: Path, labels: np.ndarray) -> None:

@@ -14,7 +14,7 @@ import pycolmap
 import yaml  # type: ignore[import-untyped]
 from pydantic import BaseModel, Field, FiniteFloat
 
-from mvseg.errors import InputError, faults_of
+from mvseg.errors import InputError
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Pixels, check_content
 from mvseg.formats.lens import opencv_lens
@@ -103,15 +103,14 @@ def read_calibration(folder: Path, file: str) -> Calibration:
     model = str(entries.get("distortionmodel") or "plumb_bob")
     is_fisheye = model in FISHEYES or bool(entries.get("fisheyemodel"))
     distortion = content.distortion[:8]
-    with faults_of(path):
-        if model not in ("plumb_bob", "rational_polynomial", *FISHEYES):
-            raise InputError(f"the distortion model '{model}' is not known, expected plumb_bob or equidistant")
-        if any(content.distortion[8:]):
-            raise InputError("has a thin prism or a tilted sensor (coefficients 9 to 14), which is not supported")
-        if len(distortion) not in (0, 4, 5, 8):
-            raise InputError(f"has {len(distortion)} distortion coefficients, expected 4, 5 or 8")
-        if is_fisheye and len(distortion) != 4:
-            raise InputError(f"a fisheye with {len(distortion)} coefficients, expected k1, k2, k3, k4")
+    if model not in ("plumb_bob", "rational_polynomial", *FISHEYES):
+        raise InputError(f"{path}: the distortion model '{model}' is not known, expected plumb_bob or equidistant")
+    if any(content.distortion[8:]):
+        raise InputError(f"{path}: has a thin prism or a tilted sensor (coefficients 9 to 14), which is not supported")
+    if len(distortion) not in (0, 4, 5, 8):
+        raise InputError(f"{path}: has {len(distortion)} distortion coefficients, expected 4, 5 or 8")
+    if is_fisheye and len(distortion) != 4:
+        raise InputError(f"{path}: a fisheye with {len(distortion)} coefficients, expected k1, k2, k3, k4")
     return Calibration(
         K=K, distortion=tuple(distortion), is_fisheye=is_fisheye, width=content.width, height=content.height
     )

@@ -54,7 +54,9 @@ class Photo:
     lens: pycolmap.Camera | None = None
 
 
-def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Path) -> Scene:
+def build_scene(
+    folder: Path, photos: Sequence[Photo], *, unit: str, source: Path, up: tuple[float, float, float] | None = None
+) -> Scene:
     """The scene of a folder from its photos.
 
     Args:
@@ -62,10 +64,11 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         photos: one per view.
         unit: of the world, "" when unknown.
         source: the file or folder that the cameras come from; messages name it.
+        up: the direction of the world that points up, None when unknown.
 
     Raises:
         InputError: fewer than two views, two views with the same name, a file name that leads out of the folder, a
-            camera that is not sound. The message names the view's index and its photo.
+            camera that is not sound, an `up` without a direction. The message names the view's index and its photo.
     """
     if len(photos) < 2:
         there = "is a single view" if photos else "are no views"
@@ -89,7 +92,7 @@ def build_scene(folder: Path, photos: Sequence[Photo], *, unit: str, source: Pat
         sizes=torch.tensor([[photo.width, photo.height] for photo in photos]),
     )
     with faults_of(source):
-        return Scene(name=scene_name(folder), views=views, cameras=cameras, unit=unit, source=source)
+        return Scene(name=scene_name(folder), views=views, cameras=cameras, unit=unit, source=source, up=up)
 
 
 def scene_name(folder: Path) -> str:
@@ -192,11 +195,6 @@ def check_photos(scene: Scene) -> None:
         deep = [path for path, bits in zip(paths, known, strict=True) if bits > 8]
         message = f"{len(deep)} photos of 16 bits hold numbers of {max(known)} bits at most: they are brightened alike"
         warn(f"{deep[0]}: {message}")
-
-
-def describe_turn(path: Path) -> str:
-    """That EXIF turns a photo, as the end of a sentence about sizes that do not fit; "" if it does not."""
-    return f"; EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
 
 
 def describe_folder(folder: Path) -> str:

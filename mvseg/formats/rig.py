@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterable
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -22,8 +21,8 @@ from pydantic import BaseModel, ConfigDict, FiniteFloat
 
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.json_file import Items, Matrix3, Pixels, Vector3, load_json, read_json
-from mvseg.formats.lens import opencv_distortion, opencv_lens
-from mvseg.formats.opencv_yaml import read_calibration
+from mvseg.formats.lens import opencv_distortion
+from mvseg.formats.opencv_yaml import Calibration, read_calibration
 from mvseg.formats.photos import Photo, build_scene, size_of_photo
 from mvseg.scene import Scene
 
@@ -79,9 +78,7 @@ def read_rig(path: Path) -> Scene:
     for index, view in enumerate(rig.views):
         with faults_of(f"{path}: view {index} ({view.file})"):
             photos.append(photo_of(path.parent, view.file, view))
-    scene = build_scene(path.parent, photos, unit=rig.unit, source=path)
-    with faults_of(path):
-        return replace(scene, up=rig.up)
+    return build_scene(path.parent, photos, unit=rig.unit, source=path, up=rig.up)
 
 
 def warn_of_unknown_keys(path: Path, entries: Iterable[tuple[str, BaseModel]]) -> None:
@@ -98,31 +95,27 @@ def photo_of(folder: Path, file: str, camera: RigCamera) -> Photo:
         InputError: there is not exactly one of K and a calibration, the calibration cannot be read or is of another
             size, the size is not known, or the distortion is not a model of OpenCV. The message is a reason.
     """
+    calibration, given = _calibration(folder, camera), (camera.width, camera.height)
+    width, height = calibration.width or camera.width, calibration.height or camera.height
+    if width is None or height is None:
+        width, height = size_of_photo(folder, file)
+    if camera.calibration and any(one not in (None, side) for one, side in zip(given, (width, height), strict=True)):
+        raise InputError(f"the calibration is of {width} x {height} pixels, the camera says {given[0]} x {given[1]}")
+    R, t, lens = np.array(camera.R), np.array(camera.t), calibration.lens(width, height)
+    return Photo(file=file, width=width, height=height, K=calibration.K, R=R, t=t, lens=lens)
+
+
+def _calibration(folder: Path, camera: RigCamera) -> Calibration:
+    distortion = camera.distortion or []
     if (camera.K is None) == (camera.calibration is None):
         raise InputError("expected either K or a calibration file")
-    size = (camera.width, camera.height)
-    if camera.calibration is None:
-        width, height = _complete_size(size, folder, file)
-        K, distortion = np.array(camera.K), camera.distortion or []
-        if len(distortion) not in (0, 4, 5, 8):
-            raise InputError(f"distortion has {len(distortion)} numbers, expected k1, k2, p1, p2, k3")
-        lens = opencv_lens(K, distortion, width=width, height=height)
-    else:
-        if camera.distortion:
+    if camera.calibration is not None:
+        if distortion:
             raise InputError("distortion beside a calibration file, expected one of them")
-        calibration = read_calibration(folder, camera.calibration)
-        known = (calibration.width or camera.width, calibration.height or camera.height)
-        width, height = _complete_size(known, folder, file)
-        if any(given not in (None, found) for given, found in zip(size, (width, height), strict=True)):
-            raise InputError(f"the calibration is of {width} x {height} pixels, the camera says {size[0]} x {size[1]}")
-        K, lens = calibration.K, calibration.lens(width, height)
-    R, t = np.array(camera.R), np.array(camera.t)
-    return Photo(file=file, width=width, height=height, K=K, R=R, t=t, lens=lens)
-
-
-def _complete_size(size: tuple[int | None, int | None], folder: Path, file: str) -> tuple[int, int]:
-    width, height = size
-    return size_of_photo(folder, file) if width is None or height is None else (width, height)
+        return read_calibration(folder, camera.calibration)
+    if len(distortion) not in (0, 4, 5, 8):
+        raise InputError(f"distortion has {len(distortion)} numbers, expected k1, k2, p1, p2, k3")
+    return Calibration(np.array(camera.K), tuple(distortion), is_fisheye=False, width=None, height=None)
 
 
 def write_rig(path: Path, scene: Scene, files: list[str]) -> None:

@@ -24,8 +24,7 @@ from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
-from mvseg.formats.lens import distort
-from mvseg.formats.rig import opencv_lens
+from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import MergedMask
 from mvseg.pipeline import run_scene

@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from mvseg.errors import InputError
+from mvseg.formats.label_png import labels_of_numbers
 from mvseg.formats.masks.found_mask import FoundMask
-from mvseg.formats.masks.label_image import labels_of_numbers
 
 
 def read_npy(path: Path, width: int, height: int) -> np.ndarray | list[FoundMask]:

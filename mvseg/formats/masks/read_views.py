@@ -8,15 +8,15 @@ from collections.abc import Collection, Iterator
 import numpy as np
 
 from mvseg.errors import InputError, warn
+from mvseg.formats.image_file import describe_turn
+from mvseg.formats.label_png import read_label_image, read_mask_images
 from mvseg.formats.masks.found_mask import FoundMask, check_categories
-from mvseg.formats.masks.label_image import read_label_image, read_mask_images
 from mvseg.formats.masks.labelme import read_labelme
 from mvseg.formats.masks.npy_masks import read_npy
 from mvseg.formats.masks.recognise import MaskFiles
 from mvseg.formats.masks.sam import read_sam
 from mvseg.formats.masks.view_regions import ViewMasks
 from mvseg.formats.masks.yolo import read_class_names, read_yolo
-from mvseg.formats.photos import describe_turn
 from mvseg.scene import Scene
 
 

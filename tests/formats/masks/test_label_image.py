@@ -9,8 +9,7 @@ import pytest
 from PIL import Image
 
 from mvseg.errors import InputError
-from mvseg.formats.label_png import read_label_png
-from mvseg.formats.masks.label_image import read_label_image, read_mask_images
+from mvseg.formats.label_png import read_label_image, read_label_png, read_mask_images
 from mvseg.regions import IGNORE_LABEL
 
 
