@@ -7,7 +7,8 @@ from typing import Literal
 
 from mvseg.errors import InputError
 
-MAX_IMAGE_SIZE = 16_384  # pixels, as in a file of weights; this module is imported for --help, and loads no torch
+# pixels, as in a file of weights; this module is imported for --help, and loads no torch
+MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384
 
 
 @dataclass(frozen=True)
@@ -19,7 +20,8 @@ class DetectConfig:
         min_score: detections that score less are discarded; in [0, 1]. The score is the detector's confidence that it
             sees a leaf, times the expected IoU of its mask.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the
-            size given with the weights, smaller ones stay as they are.
+            size given with the weights, smaller ones stay as they are; and where few masks are surely matched, as where
+            leaves are very large, half of that is tried.
         crop: auto: where the plant fills a small part of large photos, a second pass runs on their parts that show
             it: leaves are seen larger. off: one pass over whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
@@ -41,8 +43,9 @@ class DetectConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.min_score <= 1:
             raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
-        if self.image_size is not None and not 32 <= self.image_size <= MAX_IMAGE_SIZE:
-            raise InputError(f"detect.image_size is {self.image_size}, expected at least 32, at most {MAX_IMAGE_SIZE}")
+        if self.image_size is not None and not MIN_IMAGE_SIZE <= self.image_size <= MAX_IMAGE_SIZE:
+            expected = f"at least {MIN_IMAGE_SIZE}, at most {MAX_IMAGE_SIZE}"
+            raise InputError(f"detect.image_size is {self.image_size}, expected {expected}")
         if self.num_iterations < 0:
             raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")
         if self.min_views < 1:

@@ -1,10 +1,11 @@
-"""Instances in the photos of a scene: every photo once, and again, larger, where the plant fills a small part."""
+"""Instances in the photos of a scene: once, again at half the size where leaves are too large, and again, larger, where
+the plant fills a small part."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -14,16 +15,20 @@ from tqdm import tqdm
 
 from mvseg._version import code_hash
 from mvseg.detection.cached_detections import CachedDetections, delete_cached, read_detections, write_detections
-from mvseg.detection.config import DetectConfig
+from mvseg.detection.config import MIN_IMAGE_SIZE, DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass, crop_cameras, place_crops
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detectors.folded_norms import fold_norms
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
 from mvseg.system.file_hash import hash_files
+
+UNSURE = 0.5  # share of the masks that are surely matched: with fewer, leaves may be too large for the detector
+SURE_MATCH = 0.9  # match score
 
 
 def detect_scene(
@@ -35,6 +40,9 @@ def detect_scene(
     progress: bool = False,
 ) -> Callable[[Cameras], Matching]:
     """Find instances in every photo, and again, larger, where the plant fills a small part of the photos.
+
+    Where less than half of them are surely matched, leaves may be too large: the detector looks once more, at half the
+    size, unless the size is given, and the look stays whose surely matched masks cover more.
 
     Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps.
 
@@ -52,29 +60,69 @@ def detect_scene(
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
     """
+    look = partial(_look, photos, match=match, cache=cache, progress=progress)
+    seen, cameras = look(config), photos.scene.cameras
+    names = seen.names
+    if config.image_size is None and share_of_sure(seen.match(cameras).masks) < UNSURE:
+        longest = min(seen.model.transform.max_size, int(cameras.sizes.max()))
+        smaller = look(replace(config, image_size=max(MIN_IMAGE_SIZE, longest // 2)))
+        names = names | smaller.names
+        seen = max(seen, smaller, key=lambda each: area_of_sure(each.match(cameras).masks))
+    boxes = None
+    if config.crop == "auto":
+        boxes = boxes_for_second_pass(seen.match(cameras).masks, cameras, longest=seen.model.transform.max_size)
+    if boxes is not None:
+        in_crops, more_names = _detect_photos(seen.model, photos, boxes, cached=seen.cached, progress=progress)
+        names = names | more_names
+    if cache is not None:
+        delete_cached(cache, but=names)
+    if boxes is None:
+        return seen.match
+
+    def match_crops(cameras: Cameras) -> Matching:
+        matching = seen.model.match_detections(in_crops, crop_cameras(cameras, boxes), progress=progress)
+        return matching.with_masks(place_crops(matching.masks, boxes))
+
+    return match_crops
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """What a detector finds in whole photos at one size: the files that cache it, and how it is matched."""
+
+    model: MultiViewMaskRCNN
+    cached: CachedDetections | None
+    names: set[str]
+    match: Callable[[Cameras], Matching]
+
+
+def _look(photos: Photos, config: DetectConfig, *, match: MatchConfig, cache: Path | None, progress: bool) -> _Seen:
+    """Find instances in whole photos."""
     detector = load_detector(config.weights, image_size=config.image_size, min_score=config.min_score)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(fold_norms(detector), num_iterations=config.num_iterations, match=match).to(device)
     cached = None if cache is None else CachedDetections(cache, describe_detector(config, model, device))
     found, names = _detect_photos(model, photos, cached=cached, progress=progress)
-    # whole photos are matched here to find the plant, and not again by who asks for that
+    # whole photos are matched to find the plant, and not again by who asks for that
     match_found = lru_cache(maxsize=1)(partial(model.match_detections, found, progress=progress))
-    boxes, cameras = None, photos.scene.cameras
-    if config.crop == "auto":
-        boxes = boxes_for_second_pass(match_found(cameras).masks, cameras, longest=model.transform.max_size)
-    if boxes is not None:
-        in_crops, more_names = _detect_photos(model, photos, boxes, cached=cached, progress=progress)
-        names |= more_names
-    if cache is not None:
-        delete_cached(cache, but=names)
-    if boxes is None:
-        return match_found
+    return _Seen(model, cached, names, match_found)
 
-    def match_crops(cameras: Cameras) -> Matching:
-        matching = model.match_detections(in_crops, crop_cameras(cameras, boxes), progress=progress)
-        return matching.with_masks(place_crops(matching.masks, boxes))
 
-    return match_crops
+def share_of_sure(masks: Masks) -> float:
+    """The share of the masks that are surely matched; 0 without masks."""
+    return float(_is_sure(masks).float().mean()) if len(masks) else 0.0
+
+
+def area_of_sure(masks: Masks) -> float:
+    """How many pixels the surely matched masks cover, in all photos."""
+    regions = masks.regions
+    sure = _is_sure(masks).nonzero()[:, 0].tolist()
+    sides = regions.boxes[:, 2:] - regions.boxes[:, :2]
+    return sum(float(sides[region].prod() * regions.crop(region).float().mean()) for region in sure)
+
+
+def _is_sure(masks: Masks) -> Tensor:
+    return (masks.instance_ids > 0) & (masks.match_scores >= SURE_MATCH)
 
 
 def _detect_photos(

@@ -1,0 +1,67 @@
+"""A second look at half the size, where few masks are surely matched."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import as_regions
+from mvseg import demo_scene, load_scene
+from mvseg.detection import detect_scene as steps
+from mvseg.detection.config import DetectConfig
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks
+
+
+def found(*, side: int, scores: list[float]) -> Masks:
+    """A square in each of as many views as there are scores, all of one instance."""
+    labels = np.zeros((40, 40), np.int64)
+    labels[:side, :side] = 1
+    regions, _ = as_regions([labels] * len(scores))
+    return Masks.of(regions, torch.ones(len(scores), dtype=torch.int64), torch.tensor(scores))
+
+
+def test_the_share_and_the_area_of_sure_masks() -> None:
+    masks = found(side=10, scores=[0.95, 0.9, 0.5, 0.2])
+    assert steps.share_of_sure(masks) == 0.5
+    assert steps.area_of_sure(masks) == pytest.approx(200)
+    unsure = masks.select(torch.tensor([2, 3]))
+    assert steps.share_of_sure(unsure) == steps.area_of_sure(unsure) == 0
+    assert steps.share_of_sure(masks.select(torch.zeros(0, dtype=torch.int64))) == 0
+
+
+@pytest.mark.parametrize(
+    ("config", "first", "second", "sizes", "chosen"),
+    [
+        (DetectConfig(crop="off"), [0.95, 0.95], None, [None], 0),  # sure enough
+        (DetectConfig(crop="off", image_size=300), [0.1, 0.1], None, [300], 0),  # asked for
+        (DetectConfig(crop="off"), [0.95, 0.1, 0.1], [0.95, 0.95], [None, 240], 1),  # more is sure at half the size
+        (DetectConfig(crop="off"), [0.95, 0.1, 0.1], [0.1], [None, 240], 0),
+    ],
+)
+def test_half_the_size_where_few_masks_are_sure(
+    config: DetectConfig,
+    first: list[float],
+    second: list[float] | None,
+    sizes: list[int | None],
+    chosen: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Photos of 640 x 480 before a detector that scales to 480 pixels at most."""
+    asked, answers = [], [found(side=10, scores=scores) for scores in (first, second) if scores is not None]
+
+    def look(_: Photos, config: DetectConfig, **__: object) -> SimpleNamespace:
+        asked.append(config.image_size)
+        matching = SimpleNamespace(masks=answers[len(asked) - 1])
+        model = SimpleNamespace(transform=SimpleNamespace(max_size=480))
+        return SimpleNamespace(model=model, cached=None, names=set(), match=lambda _: matching)
+
+    monkeypatch.setattr(steps, "_look", look)
+    scene = load_scene(demo_scene())
+    assert scene.cameras.sizes.max() >= 480
+    matching = steps.detect_scene(Photos(scene), config)(scene.cameras)
+    assert asked == sizes
+    assert matching.masks is answers[chosen]
