@@ -1,4 +1,4 @@
-"""One set of weights on all real plants at hand: `python benchmarks/board.py DATA --weights leaf-lite runs/mine/model.safetensors`
+"""One set of weights on all real plants at hand: `python benchmarks/board.py DATA --weights leaf-lite FILE`
 
 DATA holds the real scenes, each in its folder; those that are missing are left out. One table, a row for
 each scene and a column for each set of weights:

@@ -23,8 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks.speed.__main__ import ROOT, make_environment
-from mvseg.batch.dask_workers import connect, run_on_dask
-from mvseg.batch.local_workers import run_locally
+from mvseg.batch.workers import open_workers
 from mvseg.simulation.dataset import Preset, write_dataset
 
 WORKERS, DIFFERENT, TASKS, MANY = 2, 8, 200, 1000
@@ -52,16 +51,12 @@ def start_cluster() -> Iterator[str]:
 
 def time_empty_tasks(scheduler: str | None) -> float:
     """Wall milliseconds per task that does nothing, workers running."""
-    tasks = {number: number for number in range(TASKS)}
-    if scheduler is None:
-        answers = run_locally(do_nothing, tasks, num_workers=WORKERS, started=lambda _: None)
-    else:
-        client = connect(scheduler)
-        answers = run_on_dask(do_nothing, tasks, client=client, at_once=None, started=lambda _: None)
-    next(answers)  # the workers are there
-    start = time.perf_counter()
-    assert sum(1 for _ in answers) == TASKS - 1
-    return 1000 * (time.perf_counter() - start) / (TASKS - 1)
+    with open_workers(do_nothing, WORKERS, scheduler) as run:
+        answers = run({number: number for number in range(TASKS)}, lambda _: None)
+        next(answers)  # the workers are there
+        start = time.perf_counter()
+        assert sum(1 for _ in answers) == TASKS - 1
+        return 1000 * (time.perf_counter() - start) / (TASKS - 1)
 
 
 def run_plants(table: Path, scheduler: str | None) -> list[dict[str, str]]:
