@@ -45,7 +45,7 @@ def start_cluster() -> Iterator[str]:
     """A Dask cluster of WORKERS processes, one thread each: the address of its scheduler."""
     from distributed import LocalCluster
 
-    with LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address=None) as cluster:
+    with LocalCluster(n_workers=WORKERS, threads_per_worker=1, dashboard_address=":0") as cluster:
         yield cluster.scheduler_address
 
 

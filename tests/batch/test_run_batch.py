@@ -222,7 +222,7 @@ def test_scenes_on_a_dask_cluster(plants: Path, tmp_path: Path, capsys: pytest.C
     folder = str(tmp_path / "dask")
     with (
         dask.config.set({"temporary-directory": folder}),
-        distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=1, threads_per_worker=2, dashboard_address=":0") as cluster,
     ):
         address = cluster.scheduler_address
         assert main(arguments(plants, tmp_path / "out", "--quiet", "--scheduler", address)) == 3

@@ -96,7 +96,7 @@ def test_plants_are_tracked_on_a_dask_cluster(tmp_path: Path) -> None:
     distributed = pytest.importorskip("distributed")
     rows = [(f"{plant}{day}", plant, str(day)) for plant in "ab" for day in (0, 1)]
     batch = write_batch(tmp_path / "batch", rows)
-    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=None) as cluster:
+    with distributed.LocalCluster(n_workers=1, processes=False, dashboard_address=":0") as cluster:
         arguments = ["track", str(batch), "--out", str(tmp_path / "out"), "--quiet", "--report", "false"]
         assert main([*arguments, "--scheduler", cluster.scheduler_address]) == 0
     assert {row["plant"] for row in read(tmp_path / "out" / "tracks.csv")} == {"a", "b"}
