@@ -184,6 +184,7 @@ def test_a_batch_goes_on_where_it_was_killed(
 def work_here(work: Any, items: Any, started: Any, *, num_workers: int) -> Iterator[tuple[int, Any]]:
     """Without processes that take seconds to start."""
     for key, item in items.items():
+        started(key)
         yield key, work(item)
 
 
