@@ -271,8 +271,8 @@ def fits_as_well(joint: LeafSurface, parts: Sequence[LeafSurface]) -> bool:
 
 
 def _outline_px(surface: LeafSurface) -> float:
-    """Root mean square distance between its outline and those of its masks, over the views."""
-    return float(surface.residual_px.square().mean().sqrt())
+    """Root mean square distance between its outline and those of its masks, over the views with both."""
+    return float(surface.residual_px.square().nanmean().sqrt())
 
 
 def find_shared(

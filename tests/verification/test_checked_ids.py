@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -256,8 +257,8 @@ def test_a_larger_surface_must_lie_as_near_to_the_outlines(iou: float, residual_
     """Two leaves of IoU 0.8 and 0.85 whose outlines are 1.5 and 1 px off."""
 
     def fitted(iou: float, residual_px: float) -> LeafSurface:
-        numbers = (torch.full((6,), number, dtype=torch.float64) for number in (iou, residual_px))
-        return replace(LEAVES[1], **dict(zip(("iou", "residual_px"), numbers, strict=True)))
+        residuals = torch.tensor([math.nan] + [residual_px] * 5, dtype=torch.float64)  # no edge in one view
+        return replace(LEAVES[1], iou=torch.full((6,), iou, dtype=torch.float64), residual_px=residuals)
 
     assert fits_as_well(fitted(iou, residual_px), [fitted(0.8, 1.5), fitted(0.85, 1.0)]) == expected
     assert not fits_as_well(fitted(0.65, 1.0), [fitted(0.6, 1.5), fitted(0.85, 1.0)])  # no blade

@@ -55,7 +55,8 @@ class LeafSurface:
         coefficients: (26, 3) float64 of the patch (`leaf_patch`); NaN for an instance that has no surface.
         covariance: (78, 78) float64 of `coefficients.ravel()`, calibrated on simulated leaves.
         views: (S,) int64, the views whose masks it was fitted to.
-        residual_px: (S,) float64, root mean square distance between its outline and the mask's edge in each view.
+        residual_px: (S,) float64, root mean square distance between its outline and the mask's edge in each view; NaN
+            where no part of the outline has an edge of the mask near it.
         iou: (S,) float64, with the mask in each view, without the pixels of instances that may hide it, of the surface
             drawn as much too large or small as the mask seems to be; NaN where the fit did not get that far.
         is_oriented: u runs from the stem to the tip; False where the stem's side cannot be told.
