@@ -164,7 +164,7 @@ class Masks:
             raise InputError(f"instances get the numbers {numbers.tolist()}, expected 1, 2, ... once each, or -1")
         if len(numbers) < self.num_instances:
             raise InputError(f"{self.num_instances} instances get {len(numbers)} numbers, expected one each")
-        lookup = torch.cat((numbers.to(self.instance_ids), self.instance_ids.new_tensor([-1])))
+        lookup = torch.nn.functional.pad(numbers.to(self.instance_ids), (0, 1), value=-1)
 
         def renumber(ids: Tensor) -> Tensor:
             return lookup[torch.where(ids > 0, ids - 1, len(numbers))]

@@ -18,6 +18,7 @@ from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import RunConfig
 from mvseg.corrections.apply import apply, apply_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
+from mvseg.corrections.same_scene import check_made_for
 from mvseg.errors import InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, require_photos
@@ -36,6 +37,7 @@ from mvseg.traits.up import place_scene
 # scenes to match.
 
 
+NOTHING_LEFT = "the corrections reject every mask: no leaf is left"
 NOTHING_FOUND = Matching(Masks.of(stack_regions([], [], [], labels=[], num_views=0)), MatchReport("none"))
 
 
@@ -81,12 +83,13 @@ Stage = Callable[[State], State]
 
 
 def run_scene(
-    folder: Path,
-    masks: Path | None = None,
+    folder: Path | str,
+    masks: Path | str | None = None,
     config: RunConfig = RunConfig(),
     *,
-    corrections: Corrections | Path | None = None,
-    cache: Path | None = None,
+    corrections: Corrections | Path | str | None = None,
+    force_corrections: bool = False,
+    cache: Path | str | None = None,
     workers: ProcessPoolExecutor | None = None,
     progress: bool = False,
 ) -> Result:
@@ -97,6 +100,7 @@ def run_scene(
         masks: of any kind that `load_masks` reads; None: a detector finds them in the photos.
         config: the options of all stages.
         corrections: of a person, or the file of them, see `load_corrections`; without any edits they change nothing.
+        force_corrections: apply them even if they were made for other photos.
         cache: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
             from them, and one with other options of later stages uses them again. What it holds of other photos or
             options is deleted; `delete_cached` deletes the rest.
@@ -107,14 +111,17 @@ def run_scene(
         The result; nothing is written but what `cache` says.
 
     Raises:
-        InputError: bad input; see the stages.
+        InputError: bad input; corrections of another scene; see the stages.
     """
     begun = time.perf_counter()
-    if isinstance(corrections, Path):
+    folder, masks, cache = Path(folder), *(None if path is None else Path(path) for path in (masks, cache))
+    if isinstance(corrections, Path | str):
         corrections = load_corrections(corrections)
     has_edits = corrections is not None and len(corrections.edits) > 0
     state = load(folder, masks, config, cache=cache, workers=workers, progress=progress)
     state = replace(state, corrections=corrections)
+    if corrections is not None and not force_corrections:
+        check_made_for(corrections, state.scene)
     seconds = {"load": time.perf_counter() - begun}
     for name, stage in list_stages(config, has_masks=masks is not None, has_edits=has_edits).items():
         begun = time.perf_counter()
@@ -189,6 +196,8 @@ def correct(state: State) -> State:
     corrected = apply(state.corrections, masks, state.scene)
     for message in corrected.messages:
         warnings.warn(message, InputWarning, stacklevel=3)
+    if len(masks) and not len(corrected.masks):
+        warnings.warn(NOTHING_LEFT, InputWarning, stacklevel=3)
     options = state.config.match
     matcher = partial(match_masks, corrected.masks, config=options, links=corrected.links, progress=state.progress)
     return replace(state, match=matcher, corrected=corrected)
@@ -221,6 +230,8 @@ def correct_instances(state: State) -> State:
     for message in corrected.messages:
         if message not in state.corrected.messages:
             warnings.warn(message, InputWarning, stacklevel=3)
+    if len(state.masks) and not len(masks):
+        warnings.warn(NOTHING_LEFT, InputWarning, stacklevel=3)
     return replace(state.with_masks(masks), corrected=corrected)
 
 
@@ -256,7 +267,7 @@ def check_ids(state: State) -> State:
     state = reconstruct(state, with_voxels=False)
     held = None
     if state.corrected is not None and not state.corrected.everywhere:  # these edits change the rows that links name
-        held = state.corrected.links.named(len(state.masks))
+        held = state.corrected.is_linked
     checked = checked_ids.check_ids(
         state.masks, state.surfaces or {}, cameras=state.scene.cameras, held=held, config=state.config.match
     )

@@ -21,6 +21,7 @@ from mvseg.cli import main
 from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
+from mvseg.corrections.same_scene import mark_photos, with_marks
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 from mvseg.pipeline import run_scene
@@ -116,10 +117,9 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     opened = OpenResult(folder)
     view, at = middle(opened, 1)
     (folder / "corrections.json").write_bytes(text_of([{"op": "reject", "view": view, "at": at}]))
-    corrections = opened.saved_corrections()
+    corrections = with_marks(opened.saved_corrections(), opened.found.scene, mark_photos(opened.found.scene))
     shown, outcomes, _ = opened.recompute(corrections, lambda: False)
-    config = opened.run["config"]
-    run = run_scene(Path(config["scene"]), Path(config["masks"]), RunConfig(reconstruct=None), corrections=corrections)
+    run = run_scene(opened.run.scene, opened.run.masks, RunConfig(reconstruct=None), corrections=corrections)
     assert outcomes == [""]
     assert shown.masks.instance_ids.tolist() == run.masks.instance_ids.tolist()
     assert name_masks(shown.masks, 1) == name_masks(run.masks, 1) != name_masks(run.masks, 2)
@@ -232,7 +232,8 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
         OpenResult(tmp_path)
     earlier = run["config"] | {"corrections": "corrections.json"}  # a run with corrections can be corrected again
     (tmp_path / "run.json").write_text(json.dumps(run | {"code": "other", "mvseg": "0.0", "config": earlier}))
-    assert OpenResult(tmp_path).notice == "mvseg 0.0 made this result; what you see is computed anew."
+    notice = OpenResult(tmp_path).notice
+    assert notice.startswith("What you see is computed anew. mvseg 0.0 made this result")
     assert OpenResult(folder).config.match == MatchConfig()
 
 
@@ -282,6 +283,56 @@ def test_what_was_saved_survives_a_kill(folder: Path) -> None:
             os.kill(process.pid, signal.SIGKILL)
     assert len(load_corrections(folder / "corrections.json").edits) == 1
     (folder / "corrections.json").unlink()
+
+
+def start(folder: Path) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mvseg.cli", "correct", str(folder), "--no_browser"]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def test_ctrl_c_ends_it_with_one_sentence_at_any_moment(folder: Path) -> None:
+    """Torch aborts a process that ends while one of its threads computes."""
+    with start(folder) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        process.send_signal(signal.SIGINT)
+        said, complaint = process.communicate(timeout=WAIT)
+    assert process.returncode == 0
+    assert complaint == ""
+    saved = folder / "corrections.json"
+    assert said.splitlines()[-1].endswith(f"mvseg infer --again {folder} --corrections {saved}")
+
+
+def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> None:
+    scene, out = write_scene(tmp_path / "my balls"), tmp_path / "my result"
+    config = RunConfig(reconstruct=None, scale=0.1, unit="cm", split_merged=True)
+    run_one_scene(scene, scene / "masks", out, config=config, quiet=True)
+    before = json.loads((out / "run.json").read_text())["config"]
+    with serve(out) as server:
+        view, at = middle(server.corrector.opened, 0)
+        save(server, [{"op": "confirm", "view": view, "at": at}])
+        status, answer = ask(server, "POST", "whole")
+        assert status == 200, answer
+    run = json.loads((out / "run.json").read_text())
+    assert [each["fate"] for each in run["corrections"]] == ["applied"]
+    after = run["config"]
+    assert {name: each for name, each in after.items() if before[name] != each}.keys() == {"corrections", "from_here"}
+    assert len(load_corrections(out / "corrections.json").edits) == 1
+
+
+def test_inputs_that_changed_or_moved_since(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, elsewhere = write_scene(tmp_path / "here" / "balls"), tmp_path / "there"
+    monkeypatch.chdir(tmp_path / "here")
+    run_one_scene(Path("balls"), Path("masks"), Path("out"), config=RunConfig(reconstruct=None), quiet=True)
+    monkeypatch.chdir(tmp_path)
+    run = OpenResult(tmp_path / "here" / "out").run
+    assert (run.scene, run.masks, run.changes) == (scene, scene / "masks", ())
+    (tmp_path / "here").rename(elsewhere)
+    assert OpenResult(elsewhere / "out").run.masks == elsewhere / "balls" / "masks"
+    assert OpenResult(elsewhere / "out").notice == ""
+    first, second, *_ = sorted((elsewhere / "balls" / "masks").iterdir())
+    first.write_bytes(second.read_bytes())
+    assert f"{first.parent}: has changed since this result was made." in OpenResult(elsewhere / "out").notice
 
 
 def test_a_rough_box_becomes_the_outline_of_what_is_inside() -> None:

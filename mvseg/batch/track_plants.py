@@ -22,7 +22,7 @@ from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_fil
 from mvseg.system.atomic import folder_whole
 from mvseg.system.file_hash import hash_files
 from mvseg.tracking.corrections import find_links, read_track_links
-from mvseg.tracking.dates import read_date
+from mvseg.tracking.dates import name_apart, read_date
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
 from mvseg.tracking.tables import join_tables, write_tables
@@ -149,7 +149,7 @@ def _track_plant(edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *,
         missing = [where.name for where, time in zip(plant.folders, plant.times, strict=True) if not time]
         if missing:
             raise InputError(f"{missing[0]} has no time, expected a number (days) or an ISO date (column time)")
-        dates = [read_date(where, time) for where, time in zip(plant.folders, plant.times, strict=True)]
+        dates = name_apart([read_date(where, time) for where, time in zip(plant.folders, plant.times, strict=True)])
         links, lost = find_links(edits, dates)
         tracks = track_leaves(dates, links=links, plant=plant.plant)
     except InputError as error:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from contextlib import ExitStack, suppress
 from pathlib import Path
 
 from jsonargparse import ArgumentParser, Namespace
@@ -24,8 +25,9 @@ def run(args: Namespace) -> int:
     import webbrowser
 
     from mvseg.results.read import find_result
-    from mvseg.runs.correct_result import OpenResult, check_writable, open_alone, say_how_to_run
+    from mvseg.runs.correct_result import CORRECTIONS_FILE, OpenResult, check_writable, open_alone
     from mvseg.runs.correction_server import CorrectionServer, Corrector
+    from mvseg.runs.recorded_run import repeat_command
     from mvseg.system.worker_pool import default_workers, start_workers
 
     folder = find_result(args.result)
@@ -33,20 +35,27 @@ def run(args: Namespace) -> int:
         raise InputError(f"{folder}: no such folder, expected a result of mvseg infer")
     check_writable(folder)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
-    with open_alone(folder), start_workers(num_workers) as workers:
+    with open_alone(folder), ExitStack() as stack:
+        workers = stack.enter_context(start_workers(num_workers))
         opened = OpenResult(folder, workers=workers)
         if opened.notice:
             print(f"mvseg: {opened.notice}", file=sys.stderr)
         corrector = Corrector(opened)
-        with CorrectionServer(corrector) as server:
-            threading.Thread(target=corrector.compute, daemon=True).start()
-            print(f"{server.address}\nEvery edit is saved to {folder}/corrections.json. Ctrl-C ends.", flush=True)
+        server = stack.enter_context(CorrectionServer(corrector))
+        computing = threading.Thread(target=corrector.compute)
+        try:
+            computing.start()
+            print(f"{server.address}\nEvery edit is saved to {folder}/{CORRECTIONS_FILE}. Ctrl-C ends.", flush=True)
             if not args.no_browser:
                 webbrowser.open(server.address)
-            try:
-                server.serve_forever()
-            except KeyboardInterrupt:
-                print(f"\nThe whole result with these corrections: {say_how_to_run(opened)}")
-            finally:
-                corrector.close()
+            server.serve_forever()
+        except KeyboardInterrupt:
+            command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE)
+            print(f"\nThe whole result with these corrections: {command}", flush=True)
+        finally:
+            corrector.close()
+            stack.close()  # the workers stop, whatever they are doing
+            while computing.is_alive():  # torch aborts the process if it ends before its threads
+                with suppress(KeyboardInterrupt):
+                    computing.join()
     return 0

@@ -8,36 +8,64 @@ from pathlib import Path
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import DEFAULT_OUT, add_run_options, add_shared, build_run
+from mvseg.config import RunConfig
 from mvseg.demo import demo_scene
+from mvseg.errors import InputError
 
 
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
     help_scene = "scene folder (photos, cameras of any kind in docs/formats.md); without it, the plant that ships"
     parser.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
+    help_again = "repeat the run that made this result, with its options and, if given, with other --corrections"
+    parser.add_argument("--again", type=Path | None, help=help_again)
     add_run_options(parser)
-    add_shared(parser, "corrections", "overwrite", "num_workers")
+    add_shared(parser, "corrections", "force_corrections", "overwrite", "num_workers")
 
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    if args.scene is None:
-        print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
-    scene = args.scene or demo_scene()
     from mvseg.formats.photos import scene_name  # keeps --help and wrong options quick
     from mvseg.runs.one_scene import run_one_scene
     from mvseg.system.worker_pool import default_workers
 
-    out = args.out or DEFAULT_OUT / scene_name(scene)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
+    if args.again is not None:
+        _run_again(args, num_workers)
+        return 0
+    if args.scene is None:
+        print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
+    scene = args.scene or demo_scene()
+    out = args.out or DEFAULT_OUT / scene_name(scene)
     run_one_scene(
         scene,
         args.masks,
         out,
         config=build_run(args),
         corrections=args.corrections,
+        force_corrections=args.force_corrections,
         num_workers=num_workers,
         overwrite=args.overwrite,
         quiet=args.quiet,
     )
     return 0
+
+
+def _run_again(args: Namespace, num_workers: int) -> None:
+    from mvseg.results.read import find_result
+    from mvseg.runs.one_scene import run_again
+
+    if args.scene is not None or args.masks is not None or build_run(args) != RunConfig():
+        raise InputError(
+            f"--again repeats the run of {args.again} with its options, expected no scene, no masks and no other "
+            "options than --corrections, --force_corrections, --out, --overwrite, --num_workers and --quiet"
+        )
+    run_again(
+        find_result(args.again),
+        out=args.out,
+        corrections=args.corrections,
+        force_corrections=args.force_corrections,
+        num_workers=num_workers,
+        overwrite=args.overwrite,
+        quiet=args.quiet,
+    )

@@ -17,7 +17,7 @@ def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
     parser.add_argument("scenes", nargs="+", type=Path, help="scene folders")
     add_matching_options(parser, masks=Path("masks"))
-    add_shared(parser, "corrections", "overwrite")
+    add_shared(parser, "corrections", "force_corrections", "overwrite")
 
 
 def run(args: Namespace) -> int:
@@ -42,6 +42,7 @@ def run(args: Namespace) -> int:
                 out / name,
                 config=config,
                 corrections=args.corrections,
+                force_corrections=args.force_corrections,
                 overwrite=args.overwrite,
                 quiet=args.quiet,
             )

@@ -73,6 +73,7 @@ SHARED: dict[str, tuple[Any, Any, str]] = {
            "which way is up: X Y Z, 'rig' (level cameras) or 'board' (flat ArUco markers); default: the cameras'"),
     "corrections": (Path | None, None, "file of a person's corrections, in the scene folder or anywhere; "
                     "docs/corrections.md"),
+    "force_corrections": (bool, False, "apply --corrections even if they were made for other photos"),
     "overwrite": (bool, False, "replace the result in --out even if it is another scene's"),
     "num_workers": (int | None, None, "processes that fit surfaces (default: one per core, but at most 4)"),
     "scheduler": (str | None, None, "work on a Dask cluster instead: the scheduler's address, or its file"),

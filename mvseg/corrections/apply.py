@@ -28,6 +28,7 @@ from mvseg.scene import Scene
 
 APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
 COVERED = 0.5  # of a mask, from which an outline replaces it
+MOST_COVERED = 3  # masks that an outline replaces without a word: a leaf that a stem and a twig cross is in three pieces
 
 
 @dataclass(frozen=True)
@@ -48,6 +49,8 @@ class Corrected:
     Attributes:
         masks: D masks on the CPU, by view, matched to nothing.
         links: of their rows.
+        is_linked: (D,) bool, masks that a person linked; other links keep outlines apart from what else their photos
+            show.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
         everywhere: (edit number, row, whether its instance is rejected) of each edit about a whole instance.
         fates: of the edits, in their order.
@@ -55,6 +58,7 @@ class Corrected:
 
     masks: Masks
     links: Links
+    is_linked: Tensor
     last_edits: Tensor
     everywhere: tuple[tuple[int, int, bool], ...]
     fates: tuple[Fate, ...]
@@ -79,6 +83,7 @@ class _Work:
     links: list[tuple[int, bool, EditedMask, EditedMask]] = field(default_factory=list)  # edit, must, the two
     everywhere: list[tuple[int, EditedMask, bool]] = field(default_factory=list)
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
+    rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
@@ -118,6 +123,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     order = sorted(work.masks, key=lambda mask: mask.view)
     place = {mask: n for n, mask in enumerate(order)}
     links = _agreeing_links(work, place)
+    is_linked, links = links.named(len(order)), _keep_outlines_apart(links, order)
     table = as_table(masks, order)
     if len(links.must):
         component = links.components(len(order))
@@ -126,7 +132,14 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         table = replace(table, classes=table.classes[first[component]])  # those of different classes are never matched
     everywhere = tuple((n, place[mask], rejects) for n, mask, rejects in work.everywhere if mask in place)
     last_edits = torch.tensor([max(mask.edits, default=0) for mask in order], dtype=torch.int64)
-    return Corrected(table, links, last_edits, everywhere, tuple(work.fates.values()))
+    return Corrected(
+        masks=table,
+        links=links,
+        is_linked=is_linked,
+        last_edits=last_edits,
+        everywhere=everywhere,
+        fates=tuple(work.fates.values()),
+    )
 
 
 def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:
@@ -176,11 +189,10 @@ def _apply_one(work: _Work, number: int, edit: Edit) -> None:
             work.everywhere.append((number, mask, True))
         else:
             _remove(work, number, mask)
+            work.rejected.append((number, mask))
     elif isinstance(edit, Confirm):
-        mask = _mask_at(work, (edit.view, *edit.at))
+        mask = _kept_mask_at(work, number, (edit.view, *edit.at))
         mask.origin = mask.origin if mask.origin >= Origin.CORRECTED else int(Origin.CONFIRMED)
-        _contradict(work, number, [n for n, other, rejects in work.everywhere if rejects and other is mask])
-        work.everywhere = [each for each in work.everywhere if each[1] is not mask or not each[2]]
         mask.edits.append(number)
         if edit.everywhere:
             work.everywhere.append((number, mask, False))
@@ -210,6 +222,8 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
     row = max(covered, key=lambda mask: int(mask.crop.sum())).row if covered else -1
     for mask in covered:
         _remove(work, number, mask)
+    if len(covered) > MOST_COVERED:
+        work.fates[number] = Fate(number, edit.op, APPLIED, f"it replaces {len(covered)} masks")
     made = EditedMask(view, box, crop, row, int(Origin.CORRECTED), [number])
     work.masks.append(made)
     if edit.leaf is not None:
@@ -217,7 +231,7 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
 
 
 def _split(work: _Work, number: int, edit: Split) -> None:
-    mask = _mask_at(work, (edit.view, *edit.at))
+    mask = _kept_mask_at(work, number, (edit.view, *edit.at))
     line = _to_pinhole(work.scene, mask.view, edit.line)
     if np.ptp(line, axis=0).max() < 1:
         raise _Lost("its line is a point")
@@ -234,8 +248,10 @@ def _split(work: _Work, number: int, edit: Split) -> None:
 
 
 def _link(work: _Work, number: int, edit: Link) -> None:
-    found = [_mask_at(work, place) for place in edit.at]
+    found = [_kept_mask_at(work, number, place) for place in edit.at]
     masks = list(dict.fromkeys(found))
+    for mask in masks:
+        mask.edits.append(number)
     if edit.op == "same":
         work.links += [(number, True, masks[0], mask) for mask in masks[1:]]
     elif len(masks) < len(found):
@@ -286,6 +302,15 @@ def _agreeing_links(work: _Work, place: dict[EditedMask, int]) -> Links:
     return links
 
 
+def _keep_outlines_apart(links: Links, masks: Sequence[EditedMask]) -> Links:
+    """An outline is a leaf: other masks of its photo show other ones, but for those that links join to it."""
+    component, views = links.components(len(masks)), np.array([mask.view for mask in masks], np.int64)
+    is_drawn = np.array([mask.origin == Origin.CORRECTED for mask in masks], bool)
+    apart = is_drawn[:, None] & (views[:, None] == views) & (component[:, None] != component)
+    pairs = np.argwhere(np.triu(apart | apart.T))
+    return replace(links, cannot=torch.cat((links.cannot, torch.from_numpy(pairs))))
+
+
 def _remove(work: _Work, number: int, mask: EditedMask) -> None:
     """Take a mask away; the edits that made it, or linked it, are contradicted."""
     work.masks.remove(mask)
@@ -300,13 +325,33 @@ def _contradict(work: _Work, number: int, edits: Sequence[int]) -> None:
 
 def _mask_at(work: _Work, place: Place) -> EditedMask:
     """The smallest mask at a place, as it would be drawn on top."""
+    here = _masks_at(work, place, work.masks)
+    if not here:
+        name, x, y = place
+        raise _Lost(f"there is no mask at ({x:g}, {y:g}) in view {name}")
+    return min(here, key=lambda mask: (work.is_rejected(mask), int(mask.crop.sum())))
+
+
+def _kept_mask_at(work: _Work, number: int, place: Place) -> EditedMask:
+    """The same for an edit that says something of a leaf: a mask that was rejected there comes back, if there is no
+    other, and its rejection is contradicted. The later edit wins."""
+    gone = _masks_at(work, place, [mask for _, mask in work.rejected])
+    if gone and not _masks_at(work, place, work.masks):
+        work.masks.append(gone[-1])
+    mask = _mask_at(work, place)
+    _contradict(work, number, [n for n, other in work.rejected if other is mask])
+    _contradict(work, number, [n for n, other, rejects in work.everywhere if rejects and other is mask])
+    work.rejected = [each for each in work.rejected if each[1] is not mask]
+    work.everywhere = [each for each in work.everywhere if each[1] is not mask or not each[2]]
+    return mask
+
+
+def _masks_at(work: _Work, place: Place, masks: Sequence[EditedMask]) -> list[EditedMask]:
+    """Those of these masks that a place lies in."""
     name, x, y = place
     view = _view(work.scene, name)
     column, row = np.floor(_to_pinhole(work.scene, view, [(x, y)])[0]).astype(int).tolist()
-    here = [mask for mask in work.masks if mask.view == view and mask.holds(column, row)]
-    if not here:
-        raise _Lost(f"there is no mask at ({x:g}, {y:g}) in view {name}")
-    return min(here, key=lambda mask: (work.is_rejected(mask), int(mask.crop.sum())))
+    return [mask for mask in masks if mask.view == view and mask.holds(column, row)]
 
 
 def _view(scene: Scene, name: str) -> int:

@@ -69,7 +69,7 @@ def list_doubts(masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cam
         surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
         cameras: V cameras.
     """
-    masks, known = masks.to("cpu"), surfaces or {}
+    masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
     found = _doubt_matches(masks)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
     if known:

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.types import StrictBool
 
 from mvseg.errors import InputError
-from mvseg.formats.json_file import Items
+from mvseg.formats.json_file import Items, Pixels
 from mvseg.system.atomic import write_text_whole
 
 FORMAT = "mvseg-corrections/1"
@@ -96,9 +96,19 @@ class TrackLink(_Edit):
 Edit = Annotated[Outline | Reject | Confirm | Split | Link | TrackLink, Field(discriminator="op")]
 
 
+class PhotoMark(BaseModel):
+    """What tells a photo from others: its size, pixels, and the SHA-256 of its file; None for masks without a photo."""
+
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="forbid")
+    width: Pixels
+    height: Pixels
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")] | None = None
+
+
 class _File(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
     format: Literal["mvseg-corrections/1"]
+    photos: Annotated[dict[Text, PhotoMark], Field(max_length=MOST_EDITS)] = {}
     edits: Annotated[Items[Edit], Field(max_length=MOST_EDITS)]
 
 
@@ -109,18 +119,21 @@ class Corrections:
     Attributes:
         edits: in the order of the file.
         source: the file that they were read from, for messages; None in memory.
+        photos: {view: mark} of the photos that they were made for; empty where nobody says so.
     """
 
     edits: tuple[Edit, ...] = ()
     source: Path | None = None
+    photos: Mapping[str, PhotoMark] = field(default_factory=dict)
 
 
-def load_corrections(path: Path) -> Corrections:
+def load_corrections(path: Path | str) -> Corrections:
     """Read a file of corrections.
 
     Raises:
         InputError: the file is missing, too large or not JSON; see `parse_corrections`.
     """
+    path = Path(path)
     try:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"{path}: has {path.stat().st_size} bytes, expected at most {MOST_BYTES}")
@@ -138,7 +151,7 @@ def parse_corrections(data: Any, source: Path | None = None) -> Corrections:
     """Corrections from what a JSON file holds.
 
     Args:
-        data: {"format": "mvseg-corrections/1", "edits": [{"op": ..., ...}, ...]}.
+        data: {"format": "mvseg-corrections/1", "edits": [{"op": ..., ...}, ...]}, and perhaps "photos": {view: mark}.
         source: the file, for messages.
 
     Raises:
@@ -146,7 +159,8 @@ def parse_corrections(data: Any, source: Path | None = None) -> Corrections:
             The message names the file and the edit, counted from 1.
     """
     try:
-        return Corrections(tuple(_File.model_validate(data).edits), source)
+        content = _File.model_validate(data)
+        return Corrections(tuple(content.edits), source, content.photos)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
     place, edit = first["loc"], ""
@@ -159,7 +173,8 @@ def parse_corrections(data: Any, source: Path | None = None) -> Corrections:
 
 def write_corrections(path: Path, corrections: Corrections) -> None:
     """Write a file of corrections, whole or not at all; `load_corrections` reads the same edits from it."""
-    data = {"format": FORMAT, "edits": dump_edits(corrections.edits)}
+    photos = {name: mark.model_dump(exclude_none=True) for name, mark in corrections.photos.items()}
+    data = {"format": FORMAT, **({"photos": photos} if photos else {}), "edits": dump_edits(corrections.edits)}
     write_text_whole(path, json.dumps(data, indent=1, allow_nan=False) + "\n")
 
 

@@ -104,12 +104,15 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             With `verify`, masks are 0 or 1, and `from_views` (bool) marks those that only the other views show.
 
         Raises:
-            InputError: fewer than two images, not one camera per image, or an image of another size than its camera.
+            InputError: fewer than two images, not one camera per image, an image of another size than its camera, or
+                one of integers.
         """
         if self.training or cameras is None:
             return super().forward(images, targets)
         sizes = [[image.shape[-1], image.shape[-2]] for image in images]
         _check_cameras(cameras, sizes)
+        for view, image in enumerate(images):
+            _check_image(image, f"image {view}")
         if self.verify:
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
@@ -155,7 +158,12 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:
-        """The excessive set of one image (3, H, W) in [0, 1], on the CPU: what `match_detections` takes."""
+        """The excessive set of one image (3, H, W) in [0, 1], on the CPU: what `match_detections` takes.
+
+        Raises:
+            InputError: an image of integers.
+        """
+        _check_image(image, "the image")
         return {key: value.cpu() for key, value in self._propose(image).items()}
 
     @torch.no_grad()
@@ -221,6 +229,12 @@ def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device)
         }
         results.append({key: value.to(device) for key, value in result.items()})
     return results
+
+
+def _check_image(image: Tensor, name: str) -> None:
+    if not image.is_floating_point():
+        kind = str(image.dtype).removeprefix("torch.")
+        raise InputError(f"{name} is {kind}, expected floats in [0, 1]: image.float() / 255")
 
 
 def _check_cameras(cameras: Cameras, sizes: list[list[int]]) -> None:

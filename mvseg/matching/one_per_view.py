@@ -75,7 +75,15 @@ class ViewGraph:
         """(D,) whether a person says anything of a region."""
         if self.node is None or self.apart is None:
             return np.zeros(len(self.view_index), bool)
-        return (np.bincount(self.node)[self.node] > 1) | self.apart.any(1)
+        return self.is_joined | self.apart.any(1)
+
+    @property
+    def is_joined(self) -> NDArray[np.bool_]:
+        """(D,) whether a person says of a region that it stays with another one."""
+        if self.node is None:
+            return np.zeros(len(self.view_index), bool)
+        is_joined: NDArray[np.bool_] = np.bincount(self.node)[self.node] > 1
+        return is_joined
 
     def movers(self, view: int) -> Movers:
         """The nodes that a view shows."""

@@ -10,26 +10,22 @@ import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import TypeAdapter, ValidationError
 
-from mvseg._version import code_hash
-from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, InputWarning
 from mvseg.masks import Masks
 from mvseg.pipeline import Stage, State, detect, list_stages, load, reconstruct
 from mvseg.reconstruction.shapes import Surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.results.earlier import RUN_FILE
 from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Instances, Result
+from mvseg.runs.recorded_run import read_recorded
 from mvseg.system.atomic import lock_folder
 from mvseg.verification.other_views import colors_of_leaves, fit_roughly, verify_masks
 
@@ -46,9 +42,8 @@ class OpenResult:
 
     Attributes:
         folder: of the result.
-        run: what its run.json says.
+        run: that made it.
         notice: what a person should know of it; "" for nothing.
-        config: the options of its run.
         found: the masks, not matched yet, or how to find them.
     """
 
@@ -60,12 +55,11 @@ class OpenResult:
                 photos are gone.
         """
         self.folder = folder
-        self.run = _read_run(folder)
-        self.config, scene, masks = _read_options(folder, self.run)
-        self.notice = ""
-        if self.run.get("code") != code_hash():
-            self.notice = f"mvseg {str(self.run.get('mvseg'))[:60]} made this result; what you see is computed anew."
-        state = load(scene, masks, self.config, workers=workers)
+        self.run = read_recorded(folder)
+        self.config, masks = self.run.config, self.run.masks
+        changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
+        self.notice = " ".join(("What you see is computed anew.", *changes)) if changes else ""
+        state = load(self.run.scene, masks, self.config, workers=workers)
         if not state.photos.exist:
             raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
         self.found = state if masks is not None else detect(state)
@@ -186,52 +180,3 @@ def check_writable(folder: Path) -> None:
     """Raises InputError: nothing can be written to the folder."""
     if not os.access(folder, os.W_OK | os.X_OK):
         raise InputError(f"{folder}: cannot be written to, so corrections would be lost; expected a copy of your own")
-
-
-def say_how_to_run(result: OpenResult) -> str:
-    """The command that makes the whole result with the corrections."""
-    config = result.run["config"]
-    masks = f" --masks {config['masks']}" if config.get("masks") else ""
-    verb = "match" if result.config.reconstruct is None else "infer"
-    corrections = result.folder / CORRECTIONS_FILE
-    return f"mvseg {verb} {config['scene']}{masks} --out {result.folder} --corrections {corrections}"
-
-
-def _read_run(folder: Path) -> dict[str, Any]:
-    path = folder / RUN_FILE
-    try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-    except OSError:
-        raise InputError(f"{folder}: holds no {RUN_FILE}, expected a result folder of mvseg infer") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a whole JSON file ({error})") from None
-    if not isinstance(run, dict) or not isinstance(run.get("config"), dict) or "scene" not in run["config"]:
-        raise InputError(f"{path}: does not say which scene this is, expected a result of one scene")
-    return run
-
-
-def _read_options(folder: Path, run: dict[str, Any]) -> tuple[RunConfig, Path, Path | None]:
-    """The options, the scene folder and the masks of a result."""
-    paths = ("scene", "out", "masks", "corrections")
-    options = {name: value for name, value in run["config"].items() if name not in paths}
-    known = asdict(RunConfig())
-    unknown = [name for name in options if name not in known]
-    for stage, inside in options.items():
-        if isinstance(inside, dict) and isinstance(known.get(stage), dict):
-            unknown += [f"{stage}.{name}" for name in inside if name not in known[stage]]
-    try:
-        if unknown:
-            raise InputError(f"unknown option {unknown[0]}")
-        config = TypeAdapter(RunConfig).validate_python({"reconstruct": None, **options})
-    except (ValidationError, InputError) as error:
-        problem = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
-        made = str(run.get("mvseg"))[:60]
-        message = f"mvseg {made} made this result, with options that this version does not have ({problem})"
-        raise InputError(f"{folder}: {message}; expected one made by this version") from None
-    scene, given = Path(str(run["config"]["scene"])), run["config"].get("masks")
-    masks = None if given is None else Path(str(given))
-    if not scene.exists():
-        raise InputError(f"{scene}: the scene of this result is gone, expected it there")
-    if masks is not None and not masks.exists():
-        raise InputError(f"{masks}: the masks of this result are gone, expected them there")
-    return config, scene, masks

@@ -10,7 +10,10 @@ import hmac
 import json
 import re
 import secrets
+import subprocess
+import sys
 import threading
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from http import HTTPStatus
@@ -23,7 +26,8 @@ from pydantic import BaseModel, Field
 
 from mvseg.corrections.file import MOST_BYTES, Corrections, Point, name_edits, parse_corrections, write_corrections
 from mvseg.corrections.rough_outline import refine_outline
-from mvseg.errors import InputError
+from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
+from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.results.report.page import build_page, describe_update
 from mvseg.results.report.pictures import draw_picture
@@ -51,15 +55,20 @@ class Corrector:
     """One open result, its newest edits, and a thread that computes their consequences; the newest edits win."""
 
     def __init__(self, opened: OpenResult) -> None:
-        """Raises InputError: the corrections saved in the folder, or a photo, cannot be read."""
+        """Raises InputError: the corrections saved in the folder, or a photo, cannot be read, or they are another
+        scene's."""
         self.opened = opened
-        self.corrections = opened.saved_corrections()
+        self.corrections, self.marks = opened.saved_corrections(), mark_photos(opened.found.scene)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            check_made_for(self.corrections, opened.found.scene)
         self.shown = opened.matched()
         photos, views = opened.found.photos, range(len(opened.found.scene.views))
         self.pictures = [draw_picture(photos(view), self.shown.masks, view=view) for view in views]
         self.news = threading.Condition()
         self.wanted, self.computed = 1, 0
-        self.problem, self.outcomes = opened.notice, [""] * len(self.corrections.edits)
+        self.notice = " ".join(filter(None, (opened.notice, *(f"{each.message}." for each in caught))))
+        self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
         self.revision = name_edits(self.corrections.edits)
         self.is_closing = False
@@ -68,7 +77,7 @@ class Corrector:
         """The page with the newest result, and with all edits that were saved: a reload must not lose any."""
         with self.news:
             shown, pictures = replace(self.shown, corrections=self.corrections), self.pictures
-        return build_page(shown, pictures, run=self.opened.run, is_served=True).encode()
+        return build_page(shown, pictures, run=dict(self.opened.run.said), is_served=True).encode()
 
     def save(self, text: bytes, base: str) -> dict[str, Any]:
         """Write the edits of a corrections.json to the result folder and have them computed; returns their number and
@@ -88,6 +97,7 @@ class Corrector:
         with self.news:  # one after another, in the order in which they are wanted
             if name_edits(self.corrections.edits) not in (base, name):  # the same again: its answer was lost
                 raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
+            corrections = with_marks(corrections, self.opened.found.scene, self.marks)
             write_corrections(self.opened.folder / CORRECTIONS_FILE, corrections)
             self.corrections = corrections
             self.wanted += 1
@@ -116,7 +126,7 @@ class Corrector:
                 for view, picture in enumerate(self.pictures)
             ]
             news = shown, pictures, describe_update(shown, pictures)
-            problem = " ".join([self.opened.notice, *messages]).strip()
+            problem = " ".join([self.notice, *messages]).strip()
         except Superseded:
             return
         except InputError as error:
@@ -166,6 +176,24 @@ class Corrector:
         placed = found if lens is None else photo_from_pinhole(lens, K, found)
         return {"polygon": np.round(placed, 2).tolist()}
 
+    def whole(self) -> dict[str, Any]:
+        """Make the whole result with the saved edits, in its place, by a process of its own, and say where it is.
+
+        Raises:
+            InputError: the run ended with an error; its sentence.
+        """
+        folder = self.opened.folder.resolve()
+        path = folder / CORRECTIONS_FILE
+        with self.news:
+            write_corrections(path, self.corrections)
+        words = ["infer", "--again", str(folder), "--corrections", str(path), "--quiet"]
+        run = subprocess.run([sys.executable, "-m", "mvseg.cli", *words], capture_output=True, text=True, check=False)
+        with self.news:  # edits that were saved meanwhile lay in the folder that was replaced
+            write_corrections(path, self.corrections)
+        if run.returncode:
+            raise InputError((run.stderr.strip().splitlines() or ["the run was stopped"])[-1])
+        return {"said": run.stdout.strip()}
+
     def close(self) -> None:
         """Let everybody who waits go."""
         with self.news:
@@ -210,7 +238,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._answer({"edits": lambda: self._json(self.server.corrector.save(self._body(), self._asked("base")))})
 
     def do_POST(self) -> None:
-        self._answer({"outline": lambda: self._json(self.server.corrector.outline(self._body()))})
+        corrector = self.server.corrector
+        self._answer({
+            "outline": lambda: self._json(corrector.outline(self._body())),
+            "whole": lambda: self._json(corrector.whole()),
+        })
 
     def _answer(self, places: Mapping[str, Callable[[], None]]) -> None:
         try:

@@ -25,6 +25,7 @@ from mvseg.pipeline import run_scene
 from mvseg.results.earlier import check_out, check_same_scene
 from mvseg.results.folder import save_result
 from mvseg.results.result import Result
+from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.file_hash import hash_files
 from mvseg.system.worker_pool import start_workers
@@ -37,6 +38,7 @@ def run_one_scene(
     *,
     config: RunConfig,
     corrections: Path | None = None,
+    force_corrections: bool = False,
     num_workers: int = 1,
     overwrite: bool = False,
     quiet: bool,
@@ -44,7 +46,7 @@ def run_one_scene(
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json.
 
     Raises:
-        InputError: bad input; `out` holds a result of another scene, or what a run found in its photos, and `overwrite`
+        InputError: bad input; corrections of another scene, unless `force_corrections` is set; `out` holds a result of another scene, or what a run found in its photos, and `overwrite`
             is not set; or another run detects for `out` now.
     """
     sweep_abandoned(out)
@@ -61,7 +63,14 @@ def run_one_scene(
             print(f"mvseg: going on from the detections in {cache}, for equal photos and options", file=sys.stderr)
         with start_workers(num_workers) as workers:
             result, messages = solve_scene(
-                scene, masks, config, corrections=corrections, cache=cache, workers=workers, progress=not quiet
+                scene,
+                masks,
+                config,
+                corrections=corrections,
+                force_corrections=force_corrections,
+                cache=cache,
+                workers=workers,
+                progress=not quiet,
             )
         for message in messages:
             print(f"mvseg: warning: {message}", file=sys.stderr)
@@ -73,12 +82,50 @@ def run_one_scene(
     print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
 
 
+def run_again(
+    folder: Path,
+    *,
+    out: Path | None = None,
+    corrections: Path | None = None,
+    force_corrections: bool = False,
+    num_workers: int = 1,
+    overwrite: bool = False,
+    quiet: bool,
+) -> None:
+    """The run that made a result once more, with its options; stderr says what has changed since.
+
+    Args:
+        folder: the result.
+        out: where the new one goes; None: in its place.
+        corrections: file of a person's edits; None: that of the run, if it had one.
+        force_corrections, num_workers, overwrite, quiet: as of `run_one_scene`.
+
+    Raises:
+        InputError: see `read_recorded` and `run_one_scene`.
+    """
+    run = read_recorded(folder)
+    for change in run.changes:
+        print(f"mvseg: {change}", file=sys.stderr)
+    run_one_scene(
+        run.scene,
+        None if run.masks is None else run.masks.resolve(),
+        folder if out is None else out,
+        config=run.config,
+        corrections=(corrections or run.corrections) and Path(corrections or run.corrections or "").resolve(),
+        force_corrections=force_corrections,
+        num_workers=num_workers,
+        overwrite=overwrite,
+        quiet=quiet,
+    )
+
+
 def solve_scene(
     scene: Path,
     masks: Path | None,
     config: RunConfig,
     *,
     corrections: Path | None = None,
+    force_corrections: bool = False,
     cache: Path,
     workers: ProcessPoolExecutor | None = None,
     progress: bool,
@@ -89,7 +136,14 @@ def solve_scene(
         if masks is not None and config.detect != DetectConfig():
             warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
         result = run_scene(
-            scene, masks, config, corrections=corrections, cache=cache, workers=workers, progress=progress
+            scene,
+            masks,
+            config,
+            corrections=corrections,
+            force_corrections=force_corrections,
+            cache=cache,
+            workers=workers,
+            progress=progress,
         )
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
@@ -111,7 +165,8 @@ def save_scene(
     """Write the result folder, run.json included; with the report, the findings of the checks of the scene and its
     masks."""
     run = describe_run(result, masks, config, messages=messages)
-    run["config"] = {"scene": str(scene.resolve()), "out": str(out)} | run["config"]
+    corrections = None if result.corrections is None else result.corrections.source
+    run["config"] |= record_places(scene, out, masks, corrections)
     if config.report:
         check = check_scene(result.scene, result.regions, features=False)  # of which the run has warned
         run["checks"] = [asdict(finding) for finding in check.findings]
@@ -136,14 +191,13 @@ def describe_run(
     corrections = None if result.corrections is None else result.corrections.source
     if corrections is not None:
         sources.append(corrections)
-        options["corrections"] = str(corrections)
     return {
         **made_by(),
         "torch": torch.__version__,
         "python": platform.python_version(),
         "scene": result.scene.name,
-        "inputs": {str(path): hash_files(path) for path in sources if path is not None},
-        "config": {"masks": masks and str(masks)} | options,
+        "inputs": {str(path.resolve()): hash_files(path) for path in sources if path is not None},
+        "config": options,
         "mask_kind": result.mask_kind or None,
         "warnings": list(messages),
     }

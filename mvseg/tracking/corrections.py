@@ -23,12 +23,15 @@ def read_track_links(path: Path) -> list[TrackLink]:
 def find_links(edits: Sequence[TrackLink], dates: Sequence[PlantOnDate]) -> tuple[list[LeafLink], list[str]]:
     """The links between leaves of these dates, and a sentence for each edit that points at no leaf.
 
-    Edits that name none of the scenes are another plant's: they are passed over.
+    Edits that name none of the scenes are another plant's: they are passed over. A scene may be named by the end of its
+    path, if no other one ends so.
     """
     folders = {date.scene: date.folder for date in dates if date.folder is not None}
     links, lost = [], []
-    for edit in edits:
-        if not any(scene in folders for scene, *_ in edit.at):
+    for original in edits:
+        edit, unclear = _with_full_names(original, list(folders))
+        lost += [f"{edit.op}: {name} fits {' and '.join(fitting)}, expected one of them" for name, fitting in unclear]
+        if unclear or not any(scene in folders for scene, *_ in edit.at):
             continue
         leaves = []
         for scene, view, x, y in edit.at:
@@ -53,3 +56,11 @@ def leaf_at(folder: Path, view: str, x: float, y: float) -> int:
     labels, column, row = read_labels(path), int(x // 1), int(y // 1)
     is_inside = 0 <= row < labels.shape[0] and 0 <= column < labels.shape[1]
     return int(labels[row, column]) if is_inside else 0
+
+
+def _with_full_names(edit: TrackLink, scenes: Sequence[str]) -> tuple[TrackLink, list[tuple[str, list[str]]]]:
+    """The edit with the names that scenes have, and the names that fit several, with these."""
+    fitting = {name: [each for each in scenes if each == name or each.endswith(f"/{name}")] for name, *_ in edit.at}
+    full = {name: found[0] if len(found) == 1 or name in found else name for name, found in fitting.items() if found}
+    unclear = [(name, found) for name, found in fitting.items() if len(found) > 1 and name not in found]
+    return edit.model_copy(update={"at": tuple((full.get(name, name), *at) for name, *at in edit.at)}), unclear

@@ -34,6 +34,7 @@ ROWS = 12  # of points from base to tip, three in each: edge, midrib, edge
 CLOUD = 3 * ROWS  # points that stand for a leaf
 UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}  # in millimetres
 REJECTED = "rejected:"
+MOST_PARTS = 256  # of a path: as many as there can be
 
 
 @dataclass(frozen=True)
@@ -110,6 +111,7 @@ class _World(BaseModel):
 
 class _Run(BaseModel):
     traits: _World | None = None
+    files: dict[str, str] = {}
 
 
 def read_date(folder: Path, time: str | float) -> PlantOnDate:
@@ -121,14 +123,18 @@ def read_date(folder: Path, time: str | float) -> PlantOnDate:
     folder = find_result(folder)
     if not (folder / "run.json").is_file():
         raise InputError(f"{folder}: is no result, expected a folder that mvseg infer or mvseg batch wrote")
-    world = read_json(folder / "run.json", _Run).traits
+    run = read_json(folder / "run.json", _Run)
+    world = run.traits
     if world is None or not (folder / "traits.csv").is_file():
         raise InputError(f"{folder}: has ids but no surfaces, run mvseg infer or mvseg batch with these masks first")
     by_leaf, methods = _read_traits(folder / "traits.csv")
     frame, leaves = None if world.up is None else level_frame(world.up), []
     for number, method in sorted(methods.items()):
         if number and not any(each.startswith(REJECTED) for each in method.values()):
-            vertices = _read_vertices(folder / "leaves" / f"leaf_{number:03d}.ply")
+            name = f"leaves/leaf_{number:03d}.ply"
+            if name in run.files and not (folder / name).is_file():
+                raise InputError(f"{folder / name}: is missing, expected the whole result that run.json lists")
+            vertices = _read_vertices(folder / name)
             is_oriented = BASE_UNKNOWN.method not in method.get("azimuth", "")
             leaves.append(_leaf_of(number, vertices, by_leaf[number], frame, is_oriented=is_oriented))
     return PlantOnDate(
@@ -167,7 +173,8 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
 
 
 def read_time(time: str | float) -> float:
-    """Days: the number itself, or days since year 1 of an ISO date (with a time of day, if you like).
+    """Days: the number itself, or days since year 1 of an ISO date (with a time of day and a time zone, if you like:
+    then it is counted in UTC).
 
     Raises:
         InputError: it is neither.
@@ -178,7 +185,9 @@ def read_time(time: str | float) -> float:
             return number
     except ValueError:
         with suppress(ValueError):
-            moment = datetime.datetime.fromisoformat(text).replace(tzinfo=None)
+            moment = datetime.datetime.fromisoformat(text)
+            if moment.tzinfo is not None:
+                moment = moment.astimezone(datetime.UTC).replace(tzinfo=None)
             return 1 + (moment - datetime.datetime.min) / datetime.timedelta(days=1)
     raise InputError(f"time '{time}': expected a number (days) or an ISO date, as in 2026-05-31")
 
@@ -192,6 +201,8 @@ def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
     are_iso = {_is_iso(date.written) for date in dates}
     if len(are_iso) > 1:
         raise InputError("the times are numbers and ISO dates, expected one of the two for all dates of a plant")
+    if len({_has_zone(date.written) for date in dates}) > 1:
+        raise InputError("some times have a time zone and others have none, expected one for all dates of a plant")
     ordered = sorted(dates, key=lambda date: date.time)
     for earlier, later in pairwise(ordered):
         if earlier.time == later.time:
@@ -206,6 +217,33 @@ def _is_iso(text: str) -> bool:
         return not math.isfinite(float(text))
     except ValueError:
         return True
+
+
+def _has_zone(text: str) -> bool:
+    return _is_iso(text) and datetime.datetime.fromisoformat(text).tzinfo is not None
+
+
+def name_apart(dates: Sequence[PlantOnDate]) -> list[PlantOnDate]:
+    """The dates, those whose results have one name with as much of their folders as tells them apart: of mon/plant and
+    fri/plant just this. Results in memory keep their names."""
+    named, parts = list(dates), 1
+    while any(len(same) > 1 for same in _of_one_name(named).values()):
+        parts += 1
+        for same in _of_one_name(named).values():
+            for index in same if len(same) > 1 else ():
+                folder = named[index].folder
+                longer = "" if folder is None else "/".join(folder.resolve().parts[-parts:])
+                named[index] = replace(named[index], scene=longer or named[index].scene)
+        if parts > MOST_PARTS:  # the same folder twice, or results in memory
+            break
+    return named
+
+
+def _of_one_name(dates: Sequence[PlantOnDate]) -> dict[str, list[int]]:
+    same: dict[str, list[int]] = defaultdict(list)
+    for index, date in enumerate(dates):
+        same[date.scene].append(index)
+    return same
 
 
 def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:

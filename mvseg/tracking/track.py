@@ -14,7 +14,7 @@ import numpy as np
 from mvseg.errors import InputError
 from mvseg.tracking.associate import Comparison, Link, Sight, compare_dates, link_leaves
 from mvseg.tracking.costs import leaves_of
-from mvseg.tracking.dates import Floats, PlantOnDate, date_of, order_dates, read_date
+from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
 
 if TYPE_CHECKING:
     from mvseg.results.result import Result
@@ -109,12 +109,12 @@ def track_leaves(
     if len(results) < 2:
         raise InputError(f"{plant}: has {len(results)} date, expected two or more")
     written = range(len(results)) if times is None else times
-    dates = order_dates([
+    dates = order_dates(name_apart([
         result if isinstance(result, PlantOnDate)
         else read_date(Path(result), time) if isinstance(result, Path | str)
         else date_of(result, time)
         for result, time in zip(results, written, strict=True)
-    ])  # fmt: skip
+    ]))  # fmt: skip
     leaves = [leaves_of(date) for date in dates]
     compared = compare_dates(leaves, [date.time for date in dates], knows_up=all(date.knows_up for date in dates))
     same, different = _sights_of(links, dates)
@@ -122,7 +122,7 @@ def track_leaves(
     return Tracks(
         plant=plant, dates=dates, rows=_rows(dates, found, compared.roots),
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
-        warnings=tuple(_warnings(dates, compared)),
+        warnings=tuple(_warnings(dates, compared, found)),
     )  # fmt: skip
 
 
@@ -178,12 +178,14 @@ def _rows(dates: Sequence[PlantOnDate], links: Sequence[Link], roots: np.ndarray
     return tuple(sorted(rows, key=lambda row: (row.date, row.track)))
 
 
-def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[str]:
+def _warnings(dates: Sequence[PlantOnDate], compared: Comparison, links: Sequence[Link]) -> Iterator[str]:
     for later in range(1, len(dates)):
         if compared.roots[later] == later:
             reason = compared.reasons[later - 1]
             pair = f"{dates[later - 1].scene} and {dates[later].scene}"
-            yield f"{pair} cannot be aligned surely ({reason}): their leaves are not linked"
+            by_hand = sum(link.before[0] < later <= link.after[0] for link in links)
+            what = f"only {by_hand} of their leaves are linked, by hand" if by_hand else "their leaves are not linked"
+            yield f"{pair} cannot be aligned surely ({reason}): {what}"
     for (earlier, later), motion in sorted(compared.motions.items()):
         if compared.roots[later] not in compared.roots[earlier + 1 : later]:
             pair = f"{dates[earlier].scene} and {dates[later].scene}"

@@ -81,7 +81,8 @@ class TrainConfig:
         seed: of the weights, the order, the augmentation and the samplers of the losses.
         checkpoint_every: steps between checkpoints; every epoch ends with one, too.
         log_every: steps between records of the losses in log.jsonl.
-        resume: continue from the checkpoint in output, if there is one.
+        resume: continue from the checkpoint in output, if there is one. With more `epochs` than before, the run is
+            prolonged, a finished one too; its learning rate goes on as that of a run of the new length.
     """
 
     output: Path
@@ -179,8 +180,10 @@ def config_values(config: TrainConfig) -> dict[str, Any]:
 
 
 def config_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
-    """The first field that keeps a run from being resumed with another config, "name (before, now after)", or None."""
+    """The first field that keeps a run from being resumed with another config, "name (before, now after)", or None.
+    More epochs prolong a run."""
     for name in now:
-        if name not in FREE_ON_RESUME and before.get(name) != now[name]:
+        is_longer = name == "epochs" and before.get(name, math.inf) <= now[name]
+        if name not in FREE_ON_RESUME and before.get(name) != now[name] and not is_longer:
             return f"{name} ({before.get(name)}, now {now[name]})"
     return None

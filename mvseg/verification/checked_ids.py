@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from mvseg.masks import Masks, MergedMask
+from mvseg.masks import SURE, Masks, MergedMask
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Surfaces = Mapping[int, LeafSurface]
 
+ENOUGH_VIEWS = 5  # with fewer, a surface fits wrong masks about as well as right ones: sure ids stay
 FITS = 0.5  # IoU of a mask with what its view shows of a surface, from which it shows that surface
 FEW_VIEWS = 0.75  # instances that at most this share of the views shows may be made of pieces
 INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
@@ -58,7 +59,7 @@ def check_ids(
     First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
     halves of leaves (`join_halves`). What still lies outside its own surface is matched once more (`rematch_misfits`).
     No mask loses its id without getting another. An instance may have several masks in a view afterwards: they show it
-    together. Last, the masks that show two surfaces are marked as merged (`find_shared`).
+    together. With fewer than `ENOUGH_VIEWS` views, masks that are surely matched stay. Last, the masks that show two surfaces are marked as merged (`find_shared`).
 
     Args:
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces.
@@ -75,6 +76,8 @@ def check_ids(
     on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
     old = masks.instance_ids.cpu().numpy()
     is_held = _is_held(masks, held)
+    if masks.regions.num_views < ENOUGH_VIEWS:
+        is_held |= (masks.match_scores >= SURE).cpu().numpy()
     ids, left = _move_to_surfaces(masks, surfaces, cameras=cameras, is_held=is_held)
     certain = {*old[is_held].tolist()}
     ids = join_halves(on_cpu, ids, {k: each for k, each in left.items() if k not in certain}, cameras=cameras)

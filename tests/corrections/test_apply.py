@@ -201,3 +201,41 @@ def test_a_scene_without_masks_takes_outlines() -> None:
     corrected = correct(square(5, 5, 9, 9), square(5, 5, 9, 9, view="b"), masks=empty)
     assert corrected.masks.view_index.tolist() == [0, 1]
     assert correct(at("reject", 5, 5), masks=empty).masks.view_index.tolist() == []
+
+
+@pytest.mark.parametrize("everywhere", [False, True])
+@pytest.mark.parametrize("later", [at("confirm", 15, 15), link("same", ("a", 15, 15), ("b", 15, 15))])
+def test_a_later_edit_at_the_point_of_a_rejection_wins(everywhere: bool, later: dict[str, Any]) -> None:
+    corrected = correct(at("reject", 15, 15, everywhere=everywhere), later)
+    assert fates(corrected) == ["contradicted by edit 2", "applied"]
+    assert len(corrected.masks) == 4
+    kept, corrected = apply_everywhere(corrected, replace(corrected.masks, instance_ids=torch.tensor([1, 2, 1, 2])))
+    assert len(kept) == 4
+    assert fates(corrected)[1] == "applied"
+
+
+def test_a_rejected_mask_does_not_come_back_before_the_one_below_it() -> None:
+    """The leaf under a false mask is meant, not the false one."""
+    corrected = correct(square(12, 12, 15, 15), at("reject", 13, 13), at("confirm", 13, 13))
+    assert fates(corrected) == ["contradicted by edit 2", "applied", "applied"]
+    assert len(corrected.masks) == 4
+    assert corrected.masks.origin.tolist().count(Origin.CONFIRMED) == 1
+
+
+def test_an_outline_is_a_leaf_of_its_own_unless_links_say_otherwise() -> None:
+    """Matching must not take it for a piece of another one in its photo."""
+    drawn = square(22, 10, 28, 20)
+    apart = correct(drawn)
+    row = apart.masks.origin.tolist().index(Origin.CORRECTED)
+    others = {other for pair in apart.links.cannot.tolist() for other in pair if row in pair} - {row}
+    assert others == {0, 1}  # the two masks of its photo
+    assert not apart.is_linked.any()
+    joined = correct(drawn, link("same", ("a", 25, 15), ("a", 15, 15)))
+    assert [sorted(pair) for pair in joined.links.cannot.tolist()] == [[1, 2]]
+    assert joined.is_linked.tolist() == [True, False, True, False, False]
+
+
+def test_an_outline_over_everything_says_what_it_replaces() -> None:
+    squares = [(5 * n, 10, 5 * n + 4, 20) for n in range(8)]
+    masks = Masks.of(regions_from_label_maps([label_map(*squares), label_map()]))
+    assert correct(square(0, 0, 60, 40), masks=masks).messages == ["correction 1 (outline): applied: it replaces 8 masks"]

@@ -10,7 +10,7 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.tracking.corrections import find_links, read_track_links
-from mvseg.tracking.dates import read_date
+from mvseg.tracking.dates import name_apart, read_date
 from mvseg.tracking.track import LeafLink
 from tests.plants_over_days import grow_blades, write_result
 
@@ -34,6 +34,20 @@ def test_points_become_leaves(tmp_path: Path) -> None:
     links, lost = find_links(read_track_links(path), dates)
     assert links == [LeafLink(True, (("a", 1), ("b", 2)))]
     assert lost == ["different_track: there is no leaf at (0.5, 0.5) in view 000 of b"]
+
+
+def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
+    for place in ("mon/plant", "fri/plant"):
+        write_result(tmp_path / place, grow_blades(3, 1))
+    dates = name_apart([read_date(tmp_path / place, time) for time, place in enumerate(("mon/plant", "fri/plant"))])
+    path = write(
+        tmp_path / "corrections.json",
+        {"op": "same_track", "at": [["mon/plant", "000", 5.5, 20], ["fri/plant", "000", 30.2, 20]]},
+        {"op": "same_track", "at": [["plant", "000", 5.5, 20], ["fri/plant", "000", 30.2, 20]]},
+    )
+    links, lost = find_links(read_track_links(path), dates)
+    assert links == [LeafLink(True, (("mon/plant", 1), ("fri/plant", 2)))]
+    assert lost == ["same_track: plant fits mon/plant and fri/plant, expected one of them"]
 
 
 @pytest.mark.parametrize("view", ["nothing", "../labels/000", "/etc/x"])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.tracking.dates import STATIONS, Number, date_of, order_dates, read_date, read_time
+from mvseg.tracking.dates import STATIONS, Number, date_of, name_apart, order_dates, read_date, read_time
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from tests.plants_over_days import grow_blades, see, write_result
@@ -22,6 +22,36 @@ def test_times_are_days() -> None:
     assert read_time("3.5") == 3.5
     assert read_time("2026-03-02") - read_time("2026-02-27") == 3
     assert read_time("2026-03-02T12:00") - read_time("2026-03-02") == 0.5
+
+
+def test_times_with_a_zone_are_in_the_order_in_which_they_were() -> None:
+    assert read_time("2026-03-02T12:00+00:00") == read_time("2026-03-02T12:00")
+    first, second = "2026-03-02T23:00-05:00", "2026-03-03T01:00+02:00"  # the second is 5 hours earlier
+    assert 24 * (read_time(first) - read_time(second)) == pytest.approx(5)
+    dates = [replace(see(grow_blades(4, 0), 0)[0], scene=text, written=text, time=read_time(text))
+             for text in (first, second)]  # fmt: skip
+    assert [date.scene for date in order_dates(dates)] == [second, first]
+    bare = replace(dates[0], scene="bare", written="2026-03-04", time=read_time("2026-03-04"))
+    with pytest.raises(InputError, match="some times have a time zone"):
+        order_dates([*dates, bare])
+
+
+def test_a_result_that_lost_a_leaf_is_refused(tmp_path: Path) -> None:
+    write_result(tmp_path / "day", grow_blades(3, 1))
+    run = tmp_path / "day" / "run.json"
+    run.write_text(run.read_text().replace('"files": {}', '"files": {"leaves/leaf_003.ply": "hash"}'))
+    assert len(read_date(tmp_path / "day", 0).shaped) == 3
+    (tmp_path / "day" / "leaves" / "leaf_003.ply").unlink()
+    with pytest.raises(InputError, match=r"leaf_003.ply: is missing, expected the whole result"):
+        read_date(tmp_path / "day", 0)
+
+
+def test_results_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> None:
+    for place in ("mon/plant", "fri/plant", "fri/other"):
+        write_result(tmp_path / place, grow_blades(3, 1))
+    dates = [read_date(tmp_path / place, 0) for place in ("mon/plant", "fri/plant", "fri/other")]
+    assert [date.scene for date in name_apart(dates)] == ["mon/plant", "fri/plant", "other"]
+    assert [date.scene for date in name_apart([dates[0], dates[0]])][0].endswith("mon/plant")
 
 
 @pytest.mark.parametrize("text", ["", "noon", "nan", "2026-13-01"])

@@ -2,8 +2,9 @@
 
 Pairs of views cannot tell apart leaves that share their epipolar lines; a third view can. What the views show along the
 rays of each region (`plane_sweep.py`) gives initial partitions (`initialisation.py`); the search (`search.py`) improves
-them by how well clusters explain all views (`cluster_scores.py`); then every id gets a probability (`match_scores.py`),
-and masks that cover two instances are found (`merged_masks.py`).
+them by how well clusters explain all views (`cluster_scores.py`); what shares a photo with its leaf and is likelier a
+stranger than a piece leaves (`pieces.py`); then every id gets a probability (`match_scores.py`), and masks that cover
+two instances are found (`merged_masks.py`).
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
+from mvseg.matching.nview.pieces import part_pieces
 from mvseg.matching.nview.plane_sweep import PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import search
 from mvseg.matching.one_per_view import ViewGraph, link_average, power_iteration
@@ -69,6 +71,7 @@ def match_nview(
     scores, clusters = found.scores, found.clusters
     if links is not None and not links.select(order).agree(clusters):
         scores, clusters = search_again(found, links.select(order), progress=progress)
+    clusters, chance = part_pieces(scores, clusters)
     evidence = collect_evidence(scores, clusters, found.pairwise)
     report = MatchReport(
         method=found.method,
@@ -77,7 +80,7 @@ def match_nview(
         explained=scores.explained(clusters),
         view_explained=torch.from_numpy(scores.explained_per_view(clusters)).float().to(regions.device),
     )
-    probabilities = torch.from_numpy(match_scores(evidence)).float()
+    probabilities = torch.from_numpy(np.minimum(match_scores(evidence), chance)).float()
     masks = Masks.of(ordered.to("cpu"), torch.from_numpy(clusters + 1), probabilities)
     masks = masks.with_merged(find_merged(scores, clusters, ordered)).select(order.argsort().cpu())
     masks = masks.relabel(_final_numbers(masks.instance_ids))

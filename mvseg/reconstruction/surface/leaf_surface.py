@@ -171,7 +171,8 @@ class LeafSurface:
         return trimesh.Trimesh(vertices, grid_triangles(num_rows, num_columns), process=False)
 
     def project(self, cameras: Cameras) -> list[Tensor]:
-        """V masks (H, W) bool: the pixels that the surface covers half or more of, as if nothing hid it.
+        """V masks (H, W) bool on the cameras' device: the pixels that the surface covers half or more of, as if nothing
+        hid it.
 
         Parts behind a camera are left out.
         """
@@ -181,7 +182,7 @@ class LeafSurface:
         ):
             mask = torch.zeros(height, width, dtype=torch.bool)
             mask[y1:y2, x1:x2] = torch.from_numpy(part)
-            masks.append(mask)
+            masks.append(mask.to(cameras.device))
         return masks
 
     def project_parts(self, cameras: Cameras) -> list[Part]:
@@ -189,7 +190,8 @@ class LeafSurface:
 
         Drawn once for the same cameras: many stages ask, and so does each edit of a person.
         """
-        key = cameras.px_from_world.cpu().numpy().tobytes() + cameras.sizes.cpu().numpy().tobytes()
+        cameras = cameras.to("cpu")
+        key = cameras.px_from_world.numpy().tobytes() + cameras.sizes.numpy().tobytes()
         if key not in self._drawn:
             self._drawn[key] = self._draw_parts(cameras)
         return self._drawn[key]

@@ -13,6 +13,7 @@ import numpy as np
 from mvseg.corrections.apply import APPLIED, PASSED, Fate
 from mvseg.corrections.doubtful import Doubt, list_doubts
 from mvseg.corrections.file import dump_edits, name_edits
+from mvseg.corrections.same_scene import mark_photos
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.results.report.pictures import UNITS, Picture
 from mvseg.results.result import Result
@@ -31,6 +32,7 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
     return {
         "key": hashlib.sha256(name.encode()).hexdigest()[:16],
         "edits": edits,
+        "photos": {name: mark.model_dump(exclude_none=True) for name, mark in mark_photos(result.scene).items()},
         "revision": name_edits(made),
         "outcomes": [describe_fate(fate) for fate in result.fates],
         "lenses": lenses,

@@ -95,7 +95,7 @@ class Person(Opened):
         assert path.name == "corrections.json"
         assert len(load_corrections(path).edits) == self.num_edits()
         content = json.loads(path.read_text(encoding="utf-8"))
-        assert content.keys() == {"format", "edits"}
+        assert content.keys() == {"format", "photos", "edits"}
         for edit in content["edits"]:
             edit.pop("when", None)
         return content["edits"]

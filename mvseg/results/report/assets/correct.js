@@ -7,7 +7,7 @@ class Work {
   constructor(data, addresses) {
     Object.assign(this, { data, addresses, picks: [], tool: null, draft: null, doubt: null, note: "", server: null });
     this.frames = data.views.map((view, index) => new Frame(view, data.correct.views[index], data.correct.lenses));
-    this.edits = new Edits(data.correct);
+    this.edits = new Edits(data.correct, data.views);
     this.skipped = new Set();
     this.read();
     this.panes = [new Pane(this), new Pane(this)];

@@ -10,15 +10,16 @@ const OPS = {
 };
 
 class Edits {
-  constructor({ key, edits, isServed }) {
+  constructor({ key, edits, photos, isServed }, views) {
     this.place = isServed ? null : `mvseg-corrections:${key}`; // what is served is kept by the server
     this.list = edits;
+    [this.photos, this.views] = [photos, views]; // what tells this plant's photos from others', and their names
     this.earlier = []; // lists before the last changes, for "undo"
     this.listeners = [];
     this.problem = "";
     try {
       const kept = this.place && window.localStorage.getItem(this.place);
-      if (kept !== null) this.list = readEdits(kept);
+      if (kept !== null) this.list = readEdits(kept, this.photos);
     } catch (error) {
       this.problem = `What this browser kept of earlier edits cannot be read: ${error.message}`;
     }
@@ -58,7 +59,12 @@ class Edits {
 
   text() {
     const lines = this.list.map((edit) => `  ${JSON.stringify(edit)}`);
-    return `{"format": "${FORMAT}",\n "edits": [\n${lines.join(",\n")}\n ]}\n`;
+    const named = this.list.filter((edit) => !edit.op.endsWith("_track"))
+      .flatMap((edit) => edit.view ?? edit.at.map(([view]) => view));
+    const found = [...new Set(named.map((name) => viewNamed(name, this.views)))].filter((view) => view >= 0);
+    const photos = found.map((view) => this.views[view].name).map((name) => [name, this.photos[name]]);
+    const marks = photos.length ? `\n "photos": ${JSON.stringify(Object.fromEntries(photos))},` : "";
+    return `{"format": "${FORMAT}",${marks}\n "edits": [\n${lines.join(",\n")}\n ]}\n`;
   }
 
   save() {
@@ -69,7 +75,8 @@ class Edits {
 }
 
 // The edits in the text of a corrections.json. Throws an Error whose message is one sentence.
-function readEdits(text) {
+// `photos`: of this plant; a file that names others was made for another one.
+function readEdits(text, photos) {
   if (text.length > MOST_BYTES) throw new Error(`the file has ${text.length} bytes, expected at most ${MOST_BYTES}`);
   let content;
   try {
@@ -79,6 +86,10 @@ function readEdits(text) {
   }
   if (content?.format !== FORMAT) throw new Error(`the file is none of corrections, expected "format": "${FORMAT}"`);
   if (!Array.isArray(content.edits)) throw new Error('"edits" is no list');
+  const other = Object.entries(content.photos ?? {}).find(([name, mark]) => Object.hasOwn(photos, name) &&
+    ["width", "height", "sha256"].some((key) => mark?.[key] !== undefined && photos[name][key] !== undefined &&
+      mark[key] !== photos[name][key]));
+  if (other) throw new Error(`it was made for another scene (photo ${other[0]} is another one here)`);
   if (content.edits.length > MOST_EDITS) {
     throw new Error(`the file has ${content.edits.length} edits, expected at most ${MOST_EDITS}`);
   }

@@ -145,7 +145,8 @@ class Panel {
       element("ol", { reversed: "", start: edits.list.length }, ...rows),
       element("div", { class: "answers" },
         this.button("Save corrections.json", null, () => this.save(), { disabled: !some, main: some && !server }),
-        this.button("Load\u2026", null, () => this.file.click())),
+        this.button("Load\u2026", null, () => this.file.click()),
+        ...(server ? [this.button("Make the whole result", null, () => server.whole())] : [])),
     ];
   }
 
@@ -177,7 +178,7 @@ class Panel {
     if (!file) return;
     try {
       if (file.size > MOST_BYTES) throw new Error(`the file has ${file.size} bytes, expected at most ${MOST_BYTES}`);
-      this.work.edits.change(readEdits(await file.text()));
+      this.work.edits.change(readEdits(await file.text(), this.work.edits.photos));
       const loaded = `${count(this.work.edits.list.length, "edit")} loaded, in place of those before`;
       this.work.say(`${file.name}: ${loaded} (Undo brings them back).`);
     } catch (error) {

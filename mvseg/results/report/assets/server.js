@@ -109,6 +109,17 @@ class Server {
     }
   }
 
+  // The whole result, traits included, with the edits that are saved.
+  async whole() {
+    this.tell({ whole: "" }, "Making the whole result\u2026");
+    try {
+      const { said } = await this.ask("whole", { method: "POST" });
+      this.tell({ whole: "" }, said);
+    } catch (error) {
+      this.tell({ whole: `The whole result was not made: ${error.message}` }, "");
+    }
+  }
+
   tell(messages, state) {
     Object.assign(this.messages, messages);
     this.state = state;

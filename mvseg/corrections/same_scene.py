@@ -1,0 +1,71 @@
+"""Were corrections made for this scene? Views of two plants often have the same names, and points fit anywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+from mvseg.corrections.file import Corrections, Edit, Link, PhotoMark, TrackLink
+from mvseg.errors import InputError, warn
+from mvseg.formats.find_views import find_views
+from mvseg.scene import Scene
+from mvseg.system.file_hash import hash_files
+
+
+def mark_photos(scene: Scene) -> dict[str, PhotoMark]:
+    """{name of a view: what tells its photo from others}, of all views."""
+    sizes = scene.cameras.sizes.tolist()
+    return {
+        view.name: PhotoMark(width=width, height=height, sha256=hash_files(view.path) if view.path.is_file() else None)
+        for view, (width, height) in zip(scene.views, sizes, strict=True)
+    }
+
+
+def with_marks(corrections: Corrections, scene: Scene, marks: Mapping[str, PhotoMark]) -> Corrections:
+    """The corrections with the marks of the photos that they name, of those of the scene (`mark_photos`)."""
+    found: dict[str, PhotoMark] = {}
+    for name in views_of(corrections):
+        with suppress(InputError):  # it fits several
+            (view,) = find_views([name], scene, source=Path("corrections"))
+            if view is not None:
+                found[scene.views[view].name] = marks[scene.views[view].name]
+    return replace(corrections, photos=found)
+
+
+def views_of(corrections: Corrections) -> list[str]:
+    """The views that edits of single scenes name, each once."""
+    return list(dict.fromkeys(name for edit in corrections.edits for name in _names(edit)))
+
+
+def _names(edit: Edit) -> list[str]:
+    if isinstance(edit, TrackLink):
+        return []
+    return [name for name, *_ in edit.at] if isinstance(edit, Link) else [edit.view]
+
+
+def check_made_for(corrections: Corrections, scene: Scene) -> None:
+    """Check that the photos are those that the corrections were made for; views that the scene does not have are left
+    to `apply`.
+
+    Warns (InputWarning) of a file that does not say which photos it was made for.
+
+    Raises:
+        InputError: a photo is another one, or of another size.
+    """
+    source = corrections.source or "the corrections"
+    if corrections.source is not None and views_of(corrections) and not corrections.photos:
+        warn(f"{source}: does not say which photos it was made for, and is taken for this scene's")
+    named = find_views(list(corrections.photos), scene, source=Path(str(source)))
+    marks = mark_photos(scene)
+    for (name, stated), view in zip(corrections.photos.items(), named, strict=True):
+        if view is None:
+            continue
+        actual = marks[scene.views[view].name]
+        is_other = None not in (stated.sha256, actual.sha256) and stated.sha256 != actual.sha256
+        if is_other or (stated.width, stated.height) != (actual.width, actual.height):
+            raise InputError(
+                f"{source}: was made for another scene (photo {name} is another one here), expected corrections of "
+                f"{scene.name}; --force_corrections true applies them all the same"
+            )

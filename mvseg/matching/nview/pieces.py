@@ -1,0 +1,67 @@
+"""Several masks of one photo in one cluster: pieces of one leaf, or a leaf and a stranger.
+
+A leaf that only one photo shows fits somewhere all the same: what lies along its rays is another leaf. So a second mask
+of one photo must be as likely a piece as this scene's masks are in pieces, and explained by the cluster nearly as well
+as the first. A logistic regression says how likely; `python benchmarks/pieces.py` fits it.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import expit
+
+from mvseg.matching.nview.cluster_scores import ClusterScores
+from mvseg.matching.partition import renumber
+
+Floats = NDArray[np.floating]
+Ints = NDArray[np.int64]
+
+COEFFICIENTS = (1.28, 0.84, 3.69, 4.37, -3.93)  # intercept, then one for each column of `piece_features`
+LEAST = 0.5  # probability from which a mask stays: a definition, it is likelier a piece than not
+
+
+def part_pieces(scores: ClusterScores, clusters: Ints) -> tuple[Ints, Floats]:
+    """Strangers leave their clusters and are alone.
+
+    Args:
+        scores: of D regions.
+        clusters: (D,) int64 in [0, K), regions alone included.
+
+    Returns:
+        (D,) int64 likewise, numbered by their first region. What a person joined stays. And (D,) float64: how likely
+        each region that is still a piece shows the leaf of its cluster; 1 for all others.
+    """
+    chance = np.ones(len(clusters))
+    rows, features = piece_features(scores, clusters)
+    chance[rows] = expit(COEFFICIENTS[0] + features @ np.array(COEFFICIENTS[1:]))
+    leaves = (chance < LEAST) & ~scores.graph.is_joined
+    parted = np.where(leaves, clusters.max(initial=-1) + 1 + np.arange(len(clusters)), clusters)
+    return renumber(parted), np.where(leaves, 1.0, chance)
+
+
+def piece_features(scores: ClusterScores, clusters: Ints) -> tuple[Ints, Floats]:
+    """The P regions that are not the best one of their cluster in their view, by leave-one-out score.
+
+    Returns:
+        (P,) int64 rows, and (P, 4) float64: the logarithm of the share of all other places (a cluster in a view) with
+        several regions, of which half a one is counted in any case; the score as a share of the best one's; the share
+        of the cluster's pixels in other views that show the region; and its mean epipolar weight to the members there,
+        which is low for a piece.
+    """
+    num_views = scores.sweep.num_views
+    place, is_shared = clusters * num_views + scores.sweep.view_index, np.bincount(clusters, minlength=1)[clusters] > 1
+    count = np.bincount(place, minlength=1)
+    num_split, num_places = int((count > 1).sum()), len(np.unique(place[is_shared]))
+    own = scores.own(clusters)
+    several = np.flatnonzero(count[place] > 1)
+    order = several[np.lexsort((several, -own[several], place[several]))]
+    is_best = np.diff(place[order], prepend=-1) != 0
+    best = order[is_best][is_best.cumsum() - 1]  # of the place of each
+    rows, best = order[~is_best], best[~is_best]
+    share = np.log((num_split - 0.5) / max(num_places, 1)) if len(rows) else 0.0
+    ratio = np.clip(own[rows] / np.maximum(own[best], 0.05), 0, 1)
+    coverage = np.clip(scores.coverages(clusters)[clusters[rows], rows], 0, 1) if len(rows) else np.zeros(0)
+    partners = np.maximum(scores.graph.sum_partners(np.ones_like(scores.graph.weights), clusters), 1)
+    weight = scores.graph.sum_partners(scores.graph.weights, clusters) / partners
+    return rows, np.column_stack((np.full(len(rows), share), ratio, coverage, weight[rows]))

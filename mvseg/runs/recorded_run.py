@@ -1,0 +1,148 @@
+"""What a result folder says of the run that made it, so that the run can be repeated."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import TypeAdapter, ValidationError
+
+from mvseg._version import __version__, code_hash
+from mvseg.config import RunConfig
+from mvseg.errors import InputError
+from mvseg.results.earlier import RUN_FILE
+from mvseg.system.file_hash import hash_files
+
+PLACES = ("scene", "out", "masks", "corrections")  # of run.json's config: what the run read and wrote
+
+
+@dataclass(frozen=True)
+class RecordedRun:
+    """The run that made a result.
+
+    Attributes:
+        folder: of the result.
+        said: all that its run.json says.
+        config: the options of its stages.
+        scene: folder of the scene.
+        masks: that were given; None: a detector found them.
+        corrections: file of a person's edits; None without any.
+        changes: a sentence for each input that is another one now, and for another version of mvseg.
+    """
+
+    folder: Path
+    said: Mapping[str, Any]
+    config: RunConfig
+    scene: Path
+    masks: Path | None
+    corrections: Path | None
+    changes: tuple[str, ...]
+
+
+def read_recorded(folder: Path) -> RecordedRun:
+    """The run that made a result; its inputs are looked for where they were, and then at the same place as seen from
+    the result: so they may have moved together.
+
+    Raises:
+        InputError: this is no result, or one with options that this version does not have; its scene or its masks are
+            gone.
+    """
+    said = _read_run(folder)
+    found = {name: _find(folder, said, name) for name in PLACES if said["config"].get(name) is not None}
+    scene, masks, corrections = (found.get(name) for name in ("scene", "masks", "corrections"))
+    if scene is None or not scene.exists():
+        raise InputError(f"{scene}: the scene of this result is gone, expected it there")
+    if masks is not None and not masks.exists():
+        raise InputError(f"{masks}: the masks of this result are gone, expected them there")
+    return RecordedRun(
+        folder=folder,
+        said=said,
+        config=_read_config(folder, said),
+        scene=scene,
+        masks=masks,
+        corrections=corrections,
+        changes=tuple(_list_changes(said, found)),
+    )
+
+
+def record_places(scene: Path, out: Path, masks: Path | None, corrections: Path | None) -> dict[str, Any]:
+    """What run.json says of the places of a run: absolute paths, and under "from_here" those from the result."""
+    places = {"scene": scene, "out": out, "masks": masks, "corrections": corrections}
+    absolute = {name: path and str(path.resolve()) for name, path in places.items()}
+    return absolute | {"from_here": {name: _from(out, path) for name, path in absolute.items() if path is not None}}
+
+
+def repeat_command(folder: Path, corrections: Path) -> str:
+    """The command that makes the whole result again, with its options and with corrections."""
+    return shlex.join(["mvseg", "infer", "--again", str(folder), "--corrections", str(corrections)])
+
+
+def _from(out: Path, path: str) -> str | None:
+    try:
+        return Path(os.path.relpath(path, out.resolve())).as_posix()
+    except ValueError:  # another drive of Windows
+        return None
+
+
+def _find(folder: Path, said: Mapping[str, Any], name: str) -> Path:
+    """Where an input of the run is now; where it was, if it is nowhere."""
+    stated = Path(str(said["config"][name]))
+    beside = said["config"].get("from_here")
+    relative = beside.get(name) if isinstance(beside, dict) else None
+    moved = None if relative is None else (folder / str(relative)).resolve()
+    return moved if moved is not None and not stated.exists() and moved.exists() else stated
+
+
+def _list_changes(said: Mapping[str, Any], found: Mapping[str, Path]) -> list[str]:
+    made, changes = str(said.get("mvseg"))[:60], []
+    if said.get("code") != code_hash():
+        changes.append(f"mvseg {made} made this result, and this is {__version__}: what it computes may differ.")
+    inputs = said.get("inputs")
+    moved = {str(said["config"].get(name)): path for name, path in found.items()}
+    for stated, sha256 in (inputs if isinstance(inputs, dict) else {}).items():
+        path = moved.get(stated, Path(stated))
+        if not path.exists():  # a scene's file of cameras, that moved with its folder
+            parents = [(old, new) for old, new in moved.items() if Path(old) in Path(stated).parents]
+            path = parents[0][1] / Path(stated).relative_to(parents[0][0]) if parents else path
+        if not path.exists():
+            changes.append(f"{path}: is gone since this result was made.")
+        elif hash_files(path) != sha256:
+            changes.append(f"{path}: has changed since this result was made.")
+    return changes
+
+
+def _read_run(folder: Path) -> dict[str, Any]:
+    path = folder / RUN_FILE
+    try:
+        run = json.loads(path.read_text(encoding="utf-8"))
+    except OSError:
+        raise InputError(f"{folder}: holds no {RUN_FILE}, expected a result folder of mvseg infer") from None
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not a whole JSON file ({error})") from None
+    if not isinstance(run, dict) or not isinstance(run.get("config"), dict) or "scene" not in run["config"]:
+        raise InputError(f"{path}: does not say which scene this is, expected a result of one scene")
+    return run
+
+
+def _read_config(folder: Path, said: Mapping[str, Any]) -> RunConfig:
+    """The options of the stages."""
+    options = {name: value for name, value in said["config"].items() if name not in (*PLACES, "from_here")}
+    known = asdict(RunConfig())
+    unknown = [name for name in options if name not in known]
+    for stage, inside in options.items():
+        if isinstance(inside, dict) and isinstance(known.get(stage), dict):
+            unknown += [f"{stage}.{name}" for name in inside if name not in known[stage]]
+    try:
+        if unknown:
+            raise InputError(f"unknown option {unknown[0]}")
+        return TypeAdapter(RunConfig).validate_python({"reconstruct": None, **options})
+    except (ValidationError, InputError) as error:
+        problem = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+        made = str(said.get("mvseg"))[:60]
+        message = f"mvseg {made} made this result, with options that this version does not have ({problem})"
+        raise InputError(f"{folder}: {message}; expected one made by this version") from None
