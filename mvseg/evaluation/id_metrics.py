@@ -43,7 +43,7 @@ class MatchingMetrics:
 
 
 def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
-    """Compare two int64 (D,) id vectors; -1 in the estimate is a cluster of its own.
+    """Compare two int64 (D,) id vectors of any device; -1 in the estimate is a cluster of its own.
 
     Without regions: s_match, ari and the pair scores are 1 and the rest 0.
 

@@ -10,7 +10,7 @@ def shape_distance(points: Tensor, truth: Tensor) -> float:
     """d(I, T) of Sec. 4.3: mean of the two mean nearest-neighbour distances between two point sets.
 
     Args:
-        points: (P, 3) reconstructed points.
+        points: (P, 3) reconstructed points, on any device.
         truth: (Q, 3) true points.
 
     Returns:

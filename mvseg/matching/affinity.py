@@ -50,7 +50,7 @@ def region_affinity(
         progress: show a progress bar over the pairs of views.
 
     Returns:
-        The graph. A region of weight 0 to all regions of the other views has no edge.
+        The graph, on the device of the regions. A region of weight 0 to all regions of the other views has no edge.
     """
     samples, members = view_runs(regions)
     senders = None if num_points is None else draw_points(view_samples(regions)[0], num_points, seed)

@@ -17,7 +17,7 @@ def split_merged(masks: Masks) -> Masks:
         masks: D masks, of which `second_parts` tells what shows a second instance.
 
     Returns:
-        D' >= D masks in the same order, the second part of a mask right after the first. Both have its scores; none
+        D' >= D masks on the same device and in the same order, the second part of a mask right after the first. Both have its scores; none
         shows two instances any more. A mask stays whole if one part would be empty, or if a person
         corrected it.
     """

@@ -67,7 +67,7 @@ def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
     on.
 
     Args:
-        cameras: V cameras, as they are given.
+        cameras: V cameras, as they are given; the refined ones are on their device.
         match: from cameras to the matched masks, `partial(match_regions, regions)` for example.
     """
     with warnings.catch_warnings():

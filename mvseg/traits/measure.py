@@ -82,7 +82,7 @@ def measure_plant(
     config: TraitsConfig = TraitsConfig(),
     corrections: Sequence[ColorCorrection | None] = (),
 ) -> Traits:
-    """Measure all instances, and the plant that those make which count as leaves.
+    """Measure all instances, and the plant that those make which count as leaves; on the CPU, wherever the inputs are.
 
     Args:
         scene: gives unit and the direction of up (None: angles and heights are left out).

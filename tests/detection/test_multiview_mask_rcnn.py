@@ -184,6 +184,11 @@ def test_wrong_arguments_are_named() -> None:
         wrapped(some_images(2), cameras=small_cameras(3))
     with pytest.raises(InputError, match="image 0 is 150 x 120, its camera says 160 x 120"):
         wrapped(some_images(3, width=150), cameras=small_cameras(3))
+    integers = [(255 * image).to(torch.uint8) for image in some_images(3)]
+    with pytest.raises(InputError, match=r"image 0 is uint8, expected floats in \[0, 1\]: image.float\(\) / 255"):
+        wrapped(integers, cameras=small_cameras(3))
+    with pytest.raises(InputError, match="the image is uint8"):
+        wrapped.detect(integers[0])
     with pytest.raises(InputError, match="expected one per image, two or more"):
         wrapped(some_images(1), cameras=small_cameras(2)[:1])
     with pytest.raises(InputError, match=r"expected Cameras \(of a scene"):

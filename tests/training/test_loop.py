@@ -214,6 +214,20 @@ def test_another_run_is_not_overwritten(leaves: Path, finished: Path) -> None:
         train(make_config(leaves, finished, resume=True, lr=0.5), build_tiny())
 
 
+def test_a_finished_run_can_be_prolonged(leaves: Path, tmp_path: Path) -> None:
+    """And then it is the run that had the longer end from the start, where the learning rate is constant."""
+    config = {"schedule": "constant", "hold_out_every": 0, "batch_size": 8}
+    train(make_config(leaves, tmp_path / "once", epochs=2, **config), build_tiny())
+    train(make_config(leaves, tmp_path / "twice", epochs=1, **config), build_tiny())
+    train(make_config(leaves, tmp_path / "twice", epochs=2, resume=True, **config), build_tiny())
+    assert len(read_metrics(tmp_path / "twice")["epochs"]) == 2
+    once, twice = (load_weights(tmp_path / name / "model.safetensors") for name in ("once", "twice"))
+    for key, value in once.items():
+        torch.testing.assert_close(twice[key], value, rtol=0, atol=0)
+    with pytest.raises(InputError, match=r"made with another epochs \(2, now 1\)"):
+        train(make_config(leaves, tmp_path / "twice", epochs=1, resume=True, **config), build_tiny())
+
+
 def test_a_folder_of_other_things_is_left_alone_and_a_failed_start_leaves_none(leaves: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("precious")

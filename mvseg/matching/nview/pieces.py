@@ -18,7 +18,7 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 COEFFICIENTS = (1.28, 0.84, 3.69, 4.37, -3.93)  # intercept, then one for each column of `piece_features`
-LEAST = 0.5  # probability from which a mask stays: a definition, it is likelier a piece than not
+LEAST = 0.3  # probability below which a mask leaves: higher, and ids of degraded masks lose more than strangers go
 
 
 def part_pieces(scores: ClusterScores, clusters: Ints) -> tuple[Ints, Floats]:

@@ -73,6 +73,7 @@ def fit_surfaces(
     """Fit a surface to every instance.
 
     An instance that more than `most_views` views show is fitted to that many of them, spread evenly over their order.
+    Inputs may be on any device; the work is done on the CPU, and surfaces are there.
 
     Args:
         regions: D regions. Those matched to nothing hide leaves as well.

@@ -1,0 +1,364 @@
+"""The views choose: of everything that the detector proposes, which masks show which leaf.
+
+A detector's score says how much a mask looks like the leaves that it has learned, not whether it is one. So the
+excessive set is kept, weak proposals included, and the views decide. Candidates are the instances that the matcher
+finds among the sure proposals, and again among many more, each with its surface. The likeliest leaf comes first and
+takes its masks; the others are judged by what is left (`leaf_scores.py`). So duplicates, pieces and masks over two leaves
+fall by themselves. The paper's idea of an excessive set from which the views choose, with surfaces in place of maps.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from scipy.optimize import linear_sum_assignment
+from torch import Tensor
+
+from mvseg.errors import InputWarning
+from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras
+from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, draw_views, see
+from mvseg.verification.leaf_scores import (
+    FITTED,
+    Candidates,
+    LeafScores,
+    best_masks,
+    leaf_chances,
+    leaf_features,
+    log_odds,
+    show_chances,
+)
+from mvseg.verification.rough_surfaces import LEAST_PARALLAX, fit_roughly, median_parallax
+
+Surfaces = Mapping[int, LeafSurface]
+Fit = Callable[[Masks, Surfaces], Surfaces]
+
+ROUNDS = 2  # in the first nothing hides anything, in the second the leaves of the first do
+SAME = 0.8  # Jaccard index of the masks of two candidates, from which they are one: the second is not fitted
+LEAST_SHOWN = 0.2  # q from which a mask stays with its leaf; between 0.05 and 0.3 nothing changes
+LEAST_VIEWS = 2  # that show a leaf: one alone is no agreement
+DIGITS = 9  # of q and P that count: what differs less is a tie, on every processor
+
+
+@dataclass(frozen=True, eq=False)
+class Leaves:
+    """What was chosen.
+
+    Attributes:
+        masks: D' masks on the CPU, by view and instance, with ids from 1 on, the likeliest leaf first; match scores are
+            q. At most one of each leaf in a view, but for those of a person; his that show no leaf have -1.
+        surfaces: {instance id: surface} of those with a credible one.
+        probabilities: {instance id: P}.
+        left: of the candidates that were not chosen, the most likely first: P and the rows of their masks.
+        proposals: the table of these rows.
+    """
+
+    masks: Masks
+    surfaces: dict[int, LeafSurface]
+    probabilities: dict[int, float]
+    left: tuple[tuple[float, Tensor], ...]
+    proposals: Masks
+
+
+def choose_leaves(
+    matched: Masks,
+    proposals: Masks,
+    *,
+    cameras: Cameras,
+    more: Masks | None = None,
+    linked: Tensor | None = None,
+    gone: Masks | None = None,
+    min_probability: float | None = None,
+    fit: Fit | None = None,
+) -> Leaves:
+    """Choose leaves and their masks from the excessive set.
+
+    Masks that a person corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
+    that no detector found. What else lies there goes, and what the person took away does not come back.
+
+    Args:
+        matched: D masks, matched; the `labels` of those that a detector found are rows of `proposals`.
+        proposals: R masks with detection scores, the excessive set; their ids do not matter.
+        cameras: V cameras.
+        more: masks of a second matching, of more of the proposals, with such labels, too; None: of `matched` alone.
+        linked: (D,) bool, masks that a person linked; None: none.
+        gone: masks that a person took away; None: none.
+        min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
+        fit: from masks and surfaces that are known to {instance id: surface}; None: `fit_roughly`.
+
+    Returns:
+        The leaves. Where the cameras see the plant from one side only, by less than `LEAST_PARALLAX`, surfaces are too
+        uncertain to judge by: matching and detection scores do it, and a warning (InputWarning) says so.
+    """
+    matched, proposals, cameras = matched.to("cpu"), proposals.to("cpu"), cameras.to("cpu")
+    is_held = matched.is_corrected | (matched.origin == Origin.OTHER_VIEWS) | (matched.origin == Origin.GIVEN)
+    is_held = is_held if linked is None else is_held | linked.cpu()
+    left = _without(proposals, gone)
+    held = matched.select(is_held)
+    table = Masks.concatenate((proposals, held.with_merged(())))
+    row_of = matched.regions.labels.clone()
+    row_of[is_held] = len(proposals) + torch.arange(len(held))
+    fit = fit or (lambda masks, known: fit_roughly(masks, cameras, known=known))
+    has_shapes = _is_seen_around(matched, cameras)
+    found = [(matched, row_of)] + ([] if more is None else [(more.to("cpu"), more.regions.labels.cpu())])
+    candidates = _gather(found, fit if has_shapes else None, table=table, is_held=is_held)
+    drawn = draw_views(table.regions, candidates.surfaces, cameras)
+    usable = np.concatenate((left, np.ones(len(held), bool)))
+    chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability)
+    return _take(chosen, candidates, table, num_held=len(held))
+
+
+def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
+    parallax = median_parallax(matched, cameras)
+    if parallax < LEAST_PARALLAX:
+        message = f"the cameras see the leaves from one side only ({parallax:.0f} degrees apart, as a rule)"
+        warnings.warn(f"{message}: their surfaces cannot verify their masks", InputWarning, stacklevel=3)
+    return parallax >= LEAST_PARALLAX
+
+
+def _without(proposals: Masks, gone: Masks | None) -> Bools:
+    """(R,) bool: the proposals that are not masks which a person took away, by an IoU of one half."""
+    stays = np.ones(len(proposals), bool)
+    boxes, views = proposals.regions.boxes, proposals.view_index
+    for row in range(0 if gone is None else len(gone)):
+        assert gone is not None
+        x1, y1, x2, y2 = gone.regions.boxes[row].tolist()
+        crop, area = gone.regions.crop(row), int(gone.regions.areas[row])
+        near = (views == gone.view_index[row]) & (boxes[:, 0] < x2) & (boxes[:, 1] < y2)
+        for other in (near & (boxes[:, 2] > x1) & (boxes[:, 3] > y1)).nonzero()[:, 0].tolist():
+            left, top, right, bottom = boxes[other].tolist()
+            a, b, c, d = max(x1, left), max(y1, top), min(x2, right), min(y2, bottom)
+            there = proposals.regions.crop(other)[b - top : d - top, a - left : c - left]
+            both = int((crop[b - y1 : d - y1, a - x1 : c - x1] & there).sum())
+            stays[other] &= 2 * both <= area + int(proposals.regions.areas[other]) - both
+    return stays
+
+
+def _gather(
+    found: Sequence[tuple[Masks, Tensor]], fit: Fit | None, *, table: Masks, is_held: Tensor
+) -> Candidates:
+    """The instances of each matching; those that an earlier one has, too, once.
+
+    Args:
+        found: masks of each matching and (D,) their rows in the table.
+        fit: see `choose_leaves`; None: no surfaces.
+        table: R' masks.
+        is_held: (D,) bool, of the masks of the first matching.
+    """
+    areas = table.regions.areas.double()
+    surfaces: list[LeafSurface | None] = []
+    members: list[Tensor] = []  # rows of the table, of each candidate
+    columns, certain = [], []
+    for number, (masks, rows) in enumerate(found):
+        ids = masks.instance_ids
+        instances = ids[ids > 0].unique().tolist()
+        twin = {each: _twin(rows[ids == each], members, areas) for each in instances}
+        known = {each: surfaces[other] for each, other in twin.items() if other is not None}
+        fitted = {} if fit is None else fit(masks, {k: surface for k, surface in known.items() if surface is not None})
+        for each in (each for each in instances if twin[each] is None):
+            own = ids == each
+            members.append(rows[own])
+            surface = fitted.get(each)
+            surfaces.append(surface if surface is not None and surface.exists else None)
+            columns.append(torch.full((len(table),), torch.nan, dtype=torch.float64))
+            columns[-1][rows[own]] = masks.match_scores[own].double()
+            certain.append(torch.zeros(len(table), dtype=torch.bool))
+            if number == 0:
+                certain[-1][rows[own & is_held]] = True
+    if not columns:
+        nothing = np.zeros((len(table), 0))
+        return Candidates((), nothing, nothing.astype(bool))
+    return Candidates(tuple(surfaces), torch.stack(columns, 1).numpy(), torch.stack(certain, 1).numpy())
+
+
+def _twin(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> int | None:
+    """The candidate whose masks are nearly these, by area; None if there is none."""
+    for number, others in enumerate(members):
+        common, either = areas[rows[torch.isin(rows, others)]].sum(), areas[torch.cat((rows, others)).unique()].sum()
+        if common > SAME * either:
+            return number
+    return None
+
+
+# --- the choice
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """One candidate as the choice met it.
+
+    Attributes:
+        candidate: its index.
+        chance: P, when the leaves before it had taken their masks.
+        features: (6,) that P follows from.
+        rows: of the masks that it may take.
+    """
+
+    candidate: int
+    chance: float
+    features: Floats
+    rows: Ints
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """L leaves, the likeliest first.
+
+    Attributes:
+        candidates: (L,) int64, their indices.
+        chances: (L,) P.
+        leaf: (D,) int64, the leaf that each mask shows, from 0 on; -1 for none.
+        q: (D,) how likely it does; 0 for none.
+        steps: of all candidates, the likeliest first.
+    """
+
+    candidates: Ints
+    chances: Floats
+    leaf: Ints
+    q: Floats
+    steps: tuple[Step, ...]
+
+
+def choose(
+    candidates: Candidates,
+    table: Masks,
+    *,
+    drawn: Sequence[Drawn],
+    usable: Bools | None = None,
+    min_probability: float | None = None,
+    fitted: LeafScores = FITTED,
+) -> Chosen:
+    """Choose leaves, and their masks of the table (D masks, `usable` (D,) ones only)."""
+    scores = table.detection_scores.double().numpy()
+    hides, taken, q = np.zeros(len(candidates), bool), [], np.zeros((len(table), len(candidates)))
+    steps: list[Step] = []
+    for _ in range(ROUNDS):
+        evidence = see(drawn, len(table), hides)
+        q = np.round(show_chances(candidates, evidence, scores, fitted), DIGITS)
+        q[~_same_class(candidates, table)] = 0
+        if usable is not None:
+            q[~usable] = 0
+        steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
+        least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
+        taken = [
+            each for each in steps
+            if candidates.is_certain[each.candidate] or (each.chance >= least and len(each.rows) >= LEAST_VIEWS)
+        ]  # fmt: skip
+        hides = np.zeros(len(candidates), bool)
+        hides[[each.candidate for each in taken]] = True
+        hides &= candidates.is_credible
+        if not hides.any():
+            break
+    chosen = np.array([each.candidate for each in taken], np.int64)
+    leaf, shown = assign_masks(q[:, chosen], drawn)
+    certain = candidates.certain[:, chosen]
+    leaf = np.where(certain.any(1), certain.argmax(1), leaf) if len(chosen) else leaf
+    shown = np.where(certain.any(1), 1.0, shown)
+    counts = np.bincount(leaf[leaf >= 0], minlength=len(chosen))
+    stays = (counts >= LEAST_VIEWS) | candidates.is_certain[chosen]
+    number = np.where(stays, stays.cumsum() - 1, -1)
+    leaf = np.where(leaf >= 0, number[leaf], -1) if len(chosen) else leaf
+    chances = np.array([each.chance for each in taken])
+    return Chosen(chosen[stays], chances[stays] if len(chosen) else chances, leaf, shown * (leaf >= 0), tuple(steps))
+
+
+def _same_class(candidates: Candidates, table: Masks) -> Bools:
+    """(D, K) whether a mask has the class of the masks that were matched to a candidate."""
+    classes, is_member = table.classes.numpy(), ~np.isnan(candidates.matched)
+    if not len(candidates):
+        return np.zeros((len(table), 0), bool)
+    first = is_member.argmax(0)
+    return classes[:, None] == classes[first]
+
+
+def rank(
+    candidates: Candidates, q: Floats, *, drawn: Sequence[Drawn], share: Floats, scores: Floats, fitted: LeafScores
+) -> list[Step]:
+    """The candidates, the likeliest leaf first; each takes masks that those after it can no longer have, and with them
+    all that show the same."""
+    view, place = np.zeros(len(q), np.int64), np.zeros(len(q), np.int64)
+    for number, each in enumerate(drawn):
+        view[each.rows], place[each.rows] = number, np.arange(len(each.rows))
+    left, free, clear, steps = np.ones(len(candidates), bool), q.copy(), None, []
+    sure, rows_of_views = log_odds(scores), [each.rows for each in drawn]
+    while left.any():
+        best, row = best_masks(free, rows_of_views)
+        features, clear = leaf_features(candidates, best, sure[row], share=share, clear=clear)
+        chances = np.where(left, np.round(leaf_chances(candidates, features, fitted), DIGITS), -1.0)
+        first = int(chances.argmax())
+        own = best[:, first]
+        rows = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
+        rows = np.union1d(rows, np.flatnonzero(candidates.certain[:, first]))
+        steps.append(Step(first, float(chances[first]), features[first], rows))
+        left[first] = False
+        for taken in rows.tolist():
+            there = drawn[view[taken]]
+            free[there.rows[there.is_shared[place[taken]]]] = 0
+    return steps
+
+
+def least_chance(chances: Floats) -> float:
+    """From which chance on to take things, for the largest expected F1 of what is taken against what is right: with n
+    taken, 2 sum(chances taken) / (n + sum(all chances)). Nothing is tuned here, and it is never above one half.
+
+    Args:
+        chances: (N,) in [0, 1].
+    """
+    order = np.sort(chances)[::-1]
+    if not len(order) or order[0] <= 0:
+        return 1.0
+    gain = np.round(order.cumsum() / (np.arange(1, len(order) + 1) + order.sum()), DIGITS)
+    return float(order[gain.argmax()])
+
+
+def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
+    """(D,) the leaf that each mask shows, -1 = none, and its chance.
+
+    In every view the assignment of masks to the L leaves of `q` (D, L) with the largest sum of chances, each used once.
+    Of two masks in it that show the same, the likelier one stays, and the other leaf takes its next best.
+    """
+    leaf, shown = np.full(len(q), -1), np.zeros(len(q))
+    for each in drawn if q.shape[1] else ():
+        free = np.where(q[each.rows] >= LEAST_SHOWN, q[each.rows], 0.0)
+        while True:
+            masks, leaves = linear_sum_assignment(free, maximize=True)
+            chances = free[masks, leaves]
+            order = np.argsort(-chances, kind="stable")
+            order = order[chances[order] > 0]
+            masks, leaves = masks[order], leaves[order]
+            conflicts = np.flatnonzero(np.triu(each.is_shared[np.ix_(masks, masks)], 1).any(0))
+            if not len(conflicts):
+                leaf[each.rows[masks]], shown[each.rows[masks]] = leaves, chances[order]
+                break
+            free[masks[conflicts[0]]] = 0
+    return leaf, shown
+
+
+def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, num_held: int) -> Leaves:
+    """The table of the leaves; a person's masks that show none stay without an id."""
+    is_held = np.arange(len(table)) >= len(table) - num_held
+    rows = np.flatnonzero((chosen.leaf >= 0) | is_held)
+    rows = rows[np.lexsort((chosen.leaf[rows], table.view_index.numpy()[rows]))]
+    ids = np.where(chosen.leaf[rows] >= 0, chosen.leaf[rows] + 1, -1)
+    masks = replace(
+        table.select(torch.from_numpy(rows)),
+        instance_ids=torch.from_numpy(ids),
+        match_scores=torch.from_numpy(chosen.q[rows]).float(),
+    )
+    shown = [candidates.surfaces[each] for each in chosen.candidates.tolist()]
+    taken = set(chosen.candidates.tolist())
+    return Leaves(
+        masks=masks,
+        surfaces={number: each for number, each in enumerate(shown, 1) if each is not None and each.is_credible},
+        probabilities=dict(enumerate(chosen.chances.tolist(), 1)),
+        left=tuple(
+            (each.chance, torch.from_numpy(each.rows)) for each in chosen.steps
+            if each.candidate not in taken and len(each.rows)
+        ),
+        proposals=table,
+    )  # fmt: skip

@@ -1,0 +1,128 @@
+"""How well masks show surfaces: everything of a view drawn once, nearest first. Not in the paper.
+
+Large photos are compared at every second, third ... pixel: leaves that matter are many pixels wide all the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csc_array
+
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+Placed = tuple[tuple[int, int, int, int], Bools]  # a box x1, y1, x2, y2 and the pixels in it
+
+MOST_PX = 800  # of a photo's longer side, that are compared; a limit of time: at 400 the evidence is as good
+SHARED = 0.5  # of the smaller of two masks, that the other covers: with more, they show one leaf (a definition)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """One view: N masks and K surfaces, as the pixels (P,) of the thinned photo that they cover.
+
+    Attributes:
+        rows: (N,) int64, the masks of the view, by their rows in the table.
+        masks: (P, N) int32 of 0 and 1.
+        parts: (P, K) int32, what the surfaces cover as if nothing hid them.
+        depth: (K,) of their middles, world units; infinite without a surface.
+    """
+
+    rows: Ints
+    masks: csc_array
+    parts: csc_array
+    depth: Floats
+
+    @cached_property
+    def common(self) -> Floats:
+        """(N, K) pixels that a mask and a part share."""
+        common: Floats = (self.masks.T @ self.parts).toarray().astype(np.float64)
+        return common
+
+    @cached_property
+    def is_shared(self) -> Bools:
+        """(N, N) whether one covers more than `SHARED` of the smaller one of two masks."""
+        areas, both = self.masks.sum(0), (self.masks.T @ self.masks).toarray()
+        is_shared: Bools = both > SHARED * np.maximum(np.minimum(areas[:, None], areas), 1)
+        return is_shared
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """How well D masks show K surfaces.
+
+    Attributes:
+        visible: (D, K) IoU with the part that nothing nearer hides.
+        claimed: (D, K) the same, where of the hidden part that counts as visible which the mask itself shows: photos
+            know better what lies in front.
+        share: (V, K) of what the view shows of the surface, that nothing hides; 0 where it shows nothing.
+    """
+
+    visible: Floats
+    claimed: Floats
+    share: Floats
+
+
+def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> tuple[Drawn, ...]:
+    """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out."""
+    drawn = []
+    middles = [None if each is None else each.points().reshape(-1, 3).mean(0, keepdim=True) for each in surfaces]
+    nothing: Placed = (0, 0, 0, 0), np.zeros((0, 0), bool)
+    for view, (width, height) in enumerate(cameras.sizes.tolist()):
+        step = -(-max(width, height) // MOST_PX)
+        size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
+        camera, rows = cameras[[view]], (regions.view_index == view).nonzero()[:, 0].numpy()
+        masks: list[Placed] = [(tuple(regions.boxes[row].tolist()), regions.crop(row).numpy()) for row in rows.tolist()]
+        parts = [nothing if each is None else each.project_parts(camera)[0] for each in surfaces]
+        depth = [np.inf if each is None else float(camera.project(each)[1][0, 0]) for each in middles]
+        drawn.append(
+            Drawn(rows=rows, masks=_columns(masks, size, step), parts=_columns(parts, size, step), depth=np.array(depth))
+        )
+    return tuple(drawn)
+
+
+def _columns(placed: Sequence[Placed], size: tuple[int, int], step: int) -> csc_array:
+    """(P, N) of masks in their boxes: every `step`-th pixel of the frame, from the middle of the first step on."""
+    indices, ends = [np.zeros(0, np.int64)], [0]
+    for (x1, y1, _, _), mask in placed:
+        first_x, first_y = ((step // 2 - start) % step for start in (x1, y1))
+        y, x = np.nonzero(mask[first_y::step, first_x::step])
+        indices.append((y + (y1 + first_y) // step) * size[1] + x + (x1 + first_x) // step)
+        ends.append(ends[-1] + len(y))
+    ones = np.ones(ends[-1], np.int32)
+    return csc_array((ones, np.concatenate(indices), np.array(ends)), shape=(size[0] * size[1], len(placed)))
+
+
+def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
+    """The evidence, where the surfaces `hides` (K,) hide what lies behind them, each as a whole, by its middle."""
+    shape = num_masks, len(hides)
+    visible, claimed, share = np.zeros(shape), np.zeros(shape), np.zeros((len(drawn), len(hides)))
+    for view, each in enumerate(drawn):
+        seen = _unhidden(each, hides)
+        sizes, areas = seen.sum(0), each.masks.sum(0)[:, None]
+        with_seen = (each.masks.T @ seen).toarray()
+        either = np.maximum(areas + sizes - with_seen, 1)
+        visible[each.rows], claimed[each.rows] = with_seen / either, each.common / either
+        share[view] = sizes / np.maximum(each.parts.sum(0), 1)
+    return Evidence(visible=visible, claimed=claimed, share=share)
+
+
+def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
+    """(P, K) the parts without what nearer ones of `hides` cover."""
+    parts, taken = drawn.parts, np.zeros(drawn.parts.shape[0], bool)
+    kept = np.ones(parts.nnz, np.int32)
+    for index in np.argsort(drawn.depth, kind="stable").tolist():
+        span = slice(parts.indptr[index], parts.indptr[index + 1])
+        kept[span] = ~taken[parts.indices[span]]
+        if hides[index]:
+            taken[parts.indices[span]] = True
+    return csc_array((kept, parts.indices, parts.indptr), shape=parts.shape)

@@ -1,0 +1,181 @@
+"""Two questions, each answered by a probability: does this mask show this leaf (q), and is this candidate a leaf (P)?
+
+Logistic regressions of few features. Their numbers stand in `FITTED`, and `python -m benchmarks.choice fit` fits them by
+maximum likelihood. Not in the paper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.special import expit, logit
+
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.verification.evidence import Bools, Evidence, Floats, Ints
+
+EPS = 0.01  # shares and scores are kept this far from 0 and 1, where log odds are infinite
+CLEAR = 0.6  # share of what the views must show of a candidate, that they do show, for it to be a clear leaf
+
+
+@dataclass(frozen=True)
+class LeafScores:
+    """Log odds are the first number plus the others times the features.
+
+    Attributes:
+        shows: of a mask, to show a candidate with a surface: see `shows_features`.
+        matched: the same of one without: see `matched_features`.
+        leaf: of a candidate with a surface, to be a leaf: see `leaf_features`.
+        found: the same of one without; the first four features only.
+    """
+
+    shows: tuple[float, ...]
+    matched: tuple[float, ...]
+    leaf: tuple[float, ...]
+    found: tuple[float, ...]
+
+
+FITTED = LeafScores(
+    shows=(0.611, 0.317, 1.464, 0.494),
+    matched=(-1.347, 0.975, 0.824),
+    leaf=(-14.438, 5.958, 6.161, 1.303, -0.437, 0.773),
+    found=(-6.256, 3.978, 3.129, 1.314),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Candidates:
+    """K instances that may be leaves.
+
+    Attributes:
+        surfaces: K, None where the masks of one agree on none.
+        matched: (D, K) match score of each mask that the matcher gave to the candidate, NaN for the others.
+        certain: (D, K) bool: a person says that the mask shows the candidate.
+    """
+
+    surfaces: tuple[LeafSurface | None, ...]
+    matched: Floats
+    certain: Bools
+
+    def __len__(self) -> int:
+        return len(self.surfaces)
+
+    @property
+    def is_certain(self) -> Bools:
+        """(K,) those that a person says are leaves."""
+        is_certain: Bools = self.certain.any(0)
+        return is_certain
+
+    @cached_property
+    def has_surface(self) -> Bools:
+        """(K,)"""
+        return np.array([each is not None for each in self.surfaces], bool)
+
+    @cached_property
+    def is_credible(self) -> Bools:
+        """(K,) those whose surface may hide others."""
+        return np.array([each is not None and each.is_credible for each in self.surfaces], bool)
+
+    @cached_property
+    def lengths(self) -> Floats:
+        """(K,) of the surfaces, world units; NaN for none."""
+        return np.array([np.nan if each is None else each.length for each in self.surfaces], float)
+
+    @cached_property
+    def fits(self) -> Floats:
+        """(K,) median IoU of the surfaces with the masks that they were fitted to; 0.5 for none."""
+        return np.array([0.5 if each is None else float(each.iou.nanmedian()) for each in self.surfaces], float)
+
+
+@dataclass(frozen=True, eq=False)
+class ClearLeaves:
+    """What the clear leaves of one plant are like, by which its other candidates are judged: a plant that the detector
+    has not learned scores low everywhere.
+
+    Attributes:
+        score: median log odds of the detection scores of their masks.
+        length: median, world units.
+    """
+
+    score: float
+    length: float
+
+
+def show_chances(candidates: Candidates, evidence: Evidence, scores: Floats, fitted: LeafScores = FITTED) -> Floats:
+    """(D, K) q: how likely each mask shows each candidate, from the detection scores (D,). Without a surface, only the
+    masks that were matched to a candidate can; what a person says is certain."""
+    q = expit(matched_features(candidates.matched, scores) @ np.array(fitted.matched))
+    q = np.where(np.isnan(candidates.matched), 0.0, q)
+    with_surface = candidates.has_surface
+    if with_surface.any():
+        by_surface = expit(shows_features(evidence, scores) @ np.array(fitted.shows)) * (evidence.claimed > 0)
+        q = np.where(with_surface, by_surface, q)
+    q[candidates.certain.any(1)] = 0
+    q[candidates.certain] = 1
+    return q
+
+
+def shows_features(evidence: Evidence, scores: Floats) -> Floats:
+    """(D, K, 4): 1, and the log odds of the detection score, of `Evidence.claimed` and of `Evidence.visible`."""
+    sure = np.broadcast_to(log_odds(scores)[:, None], evidence.visible.shape)
+    return np.stack((np.ones_like(sure), sure, log_odds(evidence.claimed), log_odds(evidence.visible)), 2)
+
+
+def matched_features(matched: Floats, scores: Floats) -> Floats:
+    """(D, K, 3): 1, and the log odds of the detection score and of the match score."""
+    sure = np.broadcast_to(log_odds(scores)[:, None], matched.shape)
+    return np.stack((np.ones_like(sure), sure, log_odds(np.nan_to_num(matched))), 2)
+
+
+def leaf_chances(candidates: Candidates, features: Floats, fitted: LeafScores = FITTED) -> Floats:
+    """(K,) P: how likely each candidate is a leaf; 1 where a person says so."""
+    by_surface = expit(features @ np.array(fitted.leaf))
+    by_masks = expit(features[:, : len(fitted.found)] @ np.array(fitted.found))
+    chances: Floats = np.where(candidates.has_surface, by_surface, by_masks)
+    return np.where(candidates.is_certain, 1.0, chances)
+
+
+def leaf_features(
+    candidates: Candidates, best: Floats, sure: Floats, *, share: Floats, clear: ClearLeaves | None
+) -> tuple[Floats, ClearLeaves]:
+    """(K, 6): 1; the mean q of the best masks over the views, weighted by what each shows of the surface; the logarithm
+    of the sum of q, plus 0.1; the mean log odds of their detection scores, above that of clear leaves; the logarithm
+    of the length, over theirs; and the log odds of `Candidates.fits`.
+
+    Args:
+        candidates: K.
+        best: (V, K) q of the best mask of each.
+        sure: (V, K) log odds of its detection score.
+        share: (V, K), see `Evidence`.
+        clear: None: the clear leaves are found among these candidates.
+    """
+    weight = np.where(candidates.has_surface, share, best > 0)
+    shown = (weight * best).sum(0) / np.maximum(weight.sum(0), 1e-9)
+    number, lengths = best.sum(0), candidates.lengths
+    score = (best * sure).sum(0) / np.maximum(number, 1e-9)
+    if clear is None:
+        is_clear = shown >= min(CLEAR, shown.max(initial=0))
+        known = lengths[is_clear & candidates.has_surface]
+        clear = ClearLeaves(float(np.median(score[is_clear])), float(np.median(known)) if len(known) else 1.0)
+    relative = np.log(np.maximum(np.where(candidates.has_surface, lengths, clear.length), 1e-12) / clear.length)
+    columns = np.ones_like(shown), shown, np.log(number + 0.1), score - clear.score, relative, log_odds(candidates.fits)
+    return np.stack(columns, 1), clear
+
+
+def best_masks(q: Floats, rows_of_views: Sequence[Ints]) -> tuple[Floats, Ints]:
+    """(V, K) the largest q (D, K) of each candidate in each view, and the row of its mask; 0 and row 0 in views without
+    masks."""
+    best, row = np.zeros((len(rows_of_views), q.shape[1])), np.zeros((len(rows_of_views), q.shape[1]), np.int64)
+    for view, rows in enumerate(rows_of_views):
+        if len(rows):
+            first = q[rows].argmax(0)
+            best[view], row[view] = q[rows][first, np.arange(q.shape[1])], rows[first]
+    return best, row
+
+
+def log_odds(values: Floats) -> Floats:
+    """Of shares and scores; NaN, of a mask that no detector scored, counts as one half."""
+    odds: Floats = logit(np.clip(np.nan_to_num(values, nan=0.5), EPS, 1 - EPS))
+    return odds

@@ -1,0 +1,127 @@
+"""Every public name: what it gives back is where its inputs were, or on the CPU where its docstring says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+import mvseg
+from mvseg import (
+    Cameras,
+    Masks,
+    Matching,
+    MatchReport,
+    Regions,
+    Scene,
+    check_scene,
+    cluster_affinity,
+    fit_surfaces,
+    match_regions,
+    matching_metrics,
+    measure_plant,
+    region_affinity,
+    shape_distance,
+    split_merged,
+)
+from mvseg.corrections.doubtful import list_doubts
+from mvseg.formats.photos import Photos
+from mvseg.matching.links import Links
+from mvseg.matching.match import match_masks
+from mvseg.scene import View
+from mvseg.verification.checked_ids import check_ids
+from mvseg.verification.other_views import verify_masks
+from mvseg.verification.recut import recut_masks
+from other_device import other_device
+from synthetic import ball_scene
+
+SCENE = ball_scene(4, 5, seed=1)
+IDS = SCENE.regions.labels
+CPU = torch.device("cpu")
+# Names whose answers are tried on another device in other files, and names that take and give no tensors.
+ELSEWHERE = {
+    "EpipolarAssignment", "cluster_aware_nms", "epipolar_map", "refine_poses", "RefinedPoses", "reconstruct_instances",
+    "region_affinity", "MultiViewMaskRCNN", "Regions", "Cameras",
+}  # fmt: skip
+WITHOUT_TENSORS = {
+    "__version__", "InputError", "InputWarning", "MatchConfig", "DetectConfig", "TraitsConfig", "ReconstructConfig",
+    "RunConfig", "Check", "Finding", "Corrections", "load_corrections", "LeafLink", "Tracks", "track_leaves",
+    "start_workers", "demo_scene", "Traits", "MatchReport", "Matching", "Origin", "MergedMask", "Affinity",
+}  # fmt: skip
+# They read files, or take arrays of any kind: what they make is on the CPU.
+MAKERS = {
+    "load_masks", "load_scene", "load_photos", "load_detector", "run_scene", "regions_from_masks", "Scene",
+    "regions_from_label_maps", "with_instance_ids",
+}  # fmt: skip
+
+
+def scene_there(cameras: Cameras) -> Scene:
+    views = tuple(View(f"{view}", Path("nowhere") / f"{view}.png") for view in range(len(cameras)))
+    return Scene("balls", views, cameras)
+
+
+
+SURFACES = fit_surfaces(SCENE.regions, IDS, SCENE.cameras)
+
+
+def masks_of(regions: Regions, ids: torch.Tensor) -> Masks:
+    return Masks.of(regions, ids, torch.ones(len(regions)).to(regions.device))
+
+
+Step = Callable[[Regions, Cameras, torch.Tensor], Any]
+STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the device
+    "match_regions": (lambda r, c, i: match_regions(r, c, links=Links.of([(0, 5)], [(0, 1)])).instance_ids, True),
+    "match_masks": (lambda r, c, i: match_masks(masks_of(r, i), c, links=Links.of()).match_scores, True),
+    "cluster_affinity": (lambda r, c, i: cluster_affinity(region_affinity(r, c), r.num_per_view).instance_ids, True),
+    "split_merged": (lambda r, c, i: split_merged(match_regions(r, c).masks).instance_ids, True),
+    "Masks": (lambda r, c, i: Masks.concatenate([masks_of(r, i)] * 2).close_gaps().count_sure_views(), True),
+    "LeafSurface": (lambda r, c, i: SURFACES[1].project(c)[0], True),
+    "fit_surfaces": (lambda r, c, i: fit_surfaces(r, i, c)[1].coefficients, False),
+    "check_ids": (lambda r, c, i: check_ids(masks_of(r, i), SURFACES, cameras=c).instance_ids, True),
+    "verify_masks": (lambda r, c, i: verify_masks(masks_of(r, i), cameras=c, photos=None)[0].instance_ids, False),
+    "recut_masks": (lambda r, c, i: recut_masks(masks_of(r, i), SURFACES, cameras=c).instance_ids, False),
+    "list_doubts": (lambda r, c, i: len(list_doubts(masks_of(r, i), SURFACES, cameras=c)), False),
+    "matching_metrics": (lambda r, c, i: matching_metrics(i, i).ari, False),
+    "shape_distance": (lambda r, c, i: shape_distance(c.t, c.t), False),
+    "check_scene": (lambda r, c, i: len(check_scene(scene_there(c), r, features=False).findings), False),
+    "measure_plant": (
+        lambda r, c, i: measure_plant(
+            scene_there(c), Matching(masks_of(r, i), MatchReport("none")), surfaces=SURFACES, voxels={},
+            photos=Photos(scene_there(c)),
+        ).whole["total_leaf_area"].value,
+        False,
+    ),
+}  # fmt: skip
+
+
+@pytest.fixture
+def device() -> Iterator[torch.device]:
+    with other_device() as device:
+        yield device
+
+
+@pytest.mark.filterwarnings("ignore::mvseg.errors.InputWarning")
+@pytest.mark.parametrize("name", STEPS)
+def test_the_answer_is_the_same_there(name: str, device: torch.device) -> None:
+    step, stays = STEPS[name]
+    expected = step(SCENE.regions, SCENE.cameras, IDS)
+    answer = step(SCENE.regions.to(device), SCENE.cameras.to(device), IDS.to(device))
+    if not isinstance(answer, torch.Tensor):
+        assert answer == pytest.approx(expected)
+        return
+    assert answer.device == (device if stays else CPU)
+    torch.testing.assert_close(answer.cpu(), expected)
+
+
+def test_every_public_name_is_looked_at() -> None:
+    inner = {"match_masks", "check_ids", "verify_masks", "recut_masks", "list_doubts"}  # of stages, not public
+    assert STEPS.keys() - inner | ELSEWHERE | WITHOUT_TENSORS | MAKERS == set(mvseg.__all__)
+
+
+def test_masks_keep_what_they_know(device: torch.device) -> None:
+    masks = masks_of(SCENE.regions.to(device), IDS.to(device))
+    assert replace(masks).to("cpu").instance_ids.tolist() == IDS.tolist()
