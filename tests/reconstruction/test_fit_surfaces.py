@@ -52,6 +52,16 @@ def test_bent_blade_has_its_area_length_and_width(bent: LeafSurface) -> None:
     assert (np.abs(np.array(bent.deviations) / [bent.area, bent.length, bent.width]) < 0.05).all()
 
 
+@pytest.mark.parametrize("num_views", [6, 11])
+def test_midrib_of_a_disc_does_not_wind(num_views: int) -> None:
+    """The outline does not tell where it runs: it is a diameter."""
+    cameras = ring_cameras(num_views, elevations_deg=(15, 50, 32))
+    disc = EllipticBlade(half_width=1.0)
+    surface = fit(blade_masks(disc, cameras), cameras)
+    assert np.abs(errors(surface, disc)).max() < 0.008
+    assert float((surface.midrib[-1] - surface.midrib[0]).norm()) > 0.995 * surface.length
+
+
 def test_surface_covers_the_masks_that_it_was_fitted_to(bent: LeafSurface) -> None:
     for seen, mask in zip(bent.project(CAMERAS), blade_masks(BENT, CAMERAS), strict=True):
         assert (seen.numpy() & mask).sum() / (seen.numpy() | mask).sum() > 0.95

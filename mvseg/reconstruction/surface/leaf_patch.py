@@ -23,13 +23,15 @@ COUNTS = (7, 12, 4, 3)  # coefficients of m, Q, R, S; fewer for Q cannot follow 
 NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
 
-# Standard deviations of the prior, in leaf lengths (SPEED, BEND) or half-widths.
+# Standard deviations of the prior, in leaf lengths (SPEED, BEND, SWAY) or half-widths.
 BEND_SD = 0.06  # third differences of m
+SWAY_SD = 0.1  # times length / width: turns of the midrib within the blade, from each of ten pieces to the next one
 SPEED_SD = 0.05  # of the speed along the midrib about its mean
 SIDE_SD = 1.0  # second differences of Q
 FOLD_SD, FOLD_STEP_SD = 0.35, 0.2  # R along the normal, and its differences
 CURL_SD = 0.35  # S along the normal
 SHEAR_SD = 0.15  # Q along the midrib, R and S within the blade
+NUM_PIECES = 10  # of the midrib, for SPEED and SWAY
 
 
 def place_stations(num_rows: int) -> Floats:
@@ -158,6 +160,10 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
         equations.append(_along(rows[place], along) * shear)
         if sd is not None:
             equations += [_along(rows[place], across) * shear, _along(rows[place], normal) * (noise / (sd * half))]
+    # The outline of a round blade does not tell where its midrib runs, which would wind and come out too long. That of
+    # a narrow one does.
+    turns, sideways = np.diff(_speed_rows(), axis=0), _frames(coefficients, NUM_PIECES + 1)[1][1:-1]
+    equations.append(_along(turns, sideways) * (2 * half / (SWAY_SD * length**2)))
     equations.append(_along(_speed_rows(), tangents) / (SPEED_SD * length))
     target = np.zeros(sum(map(len, equations)))
     target[-len(tangents) :] = 1 / SPEED_SD
@@ -182,8 +188,8 @@ def _differences(part: slice, order: int) -> Floats:
 @cache
 def _speed_rows() -> Floats:
     """(10, 26) rows that give dm/du on ten pieces of the midrib."""
-    u = np.linspace(0, 1, 11)
-    return np.diff(patch_basis(u, np.zeros_like(u)), axis=0) / 0.1
+    u = np.linspace(0, 1, NUM_PIECES + 1)
+    return np.diff(patch_basis(u, np.zeros_like(u)), axis=0) * NUM_PIECES
 
 
 def _frames(coefficients: Floats, count: int) -> tuple[Floats, Floats, Floats]:

@@ -1,0 +1,58 @@
+"""Surfaces to judge masks by: fitted once, to few views, and none where the cameras see the leaves from one side."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
+from types import MappingProxyType
+
+import torch
+
+from mvseg.errors import InputWarning
+from mvseg.masks import Masks
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras
+
+ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
+LEAST_PARALLAX = 30.0  # degrees between the views of an instance, from which its surface tells what they show
+
+
+def fit_roughly(
+    masks: Masks,
+    cameras: Cameras,
+    *,
+    known: Mapping[int, LeafSurface] = MappingProxyType({}),
+    workers: ProcessPoolExecutor | None = None,
+    progress: bool = False,
+) -> dict[int, LeafSurface]:
+    """{instance id: surface} to verify masks with; for `known` see `fit_surfaces`. It does not warn: what still holds
+    after the correction is said then."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", InputWarning)
+        return fit_surfaces(
+            masks.regions,
+            masks.instance_ids,
+            cameras,
+            known=known,
+            most_views=ROUGH_VIEWS,
+            is_rough=True,
+            workers=workers,
+            progress=progress,
+        )
+
+
+def median_parallax(masks: Masks, cameras: Cameras) -> float:
+    """Degrees; median over the instances of the largest angle between two lines of sight to their masks; infinite
+    without an instance that two views show."""
+    boxes = masks.regions.boxes.double()
+    centres = torch.cat((boxes[:, :2] + boxes[:, 2:], torch.full_like(boxes[:, :1], 2)), 1) / 2
+    sights = (cameras.world_from_px[masks.view_index] @ centres[:, :, None])[..., 0]
+    sights = sights / sights.norm(dim=1, keepdim=True)
+    angles = []
+    for instance in masks.instance_ids[masks.instance_ids > 0].unique().tolist():
+        own = sights[masks.instance_ids == instance]
+        if len(own) > 1:
+            angles.append(torch.rad2deg(torch.acos((own @ own.T).clamp(-1, 1)).max()))
+    return float(torch.stack(angles).median()) if angles else float("inf")
