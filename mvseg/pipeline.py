@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from mvseg.checks.check_scene import warn_of_contradictions
@@ -23,7 +24,7 @@ from mvseg.errors import InputWarning
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, require_photos
 from mvseg.formats.scene_folder import load_scene, read_masks
-from mvseg.masks import Masks
+from mvseg.masks import Masks, Origin
 from mvseg.matching.match import check_baselines, match_masks, match_regions
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.split import split_merged
@@ -32,6 +33,11 @@ from mvseg.regions import stack_regions
 from mvseg.results.result import Instances, Result
 from mvseg.scene import Cameras
 from mvseg.traits.up import place_scene
+
+if TYPE_CHECKING:
+    from mvseg.detection.detect_scene import Found
+    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+    from mvseg.verification.choose import Fit
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
@@ -50,18 +56,22 @@ class State(Result):
         photos: of the scene.
         matching: the masks as they were given, until they are matched.
         match: from cameras to the masks, matched; what `load`, `detect` or `correct` leaves.
+        found: by the detector; None: the masks were given.
         cache, workers, progress: see `run_scene`.
         colors: of leaves, see `leaf_colors`; None: those of the masks, wherever a stage asks.
+        fit: rough surfaces of masks, see `choose_leaves`; None: `fit_roughly`.
     """
 
     config: RunConfig
     photos: Photos
     matching: Matching = NOTHING_FOUND
     match: Callable[[Cameras], Matching] | None = None
+    found: Found | None = None
     cache: Path | None = None
     workers: ProcessPoolExecutor | None = None
     progress: bool = False
     colors: NDArray[np.bool_] | None = None
+    fit: Fit | None = None
 
     def with_masks(self, masks: Masks) -> State:
         """The same with other masks. Gaps between their ids close; what is known of the instances follows, but for the
@@ -137,7 +147,7 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
     leaves. What a detector found is cut before surfaces are fitted to it.
     """
     shapes = config.reconstruct
-    is_verified = not has_masks and config.detect.verify
+    is_verified = not has_masks and config.detect.verify  # the views choose
     is_checked = shapes is not None and shapes.check_ids and shapes.shape != "voxels" and not is_verified
     stages = {
         "detect": None if has_masks else detect,
@@ -146,7 +156,7 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
         "correct_instances": correct_instances if has_edits else None,
         "follow": follow if has_edits and (is_verified or shapes is not None) else None,
         "split": split if config.split_merged and not is_checked else None,
-        "verify": verify if is_verified else None,
+        "choose": choose if is_verified else None,
         "check": check_cameras,
         "check_ids": check_ids if is_checked else None,
         "split_checked": split if config.split_merged and is_checked else None,
@@ -181,8 +191,8 @@ def detect(state: State) -> State:
     from mvseg.detection.detect_scene import detect_scene
 
     config = state.config
-    matcher = detect_scene(state.photos, config.detect, match=config.match, cache=state.cache, progress=state.progress)
-    return replace(state, match=matcher)
+    found = detect_scene(state.photos, config.detect, match=config.match, cache=state.cache, progress=state.progress)
+    return replace(state, found=found, match=found.match)
 
 
 def correct(state: State) -> State:
@@ -240,16 +250,41 @@ def split(state: State) -> State:
     return state.with_masks(split_merged(state.masks))
 
 
-def verify(state: State) -> State:
-    """The other views correct what the detector found, see `verify_masks`, and `select_by_views` for the rest."""
+def choose(state: State) -> State:
+    """The views choose leaves and masks from the excessive set, see `choose_leaves`; `select_by_views` for the rest."""
+    from mvseg.detection.config import MORE_SCORE
     from mvseg.detection.few_views import select_by_views
-    from mvseg.verification.other_views import verify_masks
+    from mvseg.verification.choose import choose_leaves
+    from mvseg.verification.rough_surfaces import fit_roughly
 
-    masks, starts = verify_masks(
-        state.masks, cameras=state.scene.cameras, photos=state.photos, workers=state.workers, progress=state.progress
+    assert state.found is not None
+    cameras, detect = state.scene.cameras, state.config.detect
+    corrected = state.corrected
+
+    def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> Mapping[int, LeafSurface]:
+        return fit_roughly(masks, cameras, known=known, workers=state.workers, progress=state.progress)
+
+    with warnings.catch_warnings(action="ignore", category=InputWarning):  # the first matching has said it
+        more = state.found.match_from(cameras, min(MORE_SCORE, detect.min_score)).masks
+    leaves = choose_leaves(
+        state.masks,
+        state.found.proposals(cameras),
+        cameras=cameras,
+        more=more,
+        linked=None if corrected is None or corrected.everywhere else corrected.is_linked,
+        gone=None if corrected is None else _taken_away(state.found.match(cameras).masks.to("cpu"), state.masks),
+        min_probability=detect.min_probability,
+        fit=fit if state.fit is None else state.fit,
     )
-    masks = select_by_views(masks, state.masks, min_views=state.config.detect.min_views)
-    return replace(state, instances=Instances(starts=starts)).with_masks(masks)
+    masks = select_by_views(leaves.masks, state.masks, min_views=detect.min_views)
+    instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
+    return replace(state, instances=instances).with_masks(masks)
+
+
+def _taken_away(before: Masks, after: Masks) -> Masks:
+    """The detected masks of a table that are not in it any more, after a person's edits."""
+    is_left = torch.isin(after.origin.cpu(), torch.tensor([Origin.DETECTED, Origin.CONFIRMED]))
+    return before.select(~torch.isin(before.regions.labels, after.regions.labels.cpu()[is_left]))
 
 
 def check_cameras(state: State) -> State:

@@ -9,6 +9,9 @@ from mvseg.errors import InputError
 
 # pixels, as in a file of weights; this module is imported for --help, and loads no torch
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384
+# Scores of proposals: those that are matched first, those that are matched for more candidates, and the whole excessive
+# set, from torchvision's threshold on. Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003 (docs/notes/detector.md).
+SURE_SCORE, MORE_SCORE, LEAST_SCORE = 0.3, 0.1, 0.05
 
 
 @dataclass(frozen=True)
@@ -17,23 +20,26 @@ class DetectConfig:
 
     Attributes:
         weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
-        min_score: detections that score less are discarded; in [0, 1]. The score is the detector's confidence that it
-            sees a leaf, times the expected IoU of its mask.
+        min_probability: what is less likely a leaf is left out; in [0, 1]. The probability is calibrated: of leaves with
+            0.8 to 0.9, that part is right on plants that it was not fitted on (docs/detector.md). Null: where precision
+            and recall of the leaves together are expected to be best, never above 0.5.
+        min_score: proposals that score less are not matched at first; in [0, 1]. The score is the detector's confidence
+            that it sees a leaf, times the expected IoU of its mask. Without `verify`, they are discarded.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the
             size given with the weights, smaller ones stay as they are; and where few masks are surely matched, as where
             leaves are very large, half of that is tried.
         crop: auto: where the plant fills a small part of large photos, a second pass runs on their parts that show
             it: leaves are seen larger. off: one pass over whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
-        verify: let surfaces that are fitted to the matched masks correct them: the other views show which masks are
-            no leaves or pieces of one, and which leaves were missed (`mvseg.verification.other_views`). Finds leaves:
-            not for other things.
-        min_views: of what verification leaves, a leaf must have masks in so many photos. 1 keeps, too, what one or two
-            photos show and no other view verifies: as it was found, and marked.
+        verify: let the views choose leaves and masks from everything that the detector proposes, weak proposals
+            included, by one score (`mvseg.verification.choose`). It was fitted on leaves.
+        min_views: a leaf must have masks in so many photos. 1 keeps, too, what one or two photos show and no other view
+            verifies: as it was found, and marked.
     """
 
     weights: str = "leaf-lite"
-    min_score: float = 0.3
+    min_probability: float | None = None
+    min_score: float = SURE_SCORE
     image_size: int | None = None
     crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
@@ -43,6 +49,8 @@ class DetectConfig:
     def __post_init__(self) -> None:
         if not 0 <= self.min_score <= 1:
             raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
+        if self.min_probability is not None and not 0 <= self.min_probability <= 1:
+            raise InputError(f"detect.min_probability is {self.min_probability:g}, expected a number from 0 to 1")
         if self.image_size is not None and not MIN_IMAGE_SIZE <= self.image_size <= MAX_IMAGE_SIZE:
             expected = f"at least {MIN_IMAGE_SIZE}, at most {MAX_IMAGE_SIZE}"
             raise InputError(f"detect.image_size is {self.image_size}, expected {expected}")

@@ -15,9 +15,9 @@ from tqdm import tqdm
 
 from mvseg._version import code_hash
 from mvseg.detection.cached_detections import CachedDetections, delete_cached, read_detections, write_detections
-from mvseg.detection.config import MIN_IMAGE_SIZE, DetectConfig
+from mvseg.detection.config import LEAST_SCORE, MIN_IMAGE_SIZE, DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass, crop_cameras, place_crops
-from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+from mvseg.detection.mask_rcnn import MultiViewMaskRCNN, list_proposals
 from mvseg.detectors.folded_norms import fold_norms
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.formats.photos import Photos
@@ -38,7 +38,7 @@ def detect_scene(
     match: MatchConfig = MatchConfig(),
     cache: Path | None = None,
     progress: bool = False,
-) -> Callable[[Cameras], Matching]:
+) -> Found:
     """Find instances in every photo, and again, larger, where the plant fills a small part of the photos.
 
     Where less than half of them are surely matched, leaves may be too large: the detector looks once more, at half the
@@ -54,8 +54,7 @@ def detect_scene(
         progress: show progress bars.
 
     Returns:
-        From V cameras to what was found, matched. Those that the photos have are matched already where the plant fills
-        the photos.
+        What was found. With the cameras of the photos it is matched already where the plant fills the photos.
 
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
@@ -77,13 +76,49 @@ def detect_scene(
     if cache is not None:
         delete_cached(cache, but=names)
     if boxes is None:
-        return seen.match
+        return Found(seen.model, seen.detections, None, config.min_score, match_sure=seen.match, progress=progress)
+    return Found(seen.model, in_crops, boxes, config.min_score, progress=progress)
 
-    def match_crops(cameras: Cameras) -> Matching:
-        matching = seen.model.match_detections(in_crops, crop_cameras(cameras, boxes), progress=progress)
-        return matching.with_masks(place_crops(matching.masks, boxes))
 
-    return match_crops
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a detector finds in the photos of a scene.
+
+    Attributes:
+        model: that matches it.
+        detections: of every photo, or of its box, as `MultiViewMaskRCNN.detect` gives them.
+        boxes: (V, 4) int64 xyxy, the parts of the photos that were looked at; None: all of them.
+        min_score: of what is matched at first.
+        match_sure: from cameras to what is matched at first, where somebody has matched it before.
+        progress: show progress bars.
+    """
+
+    model: MultiViewMaskRCNN
+    detections: list[dict[str, Tensor]]
+    boxes: Tensor | None
+    min_score: float
+    match_sure: Callable[[Cameras], Matching] | None = None
+    progress: bool = False
+
+    def match(self, cameras: Cameras) -> Matching:
+        """The sure proposals, matched with V cameras, in the frames of the photos; `labels` are rows of `proposals`."""
+        return self.match_from(cameras, self.min_score) if self.match_sure is None else self.match_sure(cameras)
+
+    def match_from(self, cameras: Cameras, min_score: float) -> Matching:
+        """The same of the proposals with a score of `min_score` or more."""
+        return _match(self, cameras, min_score)
+
+    def proposals(self, cameras: Cameras) -> Masks:
+        """The excessive set: all proposals, matched to nothing, in the frames of the photos."""
+        masks = list_proposals(self.detections, cameras if self.boxes is None else crop_cameras(cameras, self.boxes))
+        return masks if self.boxes is None else place_crops(masks, self.boxes)
+
+
+@lru_cache(maxsize=2)  # each edit of a person asks again
+def _match(found: Found, cameras: Cameras, min_score: float) -> Matching:
+    posed = cameras if found.boxes is None else crop_cameras(cameras, found.boxes)
+    matching = found.model.match_detections(found.detections, posed, min_score=min_score, progress=found.progress)
+    return matching if found.boxes is None else matching.with_masks(place_crops(matching.masks, found.boxes))
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,19 +128,21 @@ class _Seen:
     model: MultiViewMaskRCNN
     cached: CachedDetections | None
     names: set[str]
+    detections: list[dict[str, Tensor]]
     match: Callable[[Cameras], Matching]
 
 
 def _look(photos: Photos, config: DetectConfig, *, match: MatchConfig, cache: Path | None, progress: bool) -> _Seen:
     """Find instances in whole photos."""
-    detector = load_detector(config.weights, image_size=config.image_size, min_score=config.min_score)
+    least = min(LEAST_SCORE, config.min_score) if config.verify else config.min_score
+    detector = load_detector(config.weights, image_size=config.image_size, min_score=least)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(fold_norms(detector), num_iterations=config.num_iterations, match=match).to(device)
     cached = None if cache is None else CachedDetections(cache, describe_detector(config, model, device))
     found, names = _detect_photos(model, photos, cached=cached, progress=progress)
     # whole photos are matched to find the plant, and not again by who asks for that
-    match_found = lru_cache(maxsize=1)(partial(model.match_detections, found, progress=progress))
-    return _Seen(model, cached, names, match_found)
+    match_found = partial(model.match_detections, found, min_score=config.min_score, progress=progress)
+    return _Seen(model, cached, names, found, lru_cache(maxsize=1)(match_found))
 
 
 def share_of_sure(masks: Masks) -> float:
@@ -155,6 +192,7 @@ def _detect_photos(
 def describe_detector(config: DetectConfig, model: MultiViewMaskRCNN, device: str) -> str:
     """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
     options = asdict(config) | {"weights": hash_files(weights_path(config.weights))}
-    options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None}
+    options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None, "min_probability": None}
+    options |= {"min_score": min(LEAST_SCORE, config.min_score) if config.verify else config.min_score}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
     return json.dumps(options | {"torch": torch.__version__, "device": device})

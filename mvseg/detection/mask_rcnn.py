@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import partial
 
 import mvseg.detectors  # noqa: F401  # before torchvision, which it loads quickly
 
@@ -12,6 +13,7 @@ from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
+from mvseg.detection.config import MORE_SCORE, SURE_SCORE
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.proposals import Proposals, gather_proposals
 from mvseg.detectors.run import run_heads
@@ -20,7 +22,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
-from mvseg.verification.other_views import verify_masks
+from mvseg.verification.choose import choose_leaves
 from mvseg.verification.recut import recut_masks
 
 
@@ -40,7 +42,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        survivors again. Masks that resemble no map form one more group.
     4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
        better one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
-    5. With `verify`, surfaces fitted to what is matched correct it: for leaves only (`verification.other_views`).
+    5. With `verify`, what is matched of the sure proposals (`SURE_SCORE`), and of many more (`MORE_SCORE`), are candidates
+       only, and the views choose leaves and masks from the whole excessive set (`verification.choose`).
 
     Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
     here, where `match` selects "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the
@@ -101,7 +104,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             In train mode the detector's losses. In eval mode V dicts with `boxes`, `labels`, `scores`, `masks`
             (probabilities, to be cut at 0.5); with cameras also `instance_ids` (int64, the same number for the same
             instance in every view, -1 = matched to nothing) and `match_scores` (float32 in [0, 1], see `Matching`).
-            With `verify`, masks are 0 or 1, and `from_views` (bool) marks those that only the other views show.
+            With `verify`, masks are 0 or 1, and match scores say how likely each mask shows its instance.
 
         Raises:
             InputError: fewer than two images, not one camera per image, an image of another size than its camera, or
@@ -140,21 +143,20 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         Raises:
             InputError: as `forward`.
         """
-        detections, sizes, photos = [], [], []
+        detections, sizes = [], []
         for image in images:
             detections.append(self.detect(image))
             sizes.append([image.shape[-1], image.shape[-2]])
-            if self.verify:
-                photos.append((255 * image.detach().cpu()).round().to(torch.uint8).permute(1, 2, 0).numpy())
         _check_cameras(cameras, sizes)
-        matching = self.match_detections(detections, cameras, progress=progress)
-        if self.verify:
-            posed = cameras.to("cpu")
-            masks, surfaces = verify_masks(
-                matching.masks, cameras=posed, photos=photos.__getitem__, progress=progress
-            )
-            matching = matching.with_masks(recut_masks(masks, surfaces, cameras=posed))
-        return matching
+        if not self.verify:
+            return self.match_detections(detections, cameras, progress=progress)
+        posed = cameras.to("cpu")
+        match = partial(self.match_detections, detections, posed, progress=progress)
+        matching = match(min_score=max(SURE_SCORE, self.roi_heads.score_thresh))
+        leaves = choose_leaves(
+            matching.masks, list_proposals(detections, posed), cameras=posed, more=match(min_score=MORE_SCORE).masks
+        )
+        return matching.with_masks(recut_masks(leaves.masks, leaves.surfaces, cameras=posed))
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:
@@ -168,18 +170,27 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 
     @torch.no_grad()
     def match_detections(
-        self, detections: list[dict[str, Tensor]], cameras: Cameras, *, progress: bool = False
+        self,
+        detections: list[dict[str, Tensor]],
+        cameras: Cameras,
+        *,
+        min_score: float = 0.0,
+        progress: bool = False,
     ) -> Matching:
-        """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched."""
+        """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals that
+        score `min_score` or more. `labels` of its regions are rows of `list_proposals`."""
         with torch.autocast("cpu", enabled=False):
             proposals = gather_proposals(detections, cameras.sizes.tolist())
-            matching = self._match(proposals, cameras.to("cpu"), progress=progress)
+            matching = self._match(proposals, cameras.to("cpu"), min_score=min_score, progress=progress)
         return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
 
-    def _match(self, proposals: Proposals, cameras: Cameras, *, progress: bool = False) -> Matching:
+    def _match(
+        self, proposals: Proposals, cameras: Cameras, *, min_score: float = 0.0, progress: bool = False
+    ) -> Matching:
         """The proposals that are kept, of those whose mask is not empty, matched; `labels` say which they are."""
+        is_asked = (proposals.regions.areas > 0) & (proposals.scores >= min_score)
         return match_proposals(
-            proposals.select((proposals.regions.areas > 0).nonzero()[:, 0]),
+            proposals.select(is_asked.nonzero()[:, 0]),
             cameras,
             num_iterations=self.num_iterations,
             cluster_iou=self.cluster_iou,
@@ -210,6 +221,15 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         return results
 
 
+def list_proposals(detections: list[dict[str, Tensor]], cameras: Cameras) -> Masks:
+    """The excessive set of V images, as `MultiViewMaskRCNN.detect` gives it, as masks on the CPU that are matched to
+    nothing; those that are empty are in it, too."""
+    proposals = gather_proposals(detections, cameras.sizes.tolist())
+    return Masks.of(
+        proposals.regions, detection_scores=proposals.scores, classes=proposals.classes, origin=Origin.DETECTED
+    )
+
+
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:
     """torchvision's result dicts of what the other views leave, best score first."""
     results = []
@@ -225,7 +245,6 @@ def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device)
             "masks": (torch.stack(frames).float() if frames else empty)[:, None],
             "instance_ids": shown.instance_ids,
             "match_scores": shown.match_scores,
-            "from_views": shown.origin == Origin.OTHER_VIEWS,
         }
         results.append({key: value.to(device) for key, value in result.items()})
     return results

@@ -27,7 +27,8 @@ class Instances:
     `Matching.support`.)
 
     Attributes:
-        starts: {instance id: surface} that masks were verified with, and the final ones are fitted from.
+        probabilities: {instance id: P}, how likely it is a leaf; of instances that a detector found and the views chose.
+        starts: {instance id: surface} that they were chosen by, and the final ones are fitted from.
         surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None if no surfaces were
             requested.
         voxels: {instance id: voxels}: of all instances if voxels were requested, otherwise of those without a credible
@@ -35,6 +36,7 @@ class Instances:
         traits: of the plant and its leaves, once ids are final; None for ids only.
     """
 
+    probabilities: Mapping[int, float] = field(default_factory=dict)
     starts: Mapping[int, LeafSurface] = field(default_factory=dict)
     surfaces: Mapping[int, LeafSurface] | None = None
     voxels: Mapping[int, VoxelGrid] | None = None
@@ -44,7 +46,12 @@ class Instances:
         """The shapes of the instances that have masks, by the ids that `masks.close_gaps()` gives them."""
         surfaces = None if self.surfaces is None else masks.renumber(self.surfaces)
         voxels = None if self.voxels is None else masks.renumber(self.voxels)
-        return Instances(starts=masks.renumber(self.starts), surfaces=surfaces, voxels=voxels)
+        return Instances(
+            probabilities=masks.renumber(self.probabilities),
+            starts=masks.renumber(self.starts),
+            surfaces=surfaces,
+            voxels=voxels,
+        )
 
 
 @dataclass(frozen=True, eq=False)

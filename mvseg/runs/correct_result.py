@@ -7,11 +7,11 @@ import hashlib
 import json
 import os
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -24,10 +24,11 @@ from mvseg.pipeline import Stage, State, detect, list_stages, load, reconstruct
 from mvseg.reconstruction.shapes import Surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.report.correct import describe_fate
-from mvseg.results.result import Instances, Result
+from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.system.atomic import lock_folder
-from mvseg.verification.other_views import colors_of_leaves, fit_roughly, verify_masks
+from mvseg.verification.leaf_color import colors_of_leaves
+from mvseg.verification.rough_surfaces import fit_roughly
 
 CORRECTIONS_FILE = "corrections.json"
 NOT_AGAIN = ("detect", "check", "measure", "reconstruct")  # stages whose outcome the page does not show, or that ran
@@ -64,7 +65,7 @@ class OpenResult:
             raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
         self.found = state if masks is not None else detect(state)
         self._fitted: dict[str, LeafSurface] = {}
-        self._rough: dict[str, LeafSurface] = {}  # that masks are verified with
+        self._rough: dict[str, LeafSurface] = {}  # that leaves are chosen by
         self.has_masks = masks is not None
 
     def saved_corrections(self) -> Corrections:
@@ -87,7 +88,7 @@ class OpenResult:
             Superseded: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        state = replace(self.found, corrections=corrections, colors=self._colors)
+        state = replace(self.found, corrections=corrections, colors=self._colors, fit=self._fit_roughly)
         messages: list[str] = []
         for stage in self._stages(has_edits=len(corrections.edits) > 0):
             if is_old():
@@ -111,7 +112,7 @@ class OpenResult:
             if name in ("check_ids", "reconstruct"):
                 stages.append(self._fit)
             if name not in NOT_AGAIN:
-                stages.append(self._verify if name == "verify" else stage)
+                stages.append(stage)
         return stages
 
     def _fit(self, state: State) -> State:
@@ -124,16 +125,14 @@ class OpenResult:
         surfaces = _fit_unknown(state.masks, self._fitted, fit)
         return replace(state, instances=replace(state.instances, surfaces=surfaces))
 
-    def _verify(self, state: State) -> State:
-        """As the stage of that name, with surfaces that are known."""
-        cameras = state.scene.cameras
+    def _fit_roughly(self, masks: Masks, known: Mapping[int, LeafSurface]) -> Mapping[int, LeafSurface]:
+        """Surfaces to choose by; those of the same masks are kept."""
+        cameras, workers = self.found.scene.cameras, self.found.workers
 
-        def fit(masks: Masks) -> dict[int, LeafSurface]:
-            again = partial(fit_roughly, masks, cameras, workers=state.workers)
-            return dict(_fit_unknown(masks, self._rough, lambda known: again(known=known)) or {})
+        def fit(more: dict[int, LeafSurface]) -> Surfaces:
+            return fit_roughly(masks, cameras, known={**known, **more}, workers=workers)
 
-        masks, starts = verify_masks(state.masks, cameras=cameras, photos=state.photos, colors=state.colors, fit=fit)
-        return replace(state, instances=Instances(starts=starts)).with_masks(masks)
+        return _fit_unknown(masks, self._rough, fit) or {}
 
 
 def _fit_unknown(

@@ -26,21 +26,17 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, mask_box, stack_regions
 from mvseg.scene import Cameras
-from mvseg.verification.leaf_color import has_leaf_color
-from mvseg.verification.other_views import (
-    LEAST_COLORED,
-    LEAST_PARALLAX,
-    LEAST_PIXELS,
-    LEAST_VISIBLE,
-    colors_of_leaves,
-    median_parallax,
-)
+from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
 from mvseg.verification.recut import AGREES, agreement
+from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
 from mvseg.verification.visible_leaves import VisibleLeaf
 
 Photos = Callable[[int], NDArray[np.uint8]]
 Frame = NDArray[np.bool_]
 
+LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this share of it is unhidden
+LEAST_PIXELS = 64  # and so many of its pixels
+LEAST_COLORED = 0.8  # the visible part of a surface becomes a mask if this share of it has the colour of leaves
 HULL = ReconstructConfig(voxel_budget=25_000)
 ROUNDS = 2  # the second one looks only where the surface of the first one is
 BESIDE_PX = 2  # from leaf colour, that a point of a leaf may be shown

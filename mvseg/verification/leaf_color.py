@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from mvseg.masks import SURE, Masks
+
+Photos = Callable[[int], NDArray[np.uint8]]
+
+SURE_VIEWS = 4  # of an instance whose masks tell that colour
 BINS = 16  # per channel
 BLUR = 1.0  # bins
 CHANNELS, RANGES = (0, 1, 2), (0, 256) * 3  # as OpenCV asks for them
@@ -64,3 +72,18 @@ def _count(photo: np.ndarray, part: np.ndarray) -> np.ndarray:
     pixels, mask = photo.reshape(-1, 1, 3), part.reshape(-1, 1).astype(np.uint8)
     counted = cv2.calcHist([pixels], CHANNELS, mask, (BINS,) * 3, RANGES)
     return counted.astype(np.int64)
+
+
+def colors_of_leaves(masks: Masks, photos: Photos) -> NDArray[np.bool_]:
+    """The colours of masks that are surely matched, of instances that are so in `SURE_VIEWS` views, or in all where
+    there are fewer; where there are no such masks, those of all that are matched."""
+    enough = masks.count_sure_views() >= min(SURE_VIEWS, masks.regions.num_views)
+    of_instance = torch.cat((enough, enough.new_zeros(1)))[masks.instance_ids.clamp(min=0) - 1]
+    is_sure = (masks.instance_ids > 0) & of_instance & (masks.match_scores >= SURE)
+    chosen = is_sure if is_sure.any() else masks.instance_ids > 0
+    counts = ColorCounts.none()
+    for view in range(masks.regions.num_views):
+        photo = photos(view)
+        size = photo.shape[1], photo.shape[0]
+        counts += count_colors(photo, masks.regions.label_map(view, chosen.long(), size).numpy() > 0)
+    return leaf_colors(counts)
