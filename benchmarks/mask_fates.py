@@ -15,6 +15,8 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from mvseg.verification.other_views import ROUGH_VIEWS, revise_masks
+
 from benchmarks.found_leaves import FOUND_IOU, tied_instances
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.detect_scene import detect_scene
@@ -29,7 +31,6 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
 from mvseg.verification.checked_ids import move_masks
-from mvseg.verification.other_views import ROUGH_VIEWS, revise_masks
 
 FATES = ("kept", "dropped: in no instance", "dropped: no credible surface", "dropped: found too rarely",
          "dropped: disagrees with its surface", "replaced: disagrees with its surface")  # fmt: skip

@@ -1,10 +1,10 @@
 """Which masks of one photo are pieces of one leaf? `python benchmarks/pieces.py --cache ~/mvseg-cells`
 
-Masks of development plants (`label_maps`, 8 to 32 leaves in 5 and 10 views, true and degraded; and straps, whole, in pieces and
-degraded), as they are, and with all masks but one of a leaf taken away, six leaves of each. What the search puts into
-one cluster of one photo is right where both masks show one leaf. Prints the coefficients of
-`mvseg/matching/nview/pieces.py`, fitted to all, and, with each plant left out in turn, how many right pieces stay and
-how many strangers leave.
+Masks of development plants (`label_maps`, 8 to 32 leaves in 5 and 10 views, true and degraded; and straps, whole, in
+pieces and degraded), as they are, and with all masks but one of a leaf taken away, six leaves of each. What the search
+puts into one cluster of one photo is right where both masks show one leaf. Prints the coefficients of
+`mvseg/matching/nview/pieces.py`, fitted to all, and, with each plant left out in turn, how many right pieces and how
+many strangers are likelier pieces than not.
 """
 
 from __future__ import annotations

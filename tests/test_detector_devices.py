@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -17,8 +16,8 @@ from mvseg.detectors.mask_cut import decide_masks
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.detectors.run import detect, leave_autocast, run_heads
 from mvseg.detectors.small import SMALL_ARCHITECTURES
-from mvseg.masks import Masks, Origin
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.masks import Masks
+from mvseg.verification.choose import Leaves
 from other_device import other_device
 from synthetic import arc_positions, cameras_at
 from tiny_training import build_tiny
@@ -133,19 +132,17 @@ def test_regions_come_back_to_the_cpu(model: MaskRCNN, photos: list[Tensor], dev
     assert torch.equal(found.instance_ids, expected.instance_ids)
 
 
-def test_masks_are_verified_on_the_cpu(
+def test_leaves_are_chosen_on_the_cpu(
     model: MaskRCNN, photos: list[Tensor], device: torch.device, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And their answer is where the images are."""
     wrapped = MultiViewMaskRCNN(model, proposals_per_view=8, verify=True)
 
-    def verify(masks: Masks, **given: Any) -> tuple[Masks, dict[int, LeafSurface]]:
-        assert given["cameras"].K.device.type == masks.view_index.device.type == "cpu"
-        assert given["photos"](2).shape == (HEIGHT, WIDTH, 3)
-        origin = torch.where(masks.detection_scores > 0.4, int(Origin.OTHER_VIEWS), masks.origin)
-        return replace(masks, origin=origin), {}
+    def choose(matched: Masks, proposals: Masks, **given: Any) -> Leaves:
+        assert {each.device.type for each in (given["cameras"].K, matched.view_index, proposals.view_index)} == {"cpu"}
+        return Leaves(matched, {}, {}, (), proposals)
 
-    monkeypatch.setattr("mvseg.detection.mask_rcnn.verify_masks", verify)
+    monkeypatch.setattr("mvseg.detection.mask_rcnn.choose_leaves", choose)
     answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
     for answer, expected in zip(answers, wrapped(photos, cameras=CAMERAS), strict=True):
         check(answer, expected, device)

@@ -7,7 +7,6 @@ import json
 import math
 import shutil
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ import torch
 
 import mvseg
 import mvseg.pipeline
-from leafy_scene import write_leafy_scene
 from mvseg import (
     InputError,
     InputWarning,
@@ -36,17 +34,16 @@ from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import Photos, read_photo
-from mvseg.masks import Masks, MergedMask, Origin
-from mvseg.matching.result import Matching, MatchReport
+from mvseg.masks import Masks, MergedMask
+from mvseg.matching.result import Matching
 from mvseg.pipeline import State
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
-from mvseg.results.result import Result
 from mvseg.runs.one_scene import describe_run
-from mvseg.scene import Cameras, Scene, View
-from mvseg.verification.other_views import verify_masks
+from mvseg.scene import Scene, View
+from mvseg.verification.choose import Leaves
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)
@@ -301,19 +298,16 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
     asked: list[Masks] = []
 
     def detect(state: State) -> State:
-        def match(cameras: Cameras) -> Matching:
-            matching = match_regions(regions, cameras)
-            origin = torch.full_like(matching.masks.origin, Origin.DETECTED)
-            return matching.with_masks(show_two(replace(matching.masks, origin=origin)))
+        matching = match_regions(regions, state.scene.cameras)
+        found = FoundMasks.of(matching.with_masks(show_two(matching.masks)))
+        return replace(state, match=found.match, found=found)
 
-        return replace(state, match=match)
-
-    def verify(masks: Masks, **_: object) -> tuple[Masks, dict[int, LeafSurface]]:
-        asked.append(masks)
-        return masks, {}
+    def choose(matched: Masks, proposals: Masks, **_: object) -> Leaves:
+        asked.append(matched)
+        return Leaves(matched, {}, {}, (), proposals)
 
     monkeypatch.setattr(mvseg.pipeline, "detect", detect)
-    monkeypatch.setattr("mvseg.verification.other_views.verify_masks", verify)
+    monkeypatch.setattr("mvseg.verification.choose.choose_leaves", choose)
     config = replace(IDS_ONLY, split_merged=True, detect=DetectConfig(verify=verifies))
     result = run_scene(plant, None, config)
     assert len(result.masks) == len(regions) + 1
@@ -323,38 +317,6 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
     assert len(whole.masks) == len(regions)
     assert len(whole.masks.merged) == 1
 
-
-def test_a_leaf_that_the_detector_missed_in_one_photo(tmp_path: Path) -> None:
-    leafy = write_leafy_scene(tmp_path, num_leaves=2, num_views=5, size=160, span_deg=180)
-    missed = (leafy.regions.view_index == 2) & (leafy.regions.labels == 1)
-    regions = leafy.regions.select(~missed)
-    found = Masks.of(
-        regions,
-        regions.labels,
-        torch.full((len(regions),), 0.9),
-        detection_scores=torch.linspace(0.4, 0.9, len(regions)),
-        classes=regions.labels + 3,
-        origin=Origin.DETECTED,
-    )
-    photos = partial(read_photo, leafy.scene)
-    masks, starts = verify_masks(found, cameras=leafy.scene.cameras, photos=photos)
-    assert len(masks) == len(found) + 1
-    (new,) = (masks.origin == Origin.OTHER_VIEWS).nonzero()[:, 0].tolist()
-    assert (int(masks.view_index[new]), int(masks.instance_ids[new])) == (2, 1)
-    of_leaf = found.detection_scores[regions.labels == 1]
-    assert float(masks.detection_scores[new]) == pytest.approx(float(of_leaf.mean()))
-    assert torch.equal(masks.classes, masks.instance_ids + 3)
-    true = leafy.regions.mask(int(missed.nonzero()), 160, 160)
-    shown = masks.regions.mask(new, 160, 160)
-    assert float((true & shown).sum() / (true | shown).sum()) > 0.9
-    assert list(starts) == [1, 2]
-    for number, start in starts.items():  # the new mask is drawn from it
-        assert set(start.views.tolist()) <= set(masks.view_index[masks.instance_ids == number].tolist())
-
-    result = Result(scene=leafy.scene, matching=Matching(masks, MatchReport("nview", has_probabilities=True)))
-    save_result(result, tmp_path / "out", {})
-    written = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
-    assert [entry["from_other_views"] for entry in written] == (masks.origin == Origin.OTHER_VIEWS).tolist()
 
 
 @pytest.mark.slow

@@ -28,7 +28,7 @@ from mvseg.scene import Scene
 
 APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
 COVERED = 0.5  # of a mask, from which an outline replaces it
-MOST_COVERED = 3  # masks that an outline replaces without a word: a leaf that a stem and a twig cross is in three pieces
+MOST_COVERED = 3  # masks that an outline replaces without a word: two stems in front of a leaf make three pieces
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ class DetectConfig:
 
     Attributes:
         weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
-        min_probability: what is less likely a leaf is left out; in [0, 1]. The probability is calibrated: of leaves with
-            0.8 to 0.9, that part is right on plants that it was not fitted on (docs/detector.md). Null: where precision
-            and recall of the leaves together are expected to be best, never above 0.5.
+        min_probability: what is less likely a leaf is left out; in [0, 1]. The probability is calibrated: of leaves
+            with 0.8 to 0.9, that part or more is right on plants that it was not fitted on (docs/detector.md). Null:
+            where precision and recall of the leaves together are expected to be best, never above 0.5.
         min_score: proposals that score less are not matched at first; in [0, 1]. The score is the detector's confidence
             that it sees a leaf, times the expected IoU of its mask. Without `verify`, they are discarded.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the

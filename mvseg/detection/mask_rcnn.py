@@ -42,8 +42,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        survivors again. Masks that resemble no map form one more group.
     4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
        better one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
-    5. With `verify`, what is matched of the sure proposals (`SURE_SCORE`), and of many more (`MORE_SCORE`), are candidates
-       only, and the views choose leaves and masks from the whole excessive set (`verification.choose`).
+    5. With `verify`, what is matched of the sure proposals (`SURE_SCORE`), and of many more (`MORE_SCORE`), are
+       candidates only, and the views choose leaves and masks from the whole excessive set (`verification.choose`).
 
     Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
     here, where `match` selects "symnmf", |k| is that of the first match. The duplicates in the other sets inflate the
@@ -177,8 +177,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         min_score: float = 0.0,
         progress: bool = False,
     ) -> Matching:
-        """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals that
-        score `min_score` or more. `labels` of its regions are rows of `list_proposals`."""
+        """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals
+        that score `min_score` or more. `labels` of its regions are rows of `list_proposals`."""
         with torch.autocast("cpu", enabled=False):
             proposals = gather_proposals(detections, cameras.sizes.tolist())
             matching = self._match(proposals, cameras.to("cpu"), min_score=min_score, progress=progress)

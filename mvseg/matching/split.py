@@ -17,9 +17,9 @@ def split_merged(masks: Masks) -> Masks:
         masks: D masks, of which `second_parts` tells what shows a second instance.
 
     Returns:
-        D' >= D masks on the same device and in the same order, the second part of a mask right after the first. Both have its scores; none
-        shows two instances any more. A mask stays whole if one part would be empty, or if a person
-        corrected it.
+        D' >= D masks on the same device and in the same order, the second part of a mask right after the first. Both
+        have its scores; none shows two instances any more. A mask stays whole if one part would be empty, or if a
+        person corrected it.
     """
     masks = masks.with_merged([each for each in masks.merged if not masks.is_corrected[each.region]])
     rows, boxes, crops, ids = [], [], [], []

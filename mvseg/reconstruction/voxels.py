@@ -120,8 +120,8 @@ def reconstruct_instances(
         progress: show a progress bar over the instances.
 
     Returns:
-        {instance id: grid}, votes on the device of the regions. Instances seen in one view only are left out: they have no bounded shape. So are, with an
-        InputWarning, those in which no voxel has enough votes.
+        {instance id: grid}, votes on the device of the regions. Instances seen in one view only are left out: they have
+        no bounded shape. So are, with an InputWarning, those in which no voxel has enough votes.
 
     Raises:
         InputError: the ids are not one per region; see also `back_project`.

@@ -27,7 +27,7 @@ class Instances:
     `Matching.support`.)
 
     Attributes:
-        probabilities: {instance id: P}, how likely it is a leaf; of instances that a detector found and the views chose.
+        probabilities: {instance id: P}, how likely it is a leaf; of those that the views chose.
         starts: {instance id: surface} that they were chosen by, and the final ones are fitted from.
         surfaces: {instance id: surface}, some of which may not be credible (`is_credible`); None if no surfaces were
             requested.

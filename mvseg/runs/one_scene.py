@@ -46,8 +46,9 @@ def run_one_scene(
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json.
 
     Raises:
-        InputError: bad input; corrections of another scene, unless `force_corrections` is set; `out` holds a result of another scene, or what a run found in its photos, and `overwrite`
-            is not set; or another run detects for `out` now.
+        InputError: bad input; corrections of another scene, unless `force_corrections` is set; `out` holds a result of
+            another scene, or what a run found in its photos, and `overwrite` is not set; or another run detects for
+            `out` now.
     """
     sweep_abandoned(out)
     check_out(out)

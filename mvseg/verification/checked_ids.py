@@ -59,7 +59,8 @@ def check_ids(
     First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
     halves of leaves (`join_halves`). What still lies outside its own surface is matched once more (`rematch_misfits`).
     No mask loses its id without getting another. An instance may have several masks in a view afterwards: they show it
-    together. With fewer than `ENOUGH_VIEWS` views, masks that are surely matched stay. Last, the masks that show two surfaces are marked as merged (`find_shared`).
+    together. With fewer than `ENOUGH_VIEWS` views, masks that are surely matched stay. Last, the masks that show two
+    surfaces are marked as merged (`find_shared`).
 
     Args:
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces.

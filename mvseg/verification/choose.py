@@ -3,8 +3,8 @@
 A detector's score says how much a mask looks like the leaves that it has learned, not whether it is one. So the
 excessive set is kept, weak proposals included, and the views decide. Candidates are the instances that the matcher
 finds among the sure proposals, and again among many more, each with its surface. The likeliest leaf comes first and
-takes its masks; the others are judged by what is left (`leaf_scores.py`). So duplicates, pieces and masks over two leaves
-fall by themselves. The paper's idea of an excessive set from which the views choose, with surfaces in place of maps.
+takes its masks; the others are judged by what is left (`leaf_scores.py`). So duplicates, pieces and masks over two
+leaves fall by themselves. The paper's idea of an excessive set from which the views choose, with surfaces for maps.
 """
 
 from __future__ import annotations
@@ -99,18 +99,33 @@ def choose_leaves(
     is_held = matched.is_corrected | (matched.origin == Origin.OTHER_VIEWS) | (matched.origin == Origin.GIVEN)
     is_held = is_held if linked is None else is_held | linked.cpu()
     left = _without(proposals, gone)
-    held = matched.select(is_held)
-    table = Masks.concatenate((proposals, held.with_merged(())))
+    is_added = is_held | ~_are_proposals(matched, proposals)  # what a person made, and what was cut since
+    added = matched.select(is_added)
+    table = Masks.concatenate((proposals, added.with_merged(())))
     row_of = matched.regions.labels.clone()
-    row_of[is_held] = len(proposals) + torch.arange(len(held))
+    row_of[is_added] = len(proposals) + torch.arange(len(added))
+    held = np.zeros(len(table), bool)
+    held[row_of[is_held].numpy()] = True
     fit = fit or (lambda masks, known: fit_roughly(masks, cameras, known=known))
     has_shapes = _is_seen_around(matched, cameras)
     found = [(matched, row_of)] + ([] if more is None else [(more.to("cpu"), more.regions.labels.cpu())])
     candidates = _gather(found, fit if has_shapes else None, table=table, is_held=is_held)
     drawn = draw_views(table.regions, candidates.surfaces, cameras)
-    usable = np.concatenate((left, np.ones(len(held), bool)))
+    usable = np.concatenate((left, np.ones(len(added), bool)))
     chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability)
-    return _take(chosen, candidates, table, num_held=len(held))
+    return _take(chosen, candidates, table, is_held=held)
+
+
+def _are_proposals(matched: Masks, proposals: Masks) -> Tensor:
+    """(D,) bool: whether masks are, pixel for pixel, the proposals that their labels name."""
+    labels, regions = matched.regions.labels, proposals.regions
+    is_there = (labels >= 0) & (labels < len(proposals))
+    for row in is_there.nonzero()[:, 0].tolist():
+        label = int(labels[row])
+        is_there[row] = torch.equal(matched.regions.boxes[row], regions.boxes[label]) and torch.equal(
+            matched.regions.crop(row), regions.crop(label)
+        )
+    return is_there
 
 
 def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
@@ -339,9 +354,8 @@ def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
     return leaf, shown
 
 
-def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, num_held: int) -> Leaves:
-    """The table of the leaves; a person's masks that show none stay without an id."""
-    is_held = np.arange(len(table)) >= len(table) - num_held
+def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bools) -> Leaves:
+    """The table of the leaves; masks that are held (D,) and show none stay without an id."""
     rows = np.flatnonzero((chosen.leaf >= 0) | is_held)
     rows = rows[np.lexsort((chosen.leaf[rows], table.view_index.numpy()[rows]))]
     ids = np.where(chosen.leaf[rows] >= 0, chosen.leaf[rows] + 1, -1)

@@ -84,9 +84,8 @@ def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras
         masks: list[Placed] = [(tuple(regions.boxes[row].tolist()), regions.crop(row).numpy()) for row in rows.tolist()]
         parts = [nothing if each is None else each.project_parts(camera)[0] for each in surfaces]
         depth = [np.inf if each is None else float(camera.project(each)[1][0, 0]) for each in middles]
-        drawn.append(
-            Drawn(rows=rows, masks=_columns(masks, size, step), parts=_columns(parts, size, step), depth=np.array(depth))
-        )
+        pixels, covered = _columns(masks, size, step), _columns(parts, size, step)
+        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=np.array(depth)))
     return tuple(drawn)
 
 

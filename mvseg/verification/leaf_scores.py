@@ -1,6 +1,6 @@
 """Two questions, each answered by a probability: does this mask show this leaf (q), and is this candidate a leaf (P)?
 
-Logistic regressions of few features. Their numbers stand in `FITTED`, and `python -m benchmarks.choice fit` fits them by
+Logistic regressions of few features. Their numbers stand in `FITTED`, and `python -m benchmarks.choice` fits them by
 maximum likelihood. Not in the paper.
 """
 

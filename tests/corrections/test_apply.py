@@ -238,4 +238,5 @@ def test_an_outline_is_a_leaf_of_its_own_unless_links_say_otherwise() -> None:
 def test_an_outline_over_everything_says_what_it_replaces() -> None:
     squares = [(5 * n, 10, 5 * n + 4, 20) for n in range(8)]
     masks = Masks.of(regions_from_label_maps([label_map(*squares), label_map()]))
-    assert correct(square(0, 0, 60, 40), masks=masks).messages == ["correction 1 (outline): applied: it replaces 8 masks"]
+    said = correct(square(0, 0, 60, 40), masks=masks).messages
+    assert said == ["correction 1 (outline): applied: it replaces 8 masks"]

@@ -23,7 +23,7 @@ from mvseg.matching.split import split_merged
 from mvseg.results.folder import write_refined
 from mvseg.results.result import Result
 from mvseg.verification.checked_ids import check_ids
-from mvseg.verification.other_views import revise_masks
+from mvseg.verification.choose import choose_leaves
 from mvseg.verification.recut import recut_masks
 from scene_folders import write_scene
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -130,10 +130,11 @@ def squares(masks: Masks) -> list[tuple[list[int], int]]:
 @pytest.mark.parametrize("origin", [Origin.DETECTED, *CORRECTED])
 def test_no_later_stage_changes_or_drops_a_corrected_mask(origin: Origin) -> None:
     masks, stays = wrong_masks(origin), [([0, 0, 9, 9], 81)]
-    revised = revise_masks(masks, LEAVES, cameras=CAMERAS, photos=None)
-    assert squares(revised) == (stays if origin in CORRECTED else [])
-    alone = revise_masks(masks, {}, cameras=CAMERAS, photos=None)
-    assert squares(alone) == (stays if origin in CORRECTED else [])
+    regions, scores = replace(masks.regions, labels=torch.arange(len(masks))), torch.full((len(masks),), 0.8)
+    numbered = replace(masks, regions=regions, detection_scores=scores)
+    for surfaces in (LEAVES, {}):
+        chosen = choose_leaves(numbered, numbered, cameras=CAMERAS, fit=lambda *_, known=surfaces: known)
+        assert squares(chosen.masks) == (stays if origin in CORRECTED else [])
     row = int(((masks.view_index == 2) & (masks.instance_ids == 1)).nonzero()[0, 0])
     half = torch.zeros(9, 9, dtype=torch.bool)
     half[:4] = True

@@ -36,7 +36,7 @@ def test_another_plant_with_the_same_names_is_refused(tmp_path: Path) -> None:
     other = write_scene(tmp_path / "others")
     check_made_for(made, load_scene(other))  # the same photos
     write_png(other / "images" / "001.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
-    with pytest.raises(InputError, match="was made for another scene .photo 001 is another one here"):
+    with pytest.raises(InputError, match=r"was made for another scene .photo 001 is another one here"):
         check_made_for(made, load_scene(other))
     masks_only = {name: mark.model_copy(update={"sha256": None}) for name, mark in made.photos.items()}
     check_made_for(replace(made, photos=masks_only), load_scene(other))

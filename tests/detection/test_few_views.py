@@ -12,6 +12,7 @@ import pytest
 import torch
 
 from blade_scene import as_regions
+from found_masks import FoundMasks
 from leafy_scene import write_leafy_scene
 from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
@@ -20,7 +21,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import State, measure, reconstruct, verify
+from mvseg.pipeline import State, choose, measure, reconstruct
 from mvseg.results.folder import save_result
 
 SIZE = 40
@@ -89,9 +90,12 @@ def test_a_leaf_in_one_photo_comes_out_marked(tmp_path: Path, min_views: int) ->
     found = Masks.of(regions, ids, (ids > 0).float(), detection_scores=scores, origin=Origin.DETECTED)
     config = RunConfig(detect=DetectConfig(min_views=min_views))
     matching = Matching(found, MatchReport("nview", has_probabilities=True))
-    state = State(config=config, scene=leafy.scene, photos=Photos(leafy.scene), matching=matching)
+    found_masks = FoundMasks.of(matching)
+    state = State(
+        config=config, scene=leafy.scene, photos=Photos(leafy.scene), matching=found_masks.matching, found=found_masks
+    )
     with pytest.warns(InputWarning, match="no other view verifies: 1") if min_views == 1 else nullcontext():
-        state = verify(state)
+        state = choose(state)
     state = measure(reconstruct(state))
     assert state.surfaces is not None
     assert state.traits is not None

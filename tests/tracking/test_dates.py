@@ -51,7 +51,7 @@ def test_results_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> 
         write_result(tmp_path / place, grow_blades(3, 1))
     dates = [read_date(tmp_path / place, 0) for place in ("mon/plant", "fri/plant", "fri/other")]
     assert [date.scene for date in name_apart(dates)] == ["mon/plant", "fri/plant", "other"]
-    assert [date.scene for date in name_apart([dates[0], dates[0]])][0].endswith("mon/plant")
+    assert next(date.scene for date in name_apart([dates[0], dates[0]])).endswith("mon/plant")
 
 
 @pytest.mark.parametrize("text", ["", "noon", "nan", "2026-13-01"])

@@ -1,0 +1,236 @@
+"""Which leaves and masks are chosen: three known leaves, one over another, seen by six cameras, and what a detector may
+propose of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import SIZE, as_regions
+from known_leaves import flat_leaf
+from mvseg.errors import InputWarning
+from mvseg.masks import Masks, Origin
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+from mvseg.verification.choose import Leaves, assign_masks, choose_leaves, least_chance
+from mvseg.verification.evidence import draw_views
+from three_leaves import CAMERAS, LEAVES, true_maps
+
+TRUE = true_maps()
+REGIONS, IDS = as_regions(TRUE)
+
+
+def proposals_of(regions: Regions, scores: torch.Tensor) -> Masks:
+    numbered = replace(regions, labels=torch.arange(len(regions)))
+    return Masks.of(numbered, detection_scores=scores, origin=Origin.DETECTED)
+
+
+def matched_of(proposals: Masks, ids: torch.Tensor, rows: torch.Tensor | None = None, score: float = 0.9) -> Masks:
+    rows = torch.arange(len(proposals)) if rows is None else rows
+    chosen = proposals.select(rows)
+    return replace(chosen, instance_ids=ids, match_scores=torch.where(ids > 0, score, 0.0))
+
+
+def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> dict[int, LeafSurface]:
+    """The known leaves, by most of the masks."""
+    found = {}
+    for instance in masks.instance_ids[masks.instance_ids > 0].unique().tolist():
+        rows = masks.regions.labels[masks.instance_ids == instance]
+        leaf = int(TRUTH[rows.clamp(max=len(TRUTH) - 1)].mode().values)
+        found[instance] = LEAVES.get(leaf, STRAY)
+    return found
+
+
+STRAY = flat_leaf(length=0.5, half_width=0.2, at=(2.0, 2.0, 0.0))
+TRUTH = IDS
+PROPOSALS = proposals_of(REGIONS, torch.full((len(REGIONS),), 0.8))
+
+
+def choose(matched: Masks, proposals: Masks = PROPOSALS, cameras: Cameras = CAMERAS, **more: object) -> Leaves:
+    return choose_leaves(matched, proposals, cameras=cameras, **({"fit": fit} | more))  # type: ignore[arg-type]
+
+
+def label_maps(leaves: Leaves) -> list[np.ndarray]:
+    ids = leaves.masks.instance_ids.clamp(min=0)
+    return [leaves.masks.regions.label_map(view, ids, (SIZE, SIZE)).numpy() for view in range(len(CAMERAS))]
+
+
+def same_partition(leaves: Leaves, truth: list[np.ndarray] = TRUE) -> bool:
+    """The same pixels, and one number here for one there."""
+    found = np.stack(label_maps(leaves)).ravel()
+    pairs = {*zip(found.tolist(), np.stack(truth).ravel().tolist(), strict=True)}
+    return len(pairs) == len({a for a, _ in pairs}) == len({b for _, b in pairs})
+
+
+def test_right_masks_are_chosen_as_they_are() -> None:
+    leaves = choose(matched_of(PROPOSALS, IDS))
+    assert same_partition(leaves)
+    assert len(leaves.masks) == len(REGIONS)
+    assert all(chance > 0.9 for chance in leaves.probabilities.values())
+    assert leaves.surfaces.keys() == {1, 2, 3}
+
+
+def test_weak_proposals_fill_what_the_sure_ones_lack() -> None:
+    """Half of the masks of one leaf score low, and were never matched: its surface finds them."""
+    weak = (IDS == 2) & (torch.arange(len(IDS)) % 2 == 0)
+    proposals = proposals_of(REGIONS, torch.where(weak, 0.06, 0.8))
+    rows = (~weak).nonzero()[:, 0]
+    assert same_partition(choose(matched_of(proposals, IDS[rows], rows), proposals))
+
+
+def test_a_duplicate_and_a_stray_instance_fall() -> None:
+    """Eroded copies form instances of their own, and one is made of masks where nothing is."""
+    rng = np.random.default_rng(0)
+    maps = [np.where(rng.random((SIZE, SIZE)) < 0.97, labels, 0) for labels in TRUE]
+    copies, copy_ids = as_regions(maps)
+    corner = [np.zeros_like(labels) for labels in TRUE]
+    for labels in corner[:2]:
+        labels[2:14, 2:14] = 9
+    strays, _ = as_regions(corner)
+    every = Masks.concatenate([Masks.of(each) for each in (REGIONS, copies, strays)]).regions
+    scored = (REGIONS, 0.8), (copies, 0.5), (strays, 0.3)
+    scores = torch.cat([torch.full((len(each),), score) for each, score in scored])
+    proposals = proposals_of(every, scores)
+    ids = torch.cat((IDS, copy_ids + 3, torch.full((len(strays),), 7)))
+    leaves = choose(matched_of(proposals, ids), proposals)
+    assert same_partition(leaves)
+    assert all(chance < 0.5 for chance, _ in leaves.left)
+
+
+def test_two_masks_of_one_photo_never_show_the_same_pixels() -> None:
+    whole = [np.where(labels > 0, 1, 0) for labels in TRUE]  # one mask over all leaves, in every photo
+    over, _ = as_regions(whole)
+    every = Masks.concatenate([Masks.of(REGIONS), Masks.of(over)]).regions
+    proposals = proposals_of(every, torch.full((len(every),), 0.8))
+    ids = torch.cat((IDS, torch.full((len(over),), -1)))
+    leaves = choose(matched_of(proposals, ids), proposals)
+    assert same_partition(leaves)
+
+
+def test_a_person_is_right() -> None:
+    """A mask that is confirmed stays with its instance, though no surface agrees; what was rejected does not return."""
+    row = int(((REGIONS.view_index == 2) & (IDS == 3)).nonzero()[0, 0])
+    matched = matched_of(PROPOSALS, torch.where(torch.arange(len(IDS)) == row, 1, IDS))
+    origin = matched.origin.clone()
+    origin[row] = Origin.CONFIRMED
+    leaves = choose(replace(matched, origin=origin))
+    stays = leaves.masks.origin == Origin.CONFIRMED
+    assert int(stays.sum()) == 1
+    partners = leaves.masks.instance_ids == leaves.masks.instance_ids[stays]
+    assert leaves.probabilities[int(leaves.masks.instance_ids[stays])] == 1
+    assert int(partners.sum()) >= 5
+    rest = torch.arange(len(IDS)) != row
+    gone = PROPOSALS.select(~rest)
+    without = choose(matched_of(PROPOSALS, IDS[rest], rest.nonzero()[:, 0]), gone=gone)
+    assert len(without.masks) == len(REGIONS) - 1
+    boxes = without.masks.regions.boxes[without.masks.view_index == 2]
+    assert not (boxes == REGIONS.boxes[row]).all(1).any()
+
+
+def test_a_drawn_mask_that_matches_nothing_stays_without_an_id() -> None:
+    ids = torch.where(torch.arange(len(IDS)) == 4, -1, IDS)
+    matched = matched_of(PROPOSALS, ids)
+    origin = matched.origin.clone()
+    origin[4] = Origin.CORRECTED
+    leaves = choose(replace(matched, origin=origin))
+    assert leaves.masks.instance_ids[leaves.masks.origin == Origin.CORRECTED].tolist() == [-1]
+
+
+def test_the_order_of_masks_does_not_matter() -> None:
+    order = torch.randperm(len(REGIONS), generator=torch.Generator().manual_seed(0))
+    proposals = proposals_of(REGIONS.select(order), torch.full((len(REGIONS),), 0.8))
+    global TRUTH
+    TRUTH = IDS[order]
+    try:
+        assert same_partition(choose(matched_of(proposals, IDS[order]), proposals))
+    finally:
+        TRUTH = IDS
+
+
+def test_classes_are_never_mixed() -> None:
+    other = (REGIONS.view_index == 3) & (IDS == 1)
+    proposals = replace(PROPOSALS, classes=torch.where(other, 2, 1))
+    ids = torch.where(other, -1, IDS)
+    leaves = choose(matched_of(proposals, ids), proposals)
+    assert set(leaves.masks.classes.tolist()) == {1}
+    assert len(leaves.masks) == len(REGIONS) - 1
+
+
+def test_a_probability_of_ones_own() -> None:
+    matched = matched_of(PROPOSALS, IDS)
+    assert len(choose(matched, min_probability=1.0).masks) == 0
+    assert same_partition(choose(matched, min_probability=0.0))
+
+
+def test_without_surfaces_matching_and_scores_decide() -> None:
+    leaves = choose(matched_of(PROPOSALS, IDS), fit=lambda masks, known: {})
+    assert same_partition(leaves)
+    assert leaves.surfaces == {}
+
+
+def test_cameras_on_one_side_are_said() -> None:
+    alike = replace(CAMERAS, R=CAMERAS.R[[0] * 6], t=CAMERAS.t[[0] * 6] + 1e-3 * torch.arange(6)[:, None])
+    with pytest.warns(InputWarning, match="the cameras see the leaves from one side only"):
+        leaves = choose(matched_of(PROPOSALS, IDS), cameras=alike)
+    assert leaves.surfaces == {}
+    assert len(leaves.masks) == len(REGIONS)
+
+
+def test_nothing_is_an_answer() -> None:
+    empty = PROPOSALS.select(torch.zeros(0, dtype=torch.int64))
+    assert len(choose(empty, empty).masks) == 0
+    assert len(choose(matched_of(PROPOSALS, -torch.ones_like(IDS))).masks) == 0
+
+
+def test_cut_masks_are_more_than_the_proposals_that_they_come_from() -> None:
+    """Two parts of a mask that showed two leaves."""
+    row = int(((REGIONS.view_index == 0) & (IDS == 1)).nonzero()[0, 0])
+    maps = [labels.copy() for labels in TRUE]
+    maps[0][maps[0] == 2] = 1
+    joined, numbers = as_regions(maps)
+    proposals = proposals_of(joined, torch.full((len(joined),), 0.8))
+    global TRUTH
+    TRUTH = numbers
+    try:
+        both = int(((joined.view_index == 0) & (numbers == 1)).nonzero()[0, 0])
+        cut = replace(REGIONS, labels=torch.tensor([
+            both if view == 0 and leaf < 3 else int(((joined.view_index == view) & (numbers == leaf)).nonzero()[0, 0])
+            for view, leaf in zip(REGIONS.view_index.tolist(), IDS.tolist(), strict=True)
+        ]))  # fmt: skip
+        matched = Masks.of(cut, IDS, torch.full((len(IDS),), 0.9), detection_scores=torch.full((len(IDS),), 0.8),
+                           origin=Origin.DETECTED)  # fmt: skip
+        assert row >= 0
+        assert same_partition(choose(matched, proposals))
+    finally:
+        TRUTH = IDS
+
+
+def test_the_best_expected_f1() -> None:
+    """Against all thresholds, plainly."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        chances = rng.random(rng.integers(1, 12)).round(3)
+        f1 = {cut: 2 * chances[chances >= cut].sum() / ((chances >= cut).sum() + chances.sum()) for cut in chances}
+        found = least_chance(chances)
+        assert f1[found] == pytest.approx(max(f1.values()))
+    assert least_chance(np.array([0.9, 0.8, 0.05])) == 0.8
+    assert least_chance(np.zeros(3)) == least_chance(np.zeros(0)) == 1
+
+
+def test_assignment_is_the_best_one_per_view() -> None:
+    """Against every permutation, where no two masks show the same."""
+    from itertools import permutations
+
+    drawn = draw_views(REGIONS, [None] * 3, CAMERAS)
+    q = np.random.default_rng(1).uniform(0.3, 1, (len(REGIONS), 3)).round(4)
+    leaf, shown = assign_masks(q, drawn)
+    for each in drawn:
+        best = max(sum(q[row, k] for row, k in zip(each.rows, order, strict=False))
+                   for order in permutations(range(3), min(len(each.rows), 3)))  # fmt: skip
+        assert shown[each.rows].sum() == pytest.approx(best)
+        assert len({k for k in leaf[each.rows] if k >= 0}) == (leaf[each.rows] >= 0).sum()
