@@ -28,8 +28,8 @@ import torch
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from benchmarks.choice import true_maps
 from benchmarks.label_maps import add_scene_options, chosen_scenes, load_maps
-from benchmarks.mask_fates import true_maps
 from benchmarks.masks_alone import change_masks_alone
 from benchmarks.simulated_person import (
     Labels,

@@ -23,7 +23,7 @@ from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.mask_fates import true_maps
+from benchmarks.choice import true_maps
 from benchmarks.masks_alone import change_masks_alone
 from benchmarks.simulated_person import Labels, Look, count_worth, list_repairs
 from mvseg.corrections.file import Corrections, Edit, Outline, Reject, Split, load_corrections, write_corrections

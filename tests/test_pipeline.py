@@ -17,6 +17,7 @@ import torch
 
 import mvseg
 import mvseg.pipeline
+from found_masks import FoundMasks
 from mvseg import (
     InputError,
     InputWarning,
@@ -200,7 +201,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert (run["scene"], run["warnings"]) == ("plant", ["odd"])
-        ran = {"masks", "match", "refine_poses", "split_merged", "coco_crowd", "categories", "report"}
+        ran = {"match", "refine_poses", "split_merged", "coco_crowd", "categories", "report"}
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"
@@ -333,8 +334,8 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
         write_png(views[-1].path, photo)
     scene = Scene("far", tuple(views), cameras)
     kept = tmp_path / "kept"
-    first = detect_scene(Photos(scene), DetectConfig(crop="off"))(cameras).masks
-    again = detect_scene(Photos(scene), cache=kept)(cameras).masks
+    first = detect_scene(Photos(scene), DetectConfig(crop="off")).match(cameras).masks
+    again = detect_scene(Photos(scene), cache=kept).match(cameras).masks
     assert len(again) > len(first)
     assert len([*kept.iterdir()]) == 2 * len(chosen)
 
@@ -342,7 +343,7 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
     for view, (x1, y1, x2, y2) in zip(views, boxes.tolist(), strict=True):
         write_png(view.path, np.ascontiguousarray(read_rgb(view.path)[y1:y2, x1:x2]))
     cut = Scene("cut", tuple(views), crop_cameras(cameras, boxes))
-    expected = detect_scene(Photos(cut))(cut.cameras).masks
+    expected = detect_scene(Photos(cut)).match(cut.cameras).masks
     placed = place_crops(expected, boxes)
     assert torch.equal(again.regions.boxes, placed.regions.boxes)
     assert torch.equal(again.regions.crops, placed.regions.crops)

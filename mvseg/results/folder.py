@@ -141,10 +141,16 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         **track,
         "attributes": {"instance_id": instance} | track,  # what datumaro and CVAT keep
         "match_score": round(float(masks.match_scores[region]), 4),
+        **({"probability": round(chance, 4)} if (chance := _chance_of(result, instance)) is not None else {}),
         **source,
         "segmentation": encode_mask(distort(mask, result.scene.views[view].lens, K)),
         **({"other_instance_id": other} if other > 0 else {}),
     }
+
+
+def _chance_of(result: Result, instance: int) -> float | None:
+    """How likely an instance is a leaf, where the views chose it."""
+    return result.instances.probabilities.get(instance)
 
 
 def write_refined(path: Path, scene: Scene) -> None:

@@ -52,7 +52,7 @@ def write_plant(result: Result, folder: Path) -> None:
     write_glb(folder / "scene.glb", meshes, colors, matrix=gltf_from_world(result.scene), about=about, extras=extras)
     if result.traits is not None:
         write_long(folder / "traits.csv", result.traits)
-        write_wide(folder / "traits_wide.csv", result.traits)
+        write_wide(folder / "traits_wide.csv", result.traits, result.instances.probabilities)
 
 
 def gltf_from_world(scene: Scene) -> NDArray[np.float64]:

@@ -73,7 +73,7 @@ def read_recorded(folder: Path) -> RecordedRun:
 def record_places(scene: Path, out: Path, masks: Path | None, corrections: Path | None) -> dict[str, Any]:
     """What run.json says of the places of a run: absolute paths, and under "from_here" those from the result."""
     places = {"scene": scene, "out": out, "masks": masks, "corrections": corrections}
-    absolute = {name: path and str(path.resolve()) for name, path in places.items()}
+    absolute = {name: None if path is None else str(path.resolve()) for name, path in places.items()}
     return absolute | {"from_here": {name: _from(out, path) for name, path in absolute.items() if path is not None}}
 
 

@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping, Sequence
 from itertools import chain
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
@@ -40,9 +41,9 @@ def write_long(path: Path, traits: Traits) -> None:
     write_csv(path, COLUMNS, rows)
 
 
-def write_wide(path: Path, traits: Traits) -> None:
-    """One row per leaf: each trait, beside it its standard deviation, and in the end the unit of lengths, the method
-    and the quality: "good", or the reasons to doubt the numbers."""
+def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = MappingProxyType({})) -> None:
+    """One row per leaf: each trait, beside it its standard deviation, and in the end the unit of lengths, the method,
+    the quality: "good", or the reasons to doubt the numbers; and how likely it is a leaf, where the views chose it."""
     rows = []
     for leaf in traits.leaves:
         numbers: list[float] = []
@@ -50,14 +51,16 @@ def write_wide(path: Path, traits: Traits) -> None:
             number = leaf.numbers[trait.name]
             numbers += [number.value, number.sd] if trait.has_sd else [number.value]
         texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or "good"
-        rows.append(as_cells(leaf.leaf, *numbers, leaf.numbers["quality"].value, *texts))
+        rows.append(
+            as_cells(leaf.leaf, *numbers, leaf.numbers["quality"].value, *texts, probabilities.get(leaf.leaf))
+        )
     write_csv(path, wide_columns(), rows)
 
 
 def wide_columns() -> list[str]:
     """The columns of `write_wide`."""
     pairs = [[trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name] for trait in WIDE_TRAITS]
-    return ["leaf", *chain.from_iterable(pairs), "iou", "unit", "method", "quality"]
+    return ["leaf", *chain.from_iterable(pairs), "iou", "unit", "method", "quality", "probability"]
 
 
 def as_cells(*values: str | float | None) -> list[str | int]:

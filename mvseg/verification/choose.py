@@ -109,7 +109,7 @@ def choose_leaves(
     fit = fit or (lambda masks, known: fit_roughly(masks, cameras, known=known))
     has_shapes = _is_seen_around(matched, cameras)
     found = [(matched, row_of)] + ([] if more is None else [(more.to("cpu"), more.regions.labels.cpu())])
-    candidates = _gather(found, fit if has_shapes else None, table=table, is_held=is_held)
+    candidates = gather_candidates(found, fit if has_shapes else None, table=table, is_held=is_held)
     drawn = draw_views(table.regions, candidates.surfaces, cameras)
     usable = np.concatenate((left, np.ones(len(added), bool)))
     chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability)
@@ -154,7 +154,7 @@ def _without(proposals: Masks, gone: Masks | None) -> Bools:
     return stays
 
 
-def _gather(
+def gather_candidates(
     found: Sequence[tuple[Masks, Tensor]], fit: Fit | None, *, table: Masks, is_held: Tensor
 ) -> Candidates:
     """The instances of each matching; those that an earlier one has, too, once.

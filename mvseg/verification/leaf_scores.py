@@ -65,8 +65,7 @@ class Candidates:
     @property
     def is_certain(self) -> Bools:
         """(K,) those that a person says are leaves."""
-        is_certain: Bools = self.certain.any(0)
-        return is_certain
+        return np.asarray(self.certain.any(0), bool)
 
     @cached_property
     def has_surface(self) -> Bools:

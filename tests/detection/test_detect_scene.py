@@ -57,11 +57,11 @@ def test_half_the_size_where_few_masks_are_sure(
         asked.append(config.image_size)
         matching = SimpleNamespace(masks=answers[len(asked) - 1])
         model = SimpleNamespace(transform=SimpleNamespace(max_size=480))
-        return SimpleNamespace(model=model, cached=None, names=set(), match=lambda _: matching)
+        return SimpleNamespace(model=model, cached=None, names=set(), detections=[], match=lambda _: matching)
 
     monkeypatch.setattr(steps, "_look", look)
     scene = load_scene(demo_scene())
     assert scene.cameras.sizes.max() >= 480
-    matching = steps.detect_scene(Photos(scene), config)(scene.cameras)
+    matching = steps.detect_scene(Photos(scene), config).match(scene.cameras)
     assert asked == sizes
     assert matching.masks is answers[chosen]

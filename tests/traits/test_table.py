@@ -86,7 +86,9 @@ def test_wide_form(tmp_path: Path) -> None:
     first, second = read(tmp_path / "wide.csv")
     assert [*first][:9] == ["leaf", "area", "area_sd", "length", "length_sd", "width", "width_sd", "length_width_ratio",
                             "length_width_ratio_sd"]  # fmt: skip
-    assert [*first][-4:] == ["iou", "unit", "method", "quality"]
+    assert [*first][-5:] == ["iou", "unit", "method", "quality", "probability"]
+    write_wide(tmp_path / "chosen.csv", traits_of(), {2: 0.75})
+    assert [row["probability"] for row in read(tmp_path / "chosen.csv")] == ["", "0.75"]
     assert (first["leaf"], first["quality"], second["leaf"]) == ("1", "good", "2")
     assert second["quality"] == "; ".join(traits_of().leaves[1].reasons)
     numbers = traits_of().leaves[0].numbers

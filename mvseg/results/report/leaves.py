@@ -30,11 +30,14 @@ UNITLESS = {"degree": "°", "1": ""}
 
 
 def describe_leaves(result: Result) -> list[dict[str, Any]]:
-    """One entry per instance: id, colour, shape, doubts, and its traits, if they were measured."""
+    """One entry per instance: id, colour, how likely it is a leaf (where the views chose it), shape, doubts, and its
+    traits, if they were measured."""
     measured = {} if result.traits is None else {leaf.leaf: leaf for leaf in result.traits.leaves}
     found = []
     for instance in range(1, result.matching.num_instances + 1):
         about: dict[str, Any] = {"id": instance, "color": f"#{bytes(instance_color(instance)).hex()}"}
+        if (chance := result.instances.probabilities.get(instance)) is not None:
+            about["probability"] = round(chance, 3)
         if (leaf := measured.get(instance)) is not None:
             # as in traits.csv, traits of voxels are omitted if there are none
             shown = [each for each in LEAF_TRAITS if leaf.numbers[each.name].exists or each.name not in VOXEL_NAMES]

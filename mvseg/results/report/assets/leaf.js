@@ -30,6 +30,9 @@ function describeLeaf(leaf, data, addresses) {
   close.addEventListener("click", () => selection.select(null));
   const swatch = element("span", { class: "swatch", style: `background:${leaf.color}` });
   const parts = [element("h2", {}, swatch, `Leaf ${leaf.id}`, close)];
+  if (leaf.probability !== undefined) {
+    parts.push(element("p", { class: "note" }, `A leaf with a probability of ${leaf.probability.toFixed(2)}.`));
+  }
   if (leaf.doubts) parts.push(describeQuality(leaf));
   const seen = data.views.flatMap((view, index) =>
     view.masks.filter((mask) => mask.leaf === leaf.id).map((mask) => ({ view, index, mask })));

@@ -83,7 +83,11 @@ function listColumns(data) {
   });
   const leaf = { ...plain("leaf", "number of the leaf, in all files", (one) => one.id), cell: leafCell };
   const score = plain("match", "mean match score of the leaf's masks, 1 is best", mean, (value) => value.toFixed(2));
-  if (data.traits.length === 0) return [leaf, plain("views", "photos with a mask of the leaf", numViews), score];
+  const chance = data.leaves.some((one) => one.probability !== undefined) ? [plain("leaf?",
+    "how likely this is a leaf", (one) => one.probability ?? null, (value) => value.toFixed(2))] : [];
+  if (data.traits.length === 0) {
+    return [leaf, ...chance, plain("views", "photos with a mask of the leaf", numViews), score];
+  }
   const shape = plain("shape", "what was measured", (one) => one.shape);
   const doubts = (one) => one.doubts.join("; ");
   const quality = {
@@ -91,7 +95,7 @@ function listColumns(data) {
     cell: (one) => element("td", { class: "text" }, doubts(one)),
     kind: "text",
   };
-  return [leaf, ...traits, score, shape, quality];
+  return [leaf, ...chance, ...traits, score, shape, quality];
 }
 
 function leafCell(leaf) {
@@ -110,6 +114,7 @@ function numberCell(number, unit) {
 function makeRow(leaf, columns) {
   const row = element("tr", { "data-leaf": leaf.id }, ...columns.map((column) => column.cell(leaf)));
   row.classList.toggle("doubtful", (leaf.doubts ?? []).length > 0);
+  if (leaf.probability !== undefined) row.style.opacity = 0.4 + 0.6 * leaf.probability; // what is doubtful is paler
   return { leaf: leaf.id, element: row, keys: columns.map((column) => column.key(leaf)) };
 }
 
