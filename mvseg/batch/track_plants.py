@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -21,6 +21,7 @@ from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.system.atomic import folder_whole
 from mvseg.system.file_hash import hash_files
+from mvseg.tracking.config import Pots
 from mvseg.tracking.corrections import find_links, read_track_links
 from mvseg.tracking.dates import name_apart, read_date
 from mvseg.tracking.growth import measure_growth
@@ -74,6 +75,7 @@ def track_plants(
     out: Path,
     *,
     corrections: Path | None = None,
+    pots: Pots = "auto",
     num_workers: int = 1,
     scheduler: str | None = None,
     report: bool = True,
@@ -88,6 +90,7 @@ def track_plants(
         out: tracks.csv, growth.csv, plants.csv, curves.csv, tracks.html, growth.png and run.json; of several plants,
             pages and pictures lie in `plants/`, and tracks.html is their list.
         corrections: a file with `same_track` and `different_track`.
+        pots: see `track_leaves`.
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
         scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.
         report: write pages and pictures, too.
@@ -104,7 +107,7 @@ def track_plants(
         with folder_whole(out) as folder:
             places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
             places = places if len(plants) > 1 else [folder]
-            work = partial(_track_plant, edits, report=report)
+            work = partial(_track_plant, edits, pots=pots, report=report)
             items = dict(enumerate(zip(plants, places, strict=True)))
             with _open(work, min(num_workers, len(items)), scheduler) as engine, closing(engine(items, int)) as answers:
                 bar = tqdm(answers, total=len(plants), desc="track", unit="plant", disable=quiet)
@@ -119,7 +122,7 @@ def track_plants(
                     write_index(folder / PAGE_FILE, [(plant.plant, each.dates, each.tracks) for plant, each in pairs])
                 else:
                     shutil.rmtree(folder / "plants")
-            _write_run(folder, plants, tracked, corrections)
+            _write_run(folder, plants, tracked, {"corrections": corrections and str(corrections), "pots": pots})
             keep_user_files(out, folder)
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
@@ -142,7 +145,9 @@ def _or_failed(answer: TrackedPlant | Lost, plant: PlantResults) -> TrackedPlant
     return answer
 
 
-def _track_plant(edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *, report: bool) -> TrackedPlant:
+def _track_plant(
+    edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *, pots: Pots, report: bool
+) -> TrackedPlant:
     """Track one plant and write its tables, and its page, into its place."""
     plant, place = item
     try:
@@ -151,7 +156,7 @@ def _track_plant(edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *,
             raise InputError(f"{missing[0]} has no time, expected a number (days) or an ISO date (column time)")
         dates = name_apart([read_date(where, time) for where, time in zip(plant.folders, plant.times, strict=True)])
         links, lost = find_links(edits, dates)
-        tracks = track_leaves(dates, links=links, plant=plant.plant)
+        tracks = track_leaves(dates, links=links, pots=pots, plant=plant.plant)
     except InputError as error:
         return TrackedPlant(sentence=f"plant {plant.plant}: {error}")
     growth = measure_growth(tracks)
@@ -164,15 +169,15 @@ def _track_plant(edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *,
 
 
 def _write_run(
-    folder: Path, plants: Sequence[PlantResults], tracked: Sequence[TrackedPlant], corrections: Path | None
+    folder: Path, plants: Sequence[PlantResults], tracked: Sequence[TrackedPlant], config: Mapping[str, str | None]
 ) -> None:
     inputs = [place / RUN_FILE for plant in plants for place in plant.folders]  # which list the hashes of all files
-    if corrections is not None:
-        inputs.append(corrections)
+    if config["corrections"] is not None:
+        inputs.append(Path(config["corrections"]))
     said = {
         **made_by(),
         "inputs": {str(path): hash_files(path) if path.is_file() else None for path in inputs},
-        "config": {"corrections": corrections and str(corrections)},
+        "config": config,
         "warnings": [sentence for plant in tracked for sentence in plant.warnings],
         "failures": [plant.sentence for plant in tracked if plant.sentence],
         "counts": {"plants": len(plants), "dates": sum(plant.dates for plant in tracked),

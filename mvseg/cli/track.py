@@ -9,6 +9,7 @@ from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import add_shared, read_workers
 from mvseg.errors import InputError
+from mvseg.tracking.config import Pots
 
 SOME_FAILED = 3
 
@@ -21,6 +22,8 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--times", type=str, nargs="+", help=help_times)
     parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: that of --out)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables and pages")
+    help_pots = "fixed (they stand as they stood), turned, or auto: learned from the dates of each plant"
+    parser.add_argument("--pots", type=Pots, default="auto", help=help_pots)
     help_corrections = "file of corrections with same_track and different_track, see docs/tracking.md"
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)
     parser.add_argument("--report", type=bool, default=True, help="write tracks.html and growth.png")
@@ -48,6 +51,7 @@ def run(args: Namespace) -> int:
         plants,
         args.out,
         corrections=args.corrections,
+        pots=args.pots,
         num_workers=num_workers,
         scheduler=args.scheduler,
         report=args.report,

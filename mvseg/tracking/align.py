@@ -1,18 +1,24 @@
 """Where the plant of one date stands in the frame of another: the pot may have been turned, moved, set down askew.
 
-Frames of different dates are never trusted: that they agree is one hypothesis among many. The others come from pairs of
-leaves. Each is refined on the leaves that it pairs, and the best one must beat every different one clearly.
+That the pot stands as it stood is one hypothesis among many; the others come from pairs of leaves. Each is refined on
+the leaves that it pairs, and has a probability: from how well they go together, and from how often this plant's pot is
+turned (`Habit`). The best one is sure if it beats every different one clearly. If not, it is a guess, which is taken
+all the same, and its probability says so.
 """
 
 from __future__ import annotations
 
+import math
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
+from scipy.special import expit, logit
 
+from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import Pair, pair_costs
 from mvseg.tracking.dates import Floats
 
@@ -22,7 +28,9 @@ MOST_LEAN = np.radians(20.0)
 COARSE = (0.18, 0.45, 0.5)  # scales of base (median lengths), direction (radians) and log length while searching
 ROUNDS = (2.5, 1.8, 1.3, 1.0, 1.0)  # scales of the costs while refining
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
-WORLD_PRIOR = 5.0  # log of how much likelier than any other pose it is that the world frames agree
+TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
+TEMPER = 0.3  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
+GUESS = (-1.39, 0.16, 0.51)  # see `guess_chance`; `python benchmarks/guessed_poses.py` fits them
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
 LARGE_NEW = 4.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
@@ -42,7 +50,10 @@ class Alignment:
         pairs: (P, 2) leaves of the two dates (rows of `Leaves`) that go together.
         gain: how much likelier these pairs are the same leaves than strangers, a natural logarithm.
         margin: by how much it is likelier than the best hypothesis of another pose.
-        reason: why it is not to be trusted; "" for a sure one.
+        reason: why it is a guess; "" for a sure one.
+        share: of the pose among all that were looked at, as probabilities.
+        probability: that the pose is right; 1 for a sure one.
+        still: probability that the pot stands as it stood.
     """
 
     pose: Floats
@@ -50,33 +61,67 @@ class Alignment:
     gain: float = 0.0
     margin: float = 0.0
     reason: str = ""
+    share: float = 1.0
+    probability: float = 1.0
+    still: float = 0.5
 
     @property
     def is_sure(self) -> bool:
         return not self.reason
 
 
-def align(pair: Pair) -> Alignment:
-    """The best alignment of two dates, each in its own frame, and whether it is sure; where up is not known, of any
-    rotation."""
-    if pair.fewer < LEAST_PAIRS:
-        reason = f"{pair.fewer or 'no'} {'leaf' if pair.fewer == 1 else 'leaves'} cannot tell how the pot stands"
-        return Alignment(np.eye(4), np.zeros((0, 2), int), reason=reason)
+@dataclass(frozen=True)
+class Habit:
+    """How often a pot stands as it stood: what somebody says, or what a plant's dates tell.
+
+    Attributes:
+        still: probability, before anything is known of a pair of dates.
+    """
+
+    still: float = 5 / 6
+
+    @staticmethod
+    def of(found: Sequence[Alignment], pots: Pots) -> Habit:
+        """From alignments of a plant's dates; each counts as much as it is known."""
+        if pots != "auto":
+            return Habit(1.0 if pots == "fixed" else 0.0)
+        start = Habit().still
+        return Habit((6 * start + sum(each.still for each in found)) / (6 + len(found)))
+
+    @property
+    def world_prior(self) -> float:
+        """Log of how much likelier than any other pose it is that the frames agree."""
+        least = 1e-6
+        return math.log(max(self.still, least) / max((1 - self.still) / TURNS, least))
+
+
+def align(pair: Pair, habit: Habit = Habit()) -> Alignment:
+    """The best alignment of two dates, each in its own frame, how likely it is, and whether it is sure; where up is not
+    known, of any rotation. Without leaves on one of them, the pot stands as it stood."""
+    if not pair.fewer:
+        nothing, reason = np.zeros((0, 2), int), "no leaves cannot tell how the pot stands"
+        return Alignment(np.eye(4), nothing, reason=reason, probability=habit.still, still=habit.still)
+    world = _as_it_stood(pair)
     poses = np.concatenate([np.eye(4)[None], draw_poses(pair)])
     scores = alikeness(pair, poses).sum(1)
     scores[0] += 1e6  # always looked at
-    found: list[Alignment] = []
+    found: list[Alignment] = [world]
     left = np.argsort(-scores, kind="stable")
-    while len(left) and len(found) < NUM_REFINED:
-        found.append(refine(pair, poses[left[0]]))
+    while len(left) and len(found) < NUM_REFINED and habit.still < 1:
+        if left[0] or pair.fewer >= LEAST_PAIRS:
+            found.append(refine(pair, poses[left[0]]))
         left = left[pose_distances(pair, poses[left[0]], poses[left]) > SAME]
     every = np.stack([each.pose for each in found])
-    scores = np.array([each.gain - LARGE_NEW * _num_large_new(pair, each.pairs) for each in found])
-    scores += WORLD_PRIOR * np.exp(-0.5 * pose_distances(pair, np.eye(4), every) ** 2)
+    gains = np.array([each.gain - LARGE_NEW * _num_large_new(pair, each.pairs) for each in found])
+    near = np.exp(-0.5 * pose_distances(pair, np.eye(4), every) ** 2)
+    scores = gains + habit.world_prior / TEMPER * near
     place = int(scores.argmax())
-    best, others = found[place], scores[pose_distances(pair, every[place], every) >= 1]
-    margin, reason = float(scores[place] - others.max(initial=0.0)), ""
-    if len(best.pairs) < max(LEAST_PAIRS, 0.4 * pair.fewer):
+    best, is_other = found[place], pose_distances(pair, every[place], every) >= 1
+    plain = gains + Habit().world_prior * near  # how alike the leaves are, whatever this plant's habit is
+    margin, reason = float(plain[place] - plain[is_other].max(initial=0.0)), ""
+    if pair.fewer < LEAST_PAIRS:
+        reason = f"{pair.fewer} {'leaf' if pair.fewer == 1 else 'leaves'} cannot tell how the pot stands"
+    elif len(best.pairs) < max(LEAST_PAIRS, 0.4 * pair.fewer):
         reason = f"only {len(best.pairs)} of {pair.fewer} leaves are alike, however the pot is turned"
     elif _num_large_new(pair, best.pairs) > MOST_LARGE_NEW * len(pair.second):
         reason = "leaves too large to be new would have appeared, however the pot is turned"
@@ -84,7 +129,30 @@ def align(pair: Pair) -> Alignment:
         reason = TWO_WAYS
     elif margin + PER_LEAF * best.gain / pair.fewer < SURE_SUM:
         reason = "the leaves are not alike enough, however the pot is turned"
-    return replace(best, margin=margin, reason=reason)
+    weights = np.exp(TEMPER * (scores - scores.max()))
+    weights /= weights.sum()
+    still = float(weights[near > np.exp(-0.5)].sum())
+    best = replace(best, margin=margin, reason=reason, share=float(weights[~is_other].sum()), still=still)
+    if habit.still == 1 or best.is_sure:
+        return best
+    return replace(best, probability=guess_chance(best.share, best.gain / pair.fewer))
+
+
+def guess_chance(share: float, gain: float) -> float:
+    """How likely a guessed pose is right.
+
+    Args:
+        share: of it among the poses that were looked at, as probabilities.
+        gain: `Alignment.gain`, by leaf of the date with fewer: that of another plant is low.
+    """
+    return float(expit(GUESS[0] + GUESS[1] * logit(np.clip(share, 1e-4, 1 - 1e-4)) + GUESS[2] * gain))
+
+
+def _as_it_stood(pair: Pair) -> Alignment:
+    """The frames agree."""
+    costs = pair_costs(pair)
+    pairs = best_pairs(costs)
+    return Alignment(np.eye(4), pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
 
 
 def _num_large_new(pair: Pair, pairs: np.ndarray) -> int:

@@ -17,7 +17,8 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.align import Alignment, align, refine
+from mvseg.tracking.align import Alignment, Habit, align, refine
+from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import ACROSS, Leaves, Pair, cloud_costs, pair_costs
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.motions import Motion, find_motion, settle
@@ -31,6 +32,7 @@ IN_PART = 0.3  # change of log length from which one of two surfaces may show a 
 ASKED = 1e4  # gain of what a person says
 CALIBRATION = (0.25, 2.8)  # slope and offset of the log odds of a link, fitted on simulated series (docs/tracking.md)
 LIKE_RIGID = 0.3  # weight of "the plant moved as a whole", in leaves
+LEAST_MARGIN = 1e-3  # less than the margin of any sure alignment
 ROUNDS = 10  # of joining anew, at most; two or three are enough
 
 
@@ -39,11 +41,12 @@ class Comparison:
     """How the T dates of a plant are aligned, and how alike their leaves are.
 
     Attributes:
-        costs: {(earlier, later): (N, M) costs of their leaves being the same}, of dates that are surely aligned.
-        poses: (T, 4, 4) first_from_date, where "first" is the earliest of the dates that are surely aligned with it, by
-            way of others.
-        roots: (T,) index of that date; its own where there is no other.
+        costs: {(earlier, later): (N, M) costs of their leaves being the same}.
+        poses: (T, 4, 4) first_from_date, where "first" is the earliest of the dates that are aligned with it, by way of
+            others, surely or not.
+        roots: (T,) index of that date.
         reasons: (T - 1,) why each date cannot be aligned surely with the next one alone, "" where it can.
+        trust: (T, T) probability that two dates stand to each other as `poses` says.
         motions: {(earlier, later): of leaves that moved otherwise than the rest}, where there are any.
     """
 
@@ -51,6 +54,7 @@ class Comparison:
     poses: Floats
     roots: np.ndarray
     reasons: tuple[str, ...]
+    trust: Floats
     motions: Mapping[tuple[int, int], Motion]
 
 
@@ -63,7 +67,9 @@ class Link:
     probability: float
 
 
-def compare_dates(dates: Sequence[Leaves], times: Sequence[float], *, knows_up: bool) -> Comparison:
+def compare_dates(
+    dates: Sequence[Leaves], times: Sequence[float], *, knows_up: bool, pots: Pots = "auto"
+) -> Comparison:
     """Dates at most MOST_GAP apart are compared.
 
     The surest alignments say how all dates stand; the others only refine that. So two dates that look alike in more
@@ -73,12 +79,18 @@ def compare_dates(dates: Sequence[Leaves], times: Sequence[float], *, knows_up: 
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)
         for later in range(len(dates)) for n in range(max(later - MOST_GAP, 0), later)
     }  # fmt: skip
-    alone = {place: settle(pair, align(pair)) for place, pair in pairs.items()}
-    poses, roots = place_dates(len(dates), alone)
+    habit, alone = Habit.of([], pots), {place: align(pair, Habit.of([], pots)) for place, pair in pairs.items()}
+    learned = Habit.of(list(alone.values()), pots)
+    if learned != habit:
+        alone = {place: align(pair, learned) for place, pair in pairs.items()}
+    alone = {place: settle(pairs[place], found) for place, found in alone.items()}
+    poses, roots, trust = place_dates(len(dates), alone)
     costs: dict[tuple[int, int], Floats] = {}
     motions: dict[tuple[int, int], Motion] = {}
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
         pair = pairs[earlier, later]
+        if not pair.fewer:
+            continue
         alignment = refine(pair, np.linalg.inv(poses[later]) @ poses[earlier])
         if not len(alignment.pairs):
             continue
@@ -90,14 +102,19 @@ def compare_dates(dates: Sequence[Leaves], times: Sequence[float], *, knows_up: 
                 motions[earlier, later] = motion
                 costs[earlier, later] = _parted_costs(pair, motion, costs[earlier, later])
     reasons = tuple(alone[n, n + 1].reason for n in range(len(dates) - 1))
-    return Comparison(costs, poses, roots, reasons, motions)
+    return Comparison(costs, poses, roots, reasons, trust, motions)
 
 
-def place_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment]) -> tuple[Floats, np.ndarray]:
-    """Poses and roots, see `Comparison`, by way of the alignments with the largest margins."""
+def place_dates(
+    num_dates: int, alignments: Mapping[tuple[int, int], Alignment]
+) -> tuple[Floats, np.ndarray, Floats]:
+    """Poses, roots and trust, see `Comparison`, by way of the alignments with the largest margins; of those that are
+    guesses, only where there is no other way, and the likeliest."""
     margins, poses, roots = np.zeros((num_dates, num_dates)), np.zeros((num_dates, 4, 4)), np.full(num_dates, -1)
+    trust = np.eye(num_dates)
     for pair, alignment in alignments.items():
-        margins[pair] = -alignment.margin if alignment.is_sure else 0.0
+        guess = LEAST_MARGIN * max(alignment.probability, LEAST_MARGIN)
+        margins[pair] = -alignment.margin if alignment.is_sure else -guess
     tree = minimum_spanning_tree(margins)
     for root in range(num_dates):
         if roots[root] < 0:
@@ -105,9 +122,12 @@ def place_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
             poses[root], roots[order] = np.eye(4), root
             for date in order[1:].tolist():
                 earlier, later = sorted((date, int(before[date])))
-                step = alignments[earlier, later].pose
+                found = alignments[earlier, later]
+                step, chance = found.pose, 1.0 if found.is_sure else found.probability
                 poses[date] = poses[before[date]] @ (step if date == earlier else np.linalg.inv(step))
-    return poses, roots
+                known = order[: order.tolist().index(date)]
+                trust[date, known] = trust[known, date] = np.minimum(trust[before[date], known], chance)
+    return poses, roots, trust
 
 
 def _bent_costs(pair: Pair, alignment: Alignment) -> Floats:
@@ -155,6 +175,7 @@ def link_leaves(
     counts: Sequence[int],
     costs: Mapping[tuple[int, int], Floats],
     *,
+    trust: Floats | None = None,
     same: Collection[tuple[Sight, Sight]] = (),
     different: Collection[tuple[Sight, Sight]] = (),
 ) -> list[Link]:
@@ -162,7 +183,7 @@ def link_leaves(
 
     Args:
         counts: number of leaves with a shape on each date.
-        costs: see `Comparison`.
+        costs, trust: see `Comparison`; None: all dates are surely aligned.
         same, different: pairs of sights that a person says are one leaf, or are not.
 
     Raises:
@@ -189,6 +210,7 @@ def link_leaves(
                 before, chance = known[-1], chances[tracks[after]]
                 is_asked = gains[known, after].max() >= ASKED
                 both = [(int(date_of[n]), int(n - starts[date_of[n]])) for n in (before, after)]
+                chance *= 1.0 if trust is None else float(trust[both[0][0], later])
                 links.append(Link(both[0], both[1], 1.0 if is_asked else chance))
     return links
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from mvseg.errors import InputError
 from mvseg.tracking.associate import Comparison, Link, Sight, compare_dates, link_leaves
+from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import leaves_of
 from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
 
@@ -82,6 +83,7 @@ def track_leaves(
     times: Sequence[float | str] | None = None,
     *,
     links: Sequence[LeafLink] = (),
+    pots: Pots = "auto",
     plant: str = "plant",
 ) -> Tracks:
     """The same leaf, with the same track, on all dates of a plant.
@@ -94,11 +96,13 @@ def track_leaves(
             memory, or `PlantOnDate`s.
         times: of each result: numbers (days) or ISO dates; None: 0, 1, 2, ...
         links: what a person says.
+        pots: "fixed": they stand as they stood, and frames agree; "turned": any turn is as likely; "auto": how often
+            this plant's pot is turned is learned from its dates.
         plant: its name.
 
     Returns:
-        The tracks. Dates that cannot be aligned surely with those before them start tracks of their own, and
-        `Tracks.warnings` says why: no link is a guess. Leaves without a shape get a track of that date alone.
+        The tracks. Where dates cannot be aligned surely, the likeliest pose is taken, links have its probability at
+        most, and `Tracks.warnings` says why. Leaves without a shape get a track of that date alone.
 
     Raises:
         InputError: fewer than two results, another number of times, times that repeat, units that cannot be converted,
@@ -116,13 +120,15 @@ def track_leaves(
         for result, time in zip(results, written, strict=True)
     ]))  # fmt: skip
     leaves = [leaves_of(date) for date in dates]
-    compared = compare_dates(leaves, [date.time for date in dates], knows_up=all(date.knows_up for date in dates))
+    knows_up = all(date.knows_up for date in dates)
+    compared = compare_dates(leaves, [date.time for date in dates], knows_up=knows_up, pots=pots)
     same, different = _sights_of(links, dates)
-    found = link_leaves([len(each) for each in leaves], compared.costs, same=same, different=different)
+    counts = [len(each) for each in leaves]
+    found = link_leaves(counts, compared.costs, trust=compared.trust, same=same, different=different)
     return Tracks(
         plant=plant, dates=dates, rows=_rows(dates, found, compared.roots),
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
-        warnings=tuple(_warnings(dates, compared, found)),
+        warnings=tuple(_warnings(dates, compared)),
     )  # fmt: skip
 
 
@@ -178,14 +184,13 @@ def _rows(dates: Sequence[PlantOnDate], links: Sequence[Link], roots: np.ndarray
     return tuple(sorted(rows, key=lambda row: (row.date, row.track)))
 
 
-def _warnings(dates: Sequence[PlantOnDate], compared: Comparison, links: Sequence[Link]) -> Iterator[str]:
+def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[str]:
     for later in range(1, len(dates)):
-        if compared.roots[later] == later:
-            reason = compared.reasons[later - 1]
-            pair = f"{dates[later - 1].scene} and {dates[later].scene}"
-            by_hand = sum(link.before[0] < later <= link.after[0] for link in links)
-            what = f"only {by_hand} of their leaves are linked, by hand" if by_hand else "their leaves are not linked"
-            yield f"{pair} cannot be aligned surely ({reason}): {what}"
+        chance = compared.trust[later - 1, later]
+        if chance < 1:
+            pair, reason = f"{dates[later - 1].scene} and {dates[later].scene}", compared.reasons[later - 1]
+            why = f" ({reason})" if reason else ""
+            yield f"{pair} cannot be aligned surely{why}: how the pot stands is a guess, right with {chance:.0%}"
     for (earlier, later), motion in sorted(compared.motions.items()):
         if compared.roots[later] not in compared.roots[earlier + 1 : later]:
             pair = f"{dates[earlier].scene} and {dates[later].scene}"

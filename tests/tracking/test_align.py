@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.tracking import see_series
 from mvseg.simulation.series import draw_specs
-from mvseg.tracking.align import align
+from mvseg.tracking.align import Habit, align
 from mvseg.tracking.costs import Pair, leaves_of
 from tests.plants_over_days import grow_blades, grown, see
 
@@ -50,6 +50,30 @@ def test_another_plant_in_the_pot_is_not_aligned(seed: int) -> None:
     alignment = align(Pair.of(first, second, days=1, knows_up=True))
     assert not alignment.is_sure
     assert alignment.reason
+    assert alignment.probability < 0.95
+
+
+def test_one_leaf_in_a_pot_that_stands_still() -> None:
+    """Any turn explains one leaf; that the pot is not turned is likelier, and certain where somebody says so."""
+    blades = {3: grow_blades(5, 3)[3]}
+    first, second = leaves_of(see(blades, 0)[0]), leaves_of(see(grown(blades, 1.2), 1)[0])
+    pair = Pair.of(first, second, days=1, knows_up=True)
+    guess, said = align(pair), align(pair, Habit(1.0))
+    np.testing.assert_allclose(guess.pose, np.eye(4))
+    assert guess.pairs.tolist() == said.pairs.tolist() == [[0, 0]]
+    assert 0.5 < guess.probability < 1 == said.probability
+
+
+def test_a_habit_is_learned_from_the_dates() -> None:
+    blades = grow_blades(9, 3)
+    first = leaves_of(see(blades, 0)[0])
+    still, turned = (align(Pair.of(first, leaves_of(see(blades, 1, turn=turn)[0]), days=1, knows_up=True))
+                     for turn in (0, 100))  # fmt: skip
+    assert still.still > 0.99
+    assert turned.still < 0.01
+    assert Habit.of([still] * 6, "auto").still > Habit().still > Habit.of([turned] * 6, "auto").still
+    assert (Habit.of([turned], "fixed").still, Habit.of([still], "turned").still) == (1, 0)
+    assert Habit(0.9).world_prior > Habit(0.5).world_prior
 
 
 def test_a_plant_that_looks_the_same_from_two_sides_is_not_aligned() -> None:

@@ -98,9 +98,12 @@ def test_rivals_make_a_link_less_probable() -> None:
 
 def test_dates_stand_as_the_surest_alignments_say() -> None:
     def moved(x: float, margin: float, reason: str = "") -> Alignment:
-        return Alignment(make_poses(np.eye(3), np.array([x, 0, 0])), np.zeros((0, 2), int), 50.0, margin, reason)
+        at = make_poses(np.eye(3), np.array([x, 0, 0]))
+        return Alignment(at, np.zeros((0, 2), int), 50.0, margin, reason, probability=0.6 if reason else 1.0)
 
     pairs = {(0, 1): moved(-1, 30), (1, 2): moved(-1, 30), (0, 2): moved(9, 20), (2, 3): moved(5, 3, "not sure")}
-    poses, roots = place_dates(5, pairs)
-    np.testing.assert_allclose(poses[:, 0, 3], [0, 1, 2, 0, 0])
-    assert roots.tolist() == [0, 0, 0, 3, 4]
+    poses, roots, trust = place_dates(5, pairs)
+    np.testing.assert_allclose(poses[:, 0, 3], [0, 1, 2, -3, 0])
+    assert roots.tolist() == [0, 0, 0, 0, 4]  # a guess is taken where there is no other way
+    np.testing.assert_allclose(trust[:4, :4], [[1, 1, 1, 0.6], [1, 1, 1, 0.6], [1, 1, 1, 0.6], [0.6, 0.6, 0.6, 1]])
+    np.testing.assert_allclose(trust[4], [0, 0, 0, 0, 1])
