@@ -182,6 +182,8 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
     run = json.loads((tmp_path / "out" / "run.json").read_text())
     assert run["config"] == {
         "scene": str(plant),
+        "corrections": None,
+        "from_here": {"scene": "../plant", "out": ".", "masks": "../plant/masks"},
         "masks": str(plant / "masks"),
         "out": str(tmp_path / "out"),
         "match": {

@@ -122,7 +122,8 @@ def track_plants(
                     write_index(folder / PAGE_FILE, [(plant.plant, each.dates, each.tracks) for plant, each in pairs])
                 else:
                     shutil.rmtree(folder / "plants")
-            _write_run(folder, plants, tracked, {"corrections": corrections and str(corrections), "pots": pots})
+            config = {"corrections": None if corrections is None else str(corrections), "pots": pots}
+            _write_run(folder, plants, tracked, config)
             keep_user_files(out, folder)
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None

@@ -58,7 +58,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         cluster_iou: NMS threshold inside a cluster, and of the set that is matched first.
         proposals_per_view: size of the excessive set; the best scores are kept.
         match: how regions are matched; a given number of instances applies to each class.
-        verify: let the other views correct what is found. All photos are then in memory, 3 bytes a pixel.
+        verify: let the views choose from the excessive set (step 5).
 
     Raises:
         InputError: the detector has no mask head.

@@ -92,15 +92,6 @@ def check_ids(
     return checked.with_merged(merged.values())
 
 
-def move_masks(
-    masks: Masks, surfaces: Surfaces, *, cameras: Cameras, held: Tensor | None = None
-) -> tuple[Masks, dict[int, LeafSurface]]:
-    """The first two steps of `check_ids`, which fit nothing, and the surfaces of the instances that still have masks.
-    What moves is forgotten to be merged."""
-    ids, left = _move_to_surfaces(masks, surfaces, cameras=cameras.to("cpu"), is_held=_is_held(masks, held))
-    return _with_ids(masks, ids), {instance: each for instance, each in left.items() if (ids == instance).any()}
-
-
 def _is_held(masks: Masks, held: Tensor | None) -> NDArray[np.bool_]:
     is_held: NDArray[np.bool_] = (masks.is_corrected if held is None else masks.is_corrected | held).cpu().numpy()
     return is_held
