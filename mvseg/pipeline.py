@@ -271,7 +271,7 @@ def choose(state: State) -> State:
         state.found.proposals(cameras),
         cameras=cameras,
         more=more,
-        linked=None if corrected is None or corrected.everywhere else corrected.is_linked,
+        linked=None if corrected is None or corrected.everywhere else _is_linked(state),
         gone=None if corrected is None else _taken_away(state.found.match(cameras).masks.to("cpu"), state.masks),
         min_probability=detect.min_probability,
         fit=fit if state.fit is None else state.fit,
@@ -279,6 +279,13 @@ def choose(state: State) -> State:
     masks = select_by_views(leaves.masks, state.masks, min_views=detect.min_views)
     instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
     return replace(state, instances=instances).with_masks(masks)
+
+
+def _is_linked(state: State) -> torch.Tensor:
+    """(D,) bool, the masks that a person linked; those that followed from drawn ones come after all others."""
+    assert state.corrected is not None
+    is_linked = state.corrected.is_linked
+    return torch.nn.functional.pad(is_linked, (0, len(state.masks) - len(is_linked)))
 
 
 def _taken_away(before: Masks, after: Masks) -> Masks:
@@ -302,7 +309,7 @@ def check_ids(state: State) -> State:
     state = reconstruct(state, with_voxels=False)
     held = None
     if state.corrected is not None and not state.corrected.everywhere:  # these edits change the rows that links name
-        held = state.corrected.is_linked
+        held = _is_linked(state)
     checked = checked_ids.check_ids(
         state.masks, state.surfaces or {}, cameras=state.scene.cameras, held=held, config=state.config.match
     )

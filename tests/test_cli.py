@@ -149,7 +149,8 @@ def test_demo_from_pixels(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     out = tmp_path / "out"
     assert main(["infer", "--quiet", *COARSE, "--out", str(out)]) == 0
     detections = json.loads((out / "instances.json").read_text())["annotations"]
-    assert all(DetectConfig().min_score <= entry["score"] <= 1 for entry in detections)
+    assert all(0.05 <= entry["score"] <= 1 for entry in detections)
+    assert all(0 <= entry["probability"] <= 1 for entry in detections)
     assert not any("source_label" in entry for entry in detections)
     run = json.loads((out / "run.json").read_text())
     assert run["config"]["masks"] is None

@@ -130,7 +130,7 @@ def test_detections_are_kept_for_other_options_of_later_stages(
     repaint(scene)
     assert not work_on_scene(out, config, scene).is_kept
     assert len(looked) == 3 + 1
-    assert not work_on_scene(out, replace(CONFIG, detect=DetectConfig(min_score=0.06)), scene).is_kept
+    assert not work_on_scene(out, replace(CONFIG, detect=DetectConfig(min_score=0.04)), scene).is_kept
     assert len(looked) == 3 + 1 + 3
     kept = sorted((scene_state(out, "p") / "detections").iterdir())
     assert len(kept) == 3  # what other options left is gone
