@@ -16,6 +16,24 @@ TEXTURE_SIZE = 256
 
 
 @dataclass(frozen=True, eq=False)
+class Marking:
+    """A second colour on every leaf of a plant.
+
+    Attributes:
+        color: (3,) linear RGB.
+        vein, blotch, edge: how much veins, patches of noise and the margin of the leaf raise the share of the second
+            colour.
+        bias: share without any of them, before it is cut to [0, 1].
+    """
+
+    color: Floats
+    vein: float
+    blotch: float
+    edge: float
+    bias: float
+
+
+@dataclass(frozen=True, eq=False)
 class Look:
     """Light, materials and camera of one scene. Colours are linear RGB, (3,) float32."""
 
@@ -44,6 +62,8 @@ class Look:
     blur_px: float
     noise: float
     vignette: float
+    skin: Floats | None = None  # (h, w, 3) over `Leaf.uv`, in place of `leaf`
+    marking: Marking | None = None
 
 
 def draw_look(rng: np.random.Generator) -> Look:

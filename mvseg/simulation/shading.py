@@ -106,7 +106,15 @@ def leaf_color(
     vein = (look.vein * np.clip(lateral + np.exp(-((v * 14) ** 2)), 0, 1))[:, None]
     sick = sample_texture(look.texture, u * 90 + number * 53, v * 40) + 3 * side**6 - 4 + look.spots
     sick = np.clip(sick, 0, 1)[:, None]
-    albedo = look.leaf * np.exp(tint + 0.08 * blotch[:, None] + vein * VEIN_TINT)
+    if look.skin is None:
+        albedo = look.leaf * np.exp(tint + 0.08 * blotch[:, None] + vein * VEIN_TINT)
+    else:
+        rows, columns = look.skin.shape[:2]
+        albedo = sample_texture(look.skin, (v + 1) / 2 * (columns - 1), u * (rows - 1)) * np.exp(tint)
+    if look.marking is not None:
+        share = look.marking.bias + look.marking.vein * vein[:, 0] / look.vein + look.marking.blotch * blotch
+        share = np.clip(share + look.marking.edge * side**4, 0, 1)[:, None]
+        albedo += share * (look.marking.color - albedo)
     albedo += sick * (SICK - albedo)
     grain = np.exp(0.15 * blotch[:, None])
     albedo += np.clip(2 * dryness, 0, 1)[:, None] * (YELLOW * grain - albedo)

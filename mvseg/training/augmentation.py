@@ -20,6 +20,7 @@ from torchvision.transforms import v2
 
 from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.regions import masks_to_boxes
+from mvseg.simulation.skins import list_skins
 from mvseg.training.config import Orientation, TrainConfig
 from mvseg.training.data import SampleList, read_sample
 from mvseg.training.new_plants import draw_background, list_backgrounds, recolor, render_new_plant
@@ -45,6 +46,7 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
         self.samples = samples
         self.config = config
         self.backgrounds = list_backgrounds(config.backgrounds)
+        self.skins = list_skins(config.skins)
 
     def __len__(self) -> int:
         return len(self.samples) + self.config.new_plants
@@ -55,7 +57,7 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
         if index < len(self.samples):
             labelled = read_sample(self.samples.samples[index])
         else:
-            labelled = render_new_plant(seed, config.image_size, self.backgrounds)
+            labelled = render_new_plant(seed, config.image_size, self.backgrounds, self.skins)
             config = replace(config, orientation="fixed", scale_range=(1.0, 1.0), recolor=False)
         return *augment(labelled, config, seed, backgrounds=self.backgrounds), index
 
