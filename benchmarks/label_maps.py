@@ -112,7 +112,7 @@ def load_detected(spec: SceneSpec, cache: Path) -> Regions:
     if not path.exists():
         photos = [torch.from_numpy(photo).permute(2, 0, 1).float() / 255 for photo in load_photos(spec, cache)]
         model = MultiViewMaskRCNN(load_detector("leaf-lite", min_score=DetectConfig.min_score))
-        found = model.find_regions(photos, load_maps(spec, cache).cameras).regions
+        found = model.find_regions(photos, load_maps(spec, cache).cameras).masks.regions
         path.parent.mkdir(parents=True, exist_ok=True)
 
         def save(partial: Path) -> None:

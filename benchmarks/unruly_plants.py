@@ -1,8 +1,9 @@
-"""Simulated plants as unruly as real ones: `python benchmarks/unruly_plants.py OUT`.
+"""Simulated plants as unruly as real ones: `python benchmarks/unruly_plants.py OUT [SKINS]`.
 
 Blades are curled and wavy, plants wild (`make_wild`), leaves move from photo to photo as in a draught, and the poses
 that the scene states are wrong by about 1.5 px. Four plants with truth, to
-judge on them what is chosen for real plants.
+judge on them what is chosen for real plants; and, with SKINS, a folder of leaves that were cut out, twelve more that
+look like other species (`dress`).
 """
 
 from __future__ import annotations
@@ -23,11 +24,18 @@ from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.blades import BLADE_COLUMNS, Leaf, leaf_from_blade
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import Plant, grow_plant
+from mvseg.simulation.look import Floats
 from mvseg.simulation.ray_cast import build_stage, render_stage
 from mvseg.simulation.scene_writer import drop_small, shuffle_labels, write_jpeg
+from mvseg.simulation.skins import dress, list_skins
 from mvseg.simulation.wild import make_wild, roll_up
 
 PLANTS = (("ovate", 18, 10, 71), ("leggy", 12, 12, 72), ("lanceolate", 16, 10, 73), ("compound", 20, 8, 74))
+DRESSED = (
+    ("ovate", 24, 16, 81), ("lanceolate", 28, 16, 82), ("ovate", 14, 12, 83), ("leggy", 20, 10, 84),
+    ("leggy", 10, 12, 85), ("rosette", 14, 10, 86), ("lobed", 10, 10, 87), ("compound", 16, 10, 88),
+    ("strap", 12, 10, 89), ("ovate", 32, 10, 90), ("lanceolate", 12, 8, 91), ("leggy", 16, 12, 92),
+)  # fmt: skip
 SIZE = 800
 CURL, WAVE = 0.7, 0.035  # radians from midrib to edge; of a leaf's length
 SWAY_DEG = 1.2  # from photo to photo: some 2 px at the tip of a leaf of 100 px
@@ -69,7 +77,9 @@ def shake_poses(cameras: Cameras, rng: np.random.Generator) -> Cameras:
     )
 
 
-def write_unruly(folder: Path, family: str, num_leaves: int, *, num_views: int, seed: int) -> None:
+def write_unruly(
+    folder: Path, family: str, num_leaves: int, *, num_views: int, seed: int, skins: tuple[Floats, ...] = ()
+) -> None:
     """A scene as `mvseg simulate` writes it, without leaf meshes: no one shape is the truth of all photos."""
     plant, rng = make_unruly(grow_plant(family, num_leaves, seed), seed), np.random.default_rng([seed, 4])
     cameras = arc_cameras(
@@ -79,7 +89,10 @@ def write_unruly(folder: Path, family: str, num_leaves: int, *, num_views: int, 
         (folder / part).mkdir(parents=True)
     names = [f"{view:03d}" for view in range(num_views)]
     for view, name in enumerate(names):
-        shot = render_stage(build_stage(sway(plant, rng), seed=seed), cameras, view)
+        stage = build_stage(sway(plant, rng), seed=seed)
+        if skins:
+            stage = replace(stage, look=dress(stage.look, skins, np.random.default_rng([seed, 5])))
+        shot = render_stage(stage, cameras, view)
         truth = drop_small(shot.ids, 30)
         write_jpeg(folder / "images" / f"{name}.jpg", shot.rgb)
         write_label_png(folder / "truth" / f"{name}.png", truth)
@@ -91,6 +104,12 @@ def write_unruly(folder: Path, family: str, num_leaves: int, *, num_views: int, 
     write_rig(folder / "cameras.json", scene, files)
 
 
+def main() -> None:
+    out, *folders = map(Path, sys.argv[1:])
+    for plants, skins in ((PLANTS, ()), (DRESSED if folders else (), list_skins(*folders))):
+        for family, num_leaves, num_views, seed in plants:
+            write_unruly(out / f"{family}-{seed}", family, num_leaves, num_views=num_views, seed=seed, skins=skins)
+
+
 if __name__ == "__main__":
-    for family, num_leaves, num_views, seed in PLANTS:
-        write_unruly(Path(sys.argv[1]) / f"{family}-{seed}", family, num_leaves, num_views=num_views, seed=seed)
+    main()
