@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import apply, apply_everywhere
+from mvseg.corrections.apply import apply, apply_everywhere, refuse
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.errors import InputWarning
@@ -204,8 +204,11 @@ def correct(state: State) -> State:
     assert state.corrections is not None
     masks = state.masks if state.mask_kind else state.match(state.scene.cameras).masks
     corrected = apply(state.corrections, masks, state.scene)
-    for message in corrected.messages:
-        warnings.warn(message, InputWarning, stacklevel=3)
+    is_verified = state.found is not None and state.config.detect.verify
+    waits = {number for number, *_ in corrected.refused} if is_verified else set()  # `choose` has more candidates
+    for fate in corrected.fates:
+        if fate.message and fate.edit not in waits:
+            warnings.warn(fate.message, InputWarning, stacklevel=3)
     if len(masks) and not len(corrected.masks):
         warnings.warn(NOTHING_LEFT, InputWarning, stacklevel=3)
     options = state.config.match
@@ -278,7 +281,14 @@ def choose(state: State) -> State:
     )
     masks = select_by_views(leaves.masks, state.masks, min_views=detect.min_views)
     instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
-    return replace(state, instances=instances).with_masks(masks)
+    left = leaves.left
+    if corrected is not None:
+        left, corrected = refuse(corrected, left)
+        asked = {number for number, *_ in corrected.refused}
+        for fate in corrected.fates:
+            if fate.message and fate.edit in asked:
+                warnings.warn(fate.message, InputWarning, stacklevel=3)
+    return replace(state, instances=instances, left=left, corrected=corrected).with_masks(masks)
 
 
 def _is_linked(state: State) -> torch.Tensor:

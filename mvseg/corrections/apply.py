@@ -10,6 +10,7 @@ from collections.abc import Collection, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -26,6 +27,9 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
 from mvseg.scene import Scene
 
+if TYPE_CHECKING:
+    from mvseg.verification.choose import LeftOut
+
 APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
 COVERED = 0.5  # of a mask, from which an outline replaces it
 MOST_COVERED = 3  # masks that an outline replaces without a word: two stems in front of a leaf make three pieces
@@ -41,6 +45,13 @@ class Fate:
     fate: str
     problem: str = ""
 
+    @property
+    def message(self) -> str:
+        """A sentence, if the edit was not applied, or is odd; "" otherwise."""
+        if not self.problem and self.fate in (APPLIED, PASSED):
+            return ""
+        return f"correction {self.edit} ({self.op}): {': '.join(filter(None, (self.fate, self.problem)))}"
+
 
 @dataclass(frozen=True, eq=False)
 class Corrected:
@@ -53,6 +64,7 @@ class Corrected:
             show.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
         everywhere: (edit number, row, whether its instance is rejected) of each edit about a whole instance.
+        refused: (edit number, view, x, y) of each pixel where a person says that no leaf is, and where no mask is.
         fates: of the edits, in their order.
     """
 
@@ -61,16 +73,13 @@ class Corrected:
     is_linked: Tensor
     last_edits: Tensor
     everywhere: tuple[tuple[int, int, bool], ...]
+    refused: tuple[tuple[int, int, int, int], ...]
     fates: tuple[Fate, ...]
 
     @property
     def messages(self) -> list[str]:
         """A sentence for each edit that was not applied, or is odd."""
-        return [
-            f"correction {each.edit} ({each.op}): {': '.join(filter(None, (each.fate, each.problem)))}"
-            for each in self.fates
-            if each.problem or each.fate not in (APPLIED, PASSED)
-        ]
+        return [each.message for each in self.fates if each.message]
 
 
 @dataclass(eq=False)
@@ -84,6 +93,7 @@ class _Work:
     everywhere: list[tuple[int, EditedMask, bool]] = field(default_factory=list)
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
     rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
+    refused: list[tuple[int, int, int, int]] = field(default_factory=list)
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
@@ -138,6 +148,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         is_linked=is_linked,
         last_edits=last_edits,
         everywhere=everywhere,
+        refused=tuple(work.refused),
         fates=tuple(work.fates.values()),
     )
 
@@ -179,11 +190,38 @@ def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corre
     return masks, replace(corrected, fates=fates)
 
 
+def refuse(corrected: Corrected, left: Sequence[LeftOut]) -> tuple[tuple[LeftOut, ...], Corrected]:
+    """The candidates that nobody said are no leaves; and the fates of the edits that did so: they are applied, not
+    beside everything."""
+    answered = {
+        number: [each for each in left if _is_shown(each.masks, view, column, row)]
+        for number, view, column, row in corrected.refused
+    }
+    gone = {id(each) for candidates in answered.values() for each in candidates}
+    fates = tuple(
+        replace(each, fate=APPLIED, problem="") if answered.get(each.edit) else each for each in corrected.fates
+    )
+    return tuple(each for each in left if id(each) not in gone), replace(corrected, fates=fates)
+
+
+def _is_shown(masks: Masks, view: int, column: int, row: int) -> bool:
+    """Whether one of the masks of a view has a pixel."""
+    x1, y1, x2, y2 = masks.regions.boxes.T
+    here = (masks.view_index == view) & (x1 <= column) & (column < x2) & (y1 <= row) & (row < y2)
+    return any(
+        bool(masks.regions.crop(index)[row - int(y1[index]), column - int(x1[index])])
+        for index in here.nonzero()[:, 0].tolist()
+    )
+
+
 def _apply_one(work: _Work, number: int, edit: Edit) -> None:
     if isinstance(edit, Outline):
         _outline(work, number, edit)
     elif isinstance(edit, Reject):
-        mask = _mask_at(work, (edit.view, *edit.at))
+        place = edit.view, *edit.at
+        if edit.everywhere and not _masks_at(work, place, work.masks):
+            work.refused.append((number, *_pixel_at(work, place)))
+        mask = _mask_at(work, place)
         if edit.everywhere:
             _contradict(work, number, mask.edits)
             work.everywhere.append((number, mask, True))
@@ -348,10 +386,16 @@ def _kept_mask_at(work: _Work, number: int, place: Place) -> EditedMask:
 
 def _masks_at(work: _Work, place: Place, masks: Sequence[EditedMask]) -> list[EditedMask]:
     """Those of these masks that a place lies in."""
+    view, column, row = _pixel_at(work, place)
+    return [mask for mask in masks if mask.view == view and mask.holds(column, row)]
+
+
+def _pixel_at(work: _Work, place: Place) -> tuple[int, int, int]:
+    """View, column and row of a place in the undistorted photo."""
     name, x, y = place
     view = _view(work.scene, name)
     column, row = np.floor(_to_pinhole(work.scene, view, [(x, y)])[0]).astype(int).tolist()
-    return [mask for mask in masks if mask.view == view and mask.holds(column, row)]
+    return view, column, row
 
 
 def _view(scene: Scene, name: str) -> int:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -15,6 +15,8 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.checked_ids import match_surfaces
+from mvseg.verification.choose import LeftOut
+from mvseg.verification.evidence import SHARED
 from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
 
 Bools = NDArray[np.bool_]
@@ -26,9 +28,12 @@ OPEN_PIXELS = 100  # of that part
 EMPTY = 0.6  # of that part, outside all masks: the mask is missing
 SIMILAR = 0.4  # IoU of that part with a mask of another leaf, that may be it
 SMOOTH = 1.5  # pixels that a proposed outline may be off
+LEAST_CHANCE = 0.1  # of a candidate that was not chosen, to be a leaf, from which it is asked about
+LEAST_VIEWS = 2  # that show it: where it is
 MISSING, COVERED, LONE = 0.8, 0.9, 0.6  # doubt of what cannot be told from scores, at most
 
-Kind = Literal["match", "unmatched", "few", "surface", "covered", "missing"]
+Kind = Literal["match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
+Outlines = tuple[tuple[int, NDArray[np.float64]], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,14 +44,15 @@ class Doubt:
         kind: "match": is the mask of that leaf? "unmatched": is it a leaf, and which? "few": is this a leaf? (it was
             found in few of the views that should show it); "surface": does the mask show that leaf? (the leaf's
             surface explains it badly); "covered": the leaf should be where a mask of another one is; "missing": it
-            should be where no mask is.
+            should be where no mask is; "leaf": is this a leaf? (a candidate that was not chosen).
         doubt: how likely something is wrong, from 0 to 1; rough, to sort by.
         view: index of the view.
-        instance: id of the leaf; -1 for "unmatched" without a guess.
-        region: row of the mask; -1 for "missing".
+        instance: id of the leaf; -1 for "unmatched" without a guess, and for "leaf".
+        region: row of the mask; -1 for "missing" and "leaf".
         other: row of the mask of the same leaf in another view that shows it best; -1 for none.
         found, expected: number of views that have a mask of the leaf, and that should.
-        outline: (P, 2) float64 pixels, undistorted: where the leaf should be; of "missing" only.
+        outlines: views, `view` first, and (P, 2) float64 pixels, undistorted: where the leaf should be; one of
+            "missing", two or more of "leaf", none of the others.
     """
 
     kind: Kind
@@ -57,10 +63,12 @@ class Doubt:
     other: int = -1
     found: int = 0
     expected: int = 0
-    outline: NDArray[np.float64] | None = None
+    outlines: Outlines = ()
 
 
-def list_doubts(masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cameras: Cameras) -> list[Doubt]:
+def list_doubts(
+    masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cameras: Cameras, left: Sequence[LeftOut] = ()
+) -> list[Doubt]:
     """What a person should look at, the most doubtful first, at most `MOST_DOUBTS`; masks that a person made or
     confirmed are not asked about, and every other mask once.
 
@@ -68,25 +76,29 @@ def list_doubts(masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cam
         masks: D masks, matched.
         surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
         cameras: V cameras.
+        left: candidates that were not chosen; those that may be leaves come where answers add most: by their chance
+            times their size.
     """
     masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
     found = _doubt_matches(masks)
+    everything, sizes = torch.ones_like(masks.instance_ids), cameras.sizes.tolist()
+    taken = [masks.regions.label_map(view, everything, size).numpy() > 0 for view, size in enumerate(sizes)]
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
     if known:
         ious, _ = match_surfaces(masks.regions, known, cameras=cameras)
-        for view, size in enumerate(cameras.sizes.tolist()):
-            taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
+        for view in range(len(cameras)):
             leaves = visible_leaves(known, cameras, view)
-            found += _doubt_view(masks, leaves, should, view=view, taken=taken, ious=ious)
+            found += _doubt_view(masks, leaves, should, view=view, taken=taken[view], ious=ious)
     found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
-    queue = []
+    queue = _doubt_left(masks, left, taken)
     for each in sorted(found, key=lambda one: (-one.doubt, one.view, one.instance, one.region)):
         name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
         if each.doubt >= LEAST_DOUBT and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
             asked.add(name)
             queue.append(each)
+    queue.sort(key=lambda one: -one.doubt)
     return [
         each if each.instance < 0 else replace(each, other=best_mask(masks, each.instance, but=each.view))
         for each in queue[:MOST_DOUBTS]
@@ -106,8 +118,7 @@ def best_mask(masks: Masks, instance: int, *, but: int) -> int:
 def _doubt_matches(masks: Masks) -> list[Doubt]:
     """Low match scores; and masks of some size that were matched to nothing."""
     ids, areas, views = masks.instance_ids.tolist(), masks.regions.areas, masks.view_index.tolist()
-    matched = areas[masks.instance_ids > 0].float()
-    usual = float(matched.median()) if len(matched) else 1.0
+    usual = _usual_area(masks)
     found = []
     for row, score in enumerate(masks.match_scores.tolist()):
         if ids[row] > 0:
@@ -115,6 +126,28 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
         elif areas[row] > 0:
             doubt = LONE * min(1.0, float(areas[row]) / max(usual, 1.0))
             found.append(Doubt("unmatched", doubt, views[row], -1, region=row))
+    return found
+
+
+def _usual_area(masks: Masks) -> float:
+    """The median of those that are matched; pixels."""
+    matched = masks.regions.areas[masks.instance_ids > 0].float()
+    return float(matched.median()) if len(matched) else 1.0
+
+
+def _doubt_left(masks: Masks, left: Sequence[LeftOut], taken: Sequence[Bools]) -> list[Doubt]:
+    """Candidates that were not chosen, in the views where no mask of the result lies; `taken` as V frames (H, W)."""
+    usual, found = _usual_area(masks), []
+    for each in left:
+        outlines, areas, regions = [], [], each.masks.regions
+        for row in regions.areas.argsort(descending=True, stable=True).tolist():
+            view, (x1, y1, x2, y2), crop = int(regions.view_index[row]), regions.boxes[row].tolist(), regions.crop(row)
+            if float(taken[view][y1:y2, x1:x2][crop.numpy()].mean()) <= SHARED:
+                outlines.append((view, _outline(crop.numpy(), (x1, y1))))
+                areas.append(float(regions.areas[row]))
+        if each.chance >= LEAST_CHANCE and len(outlines) >= LEAST_VIEWS:
+            doubt = each.chance * min(1.0, float(np.median(areas)) / max(usual, 1.0))
+            found.append(Doubt("leaf", doubt, outlines[0][0], -1, outlines=tuple(outlines)))
     return found
 
 
@@ -143,16 +176,18 @@ def _doubt_view(
             found.append(Doubt("covered", doubt, view, leaf.instance, region=nearest))
         elif empty >= EMPTY:
             doubt = MISSING * empty * leaf.share
-            found.append(Doubt("missing", doubt, view, leaf.instance, outline=_outline(leaf)))
+            found.append(
+                Doubt("missing", doubt, view, leaf.instance, outlines=((view, _outline(leaf.mask, leaf.box[:2])),))
+            )
     return found
 
 
-def _outline(leaf: VisibleLeaf) -> NDArray[np.float64]:
-    """(P, 2) the largest component of what is seen of a surface, as a polygon; pixels."""
-    lines, _ = cv2.findContours(leaf.mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+def _outline(crop: Bools, corner: Sequence[int]) -> NDArray[np.float64]:
+    """(P, 2) the largest component of a mask (h, w), cut out at a corner x, y, as a polygon; pixels."""
+    lines, _ = cv2.findContours(crop.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(lines, key=cv2.contourArea)
     points = cv2.approxPolyDP(longest, SMOOTH, True)[:, 0]
-    return np.asarray(points + np.array(leaf.box[:2]) + 0.5, dtype=np.float64)
+    return np.asarray(points + np.array(corner) + 0.5, dtype=np.float64)
 
 
 def _doubt_surfaces(masks: Masks, surfaces: Mapping[int, LeafSurface]) -> list[Doubt]:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.reconstruction.voxels import VoxelGrid
     from mvseg.traits.measure import Traits
+    from mvseg.verification.choose import LeftOut
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,6 +64,7 @@ class Result:
         matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
         instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
+        left: candidates that the views did not choose, the most likely leaf first.
         poses: outcome of their refinement; None if it was not requested.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
@@ -76,6 +78,7 @@ class Result:
     matching: Matching
     instances: Instances = Instances()
     photos: Photos | None = None
+    left: tuple[LeftOut, ...] = ()
     poses: RefinedPoses | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""

@@ -36,7 +36,7 @@ def list_skins(folder: Path | None) -> tuple[Floats, ...]:
             raise InputError(f"{path}: expected a PNG of 8 bits with an alpha channel")
         if np.count_nonzero(image[..., 3] > 127) < 100:
             raise InputError(f"{path}: no leaf in the alpha channel, expected at least 100 pixels")
-        skins.append(unroll_leaf(image[..., 2::-1], image[..., 3] > 127))
+        skins.append(unroll_leaf(image[..., 2::-1].astype(np.uint8), image[..., 3] > 127))
     return tuple(skins)
 
 

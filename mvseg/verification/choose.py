@@ -46,6 +46,14 @@ DIGITS = 9  # of q and P that count: what differs less is a tie, on every proces
 
 
 @dataclass(frozen=True, eq=False)
+class LeftOut:
+    """A candidate that was not chosen: its P, and the masks that would show it, on the CPU, at most one in a view."""
+
+    chance: float
+    masks: Masks
+
+
+@dataclass(frozen=True, eq=False)
 class Leaves:
     """What was chosen.
 
@@ -54,15 +62,13 @@ class Leaves:
             q. At most one of each leaf in a view, but for those of a person; his that show no leaf have -1.
         surfaces: {instance id: surface} of those with a credible one.
         probabilities: {instance id: P}.
-        left: of the candidates that were not chosen, the most likely first: P and the rows of their masks.
-        proposals: the table of these rows.
+        left: the candidates that were not chosen, the most likely first.
     """
 
     masks: Masks
     surfaces: dict[int, LeafSurface]
     probabilities: dict[int, float]
-    left: tuple[tuple[float, Tensor], ...]
-    proposals: Masks
+    left: tuple[LeftOut, ...]
 
 
 def choose_leaves(
@@ -371,8 +377,8 @@ def _take(chosen: Chosen, candidates: Candidates, table: Masks, *, is_held: Bool
         surfaces={number: each for number, each in enumerate(shown, 1) if each is not None and each.is_credible},
         probabilities=dict(enumerate(chosen.chances.tolist(), 1)),
         left=tuple(
-            (each.chance, torch.from_numpy(each.rows)) for each in chosen.steps
+            LeftOut(each.chance, table.select(torch.from_numpy(each.rows)))
+            for each in chosen.steps
             if each.candidate not in taken and len(each.rows)
         ),
-        proposals=table,
-    )  # fmt: skip
+    )

@@ -10,12 +10,13 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere, refuse
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Scene, View
+from mvseg.verification.choose import LeftOut
 from synthetic import cameras_at
 
 WIDTH, HEIGHT = 60, 40
@@ -240,3 +241,15 @@ def test_an_outline_over_everything_says_what_it_replaces() -> None:
     masks = Masks.of(regions_from_label_maps([label_map(*squares), label_map()]))
     said = correct(square(0, 0, 60, 40), masks=masks).messages
     assert said == ["correction 1 (outline): applied: it replaces 8 masks"]
+
+
+def test_saying_no_to_a_candidate_takes_it_off_the_list_and_is_no_mistake() -> None:
+    candidate = LeftOut(0.3, Masks.of(regions_from_label_maps([label_map((40, 25, 55, 35)), label_map()])))
+    other = LeftOut(0.2, Masks.of(regions_from_label_maps([label_map((1, 25, 9, 35)), label_map()])))
+    corrected = correct(at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True))
+    assert fates(corrected) == ["points at nothing"] * 2
+    left, answered = refuse(corrected, (candidate, other))
+    assert left == (other,)
+    assert fates(answered) == ["applied", "points at nothing"]
+    assert len(answered.messages) == 1
+    assert refuse(answered, left)[0] == (other,)

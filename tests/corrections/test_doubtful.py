@@ -13,6 +13,7 @@ from blade_scene import as_regions
 from known_leaves import make_surface
 from mvseg.corrections.doubtful import LEAST_DOUBT, Doubt, best_mask, list_doubts
 from mvseg.masks import Masks, Origin
+from mvseg.verification.choose import LeftOut
 from mvseg.verification.visible_leaves import visible_leaves
 from three_leaves import CAMERAS, LEAVES, true_maps
 
@@ -61,8 +62,9 @@ def test_low_scores_come_first_the_lowest_before_the_others() -> None:
 def test_a_missing_mask_is_proposed_where_the_surface_is_seen() -> None:
     (found,) = doubts(changed(2, 1, 0))
     assert (found.kind, found.view, found.instance, found.region) == ("missing", 2, 1, -1)
-    assert found.outline is not None
-    drawn = cv2.fillPoly(np.zeros(TRUE[2].shape, np.uint8), [np.round(found.outline - 0.5).astype(np.int32)], 1) > 0
+    ((view, outline),) = found.outlines
+    assert view == 2
+    drawn = cv2.fillPoly(np.zeros(TRUE[2].shape, np.uint8), [np.round(outline - 0.5).astype(np.int32)], 1) > 0
     true = TRUE[2] == 1
     assert (drawn & true).sum() / (drawn | true).sum() > 0.9
 
@@ -134,3 +136,41 @@ def test_the_best_mask_is_the_largest_of_the_sure_ones() -> None:
     masks.match_scores[largest] = 0.5
     assert best_mask(masks, 1, but=-1) != largest
     assert best_mask(masks, 7, but=-1) == -1
+
+
+def leave_out(leaf: int, chance: float, *views: int) -> LeftOut:
+    """The true masks of a leaf in some views, as a candidate that was not chosen."""
+    masks = masks_of(TRUE)
+    keep = (masks.instance_ids == leaf) & torch.isin(masks.view_index, torch.tensor(views))
+    return LeftOut(chance, masks.select(keep))
+
+
+def without(leaf: int) -> Masks:
+    return masks_of([np.where(labels == leaf, 0, labels) for labels in TRUE]).close_gaps()
+
+
+def test_a_candidate_that_was_not_chosen_is_shown_in_all_its_views() -> None:
+    surfaces = {1: LEAVES[1], 2: LEAVES[3]}
+    found = list_doubts(without(2), surfaces, cameras=CAMERAS, left=(leave_out(2, 0.4, 0, 2, 4),))
+    (asked,) = [each for each in found if each.kind == "leaf"]
+    assert sorted(view for view, _ in asked.outlines) == [0, 2, 4]
+    assert (asked.view, asked.region, asked.instance) == (asked.outlines[0][0], -1, -1)
+    assert 0 < asked.doubt <= 0.4
+    for view, outline in asked.outlines:
+        drawn = cv2.fillPoly(np.zeros(TRUE[view].shape, np.uint8), [np.round(outline - 0.5).astype(np.int32)], 1) > 0
+        true = TRUE[view] == 2
+        assert (drawn & true).sum() / (drawn | true).sum() > 0.9
+
+
+def test_unlikely_candidates_those_of_one_view_and_those_that_have_masks_are_not_asked_about() -> None:
+    surfaces = {1: LEAVES[1], 2: LEAVES[3]}
+    left = leave_out(2, 0.09, 0, 2, 4), leave_out(2, 0.5, 3), leave_out(1, 0.5, 0, 1, 2)
+    assert list_doubts(without(2), surfaces, cameras=CAMERAS, left=left) == []
+
+
+def test_what_is_likelier_and_larger_is_asked_first() -> None:
+    nothing = masks_of([np.where(labels == 1, labels, 0) for labels in TRUE])
+    left = leave_out(3, 0.2, 0, 1), leave_out(2, 0.4, 0, 1)
+    found = [each for each in list_doubts(nothing, None, cameras=CAMERAS, left=left) if each.kind == "leaf"]
+    assert [each.doubt for each in found] == sorted((each.doubt for each in found), reverse=True)
+    assert len(found) == 2

@@ -81,7 +81,7 @@ def test_plants_are_dressed_in_different_ways_and_a_seed_decides() -> None:
     assert kinds == {(False, False, False), (True, False, True), (False, True, False), (False, False, True)}
     again = dress(look, skins, np.random.default_rng(7))
     assert np.array_equal(again.leaf, dressed[7].leaf)
-    assert all(0 <= one.leaf.min() and one.leaf.max() < 1.5 for one in dressed)
+    assert all(one.leaf.min() >= 0 and one.leaf.max() < 1.5 for one in dressed)
 
 
 def test_files_that_are_no_cut_outs_are_named(tmp_path: Path) -> None:

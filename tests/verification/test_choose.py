@@ -99,7 +99,7 @@ def test_a_duplicate_and_a_stray_instance_fall() -> None:
     ids = torch.cat((IDS, copy_ids + 3, torch.full((len(strays),), 7)))
     leaves = choose(matched_of(proposals, ids), proposals)
     assert same_partition(leaves)
-    assert all(chance < 0.5 for chance, _ in leaves.left)
+    assert all(each.chance < 0.5 for each in leaves.left)
 
 
 def test_two_masks_of_one_photo_never_show_the_same_pixels() -> None:

@@ -80,16 +80,18 @@ def describe_doubts(result: Result, pictures: Sequence[Picture]) -> list[dict[st
     """The queue; outlines in units of the pictures."""
     cameras = result.scene.cameras.to("cpu")
     return [
-        _describe_doubt(doubt, pictures[doubt.view], cameras.sizes[doubt.view].tolist())
-        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras)
+        _describe_doubt(doubt, pictures, cameras.sizes.tolist())
+        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras, left=result.left)
     ]
 
 
-def _describe_doubt(doubt: Doubt, picture: Picture, size: list[int]) -> dict[str, Any]:
-    outline = None
-    if doubt.outline is not None:
-        left, top, right = (share * side for share, side in zip(picture.box[:3], [*size, size[0]], strict=True))
-        outline = np.round((doubt.outline - (left, top)) * UNITS / (right - left)).astype(int).tolist()
-    said = asdict(doubt) | {"doubt": round(doubt.doubt, 3), "leaf": doubt.instance, "outline": outline}
+def _describe_doubt(doubt: Doubt, pictures: Sequence[Picture], sizes: Sequence[Sequence[int]]) -> dict[str, Any]:
+    outlines = []
+    for view, outline in doubt.outlines:
+        size = sizes[view]
+        left, top, right = (share * side for share, side in zip(pictures[view].box[:3], [*size, size[0]], strict=True))
+        points = np.round((outline - (left, top)) * UNITS / (right - left)).astype(int).tolist()
+        outlines.append({"view": view, "outline": points})
+    said = asdict(doubt) | {"doubt": round(doubt.doubt, 3), "leaf": doubt.instance, "outlines": outlines}
     del said["instance"]
     return said

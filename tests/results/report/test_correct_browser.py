@@ -18,7 +18,8 @@ from mvseg.corrections.apply import Fate
 from mvseg.corrections.file import load_corrections, parse_corrections
 from mvseg.formats.lens import photo_from_pinhole
 from mvseg.results.report.page import write_report
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
+from mvseg.verification.choose import LeftOut
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
 from report_pages import HOSTILE, RUN, draw_pictures, rename_hostile, write_page
 
@@ -291,6 +292,42 @@ def test_the_most_doubtful_is_asked_first_and_answered_by_a_key(
     person.page.keyboard.press("u")
     assert "1 question " in person.page.locator("#correct-ask").inner_text()
     person.close()
+
+
+@pytest.fixture(scope="module")
+def offered(balls: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The page of the balls without the third, which is a candidate that was not chosen."""
+    is_third = balls.masks.instance_ids == 3
+    masks = balls.masks.select(~is_third).close_gaps()
+    left = (LeftOut(0.4, balls.masks.select(is_third)),)
+    result = replace(balls, matching=balls.matching.with_masks(masks), instances=Instances(), left=left)
+    return write_page(tmp_path_factory.mktemp("offered") / "report.html", result)
+
+
+def test_one_key_makes_a_leaf_of_what_was_not_chosen(
+    browser: sync_api.Browser, offered: Path, balls: Result, tmp_path: Path
+) -> None:
+    opened = Person(browser, offered)
+    asks = "modes.work.open.filter((doubt) => doubt.kind === 'leaf').length"
+    assert opened.page.evaluate(asks) == 1
+    opened.page.evaluate("modes.work.ask(modes.work.open.find((doubt) => doubt.kind === 'leaf'))")
+    assert "may show a leaf here" in opened.page.locator("#correct-ask").inner_text()
+    assert opened.page.locator("svg.work path.proposed").count() == 2
+    opened.page.keyboard.press("c")
+    edits = opened.save(tmp_path)
+    views = balls.masks.view_index[balls.masks.instance_ids == 3].tolist()
+    assert {edit["view"] for edit in edits} == {balls.scene.views[view].name for view in views}
+    assert len(edits) == len(views) >= 2
+    assert {(edit["op"], edit["leaf"]) for edit in edits} == {("outline", "offered 1")}
+    assert opened.page.evaluate(asks) == 0
+    opened.page.keyboard.press("u")
+    assert opened.page.evaluate(asks) == 1
+    opened.page.evaluate("modes.work.ask(modes.work.open.find((doubt) => doubt.kind === 'leaf'))")
+    opened.page.keyboard.press("r")
+    (edit,) = opened.save(tmp_path)
+    assert (edit["op"], edit["everywhere"]) == ("reject", True)
+    assert opened.page.evaluate(asks) == 0
+    opened.close()
 
 
 def test_hostile_names_stay_text(browser: sync_api.Browser, balls: Result, tmp_path: Path) -> None:

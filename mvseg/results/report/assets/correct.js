@@ -131,10 +131,10 @@ class Work {
     this.doubt = doubt;
     const [first, second] = this.panes;
     first.show(doubt.view);
-    first.lookAt(doubt.mask ? doubt.mask.box : boxAround(doubt.outline));
+    first.lookAt(doubt.mask ? doubt.mask.box : boxAround(doubt.outlines[0].outline));
     if (doubt.otherView !== undefined) {
       second.show(doubt.otherView);
-      second.lookAt(doubt.otherMask.box);
+      second.lookAt(doubt.otherBox);
     }
     this.active = first;
     this.picks = [[doubt.view, doubt.mask], [doubt.otherView, doubt.otherMask]]
@@ -152,7 +152,7 @@ class Work {
     if (op === "next") return this.next();
     if (op === "undo") return this.undo();
     if (op === "outline" || op === "split") return this.take(op);
-    const found = this.editsOf(op, all !== undefined || wasAsked?.kind === "few");
+    const found = this.editsOf(op, all !== undefined || ["few", "leaf"].includes(wasAsked?.kind));
     if (!found.length) return;
     this.note = "";
     this.add(found);
@@ -161,7 +161,10 @@ class Work {
 
   editsOf(op, everywhere) {
     if (op === "same" || op === "different") return this.linkEdits(op);
-    if (op === "confirm" && this.doubt?.outline) return this.outlineEdits(this.doubt.view, this.doubt.outline);
+    if (this.doubt?.kind === "leaf") return this.offeredEdits(op, this.doubt.outlines);
+    if (op === "confirm" && this.doubt?.outlines.length) {
+      return this.outlineEdits(this.doubt.view, this.doubt.outlines[0].outline);
+    }
     return this.markEdits(op, everywhere);
   }
 
@@ -193,6 +196,19 @@ class Work {
     const here = [name, ...this.frames[view].toPhoto(insidePoint(points))];
     const link = { op: "same", at: [here, ...others.map((pick) => this.placeOf(pick))] };
     return [{ op: "outline", view: name, polygon, ...(leaf ? { leaf } : {}) }, ...(others.length ? [link] : [])];
+  }
+
+  // A candidate becomes a leaf, by an outline of each of its masks under one new name; or none.
+  offeredEdits(op, outlines) {
+    if (op === "reject") {
+      const [{ view, outline }] = outlines;
+      const at = this.frames[view].toPhoto(insidePoint(outline));
+      return [{ op, view: this.data.views[view].name, at, everywhere: true }];
+    }
+    const used = new Set(this.edits.list.map((edit) => edit.leaf));
+    let number = 1;
+    while (used.has(`offered ${number}`)) number += 1;
+    return outlines.flatMap(({ view, outline }) => this.outlineEdits(view, outline, `offered ${number}`));
   }
 
   undo() {
@@ -236,7 +252,7 @@ class Work {
     const { pane, points } = this.draft;
     const wasAsked = this.doubt;
     this.add(this.outlineEdits(pane.view, points, leaf));
-    if (wasAsked?.outline) this.next();
+    if (wasAsked?.outlines.length) this.next();
   }
 
   discard(text = "") {

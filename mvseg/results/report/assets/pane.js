@@ -87,8 +87,8 @@ class Pane {
       text.setAttribute("font-size", Math.min(text.dataset.height, LARGEST_NUMBER * this.unit));
     }
     const parts = [];
-    if (doubt?.outline && doubt.view === this.view) {
-      const d = `M${doubt.outline.map((point) => point.join(" ")).join("L")}z`;
+    for (const { outline } of doubt?.outlines.filter((one) => one.view === this.view) ?? []) {
+      const d = `M${outline.map((point) => point.join(" ")).join("L")}z`;
       parts.push(drawing("path", { d, class: "proposed" }));
     }
     const size = 15 * this.unit;

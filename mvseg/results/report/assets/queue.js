@@ -15,6 +15,8 @@ function askAbout(doubt, { data }) {
         "Is it a leaf?";
     case "surface": return `Photo ${view}: this mask does not fit the shape of ${leaf}. Is it that leaf?${beside}`;
     case "covered": return `Photo ${view}: ${leaf} should be here. Is it this mask?${beside}`;
+    case "leaf": return `${count(doubt.outlines.length, "photo")} may show a leaf here that was not taken for one. ` +
+      "Is it a leaf?";
     default: return `Photo ${view}: ${leaf} should be here, where no mask is. Is it inside the dashed line?${beside}`;
   }
 }
@@ -25,7 +27,7 @@ function answersTo(doubt) {
   const later = ["next", "I cannot tell"];
   switch (doubt.kind) {
     case "missing": return [["confirm", "Yes, keep this outline"], ["next", "No, or not to be seen"]];
-    case "few": return [["confirm", "Yes"], ["reject", "No leaf, nowhere"], later];
+    case "few": case "leaf": return [["confirm", "Yes"], ["reject", "No leaf, nowhere"], later];
     case "covered": return [...pair, later];
     default: return doubt.otherView === undefined
       ? [["confirm", "Yes"], ["reject", "No leaf"], later]
@@ -39,15 +41,18 @@ function placeDoubts(data) {
   data.views.forEach((view, index) => view.masks.forEach((mask) => places.set(mask.region, { view: index, mask })));
   return data.correct.doubts.flatMap((doubt) => {
     const [mask, other] = [places.get(doubt.region)?.mask, places.get(doubt.other)];
-    if (!mask && !doubt.outline) return [];
-    const at = doubt.outline ? insidePoint(doubt.outline).map(Math.round) : mask.at;
+    if (!mask && !doubt.outlines.length) return [];
+    const at = mask ? mask.at : insidePoint(doubt.outlines[0].outline).map(Math.round);
     const name = [doubt.kind, doubt.view, ...at].join(" ");
-    return [{ ...doubt, name, mask, otherView: other?.view, otherMask: other?.mask }];
+    const otherView = other?.view ?? doubt.outlines[1]?.view;
+    const otherBox = other?.mask.box ?? (doubt.outlines[1] && boxAround(doubt.outlines[1].outline));
+    return [{ ...doubt, name, mask, otherView, otherBox, otherMask: other?.mask }];
   });
 }
 
 // Whether an edit says something of what a doubt points at.
 function isAnswered(doubt, places) {
-  return places.some(({ view, at }) =>
-    view === doubt.view && (doubt.outline ? isInside(at, doubt.outline) : isOnMask(doubt.mask, at)));
+  return places.some(({ view, at }) => (doubt.mask
+    ? view === doubt.view && isOnMask(doubt.mask, at)
+    : doubt.outlines.some((one) => one.view === view && isInside(at, one.outline))));
 }
