@@ -1,12 +1,13 @@
 """What the choice of leaves is fitted on, and what it loses: `python -m benchmarks.choice SCENE ... [--leave_out]`
 
-The scenes have photos, cameras and `truth/`. For each: what its detector proposes, the candidates, and which masks show
-which true leaf. The numbers of `mvseg/verification/leaf_scores.py` are fitted by maximum likelihood (a small ridge),
-in three rounds, since the features of a candidate depend on what was chosen before it. With `--leave_out` each scene is
-judged by numbers that were fitted on the others (scenes whose names share what stands before the first "-" count as one
-plant). Per scene: MV-PQ of what was chosen, before `recut`; its ceilings, the best proposal of each true mask that
-scores 0.3, 0.1 or 0.05 and has an IoU above one half, with the right id. In the end: how often candidates of each P are
-right.
+The scenes have photos, cameras and `truth/`; those of `MANY` photos or more are looked at a second time with every
+other photo, so that the numbers hold for plants that few photos show, too. For each: what its detector proposes, the
+candidates, and which masks show which true leaf. The numbers of `mvseg/verification/leaf_scores.py` are fitted by
+maximum likelihood (a small ridge), in three rounds, since the features of a candidate depend on what was chosen before
+it. With `--leave_out` the plants are parted in four, and each scene is judged by numbers that were fitted on the other
+three parts (scenes whose names share what stands behind the last "-" are one plant). Per scene: MV-PQ of what was
+chosen, before `recut`; its ceilings, the best proposal of each true mask that scores 0.3, 0.1 or 0.05 and has an IoU
+above one half, with the right id. In the end: how often candidates of each P are right.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ from mvseg.verification.leaf_scores import FITTED, Candidates, LeafScores, match
 from mvseg.verification.rough_surfaces import fit_roughly
 
 RIDGE, ROUNDS, SHOWS = 0.1, 3, 0.5  # SHOWS: IoU from which a mask shows a leaf
+MANY, PARTS = 8, 4
 SCORES = (SURE_SCORE, MORE_SCORE, LEAST_SCORE)
 BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97, 1.01)
 
@@ -59,8 +61,12 @@ class Study:
     of_candidate: np.ndarray
 
 
-def study(folder: Path) -> Study:
+def study(folder: Path, step: int = 1) -> Study | None:
+    """A scene with every `step`-th photo; None where that leaves too few."""
     scene = load_scene(folder)
+    if step > 1 and len(scene.views) < MANY:
+        return None
+    scene = replace(scene, views=scene.views[::step], cameras=scene.cameras[list(range(0, len(scene.views), step))])
     truth = true_maps(folder, scene)
     found = detect_scene(Photos(scene))
     table = found.proposals(scene.cameras)
@@ -75,7 +81,8 @@ def study(folder: Path) -> Study:
     leaf = true_leaves(table, truth)
     members = [~np.isnan(column) for column in candidates.matched.T]
     of_candidate = np.array([main_leaf(leaf[rows]) for rows in members])
-    return Study(folder.name, table, candidates, drawn, truth, leaf, of_candidate)
+    name = folder.name if step == 1 else f"every {step}: {folder.name}"
+    return Study(name, table, candidates, drawn, truth, leaf, of_candidate)
 
 
 def true_maps(folder: Path, scene: Scene) -> list[np.ndarray]:
@@ -198,12 +205,17 @@ def main() -> None:
     parser.add_argument("--leave_out", action="store_true")
     args = parser.parse_args()
     warnings.simplefilter("ignore", InputWarning)
-    studies = [study(folder) for folder in args.scenes]
-    plants = [each.name.partition("-")[0] for each in studies]
-    numbers = {plant: FITTED for plant in plants}
+    found = [study(folder, step) for folder in args.scenes for step in (1, 2)]
+    studies = [each for each in found if each is not None]
+    plants = [each.name.rpartition("-")[2] for each in studies]
+    part = {plant: number % PARTS for number, plant in enumerate(sorted(set(plants)))}
+    numbers = dict.fromkeys(plants, FITTED)
     if args.leave_out:
-        others = {plant: [one for one, of in zip(studies, plants, strict=True) if of != plant] for plant in plants}
-        numbers = {plant: fit(rest) for plant, rest in others.items()}
+        of_part = [
+            fit([each for each, plant in zip(studies, plants, strict=True) if part[plant] != out])
+            for out in range(PARTS)
+        ]
+        numbers = {plant: of_part[number] for plant, number in part.items()}
     print(f"{'scene':30}{'MV-PQ':>8}{'right':>7}{'false':>7}" + "".join(f"{score:>8}" for score in SCORES))
     samples = []
     for plant, each in zip(plants, studies, strict=True):

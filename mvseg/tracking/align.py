@@ -2,8 +2,7 @@
 
 That the pot stands as it stood is one hypothesis among many; the others come from pairs of leaves. Each is refined on
 the leaves that it pairs, and has a probability: from how well they go together, and from how often this plant's pot is
-turned (`Habit`). The best one is sure if it beats every different one clearly. If not, it is a guess, which is taken
-all the same, and its probability says so.
+turned (`Habit`). The best one is taken, and its probability says how far to trust it.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
-from scipy.special import expit, logit
+from scipy.special import expit
 
 from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import Pair, pair_costs
@@ -30,15 +29,11 @@ ROUNDS = (2.5, 1.8, 1.3, 1.0, 1.0)  # scales of the costs while refining
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
 TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
 TEMPER = 0.3  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
-GUESS = (-1.39, 0.16, 0.51)  # see `guess_chance`; `python benchmarks/guessed_poses.py` fits them
+GUESS = (-2.16, 0.78)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
 LARGE_NEW = 4.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
-MOST_LARGE_NEW = 0.21  # of all leaves, i.e. two in five of the larger half
 NEARLY_ALL = 0.9  # of the leaves of the date with fewer: where these are paired, large ones were missed there
-SURE_MARGIN = 7.0  # of the best hypothesis over others
-SURE_SUM, PER_LEAF = 23.5, 3.0  # of margin and PER_LEAF times the gain per leaf of the date with fewer leaves
-TWO_WAYS = "the pot could be turned in more than one way"
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,25 +44,15 @@ class Alignment:
         pose: (4, 4) second_from_first, a rotation and a shift.
         pairs: (P, 2) leaves of the two dates (rows of `Leaves`) that go together.
         gain: how much likelier these pairs are the same leaves than strangers, a natural logarithm.
-        margin: by how much it is likelier than the best hypothesis of another pose.
-        reason: why it is a guess; "" for a sure one.
-        share: of the pose among all that were looked at, as probabilities.
-        probability: that the pose is right; 1 for a sure one.
+        probability: that the pose is right, see `guess_chance`.
         still: probability that the pot stands as it stood.
     """
 
     pose: Floats
     pairs: np.ndarray
     gain: float = 0.0
-    margin: float = 0.0
-    reason: str = ""
-    share: float = 1.0
     probability: float = 1.0
     still: float = 0.5
-
-    @property
-    def is_sure(self) -> bool:
-        return not self.reason
 
 
 @dataclass(frozen=True)
@@ -95,57 +80,81 @@ class Habit:
         return math.log(max(self.still, least) / max((1 - self.still) / TURNS, least))
 
 
+@dataclass(frozen=True, eq=False)
+class Poses:
+    """H poses of one pair of dates, the first as it stood, that were looked at.
+
+    Attributes:
+        pair: the dates.
+        refined: H.
+        gains: (H,) theirs, less what large new leaves cost.
+        near: (H,) in [0, 1], how near they are to "as it stood".
+    """
+
+    pair: Pair
+    refined: tuple[Alignment, ...]
+    gains: Floats
+    near: Floats
+
+    def scores(self, habit: Habit) -> Floats:
+        """(H,) gains, and what the habit of the pot says."""
+        return self.gains + habit.world_prior / TEMPER * self.near
+
+    def weights(self, habit: Habit) -> Floats:
+        """(H,) the poses as probabilities."""
+        scores = self.scores(habit)
+        weights = np.exp(TEMPER * (scores - scores.max()))
+        return np.asarray(weights / weights.sum())
+
+    def chance(self, gain: float, habit: Habit) -> float:
+        """How likely a pose is right under which the pairs have a gain."""
+        if habit.still == 1:
+            return 1.0
+        if not self.pair.fewer:
+            return habit.still
+        return guess_chance(gain / self.pair.fewer)
+
+
 def align(pair: Pair, habit: Habit = Habit()) -> Alignment:
-    """The best alignment of two dates, each in its own frame, how likely it is, and whether it is sure; where up is not
-    known, of any rotation. Without leaves on one of them, the pot stands as it stood."""
+    """The best alignment of two dates, each in its own frame, and how likely it is; where up is not known, of any
+    rotation. Without leaves on one of them, the pot stands as it stood."""
+    return judge(list_poses(pair), habit)
+
+
+def list_poses(pair: Pair) -> Poses:
+    """The poses that look best, each refined; without leaves on one of the dates, only that it stood as it stood."""
     if not pair.fewer:
-        nothing, reason = np.zeros((0, 2), int), "no leaves cannot tell how the pot stands"
-        return Alignment(np.eye(4), nothing, reason=reason, probability=habit.still, still=habit.still)
-    world = _as_it_stood(pair)
+        return Poses(pair, (Alignment(np.eye(4), np.zeros((0, 2), int)),), np.zeros(1), np.ones(1))
     poses = np.concatenate([np.eye(4)[None], draw_poses(pair)])
     scores = alikeness(pair, poses).sum(1)
     scores[0] += 1e6  # always looked at
-    found: list[Alignment] = [world]
+    found: list[Alignment] = [_as_it_stood(pair)]
     left = np.argsort(-scores, kind="stable")
-    while len(left) and len(found) < NUM_REFINED and habit.still < 1:
+    while len(left) and len(found) < NUM_REFINED:
         if left[0] or pair.fewer >= LEAST_PAIRS:
             found.append(refine(pair, poses[left[0]]))
         left = left[pose_distances(pair, poses[left[0]], poses[left]) > SAME]
     every = np.stack([each.pose for each in found])
-    gains = np.array([each.gain - LARGE_NEW * _num_large_new(pair, each.pairs) for each in found])
-    near = np.exp(-0.5 * pose_distances(pair, np.eye(4), every) ** 2)
-    scores = gains + habit.world_prior / TEMPER * near
-    place = int(scores.argmax())
-    best, is_other = found[place], pose_distances(pair, every[place], every) >= 1
-    plain = gains + Habit().world_prior * near  # how alike the leaves are, whatever this plant's habit is
-    margin, reason = float(plain[place] - plain[is_other].max(initial=0.0)), ""
-    if pair.fewer < LEAST_PAIRS:
-        reason = f"{pair.fewer} {'leaf' if pair.fewer == 1 else 'leaves'} cannot tell how the pot stands"
-    elif len(best.pairs) < max(LEAST_PAIRS, 0.4 * pair.fewer):
-        reason = f"only {len(best.pairs)} of {pair.fewer} leaves are alike, however the pot is turned"
-    elif _num_large_new(pair, best.pairs) > MOST_LARGE_NEW * len(pair.second):
-        reason = "leaves too large to be new would have appeared, however the pot is turned"
-    elif margin < SURE_MARGIN:
-        reason = TWO_WAYS
-    elif margin + PER_LEAF * best.gain / pair.fewer < SURE_SUM:
-        reason = "the leaves are not alike enough, however the pot is turned"
-    weights = np.exp(TEMPER * (scores - scores.max()))
-    weights /= weights.sum()
-    still = float(weights[near > np.exp(-0.5)].sum())
-    best = replace(best, margin=margin, reason=reason, share=float(weights[~is_other].sum()), still=still)
-    if habit.still == 1 or best.is_sure:
-        return best
-    return replace(best, probability=guess_chance(best.share, best.gain / pair.fewer))
+    gains = np.array([each.gain - large_new(pair, each.pairs) for each in found])
+    return Poses(pair, tuple(found), gains, near_world(pair, every))
 
 
-def guess_chance(share: float, gain: float) -> float:
-    """How likely a guessed pose is right.
+def judge(poses: Poses, habit: Habit) -> Alignment:
+    """The best of the poses, and how likely it is."""
+    place = int(poses.scores(habit).argmax()) if habit.still < 1 else 0
+    best, weights = poses.refined[place], poses.weights(habit)
+    still = float(weights[poses.near > np.exp(-0.5)].sum()) if poses.pair.fewer else habit.still
+    return replace(best, still=still, probability=poses.chance(best.gain, habit))
+
+
+def guess_chance(gain: float) -> float:
+    """How likely a pose is right.
 
     Args:
-        share: of it among the poses that were looked at, as probabilities.
-        gain: `Alignment.gain`, by leaf of the date with fewer: that of another plant is low.
+        gain: `Alignment.gain`, by leaf of the date with fewer: that of another plant is low. (Once all dates are
+            placed, how likely the pose is among others of the two dates says nothing more.)
     """
-    return float(expit(GUESS[0] + GUESS[1] * logit(np.clip(share, 1e-4, 1 - 1e-4)) + GUESS[2] * gain))
+    return float(expit(GUESS[0] + GUESS[1] * gain))
 
 
 def _as_it_stood(pair: Pair) -> Alignment:
@@ -155,15 +164,20 @@ def _as_it_stood(pair: Pair) -> Alignment:
     return Alignment(np.eye(4), pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
 
 
-def _num_large_new(pair: Pair, pairs: np.ndarray) -> int:
-    """How many leaves of the larger half are in no pair; 0 where nearly all leaves of the date with fewer are in one.
-
-    A plant that is turned onto its own older leaves has many.
-    """
+def large_new(pair: Pair, pairs: np.ndarray) -> float:
+    """What leaves of the larger half that are in no pair cost; 0 where nearly all leaves of the date with fewer are in
+    one. A plant that is turned onto its own older leaves has many."""
     if len(pairs) >= NEARLY_ALL * pair.fewer:
-        return 0
+        return 0.0
     is_large = pair.second.lengths >= np.median(pair.second.lengths)
-    return int(np.delete(is_large, pairs[:, 1]).sum())
+    return LARGE_NEW * float(np.delete(is_large, pairs[:, 1]).sum())
+
+
+def near_world(pair: Pair, poses: Floats) -> Floats:
+    """(H,) in [0, 1], how near poses (H, 4, 4) are to "as it stood"; 1 without leaves to tell."""
+    if not pair.fewer:
+        return np.ones(len(poses))
+    return np.asarray(np.exp(-0.5 * pose_distances(pair, np.eye(4), poses) ** 2))
 
 
 def pose_distances(pair: Pair, pose: Floats, others: Floats) -> Floats:
@@ -260,7 +274,7 @@ def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Fl
     other = other[:, :1] + (other - other[:, :1]) * np.clip(share, 0.5, 2)[:, None, None]  # as long as it was
     places = [0, one.shape[1] // 2, -1]
     source, target = one[:, places].reshape(-1, 3), other[:, places].reshape(-1, 3)
-    mass = (weights[:, None] * (1.0, 0.4, 0.15)).ravel()
+    mass = (weights[:, None] * (0.5, 1.0, 0.5)).ravel()
     mass /= mass.sum()
     middle, aim = mass @ source, mass @ target
     source, target = source - middle, target - aim

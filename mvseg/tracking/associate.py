@@ -13,15 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.align import Alignment, Habit, align, refine
+from mvseg.tracking.align import Alignment, Habit, guess_chance, judge, list_poses, refine
 from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import ACROSS, Leaves, Pair, cloud_costs, pair_costs
 from mvseg.tracking.dates import Floats
-from mvseg.tracking.motions import Motion, find_motion, settle
+from mvseg.tracking.motions import Motion, find_motion
+from mvseg.tracking.place_dates import place_dates
 
 Sight = tuple[int, int]  # index of the date, row of its `Leaves`
 MOST_GAP = 3  # dates from one sight to another that it is compared with, at most: two dates may hide a leaf
@@ -32,7 +32,6 @@ IN_PART = 0.3  # change of log length from which one of two surfaces may show a 
 ASKED = 1e4  # gain of what a person says
 CALIBRATION = (0.25, 2.8)  # slope and offset of the log odds of a link, fitted on simulated series (docs/tracking.md)
 LIKE_RIGID = 0.3  # weight of "the plant moved as a whole", in leaves
-LEAST_MARGIN = 1e-3  # less than the margin of any sure alignment
 ROUNDS = 10  # of joining anew, at most; two or three are enough
 
 
@@ -43,9 +42,8 @@ class Comparison:
     Attributes:
         costs: {(earlier, later): (N, M) costs of their leaves being the same}.
         poses: (T, 4, 4) first_from_date, where "first" is the earliest of the dates that are aligned with it, by way of
-            others, surely or not.
+            others.
         roots: (T,) index of that date.
-        reasons: (T - 1,) why each date cannot be aligned surely with the next one alone, "" where it can.
         trust: (T, T) probability that two dates stand to each other as `poses` says.
         motions: {(earlier, later): of leaves that moved otherwise than the rest}, where there are any.
     """
@@ -53,7 +51,6 @@ class Comparison:
     costs: Mapping[tuple[int, int], Floats]
     poses: Floats
     roots: np.ndarray
-    reasons: tuple[str, ...]
     trust: Floats
     motions: Mapping[tuple[int, int], Motion]
 
@@ -72,26 +69,23 @@ def compare_dates(
 ) -> Comparison:
     """Dates at most MOST_GAP apart are compared.
 
-    The surest alignments say how all dates stand; the others only refine that. So two dates that look alike in more
-    than one way are settled by those in between.
+    `place_dates` says how they stand to each other, before anything is linked.
     """
     pairs = {
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)
         for later in range(len(dates)) for n in range(max(later - MOST_GAP, 0), later)
     }  # fmt: skip
-    habit, alone = Habit.of([], pots), {place: align(pair, Habit.of([], pots)) for place, pair in pairs.items()}
-    learned = Habit.of(list(alone.values()), pots)
-    if learned != habit:
-        alone = {place: align(pair, learned) for place, pair in pairs.items()}
-    alone = {place: settle(pairs[place], found) for place, found in alone.items()}
-    poses, roots, trust = place_dates(len(dates), alone)
+    looked = {place: list_poses(pair) for place, pair in pairs.items()}
+    habit = Habit.of([judge(poses, Habit.of([], pots)) for poses in looked.values()], pots)
+    poses, roots, steady = place_dates(len(dates), looked, habit)
+    trust = np.eye(len(dates))
     costs: dict[tuple[int, int], Floats] = {}
     motions: dict[tuple[int, int], Motion] = {}
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
-        pair = pairs[earlier, later]
-        if not pair.fewer:
-            continue
-        alignment = refine(pair, np.linalg.inv(poses[later]) @ poses[earlier])
+        pair, place = pairs[earlier, later], np.linalg.inv(poses[later]) @ poses[earlier]
+        alignment = refine(pair, place) if pair.fewer else Alignment(place, np.zeros((0, 2), int))
+        is_turn_known = float(steady[earlier:later].min())
+        trust[earlier, later] = is_turn_known * looked[earlier, later].chance(alignment.gain, habit)
         if not len(alignment.pairs):
             continue
         costs[earlier, later] = _bent_costs(pair, alignment)
@@ -99,35 +93,15 @@ def compare_dates(
         if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
             motion = find_motion(pair, alignment.pose)
             if motion is not None:
+                both = (alignment.gain + motion.gain) / pair.fewer
+                if motion.is_sure:  # the other turn is that of a second plant
+                    trust[earlier, later] = max(trust[earlier, later], guess_chance(both))
                 motions[earlier, later] = motion
                 costs[earlier, later] = _parted_costs(pair, motion, costs[earlier, later])
-    reasons = tuple(alone[n, n + 1].reason for n in range(len(dates) - 1))
-    return Comparison(costs, poses, roots, reasons, trust, motions)
-
-
-def place_dates(
-    num_dates: int, alignments: Mapping[tuple[int, int], Alignment]
-) -> tuple[Floats, np.ndarray, Floats]:
-    """Poses, roots and trust, see `Comparison`, by way of the alignments with the largest margins; of those that are
-    guesses, only where there is no other way, and the likeliest."""
-    margins, poses, roots = np.zeros((num_dates, num_dates)), np.zeros((num_dates, 4, 4)), np.full(num_dates, -1)
-    trust = np.eye(num_dates)
-    for pair, alignment in alignments.items():
-        guess = LEAST_MARGIN * max(alignment.probability, LEAST_MARGIN)
-        margins[pair] = -alignment.margin if alignment.is_sure else -guess
-    tree = minimum_spanning_tree(margins)
-    for root in range(num_dates):
-        if roots[root] < 0:
-            order, before = breadth_first_order(tree, root, directed=False)
-            poses[root], roots[order] = np.eye(4), root
-            for date in order[1:].tolist():
-                earlier, later = sorted((date, int(before[date])))
-                found = alignments[earlier, later]
-                step, chance = found.pose, 1.0 if found.is_sure else found.probability
-                poses[date] = poses[before[date]] @ (step if date == earlier else np.linalg.inv(step))
-                known = order[: order.tolist().index(date)]
-                trust[date, known] = trust[known, date] = np.minimum(trust[before[date], known], chance)
-    return poses, roots, trust
+    trust = np.maximum(trust, trust.T)
+    for date in range(len(dates)):  # by way of others
+        trust = np.maximum(trust, np.minimum(trust[:, date, None], trust[None, date]))
+    return Comparison(costs, poses, roots, trust, motions)
 
 
 def _bent_costs(pair: Pair, alignment: Alignment) -> Floats:

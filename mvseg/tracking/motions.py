@@ -7,18 +7,13 @@ some leaves under which both together are far likelier.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from mvseg.tracking.align import (
     LEAST_PAIRS,
-    PER_LEAF,
     SAME,
-    SURE_MARGIN,
-    SURE_SUM,
-    TWO_WAYS,
-    Alignment,
     alikeness,
     best_pairs,
     draw_poses,
@@ -30,6 +25,7 @@ from mvseg.tracking.dates import Floats
 
 TRIED = 8  # poses, of those that explain most of what the alignment does not
 LEAST_GAIN = 20.0  # of a second motion; of plants whose leaves only grew the largest are about 15
+SURE_MARGIN = 7.0  # of a second motion over others
 CLEARLY = 2.0  # a leaf is of the second motion where that is so much cheaper
 
 
@@ -52,17 +48,6 @@ class Motion:
     @property
     def is_sure(self) -> bool:
         return self.margin >= SURE_MARGIN
-
-
-def settle(pair: Pair, alignment: Alignment) -> Alignment:
-    """The alignment, sure where it was not only because a second plant in the pot moved in the other way."""
-    if alignment.reason == TWO_WAYS:
-        motion = find_motion(pair, alignment.pose)
-        if motion is not None and motion.is_sure:
-            per_leaf = (alignment.gain + motion.gain) / pair.fewer
-            if motion.margin + PER_LEAF * per_leaf >= SURE_SUM:
-                return replace(alignment, margin=SURE_MARGIN, reason="")
-    return alignment
 
 
 def find_motion(pair: Pair, pose: Floats) -> Motion | None:

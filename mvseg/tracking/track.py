@@ -20,6 +20,7 @@ from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order
 if TYPE_CHECKING:
     from mvseg.results.result import Result
 
+TOLD = 0.9  # probability of an alignment, below which it is a guess that a person should know of
 State = Literal["born", "seen", "hidden", "gone"]
 
 
@@ -61,9 +62,9 @@ class Tracks:
         dates: in the order of time, all in the unit of the first.
         rows: by date, then by track.
         poses: (T, 4, 4) first_from_date, where the frame of a date stands in that of the earliest date that it is
-            surely aligned with, by way of others; the identity where there is none.
+            aligned with, by way of others.
         roots: (T,) index of that earliest date.
-        warnings: dates that could not be aligned, and why.
+        warnings: dates whose alignment is a guess, leaves that moved by themselves, leaves without a shape.
     """
 
     plant: str
@@ -101,8 +102,8 @@ def track_leaves(
         plant: its name.
 
     Returns:
-        The tracks. Where dates cannot be aligned surely, the likeliest pose is taken, links have its probability at
-        most, and `Tracks.warnings` says why. Leaves without a shape get a track of that date alone.
+        The tracks. Of each two dates the likeliest alignment is taken, links have its probability at most, and
+        `Tracks.warnings` names those that are guesses. Leaves without a shape get a track of that date alone.
 
     Raises:
         InputError: fewer than two results, another number of times, times that repeat, units that cannot be converted,
@@ -187,10 +188,9 @@ def _rows(dates: Sequence[PlantOnDate], links: Sequence[Link], roots: np.ndarray
 def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[str]:
     for later in range(1, len(dates)):
         chance = compared.trust[later - 1, later]
-        if chance < 1:
-            pair, reason = f"{dates[later - 1].scene} and {dates[later].scene}", compared.reasons[later - 1]
-            why = f" ({reason})" if reason else ""
-            yield f"{pair} cannot be aligned surely{why}: how the pot stands is a guess, right with {chance:.0%}"
+        if chance < TOLD:
+            pair = f"{dates[later - 1].scene} and {dates[later].scene}"
+            yield f"{pair}: how the pot stands is a guess, right with {chance:.0%}"
     for (earlier, later), motion in sorted(compared.motions.items()):
         if compared.roots[later] not in compared.roots[earlier + 1 : later]:
             pair = f"{dates[earlier].scene} and {dates[later].scene}"

@@ -38,10 +38,10 @@ class LeafScores:
 
 
 FITTED = LeafScores(
-    shows=(0.604, 0.298, 1.480, 0.497),
-    matched=(-1.337, 0.987, 0.829),
-    leaf=(-14.860, 6.070, 6.084, 1.428, -0.177, 1.202),
-    found=(-7.143, 4.362, 3.382, 0.987),
+    shows=(0.656, 0.314, 1.431, 0.665),
+    matched=(-1.632, 0.958, 0.897),
+    leaf=(-2.385, 4.382, 0.913, 1.153, 1.157, 0.387),
+    found=(-0.732, 1.986, 1.290, 0.928),
 )
 
 
@@ -141,7 +141,7 @@ def leaf_features(
 ) -> tuple[Floats, ClearLeaves]:
     """(K, 6): 1; the mean q of the best masks over the views, weighted by what each shows of the surface; the logarithm
     of the sum of q, plus 0.1; the mean log odds of their detection scores, above that of clear leaves; the logarithm
-    of the length, over theirs; and the log odds of `Candidates.fits`.
+    of the length, over theirs, 0 for longer ones (pieces are short); and the log odds of `Candidates.fits`.
 
     Args:
         candidates: K.
@@ -159,6 +159,7 @@ def leaf_features(
         known = lengths[is_clear & candidates.has_surface]
         clear = ClearLeaves(float(np.median(score[is_clear])), float(np.median(known)) if len(known) else 1.0)
     relative = np.log(np.maximum(np.where(candidates.has_surface, lengths, clear.length), 1e-12) / clear.length)
+    relative = np.minimum(relative, 0.0)
     columns = np.ones_like(shown), shown, np.log(number + 0.1), score - clear.score, relative, log_odds(candidates.fits)
     return np.stack(columns, 1), clear
 

@@ -1,4 +1,4 @@
-"""Aligning dates: any pot, and never a guess."""
+"""Aligning dates: any pot, and how likely that is right."""
 
 from __future__ import annotations
 
@@ -8,10 +8,13 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.tracking import see_series
 from mvseg.simulation.series import draw_specs
-from mvseg.tracking.align import Habit, align
+from mvseg.tracking.align import Habit, align, list_poses
 from mvseg.tracking.costs import Pair, leaves_of
+from mvseg.tracking.place_dates import place_dates
+from mvseg.tracking.track import TOLD
 from tests.plants_over_days import grow_blades, grown, see
 
+SURE = 0.9
 
 @pytest.mark.parametrize(("turn", "lean"), [(0, 0), (75, 0), (180, 8), (300, 15)])
 def test_a_pot_that_was_turned_moved_and_leans(turn: float, lean: float) -> None:
@@ -19,7 +22,7 @@ def test_a_pot_that_was_turned_moved_and_leans(turn: float, lean: float) -> None
     first, one = see(blades, 0)
     second, other = see(grown(blades, 1.1), 2, turn=turn, lean=lean, shift=(200, -80, 15))
     alignment = align(Pair.of(leaves_of(first), leaves_of(second), days=2, knows_up=True))
-    assert alignment.is_sure
+    assert alignment.probability > SURE
     assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]
     assert len(alignment.pairs) == 9
     true = Rotation.from_euler("zx", [turn, lean], degrees=True).as_matrix()
@@ -32,25 +35,24 @@ def test_up_need_not_be_known() -> None:
     first, one = see(blades, 0)
     second, other = see(blades, 2, turn=40, lean=120, shift=(0, 0, 500))
     alignment = align(Pair.of(leaves_of(first), leaves_of(second), days=2, knows_up=False))
-    assert alignment.is_sure
+    assert alignment.probability > SURE
     assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]
 
 
-@pytest.mark.parametrize(("count", "said"), [(0, "no leaves"), (1, "1 leaf cannot"), (2, "2 leaves cannot")])
-def test_few_leaves_cannot_tell(count: int, said: str) -> None:
+@pytest.mark.parametrize("count", [0, 1, 2])
+def test_few_leaves_hardly_tell(count: int) -> None:
     blades = grow_blades(count, 3)
     first = leaves_of(see(grow_blades(5, 3), 0)[0])
     alignment = align(Pair.of(first, leaves_of(see(blades, 1)[0]), days=1, knows_up=True))
-    assert said in alignment.reason
+    np.testing.assert_allclose(alignment.pose, np.eye(4), atol=1e-9)
+    assert alignment.still > 0.3 if count else alignment.probability == Habit().still
 
 
 @pytest.mark.parametrize("seed", [11, 12, 13])
 def test_another_plant_in_the_pot_is_not_aligned(seed: int) -> None:
     first, second = leaves_of(see(grow_blades(8, 3), 0)[0]), leaves_of(see(grow_blades(8, seed), 1)[0])
     alignment = align(Pair.of(first, second, days=1, knows_up=True))
-    assert not alignment.is_sure
-    assert alignment.reason
-    assert alignment.probability < 0.95
+    assert alignment.probability < TOLD
 
 
 def test_one_leaf_in_a_pot_that_stands_still() -> None:
@@ -76,11 +78,13 @@ def test_a_habit_is_learned_from_the_dates() -> None:
     assert Habit(0.9).world_prior > Habit(0.5).world_prior
 
 
-def test_a_plant_that_looks_the_same_from_two_sides_is_not_aligned() -> None:
+def test_a_plant_that_looks_the_same_from_two_sides_may_be_turned_either_way() -> None:
     half = grow_blades(4, 5)
     other = {leaf + 4: blade * (-1, -1, 1) for leaf, blade in half.items()}  # the same, turned by half a turn
     first, second = leaves_of(see(half | other, 0)[0]), leaves_of(see(half | other, 1, turn=30)[0])
-    assert align(Pair.of(first, second, days=1, knows_up=True)).reason == "the pot could be turned in more than one way"
+    looked = {(0, 1): list_poses(Pair.of(first, second, days=1, knows_up=True))}
+    _, _, steady = place_dates(2, looked, Habit(0.0))
+    assert steady[0] < 0.75
 
 
 @pytest.mark.parametrize("pair", [(0, 2), (1, 3)])
@@ -91,7 +95,7 @@ def test_a_plant_is_not_aligned_with_its_own_older_leaves(pair: tuple[int, int])
     days = dates[pair[1]].time - dates[pair[0]].time
     alignment = align(Pair.of(one, other, days=days, knows_up=True))
     right = [true[one.index[i]] == later[other.index[j]] for i, j in alignment.pairs]
-    assert not alignment.is_sure or np.mean(right) > 0.5
+    assert alignment.probability < 0.9 or np.mean(right) > 0.5
 
 
 def test_leaves_that_were_missed_before_do_no_harm() -> None:
@@ -99,5 +103,5 @@ def test_leaves_that_were_missed_before_do_no_harm() -> None:
     first, one = see({leaf: plant[leaf] for leaf in (2, 4, 5, 7, 9, 11)}, 0)
     second, other = see(plant, 2, turn=75)
     alignment = align(Pair.of(leaves_of(first), leaves_of(second), days=2, knows_up=True))
-    assert alignment.is_sure
+    assert alignment.probability > SURE
     assert [one[i] for i, _ in alignment.pairs] == [other[j] for _, j in alignment.pairs]

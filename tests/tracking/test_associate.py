@@ -9,7 +9,8 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.tracking.align import Alignment, make_poses
-from mvseg.tracking.associate import UNLINKED, Link, join_sights, link_leaves, place_dates
+from mvseg.tracking.associate import UNLINKED, Link, join_sights, link_leaves
+from mvseg.tracking.place_dates import chain_dates
 
 Costs = dict[tuple[int, int], np.ndarray]
 
@@ -96,14 +97,11 @@ def test_rivals_make_a_link_less_probable() -> None:
     assert 0 < rivalled.probability < 0.97 < alone.probability < 1
 
 
-def test_dates_stand_as_the_surest_alignments_say() -> None:
-    def moved(x: float, margin: float, reason: str = "") -> Alignment:
-        at = make_poses(np.eye(3), np.array([x, 0, 0]))
-        return Alignment(at, np.zeros((0, 2), int), 50.0, margin, reason, probability=0.6 if reason else 1.0)
+def test_dates_stand_as_the_likeliest_alignments_say() -> None:
+    def moved(x: float, probability: float) -> Alignment:
+        return Alignment(make_poses(np.eye(3), np.array([x, 0, 0])), np.zeros((0, 2), int), probability=probability)
 
-    pairs = {(0, 1): moved(-1, 30), (1, 2): moved(-1, 30), (0, 2): moved(9, 20), (2, 3): moved(5, 3, "not sure")}
-    poses, roots, trust = place_dates(5, pairs)
+    poses, roots = chain_dates(5, {(0, 1): moved(-1, 0.9), (1, 2): moved(-1, 0.9), (0, 2): moved(9, 0.8),
+                                   (2, 3): moved(5, 0.2)})  # fmt: skip
     np.testing.assert_allclose(poses[:, 0, 3], [0, 1, 2, -3, 0])
-    assert roots.tolist() == [0, 0, 0, 0, 4]  # a guess is taken where there is no other way
-    np.testing.assert_allclose(trust[:4, :4], [[1, 1, 1, 0.6], [1, 1, 1, 0.6], [1, 1, 1, 0.6], [0.6, 0.6, 0.6, 1]])
-    np.testing.assert_allclose(trust[4], [0, 0, 0, 0, 1])
+    assert roots.tolist() == [0, 0, 0, 0, 4]

@@ -1,0 +1,134 @@
+"""How all dates of a plant stand to each other: of the poses that pairs of dates allow, those that go together best.
+
+Two dates that look alike in more than one way are settled by the others. One date after the other takes, of the poses
+that its pairs with the others suggest, that under which all of these pairs are likeliest, until none changes; from two
+starts: the likeliest alignments, and all frames alike. The likelier outcome counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+from scipy.special import expit
+
+from mvseg.tracking.align import (
+    TEMPER,
+    Alignment,
+    Habit,
+    Poses,
+    best_pairs,
+    judge,
+    large_new,
+    near_world,
+    pose_distances,
+)
+from mvseg.tracking.costs import pair_costs
+from mvseg.tracking.dates import Floats
+
+TRIED = 3  # poses of each pair, the likeliest; with five, nothing changes
+SPREAD = 1.3  # of the costs, for poses by way of other dates are less exact
+ROUNDS = 6  # at most; two or three are enough
+DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
+Looked = Mapping[tuple[int, int], Poses]
+
+
+def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, np.ndarray, Floats]:
+    """The poses of T dates.
+
+    Args:
+        num_dates: T.
+        looked: {(earlier, later): the poses of two dates that were looked at}.
+        habit: of the pot.
+
+    Returns:
+        (T, 4, 4) first_from_date, where "first" is the earliest date that is compared with it, by way of others; (T,)
+        the index of that date; and (T - 1,) how likely the plant was not turned otherwise between each date and the
+        next, see `weigh_turns`.
+    """
+    chained, roots = chain_dates(num_dates, {pair: judge(poses, habit) for pair, poses in looked.items()})
+    starts = chained, np.tile(np.eye(4), (num_dates, 1, 1))
+    found = [_search(start, roots, looked, habit) for start in starts]
+    totals = [sum(_likeliness(poses, pair, looked, habit) for pair in looked) for poses in found]
+    poses = found[int(np.argmax(np.round(totals, DIGITS)))]
+    return poses, roots, weigh_turns(poses, looked, habit)
+
+
+def weigh_turns(poses: Floats, looked: Looked, habit: Habit) -> Floats:
+    """(T - 1,) probability that the plant stands on all later dates as the poses (T, 4, 4) say, against the likeliest
+    other turn between a date and the next: of a plant that looks the same from two sides, one half."""
+    chances = np.ones(len(poses) - 1)
+    for later in range(1, len(poses)):
+        across = [pair for pair in looked if pair[0] < later <= pair[1]]
+        step, rivals = looked.get((later - 1, later)), []
+        if step is None or not step.pair.fewer or habit.still == 1:
+            continue
+        now = np.linalg.inv(poses[later]) @ poses[later - 1]
+        every = np.stack([each.pose for each in step.refined])
+        for other in every[pose_distances(step.pair, now, every) >= 1]:
+            moved = poses.copy()
+            moved[later:] = poses[later - 1] @ np.linalg.inv(other) @ np.linalg.inv(poses[later]) @ poses[later:]
+            rivals.append(sum(_likeliness(moved, pair, looked, habit) for pair in across))
+        if rivals:
+            ours = sum(_likeliness(poses, pair, looked, habit) for pair in across)
+            chances[later - 1] = expit(np.round(ours - max(rivals), DIGITS))
+    return chances
+
+
+def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment]) -> tuple[Floats, np.ndarray]:
+    """Poses and roots, see `place_dates`, by way of the likeliest alignments."""
+    weights, poses, roots = np.zeros((num_dates, num_dates)), np.zeros((num_dates, 4, 4)), np.full(num_dates, -1)
+    for pair, alignment in alignments.items():
+        weights[pair] = -1 - round(alignment.probability, DIGITS)  # any falling order will do; 0 would be no way
+    tree = minimum_spanning_tree(weights)
+    for root in range(num_dates):
+        if roots[root] < 0:
+            order, before = breadth_first_order(tree, root, directed=False)
+            poses[root], roots[order] = np.eye(4), root
+            for date in order[1:].tolist():
+                earlier, later = sorted((date, int(before[date])))
+                step = alignments[earlier, later].pose
+                poses[date] = poses[before[date]] @ (step if date == earlier else np.linalg.inv(step))
+    return poses, roots
+
+
+def _search(poses: Floats, roots: np.ndarray, looked: Looked, habit: Habit) -> Floats:
+    """One date after the other takes the pose that agrees best with the others."""
+    poses = poses.copy()
+    for _ in range(ROUNDS):
+        before = poses.copy()
+        for date in np.flatnonzero(roots != np.arange(len(roots))).tolist():
+            pairs = [pair for pair in looked if date in pair]
+            options = [poses[date], *(pose for pair in pairs for pose in _suggested(poses, date, pair, looked, habit))]
+            totals = []
+            for option in options:
+                moved = poses.copy()
+                moved[date] = option
+                totals.append(sum(_likeliness(moved, pair, looked, habit) for pair in pairs))
+            poses[date] = options[int(np.argmax(np.round(totals, DIGITS)))]
+        if np.array_equal(poses, before):
+            break
+    return poses
+
+
+def _suggested(
+    poses: Floats, date: int, pair: tuple[int, int], looked: Looked, habit: Habit
+) -> list[Floats]:
+    """The poses of a date under which the other date of a pair stands as one of the likeliest poses of the two says."""
+    earlier, later = pair
+    of_pair = looked[pair]
+    order = np.argsort(-np.round(of_pair.scores(habit), DIGITS), kind="stable")[:TRIED]
+    steps = [of_pair.refined[place].pose for place in order]
+    return [poses[earlier] @ np.linalg.inv(step) if date == later else poses[later] @ step for step in steps]
+
+
+def _likeliness(poses: Floats, pair: tuple[int, int], looked: Looked, habit: Habit) -> float:
+    """Log odds of two dates standing as the poses (T, 4, 4) say."""
+    of_pair, pose = looked[pair].pair, np.linalg.inv(poses[pair[1]]) @ poses[pair[0]]
+    gain = 0.0
+    if of_pair.fewer:
+        costs = pair_costs(of_pair.moved(pose), spread=SPREAD)
+        pairs = best_pairs(costs)
+        gain = float(-costs[pairs[:, 0], pairs[:, 1]].sum()) - large_new(of_pair, pairs)
+    return TEMPER * gain + habit.world_prior * float(near_world(of_pair, pose[None])[0])

@@ -1,0 +1,58 @@
+"""Where all dates stand: what two dates alone get wrong, the others put right."""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mvseg.tracking.align import Habit, Poses, judge, list_poses, make_poses
+from mvseg.tracking.costs import Pair, leaves_of
+from mvseg.tracking.place_dates import place_dates
+from tests.plants_over_days import grow_blades, grown, see
+
+BLADES = grow_blades(7, 3)
+TURNS = (0.0, 80.0, 200.0, 200.0)
+
+
+def look_at(turns: tuple[float, ...]) -> dict[tuple[int, int], Poses]:
+    leaves = [leaves_of(see(grown(BLADES, 1 + 0.05 * n), n, turn=turn)[0]) for n, turn in enumerate(turns)]
+    return {(a, b): list_poses(Pair.of(leaves[a], leaves[b], days=b - a, knows_up=True))
+            for a, b in combinations(range(len(turns)), 2)}  # fmt: skip
+
+
+def turns_of(poses: np.ndarray) -> np.ndarray:
+    """How far the pot is turned on each date, degrees."""
+    return np.degrees(np.arctan2(poses[:, 0, 1], poses[:, 0, 0])) % 360
+
+
+def test_all_dates_are_placed_and_sure_of_it() -> None:
+    poses, roots, steady = place_dates(4, look_at(TURNS), Habit(0.3))
+    np.testing.assert_allclose(turns_of(poses), TURNS, atol=5)
+    assert roots.tolist() == [0] * 4
+    assert steady.min() > 0.9
+
+
+@pytest.mark.parametrize("wrong", [(0, 1), (1, 2), (2, 3)])
+def test_two_dates_that_look_alike_in_a_wrong_way_are_settled_by_the_others(wrong: tuple[int, int]) -> None:
+    looked = look_at(TURNS)
+    there = looked[wrong]
+    away = make_poses(Rotation.from_euler("z", 120, degrees=True).as_matrix(), np.array([5.0, 0, 0]))
+    best = judge(there, Habit(0.3))
+    likelier = Poses(
+        there.pair,
+        (*there.refined, type(best)(away, best.pairs, gain=best.gain + 30)),
+        np.append(there.gains, best.gain + 30),
+        np.append(there.near, 0.0),
+    )
+    assert np.allclose(judge(likelier, Habit(0.3)).pose, away)
+    poses, _, _ = place_dates(4, {**looked, wrong: likelier}, Habit(0.3))
+    np.testing.assert_allclose(turns_of(poses), TURNS, atol=5)
+
+
+def test_pots_that_are_said_to_be_fixed_stand_as_they_stood() -> None:
+    poses, _, steady = place_dates(4, look_at((0.0,) * 4), Habit(1.0))
+    np.testing.assert_allclose(poses, np.tile(np.eye(4), (4, 1, 1)), atol=1e-9)
+    assert (steady == 1).all()
