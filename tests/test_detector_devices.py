@@ -140,7 +140,7 @@ def test_leaves_are_chosen_on_the_cpu(
 
     def choose(matched: Masks, proposals: Masks, **given: Any) -> Leaves:
         assert {each.device.type for each in (given["cameras"].K, matched.view_index, proposals.view_index)} == {"cpu"}
-        return Leaves(proposals, {}, {}, (), proposals)
+        return Leaves(proposals, {}, {}, ())
 
     monkeypatch.setattr("mvseg.detection.mask_rcnn.choose_leaves", choose)
     answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))

@@ -305,7 +305,7 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
 
     def choose(matched: Masks, proposals: Masks, **_: object) -> Leaves:
         asked.append(matched)
-        return Leaves(matched, {}, {}, (), proposals)
+        return Leaves(matched, {}, {}, ())
 
     monkeypatch.setattr(mvseg.pipeline, "detect", detect)
     monkeypatch.setattr("mvseg.verification.choose.choose_leaves", choose)
