@@ -29,7 +29,7 @@ ROUNDS = (2.5, 1.8, 1.3, 1.0, 1.0)  # scales of the costs while refining
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
 TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
 TEMPER = 0.3  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
-GUESS = (-2.16, 0.78)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
+GUESS = (-2.22, 0.79)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
 LARGE_NEW = 4.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
@@ -274,7 +274,7 @@ def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Fl
     other = other[:, :1] + (other - other[:, :1]) * np.clip(share, 0.5, 2)[:, None, None]  # as long as it was
     places = [0, one.shape[1] // 2, -1]
     source, target = one[:, places].reshape(-1, 3), other[:, places].reshape(-1, 3)
-    mass = (weights[:, None] * (0.5, 1.0, 0.5)).ravel()
+    mass = (weights[:, None] * (0.7, 0.7, 0.3)).ravel()
     mass /= mass.sum()
     middle, aim = mass @ source, mass @ target
     source, target = source - middle, target - aim
