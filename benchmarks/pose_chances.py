@@ -3,7 +3,7 @@
 The table and the results of real seedlings are those of `benchmarks/tracking.py results`. The dates of each plant are
 placed; of two at most three apart the pose is right where more than half of the leaves that it pairs are the same.
 Beside them: two dates of different plants, where no pose is right, and four simulated plants. Prints `GUESS` of
-`mvseg/tracking/align.py`, of greatest likelihood, other plants weighted by three tenths, as rare as they are.
+`mvseg/tracking/align.py`, of greatest likelihood, other plants weighted by a tenth, as rare as they are.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.place_dates import place_dates
 
-NUM_OTHER, OTHER_WEIGHT, RIDGE = 120, 0.3, 0.01
+NUM_OTHER, OTHER_WEIGHT, RIDGE = 120, 0.1, 0.01
 Dated = tuple[PlantOnDate, list[int]]
 
 

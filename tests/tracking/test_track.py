@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
-from mvseg.tracking.align import Habit, align, list_poses
+from mvseg.tracking.align import Habit, list_poses
 from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import LeafLink, track_leaves
