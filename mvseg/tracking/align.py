@@ -26,6 +26,7 @@ UPRIGHT = 2.0  # weight of "up stays up", in leaves
 MOST_LEAN = np.radians(20.0)
 COARSE = (0.18, 0.45, 0.5)  # scales of base (median lengths), direction (radians) and log length while searching
 ROUNDS = (2.5, 1.8, 1.3, 1.0, 1.0)  # scales of the costs while refining
+PARTS = (0.7, 0.7, 0.3)  # weights of base, middle and tip: growing petioles carry bases, and tips sway
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
 TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
 TEMPER = 0.3  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
@@ -274,7 +275,7 @@ def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Fl
     other = other[:, :1] + (other - other[:, :1]) * np.clip(share, 0.5, 2)[:, None, None]  # as long as it was
     places = [0, one.shape[1] // 2, -1]
     source, target = one[:, places].reshape(-1, 3), other[:, places].reshape(-1, 3)
-    mass = (weights[:, None] * (0.7, 0.7, 0.3)).ravel()
+    mass = (weights[:, None] * PARTS).ravel()
     mass /= mass.sum()
     middle, aim = mass @ source, mass @ target
     source, target = source - middle, target - aim
