@@ -298,7 +298,7 @@ def test_ctrl_c_ends_it_with_one_sentence_at_any_moment(folder: Path) -> None:
         process.send_signal(signal.SIGINT)
         said, complaint = process.communicate(timeout=WAIT)
     assert process.returncode == 0
-    assert not any(word in complaint for word in ("Traceback", "terminate", "Abort"))
+    assert complaint == ""
     saved = folder / "corrections.json"
     assert said.splitlines()[-1].endswith(f"mvseg infer --again {folder} --corrections {saved}")
 

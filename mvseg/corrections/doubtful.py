@@ -15,7 +15,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.checked_ids import match_surfaces
-from mvseg.verification.choose import LeftOut
+from mvseg.verification.choose import LEAST_VIEWS, LeftOut
 from mvseg.verification.evidence import SHARED
 from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
 
@@ -29,7 +29,6 @@ EMPTY = 0.6  # of that part, outside all masks: the mask is missing
 SIMILAR = 0.4  # IoU of that part with a mask of another leaf, that may be it
 SMOOTH = 1.5  # pixels that a proposed outline may be off
 LEAST_CHANCE = 0.1  # of a candidate that was not chosen, to be a leaf, from which it is asked about
-LEAST_VIEWS = 2  # that show it: where it is
 MISSING, COVERED, LONE = 0.8, 0.9, 0.6  # doubt of what cannot be told from scores, at most
 
 Kind = Literal["match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
@@ -81,18 +80,20 @@ def list_doubts(
     """
     masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
     found = _doubt_matches(masks)
-    everything, sizes = torch.ones_like(masks.instance_ids), cameras.sizes.tolist()
-    taken = [masks.regions.label_map(view, everything, size).numpy() > 0 for view, size in enumerate(sizes)]
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
-    if known:
-        ious, _ = match_surfaces(masks.regions, known, cameras=cameras)
-        for view in range(len(cameras)):
+    ious = match_surfaces(masks.regions, known, cameras=cameras)[0] if known else np.zeros((0, 0))
+    free: list[list[int]] = [[] for _ in left]  # rows of each candidate's masks where none of the result lies
+    for view, size in enumerate(cameras.sizes.tolist() if known or left else ()):
+        taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
+        if known:
             leaves = visible_leaves(known, cameras, view)
-            found += _doubt_view(masks, leaves, should, view=view, taken=taken[view], ious=ious)
+            found += _doubt_view(masks, leaves, should, view=view, taken=taken, ious=ious)
+        for rows, candidate in zip(free, left, strict=True):
+            rows += _free_rows(candidate.masks, view, taken)
     found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
-    queue = _doubt_left(masks, left, taken)
+    queue = _doubt_left(left, free, usual=_usual_area(masks))
     for each in sorted(found, key=lambda one: (-one.doubt, one.view, one.instance, one.region)):
         name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
         if each.doubt >= LEAST_DOUBT and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
@@ -135,19 +136,32 @@ def _usual_area(masks: Masks) -> float:
     return float(matched.median()) if len(matched) else 1.0
 
 
-def _doubt_left(masks: Masks, left: Sequence[LeftOut], taken: Sequence[Bools]) -> list[Doubt]:
-    """Candidates that were not chosen, in the views where no mask of the result lies; `taken` as V frames (H, W)."""
-    usual, found = _usual_area(masks), []
-    for each in left:
-        outlines, areas, regions = [], [], each.masks.regions
-        for row in regions.areas.argsort(descending=True, stable=True).tolist():
-            view, (x1, y1, x2, y2), crop = int(regions.view_index[row]), regions.boxes[row].tolist(), regions.crop(row)
-            if float(taken[view][y1:y2, x1:x2][crop.numpy()].mean()) <= SHARED:
-                outlines.append((view, _outline(crop.numpy(), (x1, y1))))
-                areas.append(float(regions.areas[row]))
-        if each.chance >= LEAST_CHANCE and len(outlines) >= LEAST_VIEWS:
-            doubt = each.chance * min(1.0, float(np.median(areas)) / max(usual, 1.0))
-            found.append(Doubt("leaf", doubt, outlines[0][0], -1, outlines=tuple(outlines)))
+def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
+    """The rows of the masks of a view of which `taken` (H, W) covers one half at most."""
+    free = []
+    for row in (masks.view_index == view).nonzero()[:, 0].tolist():
+        x1, y1, x2, y2 = masks.regions.boxes[row].tolist()
+        if float(taken[y1:y2, x1:x2][masks.regions.crop(row).numpy()].mean()) <= SHARED:
+            free.append(row)
+    return free
+
+
+def _doubt_left(left: Sequence[LeftOut], free: Sequence[Sequence[int]], *, usual: float) -> list[Doubt]:
+    """Candidates that were not chosen, in the views where no mask of the result lies, the largest mask first; `usual`
+    as `_usual_area` says."""
+    found = []
+    for each, rows in zip(left, free, strict=True):
+        if each.chance < LEAST_CHANCE or len(rows) < LEAST_VIEWS:
+            continue
+        regions = each.masks.regions
+        areas = regions.areas[rows].double()
+        order = areas.argsort(descending=True, stable=True).tolist()
+        outlines = tuple(
+            (int(regions.view_index[row]), _outline(regions.crop(row).numpy(), regions.boxes[row, :2].tolist()))
+            for row in (rows[place] for place in order)
+        )
+        doubt = each.chance * min(1.0, float(areas.median()) / max(usual, 1.0))
+        found.append(Doubt("leaf", doubt, outlines[0][0], -1, outlines=outlines))
     return found
 
 

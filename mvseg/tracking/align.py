@@ -33,6 +33,7 @@ TEMPER = 0.3  # of a gain, that counts as log odds: the differences of one leaf 
 GUESS = (-1.46, 0.69)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
+DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
 LARGE_NEW = 4.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
 NEARLY_ALL = 0.9  # of the leaves of the date with fewer: where these are paired, large ones were missed there
 
@@ -116,14 +117,9 @@ class Poses:
         return guess_chance(gain / self.pair.fewer)
 
 
-def align(pair: Pair, habit: Habit = Habit()) -> Alignment:
-    """The best alignment of two dates, each in its own frame, and how likely it is; where up is not known, of any
-    rotation. Without leaves on one of them, the pot stands as it stood."""
-    return judge(list_poses(pair), habit)
-
-
 def list_poses(pair: Pair) -> Poses:
-    """The poses that look best, each refined; without leaves on one of the dates, only that it stood as it stood."""
+    """The poses of two dates, each in its own frame, that look best, each refined; where up is not known, of any
+    rotation. Without leaves on one of them, only that it stood as it stood."""
     if not pair.fewer:
         return Poses(pair, (Alignment(np.eye(4), np.zeros((0, 2), int)),), np.zeros(1), np.ones(1))
     poses = np.concatenate([np.eye(4)[None], draw_poses(pair)])
@@ -142,7 +138,7 @@ def list_poses(pair: Pair) -> Poses:
 
 def judge(poses: Poses, habit: Habit) -> Alignment:
     """The best of the poses, and how likely it is."""
-    place = int(poses.scores(habit).argmax()) if habit.still < 1 else 0
+    place = int(np.round(poses.scores(habit), DIGITS).argmax()) if habit.still < 1 else 0
     best, weights = poses.refined[place], poses.weights(habit)
     still = float(weights[poses.near > np.exp(-0.5)].sum()) if poses.pair.fewer else habit.still
     return replace(best, still=still, probability=poses.chance(best.gain, habit))

@@ -82,10 +82,9 @@ def compare_dates(
     costs: dict[tuple[int, int], Floats] = {}
     motions: dict[tuple[int, int], Motion] = {}
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
-        pair, place = pairs[earlier, later], np.linalg.inv(poses[later]) @ poses[earlier]
-        alignment = refine(pair, place) if pair.fewer else Alignment(place, np.zeros((0, 2), int))
-        is_turn_known = float(steady[earlier:later].min())
-        trust[earlier, later] = is_turn_known * looked[earlier, later].chance(alignment.gain, habit)
+        pair, pose = pairs[earlier, later], np.linalg.inv(poses[later]) @ poses[earlier]
+        alignment = refine(pair, pose) if pair.fewer else Alignment(pose, np.zeros((0, 2), int))
+        trust[earlier, later] = steady[earlier:later].min() * looked[earlier, later].chance(alignment.gain, habit)
         if not len(alignment.pairs):
             continue
         costs[earlier, later] = _bent_costs(pair, alignment)

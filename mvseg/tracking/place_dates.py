@@ -14,6 +14,7 @@ from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import expit
 
 from mvseg.tracking.align import (
+    DIGITS,
     TEMPER,
     Alignment,
     Habit,
@@ -30,7 +31,6 @@ from mvseg.tracking.dates import Floats
 TRIED = 3  # poses of each pair, the likeliest; with five, nothing changes
 SPREAD = 1.3  # of the costs, for poses by way of other dates are less exact
 ROUNDS = 6  # at most; two or three are enough
-DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
 Looked = Mapping[tuple[int, int], Poses]
 
 
@@ -47,6 +47,8 @@ def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, n
         the index of that date; and (T - 1,) how likely the plant was not turned otherwise between each date and the
         next, see `weigh_turns`.
     """
+    if habit.still == 1:  # somebody says so
+        return np.tile(np.eye(4), (num_dates, 1, 1)), np.zeros(num_dates, int), np.ones(num_dates - 1)
     chained, roots = chain_dates(num_dates, {pair: judge(poses, habit) for pair, poses in looked.items()})
     starts = chained, np.tile(np.eye(4), (num_dates, 1, 1))
     found = [_search(start, roots, looked, habit) for start in starts]
@@ -62,7 +64,7 @@ def weigh_turns(poses: Floats, looked: Looked, habit: Habit) -> Floats:
     for later in range(1, len(poses)):
         across = [pair for pair in looked if pair[0] < later <= pair[1]]
         step, rivals = looked.get((later - 1, later)), []
-        if step is None or not step.pair.fewer or habit.still == 1:
+        if step is None or not step.pair.fewer:
             continue
         now = np.linalg.inv(poses[later]) @ poses[later - 1]
         every = np.stack([each.pose for each in step.refined])

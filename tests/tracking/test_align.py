@@ -8,13 +8,17 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.tracking import see_series
 from mvseg.simulation.series import draw_specs
-from mvseg.tracking.align import Habit, align, list_poses
+from mvseg.tracking.align import Alignment, Habit, judge, list_poses
 from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.place_dates import place_dates
 from mvseg.tracking.track import TOLD
 from tests.plants_over_days import grow_blades, grown, see
 
 SURE = 0.9
+
+
+def align(pair: Pair, *, still: float = Habit().still) -> Alignment:
+    return judge(list_poses(pair), Habit(still))
 
 @pytest.mark.parametrize(("turn", "lean"), [(0, 0), (75, 0), (180, 8), (300, 15)])
 def test_a_pot_that_was_turned_moved_and_leans(turn: float, lean: float) -> None:
@@ -60,7 +64,7 @@ def test_one_leaf_in_a_pot_that_stands_still() -> None:
     blades = {3: grow_blades(5, 3)[3]}
     first, second = leaves_of(see(blades, 0)[0]), leaves_of(see(grown(blades, 1.2), 1)[0])
     pair = Pair.of(first, second, days=1, knows_up=True)
-    guess, said = align(pair), align(pair, Habit(1.0))
+    guess, said = align(pair), align(pair, still=1.0)
     np.testing.assert_allclose(guess.pose, np.eye(4))
     assert guess.pairs.tolist() == said.pairs.tolist() == [[0, 0]]
     assert 0.5 < guess.probability < 1 == said.probability

@@ -53,6 +53,7 @@ def test_two_dates_that_look_alike_in_a_wrong_way_are_settled_by_the_others(wron
 
 
 def test_pots_that_are_said_to_be_fixed_stand_as_they_stood() -> None:
-    poses, _, steady = place_dates(4, look_at((0.0,) * 4), Habit(1.0))
+    """Even where the leaves say otherwise."""
+    poses, _, steady = place_dates(4, look_at(TURNS), Habit(1.0))
     np.testing.assert_allclose(poses, np.tile(np.eye(4), (4, 1, 1)), atol=1e-9)
     assert (steady == 1).all()
