@@ -17,7 +17,7 @@ from tests.plants_over_days import grow_blades, grown, see
 SURE = 0.9
 
 
-def align(pair: Pair, *, still: float = Habit().still) -> Alignment:
+def align(pair: Pair, *, still: float = Habit.still) -> Alignment:
     return judge(list_poses(pair), Habit(still))
 
 @pytest.mark.parametrize(("turn", "lean"), [(0, 0), (75, 0), (180, 8), (300, 15)])
