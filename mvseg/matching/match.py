@@ -222,6 +222,10 @@ def _warn_of_disagreement(matching: Matching) -> None:
         view = int(num_per_view.argmax())
         counts = f"{int(sparse.sum())} of {len(sparse)} views have at most half of the {richest} masks of view {view}"
         question = f"{counts}: are masks missing there?"
+    elif few := [view for view in odd if num_per_view[view] <= num_per_view.median() / 2]:
+        view = few[0]
+        count = f"{num_per_view[view]} against {num_per_view.median()} as a rule"
+        question = f"view {view} has few masks ({count}): are some missing, or does one cover several instances?"
     warnings.warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}", InputWarning, stacklevel=3)
 
 

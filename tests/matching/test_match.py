@@ -155,6 +155,19 @@ def test_cameras_of_other_photos_are_warned_of(
     assert matching_metrics(matching.instance_ids, demo_truth).ari < 0.7
 
 
+def test_a_mask_over_the_whole_plant_is_asked_about_and_not_the_cameras(
+    demo_scene: Scene, demo_regions: Regions
+) -> None:
+    maps = [
+        demo_regions.label_map(view, demo_regions.labels, size).numpy()
+        for view, size in enumerate(demo_scene.cameras.sizes.tolist())
+    ]
+    maps[0] = np.minimum(maps[0], 1)
+    regions = regions_from_label_maps(maps)
+    with pytest.warns(InputWarning, match=r"view 0 has few masks \(1 against \d+ as a rule\): .*cover"):
+        match_regions(regions, demo_scene.cameras)
+
+
 @pytest.mark.parametrize(("px", "is_warned"), [(5, False), (20, True)])
 def test_scores_fall_with_the_poses(
     px: float, is_warned: bool, demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
