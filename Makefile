@@ -26,7 +26,7 @@ fuzz: $(VENV)/installed
 	MVSEG_FUZZ_EXAMPLES=2000 $(PYTHON) -m pytest tests/fuzz
 	MVSEG_KILLS=20 MVSEG_KILL_SEED=$$(date +%s) $(PYTHON) -m pytest -m "" tests/test_kill.py
 
-# minutes; PREVIOUS=DIR takes turns with another checkout; FULL=--full renders for an hour at first; FULL=--threads_only
+# minutes; PREVIOUS=DIR takes turns with another checkout; FULL=--full renders more scenes at first; FULL=--threads_only
 # measures one thread against two, and nothing else
 bench: $(VENV)/installed
 	$(PYTHON) -m benchmarks.speed $(FULL) $(if $(PREVIOUS),--previous $(PREVIOUS)) --cache results/speed --into docs
