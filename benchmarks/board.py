@@ -45,7 +45,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
-from mvseg.pipeline import State, choose, detect, match, recut
+from mvseg.pipeline import State, choose, detect, match, snap
 from mvseg.results.overlay import draw_contact_sheet, draw_tile
 from mvseg.scene import Scene
 from mvseg.training.data import list_samples
@@ -81,7 +81,7 @@ def find_leaves(scene: Scene, options: DetectConfig, cache: Path | None) -> tupl
     state = State(config=RunConfig(reconstruct=None, detect=options), scene=scene, photos=Photos(scene), cache=cache)
     state = match(detect(state))
     found = state.masks
-    return found, (recut(choose(state)) if options.verify else state).masks
+    return found, (snap(choose(state)) if options.verify else state).masks
 
 
 def judge(masks: Masks, truth: list[np.ndarray]) -> Figures:

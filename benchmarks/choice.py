@@ -6,7 +6,7 @@ candidates, and which masks show which true leaf. The numbers of `mvseg/verifica
 maximum likelihood (a small ridge), in three rounds, since the features of a candidate depend on what was chosen before
 it. With `--leave_out` the plants are parted in four, and each scene is judged by numbers that were fitted on the other
 three parts (scenes whose names share what stands behind the last "-" are one plant). Per scene: MV-PQ of what was
-chosen, before `recut`; its ceilings, the best proposal of each true mask that scores 0.3, 0.1 or 0.05 and has an IoU
+chosen, before and after `snap_masks`; its ceilings (before it), the best proposal of each true mask that scores 0.3, 0.1 or 0.05 and has an IoU
 above one half, with the right id. In the end: how often candidates of each P are right.
 """
 
@@ -40,6 +40,7 @@ from mvseg.verification.choose import choose, gather_candidates
 from mvseg.verification.evidence import Drawn, draw_views, see
 from mvseg.verification.leaf_scores import FITTED, Candidates, LeafScores, matched_features, shows_features
 from mvseg.verification.rough_surfaces import fit_roughly
+from mvseg.verification.snap_edges import snap_masks
 
 RIDGE, ROUNDS, SHOWS = 0.1, 3, 0.5  # SHOWS: IoU from which a mask shows a leaf
 MANY, PARTS = 8, 4
@@ -56,6 +57,7 @@ class Study:
     table: Masks
     candidates: Candidates
     drawn: tuple[Drawn, ...]
+    photos: Photos
     truth: list[np.ndarray]
     leaf: np.ndarray
     of_candidate: np.ndarray
@@ -82,7 +84,7 @@ def study(folder: Path, step: int = 1) -> Study | None:
     members = [~np.isnan(column) for column in candidates.matched.T]
     of_candidate = np.array([main_leaf(leaf[rows]) for rows in members])
     name = folder.name if step == 1 else f"every {step}: {folder.name}"
-    return Study(name, table, candidates, drawn, truth, leaf, of_candidate)
+    return Study(name, table, candidates, drawn, Photos(scene), truth, leaf, of_candidate)
 
 
 def true_maps(folder: Path, scene: Scene) -> list[np.ndarray]:
@@ -216,15 +218,18 @@ def main() -> None:
             for out in range(PARTS)
         ]
         numbers = {plant: of_part[number] for plant, number in part.items()}
-    print(f"{'scene':30}{'MV-PQ':>8}{'right':>7}{'false':>7}" + "".join(f"{score:>8}" for score in SCORES))
+    print(f"{'scene':30}{'MV-PQ':>8}{'snapped':>8}{'right':>7}{'false':>7}" + "".join(f"{score:>8}" for score in SCORES))
     samples = []
     for plant, each in zip(plants, studies, strict=True):
         chosen = choose(each.candidates, each.table, drawn=each.drawn, fitted=numbers[plant])
         ids = torch.from_numpy(np.where(chosen.leaf >= 0, chosen.leaf + 1, -1))
-        shown = ids > 0
-        score = leaf_metrics(each.table.regions.select(shown.nonzero()[:, 0]), ids[shown], each.truth)
+        masks = replace(each.table, instance_ids=ids).select(ids > 0)
+        before, score = (
+            leaf_metrics(masks.regions, masks.instance_ids, each.truth)
+            for masks in (masks, snap_masks(masks, each.photos))
+        )
         ceilings = "".join(f"{ceiling(each, least):8.3f}" for least in SCORES)
-        print(f"{each.name:30}{score.mv_pq:8.3f}{score.num_right:7}{score.num_false:7}{ceilings}", flush=True)
+        print(f"{each.name:30}{before.mv_pq:8.3f}{score.mv_pq:8.3f}{score.num_right:7}{score.num_false:7}{ceilings}", flush=True)
         samples += leaf_samples(each, each.candidates, numbers[plant])
     chances, is_right = np.array([each[3] for each in samples]), np.array([each[2] for each in samples])
     for low, high in pairwise(BINS):

@@ -31,7 +31,7 @@ class Origin(IntEnum):
     FEW_VIEWS = 3  # a detector found it in too few views to be verified
     CORRECTED = 4  # a person drew it; from here on, no stage changes or drops a mask
     CUT = 5  # a person cut it from another one
-    CONFIRMED = 6  # a person says that it is right
+    CONFIRMED = 6  # a person says that it is right, with the edge that photos give it
 
 
 @dataclass(frozen=True, eq=False)

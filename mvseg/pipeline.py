@@ -157,12 +157,12 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
         "follow": follow if has_edits and (is_verified or shapes is not None) else None,
         "split": split if config.split_merged and not is_checked else None,
         "choose": choose if is_verified else None,
+        "snap": snap if is_verified else None,
         "check": check_cameras,
         "check_ids": check_ids if is_checked else None,
         "split_checked": split if config.split_merged and is_checked else None,
         "reconstruct": None if shapes is None else reconstruct,
         "measure": None if shapes is None else measure,
-        "recut": recut if is_verified else None,
     }
     return {name: stage for name, stage in stages.items() if stage is not None}
 
@@ -291,6 +291,13 @@ def choose(state: State) -> State:
     return replace(state, instances=instances, left=left, corrected=corrected).with_masks(masks)
 
 
+def snap(state: State) -> State:
+    """Edges of the detector's masks follow those of colour, see `snap_masks`."""
+    from mvseg.verification.snap_edges import snap_masks
+
+    return state.with_masks(snap_masks(state.masks, state.photos))
+
+
 def _is_linked(state: State) -> torch.Tensor:
     """(D,) bool, the masks that a person linked; those that followed from drawn ones come after all others."""
     assert state.corrected is not None
@@ -375,12 +382,3 @@ def measure(state: State) -> State:
         corrections=correct_views(state.scene, state.config.color_card),
     )
     return replace(state, instances=replace(state.instances, traits=traits))
-
-
-def recut(state: State) -> State:
-    """Cut the detector's masks anew by their surfaces, see `recut_masks`."""
-    from mvseg.verification.recut import recut_masks
-
-    surfaces = state.surfaces or state.instances.starts
-    masks = recut_masks(state.masks, surfaces, cameras=state.scene.cameras)
-    return replace(state, matching=state.matching.with_masks(masks))

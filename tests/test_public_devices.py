@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -36,7 +37,7 @@ from mvseg.matching.match import match_masks
 from mvseg.scene import View
 from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
-from mvseg.verification.recut import recut_masks
+from mvseg.verification.snap_edges import snap_masks
 from other_device import other_device
 from synthetic import ball_scene
 
@@ -80,6 +81,11 @@ def detected(regions: Regions, ids: torch.Tensor) -> Masks:
     return replace(masks, origin=origin, detection_scores=masks.match_scores * 0.8)
 
 
+def grey_photos(cameras: Cameras) -> Callable[[int], np.ndarray]:
+    sizes = cameras.sizes.tolist()
+    return lambda view: np.full((sizes[view][1], sizes[view][0], 3), 128, np.uint8)
+
+
 Step = Callable[[Regions, Cameras, torch.Tensor], Any]
 STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the device
     "match_regions": (lambda r, c, i: match_regions(r, c, links=Links.of([(0, 5)], [(0, 1)])).instance_ids, True),
@@ -93,7 +99,7 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
     "choose_leaves": (
         lambda r, c, i: choose_leaves(found := detected(r, i), found, cameras=c).masks.instance_ids, False
     ),
-    "recut_masks": (lambda r, c, i: recut_masks(masks_of(r, i), SURFACES, cameras=c).instance_ids, False),
+    "snap_masks": (lambda r, c, i: snap_masks(detected(r, i), grey_photos(c)).instance_ids, False),
     "list_doubts": (lambda r, c, i: len(list_doubts(masks_of(r, i), SURFACES, cameras=c)), False),
     "matching_metrics": (lambda r, c, i: matching_metrics(i, i).ari, False),
     "shape_distance": (lambda r, c, i: shape_distance(c.t, c.t), False),
@@ -128,7 +134,7 @@ def test_the_answer_is_the_same_there(name: str, device: torch.device) -> None:
 
 
 def test_every_public_name_is_looked_at() -> None:
-    inner = {"match_masks", "check_ids", "choose_leaves", "recut_masks", "list_doubts"}  # of stages, not public
+    inner = {"match_masks", "check_ids", "choose_leaves", "snap_masks", "list_doubts"}  # of stages, not public
     assert STEPS.keys() - inner | ELSEWHERE | WITHOUT_TENSORS | MAKERS == set(mvseg.__all__)
 
 

@@ -23,7 +23,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
 from mvseg.verification.choose import choose_leaves
-from mvseg.verification.recut import recut_masks
+from mvseg.verification.snap_edges import snap_masks
 
 
 class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
@@ -129,7 +129,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     def find_regions(
         self, images: Iterable[Tensor], cameras: Cameras, *, progress: bool = False
     ) -> Matching:
-        """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time, masks as crops.
+        """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time (with
+        `verify`, the others as bytes), masks as crops.
 
         Args:
             images: V tensors (3, H, W) in [0, 1] on the detector's device, e.g. from a generator.
@@ -143,9 +144,11 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         Raises:
             InputError: as `forward`.
         """
-        detections, sizes = [], []
+        detections, sizes, photos = [], [], []
         for image in images:
             detections.append(self.detect(image))
+            if self.verify:
+                photos.append((255 * image.clamp(0, 1)).round().byte().permute(1, 2, 0).cpu().numpy())
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
         if not self.verify:
@@ -156,7 +159,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         leaves = choose_leaves(
             matching.masks, list_proposals(detections, posed), cameras=posed, more=match(min_score=MORE_SCORE).masks
         )
-        return matching.with_masks(recut_masks(leaves.masks, leaves.surfaces, cameras=posed))
+        return matching.with_masks(snap_masks(leaves.masks, photos.__getitem__))
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:

@@ -27,13 +27,12 @@ from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, mask_box, stack_regions
 from mvseg.scene import Cameras
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
-from mvseg.verification.recut import AGREES, agreement
 from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
-from mvseg.verification.visible_leaves import VisibleLeaf
 
 Photos = Callable[[int], NDArray[np.uint8]]
 Frame = NDArray[np.bool_]
 
+AGREES = 0.5  # IoU of a mask with what its view shows of a surface, from which they show the same leaf
 LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this share of it is unhidden
 LEAST_PIXELS = 64  # and so many of its pixels
 LEAST_COLORED = 0.8  # the visible part of a surface becomes a mask if this share of it has the colour of leaves
@@ -139,11 +138,11 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         is_open = size >= max(LEAST_PIXELS, LEAST_VISIBLE * int(covered.sum()))
         if not is_open or int(leaf_colored.sum()) < LEAST_COLORED * size:
             continue
-        shown = VisibleLeaf(instance=leaf, box=(x1, y1, x2, y2), mask=visible, covered=covered, share=1.0)
+        frame = np.zeros_like(colored[view])
+        frame[y1:y2, x1:x2] = visible
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
         fits = {
-            row: agreement(tuple(masks.regions.boxes[row].tolist()), masks.regions.crop(row).numpy(), shown)
-            for row in free
+            row: _iou(masks.regions.boxes[row].tolist(), masks.regions.crop(row).numpy(), frame) for row in free
         }
         best = max(fits, key=lambda row: fits[row], default=-1)
         if best >= 0 and fits[best] >= AGREES:
@@ -162,6 +161,13 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         detection_scores=torch.where(is_new, torch.nan, more.detection_scores),
         origin=torch.where(is_new, int(Origin.OTHER_VIEWS), more.origin),
     )
+
+
+def _iou(box: list[int], mask: Frame, frame: Frame) -> float:
+    """Of a mask in its box (x1, y1, x2, y2) with one in the whole frame."""
+    x1, y1, x2, y2 = box
+    both = int((mask & frame[y1:y2, x1:x2]).sum())
+    return both / max(int(mask.sum()) + int(frame.sum()) - both, 1)
 
 
 def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Frame:

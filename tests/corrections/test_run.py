@@ -24,7 +24,6 @@ from mvseg.results.folder import write_refined
 from mvseg.results.result import Result
 from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
-from mvseg.verification.recut import recut_masks
 from scene_folders import write_scene
 from three_leaves import CAMERAS, LEAVES, true_maps
 
@@ -143,7 +142,7 @@ def test_no_later_stage_changes_or_drops_a_corrected_mask(origin: Origin) -> Non
 
 
 @pytest.mark.parametrize("origin", [Origin.DETECTED, *CORRECTED])
-def test_surfaces_neither_move_nor_cut_a_corrected_mask(origin: Origin) -> None:
+def test_surfaces_do_not_move_a_corrected_mask(origin: Origin) -> None:
     regions, ids = as_regions(true_maps())
     wrong = ids.clone()
     row = int(((regions.view_index == 2) & (ids == 1)).nonzero()[0, 0])
@@ -151,13 +150,6 @@ def test_surfaces_neither_move_nor_cut_a_corrected_mask(origin: Origin) -> None:
     masks = Masks.of(regions, wrong, torch.full((len(ids),), 0.9), origin=Origin.DETECTED)
     masks.origin[row] = origin
     assert int(check_ids(masks, LEAVES, cameras=CAMERAS).instance_ids[row]) == (2 if origin in CORRECTED else 1)
-    larger = [np.where(labels == 1, 0, labels) for labels in true_maps()]
-    pairs = zip(larger, true_maps(), strict=True)
-    shifted = [np.where((other == 0) & (np.roll(labels, 3, 1) == 1), 1, other) for other, labels in pairs]
-    regions, ids = as_regions(shifted)
-    masks = Masks.of(regions, ids, origin=origin)
-    recut = recut_masks(masks, LEAVES, cameras=CAMERAS)
-    assert torch.equal(recut.regions.boxes, masks.regions.boxes) == (origin in CORRECTED)
 
 
 @pytest.mark.slow
