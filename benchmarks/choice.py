@@ -6,8 +6,8 @@ candidates, and which masks show which true leaf. The numbers of `mvseg/verifica
 maximum likelihood (a small ridge), in three rounds, since the features of a candidate depend on what was chosen before
 it. With `--leave_out` the plants are parted in four, and each scene is judged by numbers that were fitted on the other
 three parts (scenes whose names share what stands behind the last "-" are one plant). Per scene: MV-PQ of what was
-chosen, before and after `snap_masks`; its ceilings (before it), the best proposal of each true mask that scores 0.3, 0.1 or 0.05 and has an IoU
-above one half, with the right id. In the end: how often candidates of each P are right.
+chosen, before and after `snap_masks`; its ceilings (before it), the best proposal of each true mask that scores 0.3,
+0.1 or 0.05 and has an IoU above one half, with the right id. In the end: how often candidates of each P are right.
 """
 
 from __future__ import annotations
@@ -218,7 +218,8 @@ def main() -> None:
             for out in range(PARTS)
         ]
         numbers = {plant: of_part[number] for plant, number in part.items()}
-    print(f"{'scene':30}{'MV-PQ':>8}{'snapped':>8}{'right':>7}{'false':>7}" + "".join(f"{score:>8}" for score in SCORES))
+    names = "".join(f"{name:>8}" for name in ("MV-PQ", "snapped", "right", "false", *SCORES))
+    print(f"{'scene':30}{names}")
     samples = []
     for plant, each in zip(plants, studies, strict=True):
         chosen = choose(each.candidates, each.table, drawn=each.drawn, fitted=numbers[plant])
@@ -229,7 +230,8 @@ def main() -> None:
             for masks in (masks, snap_masks(masks, each.photos))
         )
         ceilings = "".join(f"{ceiling(each, least):8.3f}" for least in SCORES)
-        print(f"{each.name:30}{before.mv_pq:8.3f}{score.mv_pq:8.3f}{score.num_right:7}{score.num_false:7}{ceilings}", flush=True)
+        counts = f"{score.num_right:8}{score.num_false:8}"
+        print(f"{each.name:30}{before.mv_pq:8.3f}{score.mv_pq:8.3f}{counts}{ceilings}", flush=True)
         samples += leaf_samples(each, each.candidates, numbers[plant])
     chances, is_right = np.array([each[3] for each in samples]), np.array([each[2] for each in samples])
     for low, high in pairwise(BINS):
