@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from blade_scene import SIZE, ring_cameras
+from blade_scene import ring_cameras
 from known_leaves import flat_leaf
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.verification.visible_leaves import visible_leaves
+from mvseg.verification.evidence import paint_view
 
 CAMERAS = ring_cameras(6, elevations_deg=(35, 60, 45))
 LEAVES = {
@@ -19,11 +19,4 @@ LEAVES = {
 
 def true_maps(leaves: dict[int, LeafSurface] = LEAVES) -> list[np.ndarray]:
     """V label maps of the leaves."""
-    maps = []
-    for view in range(len(CAMERAS)):
-        labels = np.zeros((SIZE, SIZE), np.int64)
-        for leaf in visible_leaves(leaves, CAMERAS, view):
-            x1, y1, x2, y2 = leaf.box
-            labels[y1:y2, x1:x2][leaf.mask] = leaf.instance
-        maps.append(labels)
-    return maps
+    return [paint_view(leaves, CAMERAS, view) for view in range(len(CAMERAS))]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -10,14 +10,13 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import find_objects
 
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.checked_ids import match_surfaces
 from mvseg.verification.choose import LEAST_VIEWS, LeftOut
-from mvseg.verification.evidence import SHARED
-from mvseg.verification.visible_leaves import VisibleLeaf, visible_leaves
+from mvseg.verification.evidence import SHARED, Evidence, Ints, Shown, paint_view
 
 Bools = NDArray[np.bool_]
 
@@ -81,13 +80,13 @@ def list_doubts(
     masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
     found = _doubt_matches(masks)
     should = np.zeros((masks.num_instances + 1, masks.regions.num_views), bool)
-    ious = match_surfaces(masks.regions, known, cameras=cameras)[0] if known else np.zeros((0, 0))
+    evidence = Shown.of(masks.regions, known, cameras).compare(known)
     free: list[list[int]] = [[] for _ in left]  # rows of each candidate's masks where none of the result lies
     for view, size in enumerate(cameras.sizes.tolist() if known or left else ()):
         taken = masks.regions.label_map(view, torch.ones_like(masks.instance_ids), size).numpy() > 0
         if known:
-            leaves = visible_leaves(known, cameras, view)
-            found += _doubt_view(masks, leaves, should, view=view, taken=taken, ious=ious)
+            painted = paint_view(known, cameras, view)
+            found += _doubt_view(masks, painted, should, view=view, taken=taken, evidence=evidence)
         for rows, candidate in zip(free, left, strict=True):
             rows += _free_rows(candidate.masks, view, taken)
     found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
@@ -166,33 +165,33 @@ def _doubt_left(left: Sequence[LeftOut], free: Sequence[Sequence[int]], *, usual
 
 
 def _doubt_view(
-    masks: Masks, leaves: Iterable[VisibleLeaf], should: Bools, *, view: int, taken: Bools, ious: NDArray[np.float64]
+    masks: Masks, painted: Ints, should: Bools, *, view: int, taken: Bools, evidence: Evidence
 ) -> list[Doubt]:
     """What one view should show of leaves and does not.
 
-    `should` (K + 1, V) gets True where it should show one; `taken` (H, W) is True in masks, `ious` as from
-    `match_surfaces`.
+    `should` (K + 1, V) gets True where it should show one; `painted` (H, W) is from `paint_view`, `taken` (H, W) is
+    True in masks, the columns of `evidence` are ids.
     """
     members = ((masks.view_index == view) & (masks.regions.areas > 0)).nonzero()[:, 0].tolist()
     here = {int(masks.instance_ids[row]) for row in members}
     found = []
-    for leaf in leaves:
-        if leaf.share < OPEN or leaf.mask.sum() < OPEN_PIXELS or leaf.instance >= len(should):
+    for instance, box in enumerate(find_objects(painted, max_label=len(should) - 1), 1):
+        if box is None:
             continue
-        should[leaf.instance, view] = True
-        if leaf.instance in here:
+        mask, share = painted[box] == instance, float(evidence.share[view, instance])
+        if share < OPEN or mask.sum() < OPEN_PIXELS:
             continue
-        x1, y1, x2, y2 = leaf.box
-        empty = float((leaf.mask & ~taken[y1:y2, x1:x2]).sum() / leaf.mask.sum())
-        nearest = max(members, key=lambda row: ious[row, leaf.instance], default=-1)
-        if nearest >= 0 and ious[nearest, leaf.instance] >= SIMILAR:
-            doubt = COVERED * min(1.0, float(ious[nearest, leaf.instance]) / 0.8)
-            found.append(Doubt("covered", doubt, view, leaf.instance, region=nearest))
+        should[instance, view] = True
+        if instance in here:
+            continue
+        empty = float((mask & ~taken[box]).sum() / mask.sum())
+        nearest = max(members, key=lambda row: evidence.visible[row, instance], default=-1)
+        if nearest >= 0 and evidence.visible[nearest, instance] >= SIMILAR:
+            doubt = COVERED * min(1.0, float(evidence.visible[nearest, instance]) / 0.8)
+            found.append(Doubt("covered", doubt, view, instance, region=nearest))
         elif empty >= EMPTY:
-            doubt = MISSING * empty * leaf.share
-            found.append(
-                Doubt("missing", doubt, view, leaf.instance, outlines=((view, _outline(leaf.mask, leaf.box[:2])),))
-            )
+            outlines = ((view, _outline(mask, (box[1].start, box[0].start))),)
+            found.append(Doubt("missing", MISSING * empty * share, view, instance, outlines=outlines))
     return found
 
 

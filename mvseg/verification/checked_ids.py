@@ -13,7 +13,6 @@ from dataclasses import replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
@@ -26,11 +25,9 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.verification.evidence import Bools, Ints, Shown, paint_view
 from mvseg.verification.rematched_masks import rematch_misfits
-from mvseg.verification.visible_leaves import visible_leaves
 
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 Surfaces = Mapping[int, LeafSurface]
 
 ENOUGH_VIEWS = 5  # with fewer, a surface fits wrong masks about as well as right ones: sure ids stay
@@ -75,36 +72,29 @@ def check_ids(
         that were matched once more have that score. Instances that lost all their masks leave gaps between the ids.
     """
     on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
-    old = masks.instance_ids.cpu().numpy()
+    old, shown = masks.instance_ids.cpu().numpy(), Shown.of(on_cpu, surfaces, cameras)
     is_held = _is_held(masks, held)
     if masks.regions.num_views < ENOUGH_VIEWS:
         is_held |= (masks.match_scores >= SURE).cpu().numpy()
-    ids, left = _move_to_surfaces(masks, surfaces, cameras=cameras, is_held=is_held)
+    ids = np.where(is_held, old, move_pieces(on_cpu, old, shown))
+    left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
+    ids = np.where(is_held, old, move_misfits(on_cpu, ids, shown))
     certain = {*old[is_held].tolist()}
     ids = join_halves(on_cpu, ids, {k: each for k, each in left.items() if k not in certain}, cameras=cameras)
     checked = _with_ids(masks, ids)
     known = unchanged_surfaces(masks, checked, left)
-    checked = rematch_misfits(checked, known, cameras=cameras, held=torch.from_numpy(is_held), config=config)
+    free = torch.from_numpy(~is_held)
+    checked = rematch_misfits(checked, known, shown=shown, cameras=cameras, free=free, config=config)
     ids = checked.instance_ids.cpu().numpy()
     merged = {each.region: each for each in checked.merged}
-    shared = find_shared(on_cpu, ids, left, cameras=cameras, named=list(merged.values()))
+    shared = find_shared(on_cpu, ids, left, shown=shown, cameras=cameras, named=list(merged.values()))
     merged |= {each.region: each for each in shared}
     return checked.with_merged(merged.values())
 
 
-def _is_held(masks: Masks, held: Tensor | None) -> NDArray[np.bool_]:
-    is_held: NDArray[np.bool_] = (masks.is_corrected if held is None else masks.is_corrected | held).cpu().numpy()
+def _is_held(masks: Masks, held: Tensor | None) -> Bools:
+    is_held: Bools = (masks.is_corrected if held is None else masks.is_corrected | held).cpu().numpy()
     return is_held
-
-
-def _move_to_surfaces(
-    masks: Masks, surfaces: Surfaces, *, cameras: Cameras, is_held: NDArray[np.bool_]
-) -> tuple[Ints, Surfaces]:
-    """(D,) ids after the pieces and the misfits moved, and the surfaces of the instances that had masks in between."""
-    regions, old = masks.regions.to("cpu"), masks.instance_ids.cpu().numpy()
-    ids = np.where(is_held, old, move_pieces(regions, old, surfaces, cameras=cameras))
-    left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
-    return np.where(is_held, old, move_misfits(regions, ids, left, cameras=cameras)), left
 
 
 def _with_ids(masks: Masks, ids: Ints) -> Masks:
@@ -139,7 +129,7 @@ def unchanged_surfaces(before: Masks, after: Masks, surfaces: Surfaces) -> dict[
     return {instance: surface for instance, surface in surfaces.items() if is_same(instance)}
 
 
-def move_pieces(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
+def move_pieces(regions: Regions, ids: Ints, shown: Shown) -> Ints:
     """Masks of instances that are made of pieces of leaves get the ids of these leaves.
 
     Where leaves cross, each piece may have a mask of its own, and pieces found in several views form instances of their
@@ -150,17 +140,13 @@ def move_pieces(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     Args:
         regions: D regions on the CPU.
         ids: (D,) from 1 on; -1 = no instance.
-        surfaces: {instance id: surface}.
-        cameras: V cameras.
+        shown: what the views show of them and of the surfaces.
 
     Returns:
         (D,) ids.
     """
     few = _seen_rarely(regions, ids)
-    leaves = {instance: surface for instance, surface in surfaces.items() if instance not in few}
-    if not few or not leaves:
-        return ids
-    inside = match_surfaces(regions, leaves, cameras=cameras)[1]
+    inside = shown.compare(set(shown.instances.tolist()) - set(few)).inside
     is_inside = inside.max(1) >= INSIDE
     revised = ids.copy()
     for instance in few:
@@ -170,16 +156,16 @@ def move_pieces(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     return revised
 
 
-def move_misfits(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
+def move_misfits(regions: Regions, ids: Ints, shown: Shown) -> Ints:
     """Masks that do not fit their own surface, but another one, get its id; for the arguments see `move_pieces`.
 
     The IoU with the visible part of their own must be below `FITS`, that with the other at least `FITS`, and no other
     mask of the view may fit that one as well. Two masks with each other's ids are swapped so. A mask that is already
     there and fits worse stays.
     """
-    ious = match_surfaces(regions, surfaces, cameras=cameras)[0]
-    every = np.arange(len(ids))
-    own_column = np.where(np.isin(ids, list(surfaces)), ids, 0)
+    present = set(ids.tolist()) & set(shown.instances.tolist())
+    ious, every = shown.compare(present).visible, np.arange(len(ids))
+    own_column = np.where(np.isin(ids, list(present)), ids, 0)
     best = ious.argmax(1)
     best_iou, own_iou = ious[every, best], ious[every, own_column]
     wants = np.flatnonzero((own_iou < FITS) & (best_iou >= FITS))
@@ -271,7 +257,7 @@ def _outline_px(surface: LeafSurface) -> float:
 
 
 def find_shared(
-    regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras, named: Iterable[MergedMask] = ()
+    regions: Regions, ids: Ints, surfaces: Surfaces, *, shown: Shown, cameras: Cameras, named: Iterable[MergedMask] = ()
 ) -> list[MergedMask]:
     """Masks that two surfaces explain in disjoint parts: their own, and of all others the one that explains most.
 
@@ -280,7 +266,7 @@ def find_shared(
     second part is what is nearer to what is seen of the second surface than to what is seen of the first. For the other
     arguments see `move_pieces`.
     """
-    inside, every = match_surfaces(regions, surfaces, cameras=cameras)[1], np.arange(len(ids))
+    inside, every = shown.compare(surfaces).inside, np.arange(len(ids))
     own = np.where(np.isin(ids, list(surfaces)), ids, 0)
     by_own = inside[every, own]
     inside[every, own] = 0
@@ -290,48 +276,14 @@ def find_shared(
     shared = []
     views = regions.view_index.numpy()
     for view in np.unique(views[is_explained]).tolist():
-        shown = _draw(surfaces, cameras, view)
+        painted = paint_view(surfaces, cameras, view)
         for region in np.flatnonzero(is_explained & (views == view)).tolist():
             pair = int(own[region]), int(second[region])
             x1, y1, x2, y2 = regions.boxes[region].tolist()
             mask = regions.crop(region).numpy()
-            seen = np.where(mask, shown[y1:y2, x1:x2], 0)
-            if (region, *pair) in pairs or (seen == pair[1]).sum() >= MOST * (shown == pair[1]).sum():
+            seen = np.where(mask, painted[y1:y2, x1:x2], 0)
+            if (region, *pair) in pairs or (seen == pair[1]).sum() >= MOST * (painted == pair[1]).sum():
                 to_first, to_second = (distance_transform_edt(seen != instance) for instance in pair)
                 part = torch.from_numpy(mask & (to_second < to_first))
                 shared.append(MergedMask(region=region, own=pair[0], other=pair[1], part=part))
     return shared
-
-
-def match_surfaces(regions: Regions, surfaces: Surfaces, *, cameras: Cameras) -> tuple[Floats, Floats]:
-    """How well masks fit surfaces.
-
-    Nearer surfaces hide others; those that are not credible show and hide nothing.
-
-    Returns:
-        (D, 1 + highest instance id) IoU of each region with what its view shows of each surface, in the column of its
-        instance; 0 where that is nothing, and in column 0. And the share of the region that lies in it, likewise.
-    """
-    columns = max(surfaces, default=0) + 1
-    ious, inside = np.zeros((len(regions), columns)), np.zeros((len(regions), columns))
-    for view in range(len(cameras)):
-        shown = _draw(surfaces, cameras, view)
-        sizes = np.bincount(shown.ravel(), minlength=columns)
-        for region in (regions.view_index == view).nonzero()[:, 0].tolist():
-            x1, y1, x2, y2 = regions.boxes[region].tolist()
-            covered = shown[y1:y2, x1:x2][regions.crop(region).numpy()]
-            common = np.bincount(covered, minlength=columns)
-            ious[region] = common / np.maximum(sizes + len(covered) - common, 1)
-            inside[region] = common / max(len(covered), 1)
-    ious[:, 0] = inside[:, 0] = 0
-    return ious, inside
-
-
-def _draw(surfaces: Surfaces, cameras: Cameras, view: int) -> Ints:
-    """(H, W) the instance whose surface each pixel of a view shows, 0 = none."""
-    width, height = cameras.sizes[view].tolist()
-    shown = np.zeros((height, width), np.int64)
-    for leaf in visible_leaves(surfaces, cameras, view):
-        x1, y1, x2, y2 = leaf.box
-        shown[y1:y2, x1:x2][leaf.mask] = leaf.instance
-    return shown

@@ -1,11 +1,14 @@
 """How well masks show surfaces: everything of a view drawn once, nearest first. Not in the paper.
 
+A surface is nearer than another as a whole, by the depth of its middle: where two leaves hide parts of each other, one
+of them is drawn wrong. Stems and pots hide nothing here. What lies behind the camera or beside the photo shows nothing.
+
 Large photos are compared at every second, third ... pixel: leaves that matter are many pixels wide all the same.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -64,18 +67,19 @@ class Evidence:
         visible: (D, K) IoU with the part that nothing nearer hides.
         claimed: (D, K) the same, where of the hidden part that counts as visible which the mask itself shows: photos
             know better what lies in front.
+        inside: (D, K) share of the mask that lies in the part that nothing nearer hides.
         share: (V, K) of what the view shows of the surface, that nothing hides; 0 where it shows nothing.
     """
 
     visible: Floats
     claimed: Floats
+    inside: Floats
     share: Floats
 
 
 def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> tuple[Drawn, ...]:
     """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out."""
-    drawn = []
-    middles = [None if each is None else each.points().reshape(-1, 3).mean(0, keepdim=True) for each in surfaces]
+    drawn, all_depths = [], _depths(surfaces, cameras)
     nothing: Placed = (0, 0, 0, 0), np.zeros((0, 0), bool)
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         step = -(-max(width, height) // MOST_PX)
@@ -83,10 +87,31 @@ def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras
         camera, rows = cameras[[view]], (regions.view_index == view).nonzero()[:, 0].numpy()
         masks: list[Placed] = [(tuple(regions.boxes[row].tolist()), regions.crop(row).numpy()) for row in rows.tolist()]
         parts = [nothing if each is None else each.project_parts(camera)[0] for each in surfaces]
-        depth = [np.inf if each is None else float(camera.project(each)[1][0, 0]) for each in middles]
         pixels, covered = _columns(masks, size, step), _columns(parts, size, step)
-        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=np.array(depth)))
+        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view]))
     return tuple(drawn)
+
+
+def _depths(surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> Floats:
+    """(V, K) of the middles of surfaces, world units; infinite without one."""
+    depths = np.full((len(cameras), len(surfaces)), np.inf)
+    for index, each in enumerate(surfaces):
+        if each is not None:
+            depths[:, index] = cameras.project(each.points().reshape(-1, 3).mean(0, keepdim=True))[1][:, 0].numpy()
+    return depths
+
+
+def paint_view(surfaces: Mapping[int, LeafSurface], cameras: Cameras, view: int) -> Ints:
+    """(H, W), at full size, the instance whose surface each pixel of a view shows, 0 = none. Surfaces that are not
+    credible show and hide nothing."""
+    width, height = cameras.sizes[view].tolist()
+    camera, shown = cameras[[view]].to("cpu"), np.zeros((height, width), np.int64)
+    credible = {instance: each for instance, each in surfaces.items() if each.is_credible}
+    names, parts = list(credible), list(credible.values())
+    for index in np.argsort(_depths(parts, camera)[0], kind="stable")[::-1].tolist():  # the farthest first
+        (x1, y1, x2, y2), covered = parts[index].project_parts(camera)[0]
+        shown[y1:y2, x1:x2][covered] = names[index]
+    return shown
 
 
 def _columns(placed: Sequence[Placed], size: tuple[int, int], step: int) -> csc_array:
@@ -104,15 +129,17 @@ def _columns(placed: Sequence[Placed], size: tuple[int, int], step: int) -> csc_
 def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
     """The evidence, where the surfaces `hides` (K,) hide what lies behind them, each as a whole, by its middle."""
     shape = num_masks, len(hides)
-    visible, claimed, share = np.zeros(shape), np.zeros(shape), np.zeros((len(drawn), len(hides)))
+    visible, claimed, inside = np.zeros((3, *shape))
+    share = np.zeros((len(drawn), len(hides)))
     for view, each in enumerate(drawn):
         seen = _unhidden(each, hides)
         sizes, areas = seen.sum(0), each.masks.sum(0)[:, None]
         with_seen = (each.masks.T @ seen).toarray()
         either = np.maximum(areas + sizes - with_seen, 1)
         visible[each.rows], claimed[each.rows] = with_seen / either, each.common / either
+        inside[each.rows] = with_seen / np.maximum(areas, 1)
         share[view] = sizes / np.maximum(each.parts.sum(0), 1)
-    return Evidence(visible=visible, claimed=claimed, share=share)
+    return Evidence(visible=visible, claimed=claimed, inside=inside, share=share)
 
 
 def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
@@ -125,3 +152,42 @@ def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
         if hides[index]:
             taken[parts.indices[span]] = True
     return csc_array((kept, parts.indices, parts.indptr), shape=parts.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class Shown:
+    """What V views show of D masks and K surfaces.
+
+    Attributes:
+        drawn: of V views.
+        instances: (K,) int64, the ids of the surfaces.
+        is_credible: (K,) bool; the others show and hide nothing.
+    """
+
+    drawn: Sequence[Drawn]
+    instances: Ints
+    is_credible: Bools
+
+    @staticmethod
+    def of(regions: Regions, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Shown:
+        there = {instance: each for instance, each in surfaces.items() if each.exists}
+        is_credible = np.array([each.is_credible for each in there.values()], bool)
+        return Shown(draw_views(regions, list(there.values()), cameras), np.array(list(there), np.int64), is_credible)
+
+    def compare(self, among: Iterable[int], *, hide: bool = True) -> Evidence:
+        """The evidence if there were only the surfaces of some instances.
+
+        Args:
+            among: their ids; those without a surface do not matter.
+            hide: nearer ones hide others, and those that are not credible count for nothing; False: nothing is hidden.
+
+        Returns:
+            The columns are instance ids, from 0 on; 0 where there is nothing, and in column 0.
+        """
+        chosen = np.isin(self.instances, list(among)) & (self.is_credible | (not hide))
+        seen = see(self.drawn, sum(len(each.rows) for each in self.drawn), chosen & hide)
+        by_id = {}
+        for name, values in vars(seen).items():
+            by_id[name] = np.zeros((len(values), 1 + int(self.instances.max(initial=0))))
+            by_id[name][:, self.instances[chosen]] = values[:, chosen]
+        return Evidence(**by_id)

@@ -20,8 +20,8 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links
 from mvseg.matching.match import match_masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.verification.evidence import Shown
 
 INSIDE = 0.4  # of a mask, within the outline of its surface: with less of it, it shows something else
 FITS = 0.5  # IoU of the surface, fitted to it and to others, from which it shows that surface all the same
@@ -32,8 +32,9 @@ def rematch_misfits(
     masks: Masks,
     surfaces: Mapping[int, LeafSurface],
     *,
+    shown: Shown,
     cameras: Cameras,
-    held: Tensor,
+    free: Tensor,
     config: MatchConfig = MatchConfig(),
 ) -> Masks:
     """Take masks that do not show their own surface out of their instances, and match them and those without an id.
@@ -44,15 +45,16 @@ def rematch_misfits(
     Args:
         masks: D masks, matched by the method "nview": with any other, they stay as they are.
         surfaces: {instance id: surface} of the instances whose masks may be taken, fitted to just these masks.
+        shown: what the views show of the masks and of all surfaces.
         cameras: V cameras.
-        held: (D,) bool, masks that keep their ids.
+        free: (D,) bool; the others keep their ids.
         config: that the masks were matched with.
 
     Returns:
         The same masks. Those with another id have the score of the second matching, and are forgotten to be merged; new
         instances have the highest ids.
     """
-    is_misfit = find_misfits(masks, surfaces, cameras=cameras) & ~held.to(masks.view_index.device)
+    is_misfit = find_misfits(masks, surfaces, shown) & free.to(masks.view_index.device)
     if config.resolved_method != "nview" or not is_misfit.any():
         return masks
     with warnings.catch_warnings():
@@ -63,35 +65,22 @@ def rematch_misfits(
     return _with_found(masks, matching.masks, is_free=is_misfit | (masks.instance_ids < 0))
 
 
-def find_misfits(masks: Masks, surfaces: Mapping[int, LeafSurface], *, cameras: Cameras) -> Tensor:
+def find_misfits(masks: Masks, surfaces: Mapping[int, LeafSurface], shown: Shown) -> Tensor:
     """(D,) bool: masks that lie outside their own surface, that do not fit it either way, and that are not sure.
 
     For the arguments see `rematch_misfits`. Nothing hides anything here: a mask of a leaf that is half hidden lies
     within what can be seen of the leaf. The IoU is that of the fit (`LeafSurface.iou`), which knows of masks that are
     drawn too large or too small; 0 in views that the fit left out.
     """
-    regions, is_misfit = masks.regions.to("cpu"), torch.zeros(len(masks), dtype=torch.bool)
-    ids, views = masks.instance_ids.cpu(), regions.view_index
+    inside, is_misfit = shown.compare(surfaces, hide=False).inside, torch.zeros(len(masks), dtype=torch.bool)
+    ids, views = masks.instance_ids.cpu(), masks.view_index.tolist()
     for instance, surface in surfaces.items():
         if not surface.exists:
             continue
         ious = dict(zip(surface.views.tolist(), surface.iou.nan_to_num(0).tolist(), strict=True))
         for row in ((ids == instance) & (masks.match_scores.cpu() < SURE)).nonzero()[:, 0].tolist():
-            if ious.get(int(views[row]), 0.0) < FITS:
-                is_misfit[row] = _share_inside(regions, row, surface, cameras) < INSIDE
+            is_misfit[row] = bool(ious.get(views[row], 0.0) < FITS and inside[row, instance] < INSIDE)
     return is_misfit.to(masks.view_index.device)
-
-
-def _share_inside(regions: Regions, row: int, surface: LeafSurface, cameras: Cameras) -> float:
-    """Of one mask, what lies in the surface as its view would show it if nothing hid it."""
-    (x1, y1, x2, y2), part = surface.project_parts(cameras[[int(regions.view_index[row])]].to("cpu"))[0]
-    left, top, right, bottom = regions.boxes[row].tolist()
-    low, high = (max(x1, left), max(y1, top)), (min(x2, right), min(y2, bottom))
-    if low[0] >= high[0] or low[1] >= high[1]:
-        return 0.0
-    covered = torch.from_numpy(part[low[1] - y1 : high[1] - y1, low[0] - x1 : high[0] - x1])
-    mask = regions.crop(row)[low[1] - top : high[1] - top, low[0] - left : high[0] - left]
-    return int((mask & covered).sum()) / max(int(regions.areas[row]), 1)
 
 
 def _links(ids: Tensor, is_misfit: Tensor) -> Links:

@@ -13,7 +13,7 @@ from mvseg.reconstruction.surface.hull import Hull
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.surface.orientation import mirror_matrix, turn_matrix
 from mvseg.scene import Cameras
-from mvseg.verification.visible_leaves import visible_leaves
+from mvseg.verification.evidence import paint_view
 
 FLAT, BENT = EllipticBlade(), EllipticBlade(bend=0.9)
 CAMERAS = ring_cameras(10)
@@ -127,14 +127,10 @@ def test_a_rough_fit_is_the_first_of_two_and_nearly_as_good(bent: LeafSurface, m
 
 
 def test_known_surfaces_stay_and_the_others_are_fitted_beside_them(monkeypatch: pytest.MonkeyPatch) -> None:
-    cameras, maps = CAMERAS[[0, 2, 4, 6, 8]], []
+    cameras = CAMERAS[[0, 2, 4, 6, 8]]
     leaves = {1: flat_leaf(length=1.4, half_width=0.3, at=(-0.7, -0.2, 0.3)),
               2: flat_leaf(length=1.4, half_width=0.35, at=(-0.6, 0.1, 0.0))}  # fmt: skip
-    for view in range(len(cameras)):
-        maps.append(np.zeros((SIZE, SIZE), np.int64))
-        for leaf in visible_leaves(leaves, cameras, view):
-            x1, y1, x2, y2 = leaf.box
-            maps[-1][y1:y2, x1:x2][leaf.mask] = leaf.instance
+    maps = [paint_view(leaves, cameras, view) for view in range(len(cameras))]
     regions, ids = as_regions(maps)
     both = fit_surfaces(regions, ids, cameras)
     gone = LeafSurface.none(torch.arange(2), "a reason")

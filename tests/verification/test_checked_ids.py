@@ -21,10 +21,10 @@ from mvseg.regions import Regions
 from mvseg.verification.checked_ids import (
     check_ids,
     fits_as_well,
-    match_surfaces,
     touched_surface,
     unchanged_surfaces,
 )
+from mvseg.verification.evidence import Shown
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 
@@ -190,15 +190,15 @@ def test_the_order_of_masks_and_of_ids_does_not_matter() -> None:
 def test_shares_are_those_of_whole_frames(scene: tuple[Regions, Tensor]) -> None:
     """The same as counted on frames, mask by mask and leaf by leaf."""
     regions, _ = scene
-    ious, inside = match_surfaces(regions, LEAVES, cameras=CAMERAS)
+    found = Shown.of(regions, LEAVES, CAMERAS).compare(LEAVES)
     for view, labels in enumerate(true_maps()):
         for region in (regions.view_index == view).nonzero()[:, 0].tolist():
             mask = regions.mask(region, SIZE, SIZE).numpy()
             for leaf in LEAVES:
                 both = (mask & (labels == leaf)).sum()
-                assert ious[region, leaf] == pytest.approx(both / (mask | (labels == leaf)).sum())
-                assert inside[region, leaf] == pytest.approx(both / mask.sum())
-    assert not ious[:, 0].any()
+                assert found.visible[region, leaf] == pytest.approx(both / (mask | (labels == leaf)).sum())
+                assert found.inside[region, leaf] == pytest.approx(both / mask.sum())
+    assert not found.visible[:, 0].any()
 
 
 def test_without_surfaces_or_masks_nothing_happens(scene: tuple[Regions, Tensor]) -> None:

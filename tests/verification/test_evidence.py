@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from blade_scene import SIZE, as_regions
+from known_leaves import flat_leaf
 from mvseg.verification import evidence
-from mvseg.verification.evidence import draw_views, see
+from mvseg.verification.evidence import Shown, draw_views, paint_view, see
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 MAPS = true_maps()
@@ -62,3 +65,38 @@ def test_nothing_to_compare() -> None:
     assert nothing.visible.shape == (len(REGIONS), 0)
     empty = REGIONS.select(torch.zeros(0, dtype=torch.int64))
     assert see(draw_views(empty, SURFACES, CAMERAS), 0, np.zeros(4, bool)).share.shape == (len(CAMERAS), 4)
+
+
+def test_photos_are_painted_with_the_nearest_surface() -> None:
+    """Those that are not credible, or not in the photo, are left out."""
+    doubtful = replace(LEAVES[1], iou=torch.full_like(LEAVES[1].iou, 0.3))
+    beside = flat_leaf(length=1.6, half_width=0.5, at=(50, 0, 0))
+    surfaces = {5: LEAVES[1], 7: LEAVES[2], 8: doubtful, 9: beside}
+    _, seen = frames(np.array([True, False, True, False]))
+    for view in range(len(CAMERAS)):
+        painted = paint_view(surfaces, CAMERAS, view)
+        np.testing.assert_array_equal(painted == 5, seen[view, 0])
+        np.testing.assert_array_equal(painted == 7, seen[view, 2])
+        assert set(np.unique(painted).tolist()) <= {0, 5, 7}
+    assert not paint_view({}, CAMERAS, 0).any()
+
+
+def test_some_instances_among_others() -> None:
+    """In the columns of their ids; a surface that is not credible shows itself where nothing hides anything."""
+    doubtful = replace(LEAVES[3], iou=torch.full_like(LEAVES[3].iou, 0.3))
+    shown = Shown.of(REGIONS, {4: LEAVES[1], 2: LEAVES[2], 6: doubtful}, CAMERAS)
+    surfaces = [LEAVES[1], LEAVES[2], LEAVES[3]]
+    expected = see(draw_views(REGIONS, surfaces, CAMERAS), len(REGIONS), np.array([True, True, False]))
+    both = shown.compare([2, 4, 6, 9])
+    np.testing.assert_array_equal(both.visible[:, [4, 2]], expected.visible[:, :2])
+    np.testing.assert_array_equal(both.share[:, [4, 2]], expected.share[:, :2])
+    assert not both.inside[:, [0, 1, 3, 5, 6]].any()
+    alone = shown.compare([2])
+    assert not alone.visible[:, 4].any()
+    assert (alone.inside[:, 2] >= both.inside[:, 2]).all()
+    assert (alone.share[:, 2] == (both.share[:, 2] > 0)).all()
+    assert both.share[:, 2].min() < 1
+    np.testing.assert_array_equal(
+        shown.compare([6], hide=False).inside[:, 6],
+        see(draw_views(REGIONS, surfaces, CAMERAS), len(REGIONS), np.zeros(3, bool)).inside[:, 2],
+    )

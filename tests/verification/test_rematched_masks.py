@@ -16,6 +16,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.verification.checked_ids import check_ids
+from mvseg.verification.evidence import Shown
 from mvseg.verification.rematched_masks import find_misfits, rematch_misfits
 from three_leaves import CAMERAS, LEAVES, true_maps
 
@@ -49,8 +50,13 @@ def unsure(regions: Regions, ids: Tensor, rows: Tensor) -> Masks:
 
 
 def rematch(masks: Masks, *, held: Tensor = NOBODY, config: MatchConfig = MatchConfig()) -> Masks:
-    held = held if len(held) else torch.zeros(len(masks), dtype=torch.bool)
-    return rematch_misfits(masks, SURFACES, cameras=CAMERAS, held=held, config=config)
+    free = ~held if len(held) else torch.ones(len(masks), dtype=torch.bool)
+    shown = Shown.of(masks.regions, SURFACES, CAMERAS)
+    return rematch_misfits(masks, SURFACES, shown=shown, cameras=CAMERAS, free=free, config=config)
+
+
+def misfits(masks: Masks, surfaces: dict[int, LeafSurface]) -> Tensor:
+    return find_misfits(masks, surfaces, Shown.of(masks.regions, surfaces, CAMERAS))
 
 
 def test_the_masks_of_a_scattered_leaf_find_each_other(scattered: tuple[Regions, Tensor, Tensor]) -> None:
@@ -59,7 +65,7 @@ def test_the_masks_of_a_scattered_leaf_find_each_other(scattered: tuple[Regions,
     rows = is_second.nonzero()[:, 0].tolist()
     merged = [MergedMask(region=rows[0], own=1, other=3, part=regions.crop(rows[0]))]
     masks = unsure(regions, ids, is_second).with_merged(merged)
-    assert torch.equal(find_misfits(masks, SURFACES, cameras=CAMERAS), is_second)
+    assert torch.equal(misfits(masks, SURFACES), is_second)
     found = rematch(masks)
     assert torch.equal(found.instance_ids, torch.where(is_second, 4, ids))
     assert torch.equal(found.match_scores[~is_second], masks.match_scores[~is_second])
@@ -78,8 +84,8 @@ def test_other_masks_stay(scattered: tuple[Regions, Tensor, Tensor], reason: str
     masks = unsure(regions, ids, is_second & (reason != "sure"))
     surfaces = {"fits": LEAVES, "no surface": {1: LeafSurface.none(torch.arange(6), "a test")}}.get(reason, SURFACES)
     config = MatchConfig(num_instances=3) if reason == "another method" else MatchConfig()
-    held = is_second & (reason == "held")
-    found = rematch_misfits(masks, surfaces, cameras=CAMERAS, held=held, config=config)
+    free, shown = ~is_second | (reason != "held"), Shown.of(regions, surfaces, CAMERAS)
+    found = rematch_misfits(masks, surfaces, shown=shown, cameras=CAMERAS, free=free, config=config)
     assert found is masks
 
 
@@ -93,7 +99,7 @@ def test_a_mask_joins_the_leaf_that_it_shows_or_stays() -> None:
     is_wrong = (leaves == 13) | ((leaves == 2) & (regions.view_index == 0))
     ids = torch.where(leaves == 13, 3, torch.where(is_wrong, 1, leaves))
     masks = unsure(regions, ids, is_wrong)
-    assert torch.equal(find_misfits(masks, SURFACES, cameras=CAMERAS), is_wrong)
+    assert torch.equal(misfits(masks, SURFACES), is_wrong)
     found = rematch(masks)
     assert torch.equal(found.instance_ids, torch.where(leaves == 13, 3, leaves))
     assert found.match_scores[leaves == 13].tolist() == [0.5]
@@ -111,4 +117,4 @@ def test_what_lies_inside_is_counted_as_on_whole_frames(shift: int) -> None:
     for row, view in enumerate(views):
         mask = regions.mask(row, SIZE, SIZE).numpy()
         shares.append((mask & (maps[view] == 1)).sum() / mask.sum())
-    assert find_misfits(masks, surfaces, cameras=CAMERAS).tolist() == [share < 0.4 for share in shares]
+    assert misfits(masks, surfaces).tolist() == [share < 0.4 for share in shares]
