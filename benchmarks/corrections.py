@@ -103,8 +103,13 @@ def list_cases(args: argparse.Namespace) -> Iterator[Case]:
         yield degraded_case(spec, args.cache)
     folders = [render(spec, args.cache) for spec in chosen_scenes(args)] if "detected" in args.masks else []
     for folder in [*folders, *args.scenes]:
-        state = detect(load(folder, None, RunConfig(), cache=args.cache / "kept" / folder.name))
-        yield Case(f"detected_{folder.name}", state, true_maps(folder, state.scene), has_masks=False)
+        yield detect_case(folder, RunConfig(), cache=args.cache / "kept" / folder.name)
+
+
+def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -> Case:
+    """A scene whose leaves the detector finds."""
+    state = detect(load(folder, None, config, cache=cache))
+    return Case(f"detected_{folder.name}", state, true_maps(folder, state.scene), has_masks=False)
 
 
 def degraded_case(spec: SceneSpec, cache: Path) -> Case:

@@ -1,9 +1,9 @@
 """Simulated plants as unruly as real ones: `python benchmarks/unruly_plants.py OUT [SKINS]`.
 
 Blades are curled and wavy, plants wild (`make_wild`), leaves move from photo to photo as in a draught, and the poses
-that the scene states are wrong by about 1.5 px. Four plants with truth, to
-judge on them what is chosen for real plants; and, with SKINS, a folder of leaves that were cut out, twelve more that
-look like other species (`dress`).
+that the scene states are wrong by about 1.5 px. Four plants with truth, to judge on them what is chosen for real plants; and,
+with SKINS, a folder of leaves that were cut out, twelve more that look like other species (`dress`), and four of these
+seen from so near that leaves fill the photos, as somebody with a phone does.
 """
 
 from __future__ import annotations
@@ -36,6 +36,10 @@ DRESSED = (
     ("leggy", 10, 12, 85), ("rosette", 14, 10, 86), ("lobed", 10, 10, 87), ("compound", 16, 10, 88),
     ("strap", 12, 10, 89), ("ovate", 32, 10, 90), ("lanceolate", 12, 8, 91), ("leggy", 16, 12, 92),
 )  # fmt: skip
+CLOSE = (
+    ("ovate", 20, 14, 181), ("lanceolate", 18, 14, 182), ("rosette", 16, 12, 186), ("lobed", 12, 12, 187),
+)  # fmt: skip
+ZOOM = 2.2  # of these, over the focal length that fills the photo with the plant
 SIZE = 800
 CURL, WAVE = 0.7, 0.035  # radians from midrib to edge; of a leaf's length
 SWAY_DEG = 1.2  # from photo to photo: some 2 px at the tip of a leaf of 100 px
@@ -78,13 +82,23 @@ def shake_poses(cameras: Cameras, rng: np.random.Generator) -> Cameras:
 
 
 def write_unruly(
-    folder: Path, family: str, num_leaves: int, *, num_views: int, seed: int, skins: tuple[Floats, ...] = ()
+    folder: Path,
+    family: str,
+    num_leaves: int,
+    *,
+    num_views: int,
+    seed: int,
+    skins: tuple[Floats, ...] = (),
+    zoom: float = 1.0,
 ) -> None:
     """A scene as `mvseg simulate` writes it, without leaf meshes: no one shape is the truth of all photos."""
     plant, rng = make_unruly(grow_plant(family, num_leaves, seed), seed), np.random.default_rng([seed, 4])
     cameras = arc_cameras(
         num_views, plant, span_deg=360, start_deg=seed, elevations_deg=(15.0, 45.0, 30.0), width=SIZE, height=SIZE
     )
+    K = cameras.K.clone()
+    K[:, :2, :2] *= zoom
+    cameras = replace(cameras, K=K)
     for part in ("images", "masks", "truth"):
         (folder / part).mkdir(parents=True)
     names = [f"{view:03d}" for view in range(num_views)]
@@ -106,9 +120,11 @@ def write_unruly(
 
 def main() -> None:
     out, *folders = map(Path, sys.argv[1:])
-    for plants, skins in ((PLANTS, ()), (DRESSED if folders else (), list_skins(*folders))):
-        for family, num_leaves, num_views, seed in plants:
-            write_unruly(out / f"{family}-{seed}", family, num_leaves, num_views=num_views, seed=seed, skins=skins)
+    skins = list_skins(*folders) if folders else ()
+    for plants, worn, zoom in ((PLANTS, (), 1.0), (DRESSED, skins, 1.0), (CLOSE, skins, ZOOM)):
+        for family, num_leaves, num_views, seed in plants if skins or plants is PLANTS else ():
+            folder = out / f"{family}-{seed}"
+            write_unruly(folder, family, num_leaves, num_views=num_views, seed=seed, skins=worn, zoom=zoom)
 
 
 if __name__ == "__main__":

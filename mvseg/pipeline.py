@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import apply, apply_everywhere, refuse
+from mvseg.corrections.apply import apply, apply_everywhere, settle
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.errors import InputWarning
@@ -162,6 +162,7 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
         "check_ids": check_ids if is_checked else None,
         "split_checked": split if config.split_merged and is_checked else None,
         "reconstruct": None if shapes is None else reconstruct,
+        "settle": settle_edits if has_edits else None,
         "measure": None if shapes is None else measure,
     }
     return {name: stage for name, stage in stages.items() if stage is not None}
@@ -204,8 +205,7 @@ def correct(state: State) -> State:
     assert state.corrections is not None
     masks = state.masks if state.mask_kind else state.match(state.scene.cameras).masks
     corrected = apply(state.corrections, masks, state.scene)
-    is_verified = state.found is not None and state.config.detect.verify
-    waits = {number for number, *_ in corrected.refused} if is_verified else set()  # `choose` has more candidates
+    waits = {number for number, *_ in corrected.refused}  # for `settle_edits`
     for fate in corrected.fates:
         if fate.message and fate.edit not in waits:
             warnings.warn(fate.message, InputWarning, stacklevel=3)
@@ -281,14 +281,7 @@ def choose(state: State) -> State:
     )
     masks = select_by_views(leaves.masks, state.masks, min_views=detect.min_views)
     instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
-    left = leaves.left
-    if corrected is not None:
-        left, corrected = refuse(corrected, left)
-        asked = {number for number, *_ in corrected.refused}
-        for fate in corrected.fates:
-            if fate.message and fate.edit in asked:
-                warnings.warn(fate.message, InputWarning, stacklevel=3)
-    return replace(state, instances=instances, left=left, corrected=corrected).with_masks(masks)
+    return replace(state, instances=instances, left=leaves.left).with_masks(masks)
 
 
 def snap(state: State) -> State:
@@ -343,6 +336,7 @@ def follow(state: State) -> State:
         cameras=state.scene.cameras,
         photos=state.photos if state.photos.exist else None,
         colors=state.colors,
+        proposals=None if state.found is None else state.found.proposals(state.scene.cameras),
         workers=state.workers,
     )
     return replace(state, instances=Instances(starts=starts)).with_masks(masks)
@@ -365,6 +359,19 @@ def reconstruct(state: State, *, with_voxels: bool = True) -> State:
         progress=state.progress,
     )
     return replace(state, instances=replace(state.instances, surfaces=surfaces, voxels=voxels))
+
+
+def settle_edits(state: State) -> State:
+    """Edits that say "no leaf" where no mask is may answer a question of the page, see `settle`; warns (InputWarning)
+    of each that does not."""
+    assert state.corrected is not None
+    surfaces = state.surfaces or state.instances.starts
+    left, corrected = settle(state.corrected, state.left, surfaces, cameras=state.scene.cameras)
+    waited = {number for number, *_ in corrected.refused}
+    for fate in corrected.fates:
+        if fate.message and fate.edit in waited:
+            warnings.warn(fate.message, InputWarning, stacklevel=3)
+    return replace(state, left=left, corrected=corrected)
 
 
 def measure(state: State) -> State:

@@ -10,12 +10,14 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+import torch
 
 from mvseg.cli import main
 from mvseg.config import RunConfig
@@ -23,11 +25,17 @@ from mvseg.corrections.file import Corrections, load_corrections, name_edits
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
 from mvseg.errors import InputError
+from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import run_scene
-from mvseg.runs.correct_result import OpenResult, Superseded, name_masks, open_alone
-from mvseg.runs.correction_server import CorrectionServer, Corrector
+from mvseg.regions import regions_from_label_maps
+from mvseg.results.result import Instances, Result
+from mvseg.runs.correct_result import OpenResult, Superseded, keep_numbers, name_masks, open_alone
+from mvseg.runs.correction_server import CHANGED, CorrectionServer, Corrector
 from mvseg.runs.one_scene import run_one_scene
+from mvseg.scene import Scene, View
+from room_scene import room_cameras
 from scene_folders import write_scene
 from served_result import WAIT, ask, save, save_text, serve, text_of, wait_until_computed
 
@@ -100,6 +108,67 @@ def test_edits_that_another_page_has_changed_are_not_saved_over(served: Correcti
         assert refusal["problem"] == "Another page has changed the edits since this one was loaded."
     assert json.loads((folder / "corrections.json").read_text())["edits"] == first
     assert ask(served, "PUT", f"edits?base={answer['revision']}", text_of(second))[0] == 200
+
+
+def test_a_file_that_another_program_has_changed_is_not_saved_over(served: CorrectionServer, folder: Path) -> None:
+    view, at = middle(served.corrector.opened, 0)
+    mine, theirs = ([{"op": op, "view": view, "at": at}] for op in ("reject", "confirm"))
+    state = wait_until_computed(served)
+    assert not state["isChanged"]
+    (folder / "corrections.json").write_bytes(text_of(theirs))
+    assert ask(served, "GET", f"state?after={state['number']}")[1]["isChanged"]
+    status, refusal = save(served, mine)
+    assert (status, refusal["problem"]) == (409, CHANGED)
+    assert ask(served, "POST", "whole")[1]["problem"] == CHANGED
+    assert json.loads((folder / "corrections.json").read_text())["edits"] == theirs
+    _, page = ask(served, "GET", "")  # a reload goes on from there
+    assert json.loads(page.split('id="data">')[1].split("</script>")[0])["correct"]["edits"] == theirs
+    assert wait_until_computed(served)["outcomes"] == [""]
+    (folder / "corrections.json").write_text("{")
+    assert ask(served, "GET", "")[0] == 200
+    state = wait_until_computed(served)
+    assert "not a whole JSON file" in state["problem"]
+    assert save(served, mine)[0] == 409
+    (folder / "corrections.json").unlink()
+    assert not ask(served, "GET", "state")[1]["isChanged"]
+
+
+def test_leaves_keep_their_numbers_when_one_goes_and_comes_back(served: CorrectionServer) -> None:
+    def numbers(state: dict[str, Any]) -> list[int]:
+        return [leaf["id"] for leaf in state["update"]["leaves"]]
+
+    before = wait_until_computed(served)
+    masks = [mask for view in before["update"]["views"] for mask in view["masks"] if mask["leaf"] == 1]
+    view, at = middle(served.corrector.opened, masks[0]["region"])
+    save(served, [{"op": "reject", "view": view, "at": at, "everywhere": True}])
+    assert numbers(wait_until_computed(served)) == [each for each in numbers(before) if each != 1]
+    save(served, [])
+    assert wait_until_computed(served)["update"] == before["update"]
+
+
+def test_numbers_go_to_most_pixels_and_new_leaves_get_new_ones() -> None:
+    maps = [np.kron(np.array([[1, 0, 2], [0, 0, 0], [3, 3, 0]]), np.ones((4, 4), int)) for _ in range(3)]
+    masks = Masks.of(regions_from_label_maps(maps))
+    first = replace(masks, instance_ids=masks.regions.labels.clone())
+    scene = Scene("maps", tuple(View(name, Path(name)) for name in "abc"), room_cameras(3))
+
+    def keep(masks: Masks) -> list[int]:
+        instances = Instances(probabilities={int(id): float(id) for id in masks.instance_ids.unique() if id > 0})
+        result = Result(scene=scene, matching=Matching(masks, MatchReport("test")), instances=instances)
+        kept = keep_numbers(result, known)
+        for old, new in zip(masks.instance_ids.tolist(), kept.masks.instance_ids.tolist(), strict=True):
+            assert old < 0 or kept.instances.probabilities[new] == old
+        return kept.masks.instance_ids.tolist()
+
+    known: dict[str, int] = {}
+    assert keep(first) == first.instance_ids.tolist()
+    left = first.select(first.instance_ids != 1)
+    assert keep(left.close_gaps()) == left.instance_ids.tolist()
+    merged = replace(first, instance_ids=first.instance_ids.clamp(max=2))
+    assert keep(merged) == torch.where(first.instance_ids == 1, 1, 3).tolist()  # the third is the larger one
+    apart = replace(first, instance_ids=torch.arange(1, 10))
+    assert len(set(keep(apart))) == 9
+    assert max(keep(apart)) == 10  # 2 was given, and is nobody's any more
 
 
 def test_a_page_that_knows_all_waits_for_news(served: CorrectionServer) -> None:

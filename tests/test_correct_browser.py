@@ -14,7 +14,7 @@ from mvseg.runs.correction_server import CorrectionServer
 from mvseg.runs.one_scene import run_one_scene
 from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from scene_folders import write_scene
-from served_result import serve
+from served_result import serve, text_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
 
@@ -135,4 +135,22 @@ def test_an_edit_that_could_not_be_saved_is_saved_later(
     tab.page.unroute("**/edits?*")
     tab.wait_for("What you see follows from all edits.")
     assert edits_of(folder) == saved
+    tab.page.close()
+
+
+def test_a_file_that_another_program_has_changed_is_offered(
+    browser: sync_api.Browser, served: CorrectionServer, folder: Path
+) -> None:
+    tab = Tab(browser, served)
+    tab.wait_for("What you see follows from all edits.")
+    tab.press_on(0, 1, "r")
+    tab.wait_for("What you see follows from all edits.")
+    (reject,) = edits_of(folder)
+    (folder / "corrections.json").write_bytes(text_of([reject, reject | {"op": "confirm"}]))
+    tab.wait_for("Another program has changed corrections.json.")
+    tab.press_on(0, 2, "r")
+    assert ops(folder) == ["reject", "confirm"]
+    tab.page.get_by_role("button", name="Reload").click()
+    tab.wait_for("What you see follows from all edits.")
+    assert len(tab.rows()) == 2
     tab.page.close()

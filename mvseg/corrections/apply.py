@@ -6,7 +6,7 @@ whole instances (`everywhere`) waits until they are known: see `apply_everywhere
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -25,9 +25,10 @@ from mvseg.formats.find_views import find_views
 from mvseg.formats.lens import pinhole_from_photo, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
-from mvseg.scene import Scene
+from mvseg.scene import Cameras, Scene
 
 if TYPE_CHECKING:
+    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.verification.choose import LeftOut
 
 APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
@@ -64,7 +65,8 @@ class Corrected:
             show.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
         everywhere: (edit number, row, whether its instance is rejected) of each edit about a whole instance.
-        refused: (edit number, view, x, y) of each pixel where a person says that no leaf is, and where no mask is.
+        refused: (edit number, view, x, y, whether in all photos) of each pixel where a person says that no leaf is,
+            and where no mask is: it may be the answer to a question, see `settle`.
         fates: of the edits, in their order.
     """
 
@@ -73,7 +75,7 @@ class Corrected:
     is_linked: Tensor
     last_edits: Tensor
     everywhere: tuple[tuple[int, int, bool], ...]
-    refused: tuple[tuple[int, int, int, int], ...]
+    refused: tuple[tuple[int, int, int, int, bool], ...]
     fates: tuple[Fate, ...]
 
     @property
@@ -93,7 +95,7 @@ class _Work:
     everywhere: list[tuple[int, EditedMask, bool]] = field(default_factory=list)
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
     rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
-    refused: list[tuple[int, int, int, int]] = field(default_factory=list)
+    refused: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
@@ -190,16 +192,36 @@ def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corre
     return masks, replace(corrected, fates=fates)
 
 
-def refuse(corrected: Corrected, left: Sequence[LeftOut]) -> tuple[tuple[LeftOut, ...], Corrected]:
-    """The candidates that nobody said are no leaves; and the fates of the edits that did so: they are applied, not
-    beside everything."""
-    answered = {
-        number: [each for each in left if _is_shown(each.masks, view, column, row)]
-        for number, view, column, row in corrected.refused
-    }
-    gone = {id(each) for candidates in answered.values() for each in candidates}
+def settle(
+    corrected: Corrected, left: Sequence[LeftOut], surfaces: Mapping[int, LeafSurface], *, cameras: Cameras
+) -> tuple[tuple[LeftOut, ...], Corrected]:
+    """The edits that say "no leaf" where no mask is, once all is known that a person may be asked about.
+
+    They are applied where they answer a question: a candidate that was not chosen is shown there, which goes if the
+    edit is about all photos, or a surface, of which no mask is there.
+
+    Args:
+        corrected: what came of all edits.
+        left: candidates that were not chosen.
+        surfaces: {instance id: surface}.
+        cameras: V cameras.
+
+    Returns:
+        The candidates that are left, and the same with the final fates.
+    """
+    from mvseg.verification.evidence import paint_view
+
+    gone: set[int] = set()
+    answers: set[int] = set()
+    for number, view, column, row, is_about_all in corrected.refused:
+        shown = [each for each in left if _is_shown(each.masks, view, column, row)]
+        gone |= {id(each) for each in shown if is_about_all}
+        width, height = cameras.sizes[view].tolist()
+        is_in_photo = 0 <= column < width and 0 <= row < height
+        if shown or (is_in_photo and paint_view(surfaces, cameras, view)[row, column] > 0):
+            answers.add(number)
     fates = tuple(
-        replace(each, fate=APPLIED, problem="") if answered.get(each.edit) else each for each in corrected.fates
+        replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in corrected.fates
     )
     return tuple(each for each in left if id(each) not in gone), replace(corrected, fates=fates)
 
@@ -219,8 +241,8 @@ def _apply_one(work: _Work, number: int, edit: Edit) -> None:
         _outline(work, number, edit)
     elif isinstance(edit, Reject):
         place = edit.view, *edit.at
-        if edit.everywhere and not _masks_at(work, place, work.masks):
-            work.refused.append((number, *_pixel_at(work, place)))
+        if not _masks_at(work, place, work.masks):
+            work.refused.append((number, *_pixel_at(work, place), edit.everywhere))
         mask = _mask_at(work, place)
         if edit.everywhere:
             _contradict(work, number, mask.edits)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
@@ -20,6 +20,8 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.reconstruction.voxels import VoxelGrid
     from mvseg.traits.measure import Traits
     from mvseg.verification.choose import LeftOut
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,20 @@ class Instances:
             starts=masks.renumber(self.starts),
             surfaces=surfaces,
             voxels=voxels,
+        )
+
+
+    def renumber(self, numbers: Mapping[int, int]) -> Instances:
+        """Instance k by the id `numbers[k]`."""
+
+        def by_number(known: Mapping[int, T]) -> dict[int, T]:
+            return {numbers[instance]: each for instance, each in known.items()}
+
+        return Instances(
+            probabilities=by_number(self.probabilities),
+            starts=by_number(self.starts),
+            surfaces=None if self.surfaces is None else by_number(self.surfaces),
+            voxels=None if self.voxels is None else by_number(self.voxels),
         )
 
 

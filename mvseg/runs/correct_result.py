@@ -7,15 +7,19 @@ import hashlib
 import json
 import os
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cached_property
+from itertools import count
 from pathlib import Path
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, InputWarning
@@ -66,6 +70,7 @@ class OpenResult:
         self.found = state if masks is not None else detect(state)
         self._fitted: dict[str, LeafSurface] = {}
         self._rough: dict[str, LeafSurface] = {}  # that leaves are chosen by
+        self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self.has_masks = masks is not None
 
     def saved_corrections(self) -> Corrections:
@@ -79,7 +84,7 @@ class OpenResult:
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
-        and the other warnings on the way.
+        and the other warnings on the way. Leaves keep their numbers from one result to the next, see `keep_numbers`.
 
         A surface is fitted anew only if its instance's masks differ from those in all results before. (A run from
         the command line fits all of them: each surface also depends a little on the masks that may hide it.)
@@ -99,7 +104,8 @@ class OpenResult:
             messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
         told = () if state.corrected is None else state.corrected.messages
         outcomes = [describe_fate(fate) for fate in state.fates]
-        return state.result(), outcomes, [text for text in dict.fromkeys(messages) if text not in told]
+        shown = keep_numbers(state.result(), self._numbers)
+        return shown, outcomes, [text for text in dict.fromkeys(messages) if text not in told]
 
     @cached_property
     def _colors(self) -> NDArray[np.bool_]:
@@ -152,12 +158,45 @@ def _fit_unknown(
 
 def name_masks(masks: Masks, instance: int) -> str:
     """A name that two instances share only if they have the same masks in the same views, whatever their numbers."""
-    own = masks.select(masks.instance_ids == instance).regions.to("cpu")
-    each = [
-        (view, *box, hashlib.sha256(own.crop(row).numpy().tobytes()).hexdigest())
-        for row, (view, box) in enumerate(zip(own.view_index.tolist(), own.boxes.tolist(), strict=True))
+    return json.dumps(sorted(_name_each(masks.select(masks.instance_ids == instance))))
+
+
+def _name_each(masks: Masks) -> list[str]:
+    """A name of each mask, that it shares with no other."""
+    regions = masks.regions.to("cpu")
+    places = zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
+    return [
+        json.dumps([view, *box, hashlib.sha256(regions.crop(row).numpy().tobytes()).hexdigest()])
+        for row, (view, box) in enumerate(places)
     ]
-    return json.dumps(sorted(each))
+
+
+def keep_numbers(result: Result, known: dict[str, int]) -> Result:
+    """The result whose leaves have the numbers that most of their masks' pixels had last; the others get new ones, in
+    their order. So ids may have gaps. `known`, {name of a mask: number of its leaf}, learns them."""
+    masks = result.masks
+    named = [(int(id), int(area), name) for id, area, name in
+             zip(masks.instance_ids, masks.regions.areas, _name_each(masks), strict=True) if id > 0]  # fmt: skip
+    votes = Counter[tuple[int, int]]()
+    for instance, area, name in named:
+        if name in known:
+            votes[instance, known[name]] += area
+    numbers: dict[int, int] = {}
+    for instance, number in sorted(votes, key=lambda pair: (-votes[pair], pair)):
+        if instance not in numbers and number not in numbers.values():
+            numbers[instance] = number
+    new = count(max(known.values(), default=0) + 1)
+    for instance in sorted({each[0] for each in named} - set(numbers)):
+        numbers[instance] = next(new)
+    known.update({name: numbers[instance] for instance, _, name in named})
+
+    def renumber(ids: Tensor) -> Tensor:
+        return torch.tensor([numbers.get(each, -1) for each in ids.tolist()], dtype=torch.int64, device=ids.device)
+
+    merged = [each for each in masks.merged if each.other in numbers]
+    masks = masks.with_merged(merged)
+    ids = replace(masks, instance_ids=renumber(masks.instance_ids), second_ids=renumber(masks.second_ids))
+    return replace(result, matching=result.matching.with_masks(ids), instances=result.instances.renumber(numbers))
 
 
 @contextmanager

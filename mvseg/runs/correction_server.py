@@ -13,6 +13,7 @@ import secrets
 import subprocess
 import sys
 import threading
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import replace
@@ -35,7 +36,9 @@ from mvseg.runs.correct_result import CORRECTIONS_FILE, OpenResult, Superseded
 
 HOST = "127.0.0.1"
 WAIT_SECONDS = 20.0  # that a page's question for news stays open
+LOOK_SECONDS = 1.0  # until it looks again whether another program has changed the edits
 MOST_CORNERS = 10_000
+CHANGED = "corrections.json was changed by another program since this page was loaded."
 
 
 class Refused(Exception):
@@ -58,24 +61,23 @@ class Corrector:
         """Raises InputError: the corrections saved in the folder, or a photo, cannot be read, or they are another
         scene's."""
         self.opened = opened
-        self.corrections, self.marks = opened.saved_corrections(), mark_photos(opened.found.scene)
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", InputWarning)
-            check_made_for(self.corrections, opened.found.scene)
+        self.written, self.marks = self._stamp(), mark_photos(opened.found.scene)
+        self.corrections, said = self._read_edits()
         self.shown = opened.matched()
         photos, views = opened.found.photos, range(len(opened.found.scene.views))
         self.pictures = [draw_picture(photos(view), self.shown.masks, view=view) for view in views]
         self.news = threading.Condition()
         self.wanted, self.computed = 1, 0
-        self.notice = " ".join(filter(None, (opened.notice, *(f"{each.message}." for each in caught))))
+        self.notice = " ".join(filter(None, (opened.notice, said)))
         self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
-        self.revision = name_edits(self.corrections.edits)
         self.is_closing = False
 
     def page(self) -> bytes:
-        """The page with the newest result, and with all edits that were saved: a reload must not lose any."""
+        """The page with the newest result, and with all edits that were saved: a reload must not lose any; nor those
+        that another program has written to the file since."""
         with self.news:
+            self._take_changes()
             shown, pictures = replace(self.shown, corrections=self.corrections), self.pictures
         return build_page(shown, pictures, run=dict(self.opened.run.said), is_served=True).encode()
 
@@ -97,12 +99,58 @@ class Corrector:
         with self.news:  # one after another, in the order in which they are wanted
             if name_edits(self.corrections.edits) not in (base, name):  # the same again: its answer was lost
                 raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
+            if self._is_changed():
+                raise Refused(HTTPStatus.CONFLICT, CHANGED)
             corrections = with_marks(corrections, self.opened.found.scene, self.marks)
             write_corrections(self.opened.folder / CORRECTIONS_FILE, corrections)
-            self.corrections = corrections
+            self.corrections, self.written = corrections, self._stamp()
             self.wanted += 1
             self.news.notify_all()
         return {"saved": len(corrections.edits), "revision": name}
+
+    def _read_edits(self) -> tuple[Corrections, str]:
+        """The edits in the folder, and what a person should know of them."""
+        found = self.opened.saved_corrections()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            check_made_for(found, self.opened.found.scene)
+        return found, " ".join(f"{each.message}." for each in caught)
+
+    def _stamp(self) -> tuple[int, int] | None:
+        """What changes when the file of the edits does; None without one."""
+        try:
+            about = (self.opened.folder / CORRECTIONS_FILE).stat()
+        except OSError:
+            return None
+        return about.st_mtime_ns, about.st_size
+
+    def _is_changed(self) -> bool:
+        """Whether another program has written other edits to the file. (One that was deleted is written again.)"""
+        stamp = self._stamp()
+        if stamp in (None, self.written):
+            return False
+        try:
+            found = self.opened.saved_corrections()
+        except InputError:
+            return True
+        if name_edits(found.edits) != name_edits(self.corrections.edits):
+            return True
+        self.written = stamp
+        return False
+
+    def _take_changes(self) -> None:
+        """Go on from what another program has written to the file, if it can be read."""
+        if not self._is_changed():
+            return
+        try:
+            stamp = self._stamp()
+            self.corrections, self.notice = self._read_edits()
+        except InputError as error:
+            self.problem = f"{error}. The edits on this page are those before."
+            return
+        self.written = stamp
+        self.wanted += 1
+        self.news.notify_all()
 
     def compute(self) -> None:
         """Work until `close`; for a thread of its own."""
@@ -136,19 +184,22 @@ class Corrector:
         with self.news:
             self.shown, self.pictures, self.update = news
             self.problem, self.outcomes, self.computed = problem, outcomes, wanted
-            self.revision = name_edits(corrections.edits)
             self.news.notify_all()
 
     def state(self, after: int) -> dict[str, Any]:
-        """What the page shows, and of which edits (`revision`): at once for an `after` below 0, otherwise as soon as
-        there is something newer."""
+        """What the page shows, and the name of the edits that are saved (`revision`): at once for an `after` below 0,
+        otherwise as soon as there is something newer."""
         with self.news:
-            if after >= 0:
-                self.news.wait_for(lambda: self.is_closing or self.computed > after, WAIT_SECONDS)
+            end = time.monotonic() + WAIT_SECONDS
+            while 0 <= after >= self.computed and not self.is_closing and time.monotonic() < end:
+                if self._is_changed():
+                    break
+                self.news.wait(LOOK_SECONDS)
             return {
                 "number": self.computed,
-                "revision": self.revision,
+                "revision": name_edits(self.corrections.edits),
                 "isComputing": self.wanted > self.computed,
+                "isChanged": self._is_changed(),
                 "problem": self.problem,
                 "outcomes": self.outcomes,
                 "update": self.update if self.computed > after else None,
@@ -185,11 +236,14 @@ class Corrector:
         folder = self.opened.folder.resolve()
         path = folder / CORRECTIONS_FILE
         with self.news:
+            if self._is_changed():
+                raise InputError(CHANGED)
             write_corrections(path, self.corrections)
         words = ["infer", "--again", str(folder), "--corrections", str(path), "--quiet"]
         run = subprocess.run([sys.executable, "-m", "mvseg.cli", *words], capture_output=True, text=True, check=False)
         with self.news:  # edits that were saved meanwhile lay in the folder that was replaced
             write_corrections(path, self.corrections)
+            self.written = self._stamp()
         if run.returncode:
             raise InputError((run.stderr.strip().splitlines() or ["the run was stopped"])[-1])
         return {"said": run.stdout.strip()}

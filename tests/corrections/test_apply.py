@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere, refuse
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere, settle
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
@@ -243,13 +243,17 @@ def test_an_outline_over_everything_says_what_it_replaces() -> None:
     assert said == ["correction 1 (outline): applied: it replaces 8 masks"]
 
 
-def test_saying_no_to_a_candidate_takes_it_off_the_list_and_is_no_mistake() -> None:
+def test_saying_no_where_no_mask_is_answers_a_question() -> None:
+    """A candidate goes, if it is no leaf in any photo; where a surface promises a mask, none is right. Elsewhere it is
+    a mistake."""
     candidate = LeftOut(0.3, Masks.of(regions_from_label_maps([label_map((40, 25, 55, 35)), label_map()])))
     other = LeftOut(0.2, Masks.of(regions_from_label_maps([label_map((1, 25, 9, 35)), label_map()])))
-    corrected = correct(at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True))
-    assert fates(corrected) == ["points at nothing"] * 2
-    left, answered = refuse(corrected, (candidate, other))
+    corrected = correct(
+        at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True), at("reject", 5, 30)
+    )
+    assert fates(corrected) == ["points at nothing"] * 3
+    left, answered = settle(corrected, (candidate, other), {}, cameras=SCENE.cameras)
     assert left == (other,)
-    assert fates(answered) == ["applied", "points at nothing"]
+    assert fates(answered) == ["applied", "points at nothing", "applied"]
     assert len(answered.messages) == 1
-    assert refuse(answered, left)[0] == (other,)
+    assert settle(answered, left, {}, cameras=SCENE.cameras)[0] == (other,)

@@ -30,11 +30,12 @@ UNITLESS = {"degree": "°", "1": ""}
 
 
 def describe_leaves(result: Result) -> list[dict[str, Any]]:
-    """One entry per instance: id, colour, how likely it is a leaf (where the views chose it), shape, doubts, and its
+    """One entry per instance that has masks: id, colour, how likely it is a leaf (where the views chose it), shape, doubts, and its
     traits, if they were measured."""
     measured = {} if result.traits is None else {leaf.leaf: leaf for leaf in result.traits.leaves}
     found = []
-    for instance in range(1, result.matching.num_instances + 1):
+    ids = result.masks.instance_ids
+    for instance in ids[ids > 0].unique().tolist():
         about: dict[str, Any] = {"id": instance, "color": f"#{bytes(instance_color(instance)).hex()}"}
         if (chance := result.instances.probabilities.get(instance)) is not None:
             about["probability"] = round(chance, 3)

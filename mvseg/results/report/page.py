@@ -25,7 +25,7 @@ from mvseg.results.result import Result
 ASSETS = files("mvseg.results.report") / "assets"
 SCRIPTS = (
     "selection.js", "numbers.js", "shapes.js", "space.js", "photos.js", "table.js", "leaf.js", "run.js",
-    "lens.js", "edits.js", "pane.js", "queue.js", "panel.js", "correct.js", "server.js", "page.js",
+    "lens.js", "edits.js", "brush.js", "pane.js", "queue.js", "panel.js", "correct.js", "server.js", "page.js",
 )  # fmt: skip
 RUN_FIELDS = (
     "mvseg", "torch", "python", "mask_kind", "matched_by", "residual_px", "seconds", "warnings", "checks", "inputs"

@@ -216,6 +216,78 @@ def test_a_cut_goes_through_the_mask_that_it_crosses(opened: Person, tmp_path: P
     assert "crosses no mask" in opened.page.locator("#correct-note").inner_text()
 
 
+def test_a_brush_paints_a_leaf_and_an_eraser_takes_from_it(opened: Person, tmp_path: Path) -> None:
+    """A stroke is as wide as the brush; what the eraser cuts off goes, for the largest part is the leaf."""
+    opened.page.keyboard.press("b")
+    opened.drag(0, [[900, 300], [1100, 300], [1300, 300]])
+    unit = opened.page.evaluate("modes.work.panes[0].unit")
+    radius = opened.page.evaluate("modes.work.radius") * unit
+    opened.page.keyboard.press("e")
+    opened.page.keyboard.press("[")
+    assert opened.page.evaluate("modes.work.radius") * unit < radius
+    opened.drag(0, [[1200, 300 - 2 * radius], [1200, 300 + 2 * radius]])
+    opened.page.keyboard.press("Enter")
+    (edit,) = opened.save(tmp_path)
+    assert edit["op"] == "outline"
+    points = opened.page.evaluate(
+        "(points) => points.map((point) => modes.work.frames[0].toPicture(point))", edit["polygon"]
+    )
+    (x1, y1), (x2, y2) = np.min(points, 0), np.max(points, 0)
+    assert (x1, y1) == pytest.approx((900 - radius, 300 - radius), abs=6)
+    assert y2 == pytest.approx(300 + radius, abs=6)
+    assert 1200 - radius < x2 < 1200
+    x, y = np.array(points).T
+    area = abs(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1))) / 2
+    assert area == pytest.approx(2 * radius * (x2 - 900) + np.pi * radius**2 / 2, rel=0.04)
+
+
+def test_the_eraser_takes_from_the_mask_that_is_picked(opened: Person, tmp_path: Path) -> None:
+    x1, y1, x2, y2 = opened.mask(0, 2)["box"]
+    opened.page.keyboard.press("e")
+    opened.drag(0, [[x1, y1], [x1, y2]])
+    assert "Pick the mask first" in opened.page.locator("#correct-note").inner_text()
+    opened.page.keyboard.press("Escape")
+    opened.click_mask(0, 2)
+    opened.page.keyboard.press("e")
+    opened.drag(0, [[x1, y1], [x1, y2]])
+    opened.page.get_by_role("button", name="Keep it").click()
+    (edit,) = opened.save(tmp_path)
+    points = opened.page.evaluate(
+        "(points) => points.map((point) => modes.work.frames[0].toPicture(point))", edit["polygon"]
+    )
+    assert np.min(points, 0)[0] > x1 + 5
+    assert np.max(points, 0)[0] == pytest.approx(x2, abs=6)
+
+
+def test_masks_in_an_area_are_rejected_at_once_and_struck_out(opened: Person, tmp_path: Path) -> None:
+    boxes = [opened.mask(0, leaf)["box"] for leaf in (1, 2)]
+    (x1, y1), (x2, y2) = np.min(boxes, 0)[:2] - 5, np.max(boxes, 0)[2:] + 5
+    inside = [
+        leaf for leaf in (1, 2, 3)
+        if x1 < opened.mask(0, leaf)["at"][0] < x2 and y1 < opened.mask(0, leaf)["at"][1] < y2
+    ]  # fmt: skip
+    corners = [[x1, y1], [x2, y1], [x2, y2], [x1, y2], [x1, y1]]
+    opened.page.keyboard.press("a")
+    for corner in corners:
+        opened.page.mouse.click(*opened.at(0, [float(value) for value in corner]))
+    edits = opened.save(tmp_path)
+    assert [edit["op"] for edit in edits] == ["reject"] * len(inside)
+    assert len(inside) >= 2
+    gone = opened.page.locator(".pane:first-child path.gone")
+    assert gone.count() == len(inside)
+    opened.click_mask(0, 1)  # the later edit wins
+    opened.page.keyboard.press("c")
+    assert gone.count() == len(inside) - 1
+
+
+def test_a_leaf_that_is_rejected_everywhere_is_struck_out_everywhere(opened: Person) -> None:
+    opened.click_mask(0, 1)
+    opened.page.keyboard.press("Shift+R")
+    gone = "modes.work.gone.size === data.views.flatMap((view) => view.masks).filter(({ leaf }) => leaf === 1).length"
+    assert opened.page.evaluate(gone)
+    assert opened.page.locator("path.gone").count() == 2  # of the two photos that are shown
+
+
 def test_edits_survive_a_reload_and_can_be_undone(opened: Person, tmp_path: Path) -> None:
     for leaf, key in ((1, "r"), (2, "c"), (3, "r")):
         opened.click_mask(0, leaf)

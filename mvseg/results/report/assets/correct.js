@@ -1,11 +1,14 @@
 // The mode "Correct": two photos side by side, what a person picks and draws in them, and what they say of it.
 
 const KEYS = { n: "next", s: "same", d: "different", r: "reject", R: "reject-all", c: "confirm", C: "confirm-all",
-  u: "undo", o: "outline", l: "split" };
+  u: "undo", o: "outline", l: "split", b: "brush", e: "erase", a: "area" };
+const TOOLS = ["outline", "split", "brush", "erase", "area"];
+const RADIUS = { start: 12, least: 2, most: 80, step: 1.3 }; // of the brush, pixels of the screen
 
 class Work {
   constructor(data, addresses) {
     Object.assign(this, { data, addresses, picks: [], tool: null, draft: null, doubt: null, note: "", server: null });
+    this.radius = RADIUS.start;
     this.frames = data.views.map((view, index) => new Frame(view, data.correct.views[index], data.correct.lenses));
     this.edits = new Edits(data.correct, data.views);
     this.skipped = new Set();
@@ -41,6 +44,7 @@ class Work {
 
   readEdits() {
     this.places = placesOf(this.edits.list, this);
+    this.gone = rejectedMasks(this.places, this.data.views);
     this.open = this.doubts.filter((doubt) => !isAnswered(doubt, this.places));
   }
 
@@ -151,7 +155,7 @@ class Work {
     const wasAsked = this.doubt;
     if (op === "next") return this.next();
     if (op === "undo") return this.undo();
-    if (op === "outline" || op === "split") return this.take(op);
+    if (TOOLS.includes(op)) return this.take(op);
     const found = this.editsOf(op, all !== undefined || ["few", "leaf"].includes(wasAsked?.kind));
     if (!found.length) return;
     this.note = "";
@@ -162,6 +166,7 @@ class Work {
   editsOf(op, everywhere) {
     if (op === "same" || op === "different") return this.linkEdits(op);
     if (this.doubt?.kind === "leaf") return this.offeredEdits(op, this.doubt.outlines);
+    if (this.doubt?.kind === "missing" && op === "reject") return [this.noLeafIn(this.doubt.outlines[0])];
     if (op === "confirm" && this.doubt?.outlines.length) {
       return this.outlineEdits(this.doubt.view, this.doubt.outlines[0].outline);
     }
@@ -200,15 +205,15 @@ class Work {
 
   // A candidate becomes a leaf, by an outline of each of its masks under one new name; or none.
   offeredEdits(op, outlines) {
-    if (op === "reject") {
-      const [{ view, outline }] = outlines;
-      const at = this.frames[view].toPhoto(insidePoint(outline));
-      return [{ op, view: this.data.views[view].name, at, everywhere: true }];
-    }
+    if (op === "reject") return [{ ...this.noLeafIn(outlines[0]), everywhere: true }];
     const used = new Set(this.edits.list.map((edit) => edit.leaf));
     let number = 1;
     while (used.has(`offered ${number}`)) number += 1;
     return outlines.flatMap(({ view, outline }) => this.outlineEdits(view, outline, `offered ${number}`));
+  }
+
+  noLeafIn({ view, outline }) {
+    return { op: "reject", view: this.data.views[view].name, at: this.frames[view].toPhoto(insidePoint(outline)) };
   }
 
   undo() {
@@ -220,8 +225,28 @@ class Work {
   // --- drawing
 
   take(tool) {
-    this.draft = null;
+    const isPaint = (one) => one === "brush" || one === "erase";
+    if (!isPaint(tool) || !this.draft?.paint) this.draft = null; // brush and eraser work on one mask
     this.tool = this.tool === tool ? null : tool;
+    this.changed();
+  }
+
+  resize(factor) {
+    this.radius = clamp(this.radius * factor, RADIUS.least, RADIUS.most);
+    this.changed();
+  }
+
+  // A stroke of the brush or the eraser, on a mask that is painted anew, or on the one that is picked in this photo.
+  paint(pane, from, to) {
+    const erases = this.tool === "erase";
+    if (this.draft?.pane !== pane || !this.draft.paint) {
+      const picked = this.picks.find((pick) => pick.view === pane.view && pick.mask);
+      if (erases && !picked) return this.say("Pick the mask first that the eraser takes from.");
+      const paint = new Paint(pane.frame.height, picked?.mask);
+      this.draft = { pane, kind: "outline", points: [], isClosed: true, paint };
+    }
+    this.draft.paint.stroke(from, to, { radius: this.radius * pane.unit, erases });
+    this.draft.points = this.draft.paint.outline();
     this.changed();
   }
 
@@ -229,14 +254,25 @@ class Work {
   finish() {
     const { draft } = this;
     if (!draft || draft.isClosed) return;
-    if (draft.points.length < (draft.kind === "outline" ? 3 : 2)) return this.say("That is too short.");
+    if (draft.points.length < (draft.kind === "split" ? 2 : 3)) return this.say("That is too short.");
     draft.isClosed = draft.kind === "outline";
     if (draft.kind === "outline") return this.changed();
     const { view } = draft.pane;
+    if (draft.kind === "area") return this.rejectIn(view, draft.points);
     const mask = this.maskUnder(view, draft.points);
     if (!mask) return this.discard("The line crosses no mask: draw it across the mask that shows two leaves.");
     const [name, ...at] = this.placeOf({ view, at: mask.at });
     this.add([{ op: "split", view: name, at, line: draft.points.map((point) => this.frames[view].toPhoto(point)) }]);
+  }
+
+  // No mask whose thickest place lies in an area is a leaf.
+  rejectIn(view, points) {
+    const inside = this.data.views[view].masks.filter((mask) => !this.gone.has(mask) && isInside(mask.at, points));
+    if (!inside.length) return this.discard("No mask lies in it.");
+    this.add(inside.map((mask) => {
+      const [name, ...at] = this.placeOf(this.pickOf(view, `r${mask.region}`, mask));
+      return { op: "reject", view: name, at };
+    }));
   }
 
   // The mask that has most of a line.
@@ -250,6 +286,7 @@ class Work {
 
   keep(leaf) {
     const { pane, points } = this.draft;
+    if (points.length < 3) return this.discard("Nothing is left of it.");
     const wasAsked = this.doubt;
     this.add(this.outlineEdits(pane.view, points, leaf));
     if (wasAsked?.outlines.length) this.next();
@@ -274,6 +311,8 @@ class Work {
     } else if (event.key === "Enter" && this.draft && (isTyping || !event.target.matches?.("button"))) {
       if (this.draft.isClosed) this.panel.keep();
       else this.finish();
+    } else if ((event.key === "[" || event.key === "]") && !isTyping) {
+      this.resize(event.key === "]" ? RADIUS.step : 1 / RADIUS.step);
     } else if (event.key in KEYS && !isTyping) {
       this.act(KEYS[event.key]);
     } else return;
@@ -291,6 +330,22 @@ const brush = document.createElement("canvas").getContext("2d");
 function isOnMask(mask, [x, y]) {
   mask.shape ??= new Path2D(mask.path);
   return brush.isPointInPath(mask.shape, x, y, "evenodd");
+}
+
+// The masks that edits say are no leaves: they are struck out before what follows is known.
+function rejectedMasks(places, views) {
+  const gone = new Set();
+  for (const { edit, view, at } of places) {
+    const mask = view < 0 ? null : views[view].masks.findLast((one) => isOnMask(one, at));
+    if (!mask) continue;
+    const isAll = edit.everywhere && mask.leaf > 0;
+    const all = isAll ? views.flatMap((one) => one.masks.filter(({ leaf }) => leaf === mask.leaf)) : [mask];
+    for (const one of all) {
+      if (edit.op === "reject") gone.add(one);
+      else gone.delete(one); // the later edit wins
+    }
+  }
+  return gone;
 }
 
 // Changes between looking at the result and correcting it.

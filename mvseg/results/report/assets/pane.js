@@ -53,9 +53,10 @@ class Pane {
     const sharp = image(addresses.pictures[this.view], { x: 0, y: 0, width: UNITS, height: this.frame.height });
     const paths = view.masks.map((mask) => drawing("path", {
       d: mask.path, fill: colors.get(mask.leaf) ?? "#969696", stroke: colors.get(mask.leaf) ?? "#969696",
-      class: mask.leaf > 0 ? "mask" : "mask unmatched", "data-region": mask.region,
+      class: `mask${mask.leaf > 0 ? "" : " unmatched"}${this.work.gone.has(mask) ? " gone" : ""}`,
+      "data-region": mask.region,
     }));
-    const numbers = view.masks.filter((mask) => mask.leaf > 0).map((mask) => drawing(
+    const numbers = view.masks.filter((mask) => mask.leaf > 0 && !this.work.gone.has(mask)).map((mask) => drawing(
       "text", { x: mask.at[0], y: mask.at[1], "data-height": mask.height }, `${mask.leaf}${mask.is_sure ? "" : "?"}`));
     this.layer = drawing("g", {});
     this.numbers = numbers;
@@ -96,6 +97,10 @@ class Pane {
       const above = y - 1.5 * size; // the leaf's number stays to be seen
       parts.push(drawing("circle", { cx: x, cy: above, r: 0.62 * size, class: "badge" }));
       parts.push(drawing("text", { x, y: above, "font-size": size, class: "badge" }, symbol));
+    }
+    if (this.paints && this.pointer) {
+      const [cx, cy] = this.pointer;
+      parts.push(drawing("circle", { cx, cy, r: this.work.radius * this.unit, class: "brush" }));
     }
     if (draft?.pane === this) {
       const points = draft.points.map((point) => point.map((value) => value.toFixed(1)).join(" "));
@@ -151,6 +156,10 @@ class Pane {
     return [x, y];
   }
 
+  get paints() {
+    return this.work.tool === "brush" || this.work.tool === "erase";
+  }
+
   // --- pointers
 
   listen() {
@@ -177,11 +186,12 @@ class Pane {
     const path = event.target.closest?.("path.mask");
     this.pointers.set(event.pointerId, { start: [event.clientX, event.clientY], last: event, path, moved: false });
     const { tool, draft } = this.work;
-    if (!tool || this.pointers.size > 1 || draft?.isClosed) return;
     const at = this.unitsAt(event);
+    if (this.paints && this.pointers.size === 1) return this.work.paint(this, at, at);
+    if (!tool || this.pointers.size > 1 || draft?.isClosed) return;
     if (draft?.pane !== this) this.work.draft = { pane: this, kind: tool, points: [], isClosed: false };
     const { points } = this.work.draft;
-    const isBack = points.length > 2 && this.screenDistance(at, points[0]) < NEAR && tool === "outline";
+    const isBack = points.length > 2 && this.screenDistance(at, points[0]) < NEAR && tool !== "split";
     if (isBack) this.work.finish();
     else if (!points.length || this.screenDistance(at, points.at(-1)) > 2) points.push(at);
     this.work.changed();
@@ -193,12 +203,18 @@ class Pane {
 
   drag(event) {
     const pointer = this.pointers.get(event.pointerId);
+    if (this.paints) {
+      this.pointer = this.unitsAt(event);
+      this.mark();
+    }
     if (!pointer) return;
     const before = pointer.last;
     pointer.last = event;
     if (Math.hypot(event.clientX - pointer.start[0], event.clientY - pointer.start[1]) > CLICK) pointer.moved = true;
     if (this.pointers.size > 1) {
       this.pinch(pointer, before);
+    } else if (this.paints) {
+      this.work.paint(this, this.unitsAt(before), this.unitsAt(event));
     } else if (this.work.tool && this.work.draft?.pane === this && !this.work.draft.isClosed) {
       const at = this.unitsAt(event);
       const { points } = this.work.draft;
@@ -228,7 +244,7 @@ class Pane {
     this.pointers.delete(event.pointerId);
     if (!pointer) return;
     const { tool, draft } = this.work;
-    if (tool && draft?.pane === this) {
+    if (tool && draft?.pane === this && !draft.paint) {
       const isBack = draft.points.length > 3 && this.screenDistance(draft.points.at(-1), draft.points[0]) < NEAR;
       const inOneGo = pointer.moved && (draft.points.length > 7 || isBack);
       const isCut = tool === "split" && pointer.moved && draft.points.length > 1;

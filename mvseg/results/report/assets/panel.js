@@ -7,6 +7,9 @@ const HINTS = {
   draw: "A leaf that was missed, drawn in two photos, is found in the others.",
   outline: "Draw around the leaf in one go; or click its corners, and the first one again (or Enter) to end. " +
     "Esc: not now.",
+  area: "Draw around masks: none of those whose middle lies inside is a leaf. Esc: not now.",
+  brush: "Paint a leaf, or add to the mask that is picked here. [ and ]: size of the brush. Enter keeps it.",
+  erase: "Take away from what is painted, or from the mask that is picked here. [ and ]: size of the eraser.",
   split: "Draw a line across the mask, from edge to edge, where the two leaves meet. Esc: not now.",
   word: "Outlines with the same name, in several photos, show the same leaf.",
   saved: "Saved where your browser saves files. To have every photo follow: " +
@@ -107,10 +110,16 @@ class Panel {
 
   tools() {
     const { draft, tool } = this.work;
-    if (draft?.isClosed) return [element("h2", {}, "Outline"), ...this.draftTools()];
+    const brushes = [this.action("brush", "Brush", { pressed: tool === "brush" }),
+      this.action("erase", "Eraser", { pressed: tool === "erase" })];
+    if (draft?.isClosed) {
+      const paints = draft.paint ? [element("div", { class: "answers" }, ...brushes)] : [];
+      return [element("h2", {}, "Outline"), ...paints, ...this.draftTools()];
+    }
     return [element("h2", {}, "Draw"), element("div", { class: "answers" },
-      this.action("outline", "Outline a leaf", { pressed: tool === "outline" }),
-      this.action("split", "Cut a mask in two", { pressed: tool === "split" })),
+      this.action("outline", "Outline a leaf", { pressed: tool === "outline" }), ...brushes,
+      this.action("split", "Cut a mask in two", { pressed: tool === "split" }),
+      this.action("area", "No leaves in an area", { pressed: tool === "area" })),
     element("p", { class: "note" }, HINTS[tool ?? "draw"])];
   }
 

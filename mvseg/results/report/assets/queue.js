@@ -26,7 +26,7 @@ function answersTo(doubt) {
   const pair = [["same", "Yes, the same leaf"], ["different", "No, another leaf"]];
   const later = ["next", "I cannot tell"];
   switch (doubt.kind) {
-    case "missing": return [["confirm", "Yes, keep this outline"], ["next", "No, or not to be seen"]];
+    case "missing": return [["confirm", "Yes, keep this outline"], ["reject", "No, or not to be seen"], later];
     case "few": case "leaf": return [["confirm", "Yes"], ["reject", "No leaf, nowhere"], later];
     case "covered": return [...pair, later];
     default: return doubt.otherView === undefined

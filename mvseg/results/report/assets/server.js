@@ -76,10 +76,11 @@ class Server {
     }
   }
 
-  hear({ number, revision, outcomes, update, problem, isComputing }) {
-    if (!this.own.has(revision)) {
+  hear({ number, revision, outcomes, update, problem, isComputing, isChanged }) {
+    if (isChanged || !this.own.has(revision)) {
       this.isStale = true;
-      this.tell({ state: "Another page has changed the edits." }, "");
+      const who = isChanged ? "Another program has changed corrections.json." : "Another page has changed the edits.";
+      this.tell({ state: who }, "");
       return;
     }
     const isFirst = this.number < 0;
