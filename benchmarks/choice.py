@@ -72,7 +72,7 @@ def study(folder: Path, step: int = 1) -> Study | None:
     truth = true_maps(folder, scene)
     found = detect_scene(Photos(scene))
     table = found.proposals(scene.cameras)
-    matched = [found.match_from(scene.cameras, score).masks for score in (SURE_SCORE, MORE_SCORE)]
+    matched = [found.match(scene.cameras).masks, *found.match_more(scene.cameras)]
     candidates = gather_candidates(
         [(masks, masks.regions.labels) for masks in matched],
         lambda masks, known: fit_roughly(masks, scene.cameras, known=known),

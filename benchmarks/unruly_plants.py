@@ -1,9 +1,9 @@
 """Simulated plants as unruly as real ones: `python benchmarks/unruly_plants.py OUT [SKINS]`.
 
 Blades are curled and wavy, plants wild (`make_wild`), leaves move from photo to photo as in a draught, and the poses
-that the scene states are wrong by about 1.5 px. Four plants with truth, to judge on them what is chosen for real plants; and,
-with SKINS, a folder of leaves that were cut out, twelve more that look like other species (`dress`), and four of these
-seen from so near that leaves fill the photos, as somebody with a phone does.
+that the scene states are wrong by about 1.5 px. Four plants with truth, to judge on them what is chosen for real
+plants; and, with SKINS, a folder of leaves that were cut out, twelve more that look like other species (`dress`), and
+four of these seen from so near that leaves fill the photos, as somebody with a phone does.
 """
 
 from __future__ import annotations

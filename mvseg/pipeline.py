@@ -255,7 +255,6 @@ def split(state: State) -> State:
 
 def choose(state: State) -> State:
     """The views choose leaves and masks from the excessive set, see `choose_leaves`; `select_by_views` for the rest."""
-    from mvseg.detection.config import MORE_SCORE
     from mvseg.detection.few_views import select_by_views
     from mvseg.verification.choose import choose_leaves
     from mvseg.verification.rough_surfaces import fit_roughly
@@ -268,7 +267,7 @@ def choose(state: State) -> State:
         return fit_roughly(masks, cameras, known=known, workers=state.workers, progress=state.progress)
 
     with warnings.catch_warnings(action="ignore", category=InputWarning):  # the first matching has said it
-        more = state.found.match_from(cameras, min(MORE_SCORE, detect.min_score)).masks
+        more = state.found.match_more(cameras)
     leaves = choose_leaves(
         state.masks,
         state.found.proposals(cameras),

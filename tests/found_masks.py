@@ -30,8 +30,8 @@ class FoundMasks:
     def match(self, cameras: Cameras) -> Matching:
         return self.matching
 
-    def match_from(self, cameras: Cameras, min_score: float) -> Matching:
-        return self.matching
+    def match_more(self, cameras: Cameras) -> tuple[Masks, ...]:
+        return (self.matching.masks,)
 
     def proposals(self, cameras: Cameras) -> Masks:
         return self.excessive

@@ -1,5 +1,5 @@
-"""Instances in the photos of a scene: once, again at half the size where leaves are too large, and again, larger, where
-the plant fills a small part."""
+"""Instances in the photos of a scene: once, again at half the size where leaves may be too large for the detector, and
+again, larger, where the plant fills a small part."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tqdm import tqdm
 
 from mvseg._version import code_hash
 from mvseg.detection.cached_detections import CachedDetections, delete_cached, read_detections, write_detections
-from mvseg.detection.config import LEAST_SCORE, MIN_IMAGE_SIZE, DetectConfig
+from mvseg.detection.config import LEAST_SCORE, MIN_IMAGE_SIZE, MORE_SCORE, DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass, crop_cameras, place_crops
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN, list_proposals
 from mvseg.detectors.folded_norms import fold_norms
@@ -29,6 +29,10 @@ from mvseg.system.file_hash import hash_files
 
 UNSURE = 0.5  # share of the masks that are surely matched: with fewer, leaves may be too large for the detector
 SURE_MATCH = 0.9  # match score
+# Root of the area of masks, in pixels as the detector sees them, from which both sizes are better than either. The
+# medians of plants that fill the photo are about 40, of close-ups 83 to 100 (docs/notes/detector.md): a third more or
+# less changes none of them.
+LARGE = 64.0
 
 
 def detect_scene(
@@ -42,7 +46,8 @@ def detect_scene(
     """Find instances in every photo, and again, larger, where the plant fills a small part of the photos.
 
     Where less than half of them are surely matched, leaves may be too large: the detector looks once more, at half the
-    size, unless the size is given, and the look stays whose surely matched masks cover more.
+    size, unless the size is given. Where masks are large, both looks count; elsewhere the one stays whose surely
+    matched masks cover more.
 
     Runs on the first GPU, if there is one. One photo at a time is in memory, and those that `Photos` keeps.
 
@@ -61,14 +66,17 @@ def detect_scene(
     """
     look = partial(_look, photos, match=match, cache=cache, progress=progress)
     seen, cameras = look(config), photos.scene.cameras
-    names = seen.names
+    names, beside = seen.names, None
     if config.image_size is None and share_of_sure(seen.match(cameras).masks) < UNSURE:
         longest = min(seen.model.transform.max_size, int(cameras.sizes.max()))
         smaller = look(replace(config, image_size=max(MIN_IMAGE_SIZE, longest // 2)))
         names = names | smaller.names
-        seen = max(seen, smaller, key=lambda each: area_of_sure(each.match(cameras).masks))
+        if config.verify and median_side(seen.match(cameras).masks) * longest >= LARGE * int(cameras.sizes.max()):
+            beside = Found(smaller.model, smaller.detections, None, config.min_score, smaller.match, progress=progress)
+        else:
+            seen = max(seen, smaller, key=lambda each: area_of_sure(each.match(cameras).masks))
     boxes = None
-    if config.crop == "auto":
+    if config.crop == "auto" and beside is None:
         boxes = boxes_for_second_pass(seen.match(cameras).masks, cameras, longest=seen.model.transform.max_size)
     if boxes is not None:
         in_crops, more_names = _detect_photos(seen.model, photos, boxes, cached=seen.cached, progress=progress)
@@ -76,7 +84,7 @@ def detect_scene(
     if cache is not None:
         delete_cached(cache, but=names)
     if boxes is None:
-        return Found(seen.model, seen.detections, None, config.min_score, match_sure=seen.match, progress=progress)
+        return Found(seen.model, seen.detections, None, config.min_score, seen.match, beside, progress=progress)
     return Found(seen.model, in_crops, boxes, config.min_score, progress=progress)
 
 
@@ -90,6 +98,7 @@ class Found:
         boxes: (V, 4) int64 xyxy, the parts of the photos that were looked at; None: all of them.
         min_score: of what is matched at first.
         match_sure: from cameras to what is matched at first, where somebody has matched it before.
+        beside: what it finds at another size, where leaves are large.
         progress: show progress bars.
     """
 
@@ -98,6 +107,7 @@ class Found:
     boxes: Tensor | None
     min_score: float
     match_sure: Callable[[Cameras], Matching] | None = None
+    beside: Found | None = None
     progress: bool = False
 
     def match(self, cameras: Cameras) -> Matching:
@@ -108,13 +118,27 @@ class Found:
         """The same of the proposals with a score of `min_score` or more."""
         return _match(self, cameras, min_score)
 
+    def match_more(self, cameras: Cameras) -> tuple[Masks, ...]:
+        """Other matchings, for more candidates: of weaker proposals, and of those of another size."""
+        more = (self.match_from(cameras, min(MORE_SCORE, self.min_score)).masks,)
+        if self.beside is None:
+            return more
+        offset = len(self._own_proposals(cameras))
+        others = self.beside.match(cameras).masks, *self.beside.match_more(cameras)
+        return *more, *(replace(each, regions=replace(each.regions, labels=each.regions.labels + offset))
+                        for each in others)  # fmt: skip
+
     def proposals(self, cameras: Cameras) -> Masks:
         """The excessive set: all proposals, matched to nothing, in the frames of the photos."""
+        own = self._own_proposals(cameras)
+        return own if self.beside is None else Masks.concatenate((own, self.beside.proposals(cameras)))
+
+    def _own_proposals(self, cameras: Cameras) -> Masks:
         masks = list_proposals(self.detections, cameras if self.boxes is None else crop_cameras(cameras, self.boxes))
         return masks if self.boxes is None else place_crops(masks, self.boxes)
 
 
-@lru_cache(maxsize=2)  # each edit of a person asks again
+@lru_cache(maxsize=4)  # each edit of a person asks again
 def _match(found: Found, cameras: Cameras, min_score: float) -> Matching:
     posed = cameras if found.boxes is None else crop_cameras(cameras, found.boxes)
     matching = found.model.match_detections(found.detections, posed, min_score=min_score, progress=found.progress)
@@ -148,6 +172,11 @@ def _look(photos: Photos, config: DetectConfig, *, match: MatchConfig, cache: Pa
 def share_of_sure(masks: Masks) -> float:
     """The share of the masks that are surely matched; 0 without masks."""
     return float(_is_sure(masks).float().mean()) if len(masks) else 0.0
+
+
+def median_side(masks: Masks) -> float:
+    """Pixels: the median root of the masks' areas; 0 without masks."""
+    return float(masks.regions.areas.double().sqrt().median()) if len(masks) else 0.0
 
 
 def area_of_sure(masks: Masks) -> float:

@@ -157,7 +157,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         match = partial(self.match_detections, detections, posed, progress=progress)
         matching = match(min_score=max(SURE_SCORE, self.roi_heads.score_thresh))
         leaves = choose_leaves(
-            matching.masks, list_proposals(detections, posed), cameras=posed, more=match(min_score=MORE_SCORE).masks
+            matching.masks, list_proposals(detections, posed), cameras=posed, more=(match(min_score=MORE_SCORE).masks,)
         )
         return matching.with_masks(snap_masks(leaves.masks, photos.__getitem__))
 

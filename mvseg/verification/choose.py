@@ -76,7 +76,7 @@ def choose_leaves(
     proposals: Masks,
     *,
     cameras: Cameras,
-    more: Masks | None = None,
+    more: Sequence[Masks] = (),
     linked: Tensor | None = None,
     gone: Masks | None = None,
     min_probability: float | None = None,
@@ -91,7 +91,7 @@ def choose_leaves(
         matched: D masks, matched; the `labels` of those that a detector found are rows of `proposals`.
         proposals: R masks with detection scores, the excessive set; their ids do not matter.
         cameras: V cameras.
-        more: masks of a second matching, of more of the proposals, with such labels, too; None: of `matched` alone.
+        more: masks of other matchings, of more of the proposals, with such labels, too.
         linked: (D,) bool, masks that a person linked; None: none.
         gone: masks that a person took away; None: none.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
@@ -114,7 +114,7 @@ def choose_leaves(
     held[row_of[is_held].numpy()] = True
     fit = fit or (lambda masks, known: fit_roughly(masks, cameras, known=known))
     has_shapes = _is_seen_around(matched, cameras)
-    found = [(matched, row_of)] + ([] if more is None else [(more.to("cpu"), more.regions.labels.cpu())])
+    found = [(matched, row_of), *((each.to("cpu"), each.regions.labels.cpu()) for each in more)]
     candidates = gather_candidates(found, fit if has_shapes else None, table=table, is_held=is_held)
     drawn = draw_views(table.regions, candidates.surfaces, cameras)
     usable = np.concatenate((left, np.ones(len(added), bool)))

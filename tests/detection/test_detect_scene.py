@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -18,10 +19,40 @@ from mvseg.masks import Masks
 
 def found(*, side: int, scores: list[float]) -> Masks:
     """A square in each of as many views as there are scores, all of one instance."""
-    labels = np.zeros((40, 40), np.int64)
+    labels = np.zeros((120, 120), np.int64)
     labels[:side, :side] = 1
     regions, _ = as_regions([labels] * len(scores))
     return Masks.of(regions, torch.ones(len(scores), dtype=torch.int64), torch.tensor(scores))
+
+
+def test_both_sizes_count_where_masks_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is proposed at half the size follows, and the labels of all matchings are rows of the whole set."""
+    scene = load_scene(demo_scene())
+    views, sides = len(scene.views), (100, 50)
+    tables = [found(side=side, scores=[0.1] * views) for side in sides]
+    tables = [replace(each, regions=replace(each.regions, labels=torch.arange(views))) for each in tables]
+
+    def look(_: Photos, config: DetectConfig, **__: object) -> SimpleNamespace:
+        table = tables[config.image_size is not None]
+        model = SimpleNamespace(transform=SimpleNamespace(max_size=int(scene.cameras.sizes.max())))
+        model.match_detections = lambda found, _, min_score, progress: SimpleNamespace(masks=found)
+        matching = SimpleNamespace(masks=table)
+        return SimpleNamespace(model=model, cached=None, names=set(), detections=table, match=lambda _: matching)
+
+    monkeypatch.setattr(steps, "_look", look)
+    monkeypatch.setattr(steps, "list_proposals", lambda detections, _: detections)
+    seen = steps.detect_scene(Photos(scene))
+    proposals = seen.proposals(scene.cameras)
+    assert len(proposals) == 2 * views
+    assert [*map(steps.median_side, tables)] == [*sides]
+    own, *others = seen.match_more(scene.cameras)
+    assert own.regions.labels.tolist() == [*range(views)]
+    assert [each.regions.labels.tolist() for each in others] == [[*range(views, 2 * views)]] * 2
+    for each in others:
+        assert torch.equal(each.regions.areas, proposals.regions.areas[each.regions.labels])
+    monkeypatch.setattr(steps, "LARGE", 101.0)
+    assert len(steps.detect_scene(Photos(scene)).proposals(scene.cameras)) == views
+    assert steps.detect_scene(Photos(scene), DetectConfig(verify=False)).beside is None
 
 
 def test_the_share_and_the_area_of_sure_masks() -> None:

@@ -30,8 +30,8 @@ UNITLESS = {"degree": "°", "1": ""}
 
 
 def describe_leaves(result: Result) -> list[dict[str, Any]]:
-    """One entry per instance that has masks: id, colour, how likely it is a leaf (where the views chose it), shape, doubts, and its
-    traits, if they were measured."""
+    """One entry per instance that has masks: id, colour, how likely it is a leaf (where the views chose it), shape,
+    doubts, and its traits, if they were measured."""
     measured = {} if result.traits is None else {leaf.leaf: leaf for leaf in result.traits.leaves}
     found = []
     ids = result.masks.instance_ids
