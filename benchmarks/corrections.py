@@ -61,7 +61,7 @@ from mvseg.system.atomic import write_text_whole
 
 Record = dict[str, Any]
 
-NOT_AGAIN = ("detect", "check", "measure")  # done once, or not shown
+NOT_AGAIN = ("detect", "say_what_is_missing", "check", "measure")  # done once, or not shown
 MOST, ROUNDS = 2.0, 8  # edits' worth per leaf, and in how many rounds, as a rule
 CURVES = (
     ("corrected, what repairs most first", "repair", "", "C2-"),

@@ -158,6 +158,7 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
         "split": split if config.split_merged and not is_checked else None,
         "choose": choose if is_verified else None,
         "snap": snap if is_verified else None,
+        "say_what_is_missing": say_what_is_missing if is_verified else None,
         "check": check_cameras,
         "check_ids": check_ids if is_checked else None,
         "split_checked": split if config.split_merged and is_checked else None,
@@ -288,6 +289,16 @@ def snap(state: State) -> State:
     from mvseg.verification.snap_edges import snap_masks
 
     return state.with_masks(snap_masks(state.masks, state.photos))
+
+
+def say_what_is_missing(state: State) -> State:
+    """Warns (InputWarning) where leaves were probably missed, see `describe_missing`."""
+    from mvseg.detection.config import SURE_SCORE
+    from mvseg.verification.unexplained import describe_missing
+
+    if len(state.masks) and (said := describe_missing(state.masks, state.photos, sure_score=SURE_SCORE)):
+        warnings.warn(said, InputWarning, stacklevel=3)
+    return state
 
 
 def _is_linked(state: State) -> torch.Tensor:

@@ -1,0 +1,65 @@
+"""How much of what looks like leaves no mask explains: where it is most of it, leaves were missed. Not in the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.masks import Masks
+from mvseg.verification.evidence import MOST_PX
+from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+
+Photos = Callable[[int], NDArray[np.uint8]]
+
+# Of the pixels of leaf colour, outside all leaves: more than inside. Of plants that were found whole, 0.15 to 0.39 are
+# (stems, soil and pots), of those of which a quarter was found, 0.48 to 0.84 (docs/notes/detector.md).
+MUCH = 0.5
+HELP = "what helps most: correct a few leaves (mvseg correct), fine-tune on them (mvseg train), or give masks (--masks)"
+
+
+def share_unexplained(masks: Masks, photos: Photos) -> float:
+    """Of all pixels that are in masks, or have the colours of these, the share that is in none; 0 without any.
+
+    Args:
+        masks: D masks, those of leaves with an id.
+        photos: view index -> (H, W, 3) uint8 RGB, undistorted; every second, third ... pixel of large ones counts.
+    """
+    counts, views = ColorCounts.none(), []
+    for view in range(masks.regions.num_views):
+        photo = photos(view)
+        height, width = photo.shape[:2]
+        step = -(-max(height, width) // MOST_PX)
+        inside = masks.regions.label_map(view, (masks.instance_ids > 0).long(), (width, height)).numpy() > 0
+        views.append((np.ascontiguousarray(photo[::step, ::step]), inside[::step, ::step]))
+        counts += count_colors(*views[-1])
+    colors, total, beside = leaf_colors(counts), 0, 0
+    for photo, inside in views:
+        is_leaf = has_leaf_color(photo, colors) | inside
+        total += int(is_leaf.sum())
+        beside += int((is_leaf & ~inside).sum())
+    return beside / max(total, 1)
+
+
+def describe_missing(masks: Masks, photos: Photos, *, sure_score: float) -> str:
+    """A sentence where leaves were probably missed, "" elsewhere.
+
+    Args:
+        masks, photos: see `share_unexplained`.
+        sure_score: detection score of what the detector is sure of.
+    """
+    found = masks.instance_ids > 0
+    if not found.any():
+        return f"no leaf was found that two photos agree on; {HELP}"
+    scores = masks.detection_scores[found]
+    scores = scores[~scores.isnan()]
+    if len(scores) and float(scores.median()) < sure_score:
+        return (
+            f"most leaves score less than {sure_score:g}: the detector does not know this species well, and has "
+            f"probably missed others; {HELP}"
+        )
+    share = share_unexplained(masks, photos)
+    if share > MUCH:
+        return f"{share:.0%} of what has the colour of the leaves that were found is in none: some are missing; {HELP}"
+    return ""

@@ -1,0 +1,59 @@
+"""Where leaves were probably missed, one sentence says so; where none was, nothing is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import SIZE, as_regions
+from mvseg.masks import Masks
+from mvseg.verification.unexplained import describe_missing, share_unexplained
+from three_leaves import true_maps
+
+MAPS = true_maps()
+REGIONS, IDS = as_regions(MAPS)
+GREEN, GREY = (40, 160, 50), (128, 120, 110)
+
+
+def photo(view: int) -> np.ndarray:
+    """Green leaves before grey."""
+    return np.where((MAPS[view] > 0)[..., None], np.uint8(GREEN), np.uint8(GREY))
+
+
+def found(leaves: tuple[int, ...], score: float = 0.8) -> Masks:
+    keep = torch.isin(IDS, torch.tensor(leaves, dtype=torch.int64))
+    scores = torch.full((int(keep.sum()),), score)
+    return Masks.of(REGIONS.select(keep), IDS[keep], torch.ones_like(scores), detection_scores=scores)
+
+
+@pytest.mark.parametrize("leaves", [(1, 2, 3), (1, 3), (2,)])
+def test_the_share_is_that_of_the_pixels(leaves: tuple[int, ...]) -> None:
+    every = sum(int((labels > 0).sum()) for labels in MAPS)
+    inside = sum(int(np.isin(labels, leaves).sum()) for labels in MAPS)
+    assert share_unexplained(found(leaves), photo) == pytest.approx(1 - inside / every)
+
+
+def test_thinned_photos_say_nearly_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = share_unexplained(found((2,)), photo)
+    monkeypatch.setattr("mvseg.verification.unexplained.MOST_PX", SIZE // 2)
+    assert share_unexplained(found((2,)), photo) == pytest.approx(whole, abs=0.01)
+
+
+def test_a_plant_that_is_found_whole_is_not_spoken_of() -> None:
+    assert describe_missing(found((1, 2, 3)), photo, sure_score=0.3) == ""
+
+
+def test_what_is_missing_is_said_once() -> None:
+    share = share_unexplained(found((2,)), photo)
+    assert share > 0.5
+    said = describe_missing(found((2,)), photo, sure_score=0.3)
+    assert said.startswith(f"{share:.0%} of what has the colour")
+    assert "mvseg correct" in said
+    assert "does not know this species" in describe_missing(found((1, 2, 3), score=0.2), photo, sure_score=0.3)
+    nothing = replace(found((1,)), instance_ids=torch.full((len(found((1,))),), -1))
+    assert "no leaf" in describe_missing(nothing, photo, sure_score=0.3)
+    by_hand = replace(found((1, 2, 3)), detection_scores=torch.full((len(IDS),), torch.nan))
+    assert describe_missing(by_hand, photo, sure_score=0.3) == ""
