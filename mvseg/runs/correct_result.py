@@ -35,7 +35,8 @@ from mvseg.verification.leaf_color import colors_of_leaves
 from mvseg.verification.rough_surfaces import fit_roughly
 
 CORRECTIONS_FILE = "corrections.json"
-NOT_AGAIN = ("detect", "say_what_is_missing", "check", "measure", "reconstruct")  # stages whose outcome the page does not show, or that ran
+# Stages whose outcome the page does not show, or that ran.
+NOT_AGAIN = ("detect", "say_what_is_missing", "check", "measure", "reconstruct")
 
 
 class Superseded(Exception):
