@@ -346,7 +346,6 @@ def follow(state: State) -> State:
         cameras=state.scene.cameras,
         photos=state.photos if state.photos.exist else None,
         colors=state.colors,
-        proposals=None if state.found is None else state.found.proposals(state.scene.cameras),
         workers=state.workers,
     )
     return replace(state, instances=Instances(starts=starts)).with_masks(masks)

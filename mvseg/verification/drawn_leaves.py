@@ -2,15 +2,13 @@
 
 Two outlines leave a surface's tilt open. The other views close it: what has the colour of leaves there, and is in no
 mask of another leaf, is the leaf itself wherever the points that both outlines allow come to lie in it. The surface
-is fitted to those parts as well. Then what the detector proposes is asked whether it shows that surface (q of
-`leaf_scores.py`): the best proposals become masks, and the surface is fitted to them instead. In the views that are
-left, it says itself what they show of the leaf. Not in the paper.
+is fitted to those parts as well, and then says what each view shows of the leaf. Not in the paper.
 """
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
@@ -28,10 +26,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, mask_box, stack_regions
 from mvseg.scene import Cameras
-from mvseg.verification.choose import DIGITS
-from mvseg.verification.evidence import SHARED, Bools, Drawn, draw_views, see
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
-from mvseg.verification.leaf_scores import Candidates, best_masks, show_chances
 from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
 
 Photos = Callable[[int], NDArray[np.uint8]]
@@ -42,7 +37,6 @@ LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this share of it
 LEAST_PIXELS = 64  # and so many of its pixels
 LEAST_COLORED = 0.8  # the visible part of a surface becomes a mask if this share of it has the colour of leaves
 HULL = ReconstructConfig(voxel_budget=25_000)
-MORE_LIKELY = 0.5  # q from which a proposal shows the leaf more likely than not (a definition)
 ROUNDS = 2  # the second one looks only where the surface of the first one is
 BESIDE_PX = 2  # from leaf colour, that a point of a leaf may be shown
 MOST_AGAINST = 0.15  # of the views that look past a point: stakes and labels hide leaves, too
@@ -56,23 +50,19 @@ def follow_drawn(
     cameras: Cameras,
     photos: Photos | None,
     colors: Frame | None = None,
-    proposals: Masks | None = None,
     workers: ProcessPoolExecutor | None = None,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
     """Give the leaves that a person drew a mask in each other view that shows them openly.
 
-    First the proposals that more likely than not show the leaf's surface, see `pick_proposals`. Then, where at least
-    `LEAST_VISIBLE` of it, and `LEAST_PIXELS`, lie in no mask of another leaf, and `LEAST_COLORED` of that have the
-    colour of leaves, a mask that was matched to nothing and agrees with it (`AGREES`), or that part itself, with
-    `Origin.OTHER_VIEWS`.
+    That is where at least `LEAST_VISIBLE` of the leaf's surface, and `LEAST_PIXELS`, lie in no mask of another leaf,
+    and `LEAST_COLORED` of it have the colour of leaves. There, a mask that was matched to nothing and agrees with it
+    (`AGREES`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
 
     Args:
         masks: D masks, matched; those that a person drew have `Origin.CORRECTED`.
         cameras: V cameras.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted. None: the outlines alone tell.
         colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
-        proposals: R masks, the excessive set, with detection scores; the `labels` of the detector's masks are their
-            rows. None: masks were given.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
 
     Returns:
@@ -92,8 +82,6 @@ def follow_drawn(
     for leaf in (leaf for leaf in drawn if others[leaf]):
         surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras, workers=workers)
         if surface.is_credible:
-            if proposals is not None:
-                masks, surface = _add_proposals(masks, leaf, surface, proposals.to("cpu"), cameras=cameras)
             surfaces[leaf] = surface
             masks = _show(masks, leaf, surface, cameras=cameras, colored=colored)
     return masks, surfaces
@@ -137,82 +125,6 @@ def _fit(
     if best is None or is_own is None or float(best.iou[is_own].min()) < AGREES:  # the outlines are certain
         return fit({}, None)
     return best
-
-
-def _add_proposals(
-    masks: Masks, leaf: int, surface: LeafSurface, proposals: Masks, *, cameras: Cameras
-) -> tuple[Masks, LeafSurface]:
-    """The masks with the proposals that show a leaf, and its surface fitted to them; as they were, where that is not
-    credible any more, or does not agree with the outlines."""
-    best = masks, surface
-    for _ in range(ROUNDS):
-        found = pick_proposals(masks, leaf, best[1], proposals, cameras=cameras)
-        more = _with_proposals(masks, leaf, proposals, found)
-        own = more.instance_ids == leaf
-        ids = torch.where(own, leaf, -1)
-        fitted = fit_surfaces(more.regions, ids, cameras, starts={leaf: best[1]})[leaf] if len(found) else best[1]
-        if not len(found) or not fitted.is_credible:
-            break
-        drawn_views = more.view_index[own & more.is_corrected]
-        if float(fitted.iou[torch.isin(fitted.views, drawn_views)].min()) < AGREES:
-            break
-        best = more, fitted
-    return best
-
-
-def pick_proposals(
-    masks: Masks, leaf: int, surface: LeafSurface, proposals: Masks, *, cameras: Cameras
-) -> NDArray[np.int64]:
-    """Rows of the proposals that show the surface of a leaf more likely than not, the best one in each view that has no
-    mask of it yet.
-
-    Masks of other instances lie in front of it, and what shows the same as one of them shows no second leaf. For the
-    arguments see `follow_drawn`.
-    """
-    is_other = (masks.instance_ids != leaf) & ((masks.instance_ids > 0) | masks.is_corrected)
-    others = masks.regions.select(is_other)
-    views = torch.tensor(_views_without(masks, leaf))
-    is_near = torch.isin(proposals.view_index, views) & (proposals.regions.areas > 0)
-    for view, ((x1, y1, x2, y2), _) in enumerate(surface.project_parts(cameras)):
-        boxes = proposals.regions.boxes
-        meets = (boxes[:, 0] < x2) & (boxes[:, 2] > x1) & (boxes[:, 1] < y2) & (boxes[:, 3] > y1)
-        is_near &= meets | (proposals.view_index != view)
-    rows = is_near.nonzero()[:, 0]
-    near = proposals.select(rows)
-    if not len(near):
-        return np.zeros(0, np.int64)
-    drawn = draw_views(near.regions, [surface], cameras, front=others)
-    unmatched = np.full((len(near), 1), np.nan)
-    candidate = Candidates((surface,), unmatched, np.zeros_like(unmatched, bool))
-    scores = near.detection_scores.double().numpy()
-    q = np.round(show_chances(candidate, see(drawn, len(near), np.zeros(1, bool)), scores), DIGITS)
-    q[near.classes.numpy() != int(masks.classes[masks.instance_ids == leaf][0])] = 0
-    q[_show_others(drawn)] = 0
-    best, row = best_masks(q, [each.rows for each in drawn])
-    return rows.numpy()[np.sort(row[best[:, 0] > MORE_LIKELY, 0])]
-
-
-def _show_others(drawn: Sequence[Drawn]) -> Bools:
-    """(D,) masks of which more than `SHARED` lies in front of all surfaces."""
-    shows = np.zeros(sum(len(each.rows) for each in drawn), bool)
-    for each in drawn:
-        shows[each.rows] = each.masks.T @ each.front > SHARED * each.masks.sum(0)
-    return shows
-
-
-def _with_proposals(masks: Masks, leaf: int, proposals: Masks, found: NDArray[np.int64]) -> Masks:
-    """The masks with the proposals `found` (rows) in an instance, in their own rows or, of those that were not matched,
-    after all others."""
-    row_of = {int(label): row for row, label in enumerate(masks.regions.labels.tolist())
-              if masks.origin[row] == Origin.DETECTED}  # fmt: skip
-    there = [row_of[row] for row in found.tolist() if row in row_of]
-    new = proposals.select(torch.tensor([row for row in found.tolist() if row not in row_of], dtype=torch.int64))
-    score = masks.match_scores[masks.instance_ids == leaf].mean()
-    is_found = torch.arange(len(masks) + len(new)) >= len(masks)
-    is_found[there] = True
-    both = Masks.concatenate((masks, new.with_merged(())))
-    ids, scores = both.instance_ids.masked_fill(is_found, leaf), both.match_scores.masked_fill(is_found, float(score))
-    return replace(both, instance_ids=ids, match_scores=scores).with_merged(masks.merged)
 
 
 def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, colored: list[Frame]) -> Masks:

@@ -38,14 +38,12 @@ class Drawn:
         masks: (P, N) int32 of 0 and 1.
         parts: (P, K) int32, what the surfaces cover as if nothing hid them.
         depth: (K,) of their middles, world units; infinite without a surface.
-        front: (P,) bool, what lies in front of all surfaces.
     """
 
     rows: Ints
     masks: csc_array
     parts: csc_array
     depth: Floats
-    front: Bools
 
     @cached_property
     def common(self) -> Floats:
@@ -79,32 +77,19 @@ class Evidence:
     share: Floats
 
 
-def draw_views(
-    regions: Regions,
-    surfaces: Sequence[LeafSurface | None],
-    cameras: Cameras,
-    *,
-    front: Regions | None = None,
-) -> tuple[Drawn, ...]:
-    """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out. Other regions, `front`,
-    lie in front of all surfaces."""
+def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> tuple[Drawn, ...]:
+    """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out."""
     drawn, all_depths = [], _depths(surfaces, cameras)
     nothing: Placed = (0, 0, 0, 0), np.zeros((0, 0), bool)
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         step = -(-max(width, height) // MOST_PX)
         size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
         camera, rows = cameras[[view]], (regions.view_index == view).nonzero()[:, 0].numpy()
-        masks = _placed(regions, rows.tolist())
-        before = [] if front is None else _placed(front, (front.view_index == view).nonzero()[:, 0].tolist())
+        masks: list[Placed] = [(tuple(regions.boxes[row].tolist()), regions.crop(row).numpy()) for row in rows.tolist()]
         parts = [nothing if each is None else each.project_parts(camera)[0] for each in surfaces]
         pixels, covered = _columns(masks, size, step), _columns(parts, size, step)
-        is_front = np.asarray(_columns(before, size, step).sum(1) > 0, bool).reshape(-1)
-        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view], front=is_front))
+        drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view]))
     return tuple(drawn)
-
-
-def _placed(regions: Regions, rows: Sequence[int]) -> list[Placed]:
-    return [(tuple(regions.boxes[row].tolist()), regions.crop(row).numpy()) for row in rows]
 
 
 def _depths(surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> Floats:
@@ -159,7 +144,7 @@ def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
 
 def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
     """(P, K) the parts without what nearer ones of `hides` cover."""
-    parts, taken = drawn.parts, drawn.front.copy()
+    parts, taken = drawn.parts, np.zeros(drawn.parts.shape[0], bool)
     kept = np.ones(parts.nnz, np.int32)
     for index in np.argsort(drawn.depth, kind="stable").tolist():
         span = slice(parts.indptr[index], parts.indptr[index + 1])

@@ -15,7 +15,7 @@ from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions
 from mvseg.scene import Scene
-from mvseg.verification.drawn_leaves import follow_drawn, pick_proposals
+from mvseg.verification.drawn_leaves import follow_drawn
 
 
 @pytest.fixture(scope="module")
@@ -98,33 +98,3 @@ def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions]
     after, _ = follow_drawn(both, cameras=scene.cameras, photos=Photos(scene))
     for name in ("instance_ids", "origin", "match_scores"):
         assert torch.equal(getattr(after, name)[: len(both)], getattr(both, name))
-
-
-def test_proposals_that_show_it_become_its_masks(plant: tuple[Scene, Regions]) -> None:
-    """Weak ones, too; not one that shows another leaf, nor one of another class, nor a leaf that has a mask there."""
-    scene, truth = plant
-    masks = drawn(truth, 8, (4, 7))
-    shown = truth.select(truth.labels == 8)
-    beside = truth.select((truth.labels == 3) | (truth.labels == 10))
-    proposals = Masks.concatenate((
-        Masks.of(shown, detection_scores=torch.full((len(shown),), 0.06), origin=Origin.DETECTED),
-        Masks.of(beside, detection_scores=torch.full((len(beside),), 0.9), origin=Origin.DETECTED),
-    ))  # fmt: skip
-    after, surfaces = follow_drawn(masks, cameras=scene.cameras, photos=Photos(scene), proposals=proposals)
-    is_new = torch.arange(len(after)) >= len(masks)
-    found = after.select(is_new & (after.origin == Origin.DETECTED))
-    assert (found.instance_ids == 8).all()
-    assert (found.detection_scores == 0.06).all()
-    assert len(found) >= 5
-    assert found.view_index.unique().numel() == len(found)
-    assert not torch.isin(found.view_index, torch.tensor([4, 7])).any()
-    others = replace(proposals, classes=torch.full_like(proposals.classes, 2))
-    _, surface = follow_drawn(masks, cameras=scene.cameras, photos=Photos(scene))
-    assert not len(pick_proposals(masks, 8, surface[8], others, cameras=scene.cameras))
-    taken = Masks.concatenate((masks, Masks.of(shown, torch.full((len(shown),), 1))))
-    assert not len(pick_proposals(taken, 8, surface[8], proposals, cameras=scene.cameras))
-    order = torch.randperm(len(proposals), generator=torch.Generator().manual_seed(1))
-    rows = pick_proposals(masks, 8, surface[8], proposals, cameras=scene.cameras)
-    again = pick_proposals(masks, 8, surface[8], proposals.select(order), cameras=scene.cameras)
-    assert sorted(order[again].tolist()) == rows.tolist()
-    assert surfaces[8].is_credible
