@@ -43,11 +43,11 @@ def room_cameras(num_views: int = 7, *, width: int = WIDTH, height: int = HEIGHT
     )
 
 
-def texture(seed: int) -> np.ndarray:
-    """(H, W, 3) uint8: noise of several grain sizes."""
+def texture(seed: int, grains: tuple[int, ...] = (20, 40, 100)) -> np.ndarray:
+    """(H, W, 3) uint8: noise of several grain sizes, pixels."""
     rng, size = np.random.default_rng(seed), round(SIDE * PX_PER_MM)
     total = np.zeros((size, size, 3))
-    for grain in (20, 40, 100):
+    for grain in grains:
         noise = rng.normal(size=(size // grain + 1, size // grain + 1, 3))
         total += cv2.resize(noise, (size, size), interpolation=cv2.INTER_CUBIC)
     return np.clip(128 + 40 * total, 0, 255).astype(np.uint8)

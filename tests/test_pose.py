@@ -11,6 +11,7 @@ import sys
 import time
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -141,6 +142,27 @@ def test_places_that_are_not_ours(
     assert main(["pose", str(plant / "images"), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert "8.png: the photo cannot be read" in capsys.readouterr().err
     assert sorted(path.name for path in tmp_path.iterdir()) == ["empty", "plant"]
+
+
+def test_a_video_gives_photos(tmp_path: Path, quick: list, capsys: pytest.CaptureFixture[str]) -> None:
+    """Or one sentence, and nothing is left behind."""
+    picture = np.random.default_rng(0).integers(0, 255, (50, 80, 3), np.uint8).repeat(8, 0).repeat(8, 1)
+    for name, step in (("walk.mp4", 8), ("still.mp4", 0)):
+        video = cv2.VideoWriter(str(tmp_path / name), cv2.VideoWriter.fourcc(*"mp4v"), 15, (320, 240))
+        for frame in range(24):
+            video.write(np.ascontiguousarray(picture[:240, step * frame : step * frame + 320]))
+        video.release()
+    (tmp_path / "broken.mp4").write_bytes(b"no video")
+    for name, message in (
+        ("walk.mp4", "structure from motion was reached"),
+        ("still.mp4", "still.mp4: the picture moves by 0% of its longer side in 24 frames, expected 8% or more"),
+        ("broken.mp4", "broken.mp4: the video cannot be opened"),
+        ("nowhere.mp4", "nowhere.mp4: no such folder, expected a folder of photos or a video"),
+    ):
+        assert main(["pose", str(tmp_path / name), "--out", str(tmp_path / "out"), "--quiet"]) == 2
+        assert message in capsys.readouterr().err
+    assert len(quick) == 1
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["broken.mp4", "still.mp4", "walk.mp4"]
 
 
 @pytest.mark.slow

@@ -1,4 +1,4 @@
-"""Estimate the cameras of photos: a scene folder for mvseg infer, from photos alone."""
+"""Estimate the cameras of photos or of a video: a scene folder for mvseg infer, from these alone."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from mvseg.poses.config import Known, PoseConfig
 
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
-    parser.add_argument("photos", type=Path, help="folder of photos, or of folders of photos, one per camera")
+    parser.add_argument("photos", type=Path, help="folder of photos, or of one such folder per camera; or a video")
     parser.add_argument("--out", type=Path, required=True, help="the scene folder")
     parser.add_argument("--config", action=CheckedConfig, help="YAML file with any of these options")
     add_shared(parser, "quiet")

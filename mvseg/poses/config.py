@@ -23,15 +23,17 @@ class PoseConfig:
 
     Attributes:
         pairs: which photos are compared: all pairs (exhaustive), or neighbours in the order of their names and a few
-            further away, the last being neighbours of the first (sequential). By default all pairs of up to 40 photos,
-            neighbours of more.
-        image_size: photos whose longer side has more pixels are scaled down to it for finding features.
+            further away, the last being neighbours of the first (sequential). By default all pairs of up to 30 photos;
+            of more, neighbours and those that look alike, and all pairs of photos that these leave out.
+        image_size: photos whose longer side has more pixels are scaled down to it for finding features; to 1600
+            at the first attempt, which is quick.
         camera_model: COLMAP's name of the lens.
         shared_camera: true: one camera took all photos, with one zoom; false: every photo has a camera of its own. By
             default photos of one folder, size and (EXIF) focal length share one.
         calibration: file of OpenCV or ROS with the camera matrix and distortion of all photos; they are then not
             estimated.
         min_registered: number of photos that must register; by default 60 %, and at least 3.
+        frames: of a video, at most so many become photos.
     """
 
     pairs: Pairs | None = None
@@ -40,12 +42,15 @@ class PoseConfig:
     shared_camera: bool | None = None
     calibration: Path | None = None
     min_registered: int | None = None
+    frames: int = 60
 
     def __post_init__(self) -> None:
         if self.image_size < 64:
             raise InputError(f"image_size is {self.image_size}, expected 64 or more")
         if self.min_registered is not None and self.min_registered < LEAST:
             raise InputError(f"min_registered is {self.min_registered}, expected {LEAST} or more")
+        if self.frames < LEAST:
+            raise InputError(f"frames is {self.frames}, expected {LEAST} or more")
         if self.calibration is not None and self.shared_camera is False:
             raise InputError("shared_camera is false beside a calibration, expected one of them")
 

@@ -1,4 +1,7 @@
-"""Which photos are compared, SIFT features of every photo and their matches, computed by COLMAP into its database.
+"""SIFT features of every photo and their matches, in COLMAP's database.
+
+`find_features` is quick. `extract_features` finds more, COLMAP's own, in four times the time, and matching those takes
+nearly ten times as long: for photos of which too few register otherwise.
 
 COLMAP's lists of pairs cannot hold names with spaces, so it gets the photos under numbers.
 """
@@ -7,59 +10,27 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 from tqdm import tqdm
 
 from mvseg.errors import InputError
+from mvseg.formats.image_file import read_rgb
 from mvseg.poses.cancellable import run_cancellable
-from mvseg.poses.config import Pairs, PoseConfig
+from mvseg.poses.config import PoseConfig
 from mvseg.poses.photo_files import PhotoFile, group_by_camera
+from mvseg.poses.sift import coarsest, count_alike, find_sift
 
 PHOTOS_AT_ONCE = max(2, os.cpu_count() or 1)  # of one call, after which the progress bar advances
-PAIRS_AT_ONCE = 10
+PAIRS_AT_ONCE = 100  # of one call, which indexes each of its photos once: at 10 matching takes several times as long
 SEED = 0
-FEW = 40  # photos up to which all pairs are compared: 780 pairs, a minute or two on two cores
-OVERLAP = 10  # neighbours on either side in a sequence
-FAR = 2  # neighbours further away are 2 x OVERLAP, 4 x OVERLAP, ... steps off
-
-
-def choose_pairs(names: Sequence[str], pairs: Pairs | None = None) -> list[tuple[int, int]]:
-    """Pairs of photos to compare, as indices i < j, each once, in order.
-
-    "exhaustive" are all pairs. "sequential" is for walks round a plant and turntables: each photo with its OVERLAP
-    next neighbours on either side and with some further away, the last photos being neighbours of the first. Photos of
-    different folders (one per camera) are neighbours if their places in their sequences are.
-
-    Args:
-        names: paths of the photos, "/" between folders, in the order in which they were taken.
-        pairs: None: exhaustive for FEW photos, sequential for more.
-    """
-    if pairs == "exhaustive" or (pairs is None and len(names) <= FEW):
-        return list(combinations(range(len(names)), 2))
-    sequences: dict[str, list[int]] = defaultdict(list)
-    for index, name in enumerate(names):
-        sequences[name.rpartition("/")[0]].append(index)
-    found: set[tuple[int, int]] = set()
-    for one in sequences.values():
-        for other in sequences.values():
-            for place, index in enumerate(one):
-                same = round(place * len(other) / len(one))  # the place of this photo in the other sequence
-                near = {other[(same + step) % len(other)] for step in _steps(len(other))}
-                found |= {(min(index, each), max(index, each)) for each in near if each != index}
-    return sorted(found)
-
-
-def _steps(num_photos: int) -> list[int]:
-    """How far off the neighbours of a photo are, in a sequence."""
-    steps = list(range(OVERLAP + 1))
-    while steps[-1] * FAR <= num_photos // 2:
-        steps.append(steps[-1] * FAR)
-    return [sign * step for step in steps for sign in (1, -1)]
+QUICK_SIZE = 1600  # pixels of the longer side; a third more takes twice as long
+QUICK_MOST = 4096  # features of a photo, those of most contrast; a third more take half as long again to match
 
 
 def number_photos(images: Path, photos: Sequence[PhotoFile], folder: Path) -> dict[str, PhotoFile]:
@@ -74,6 +45,52 @@ def number_photos(images: Path, photos: Sequence[PhotoFile], folder: Path) -> di
     return numbered
 
 
+def make_database(
+    database: Path,
+    folder: Path,
+    numbered: Mapping[str, PhotoFile],
+    *,
+    config: PoseConfig,
+    lens: pycolmap.Camera | None = None,
+) -> None:
+    """A new database with all photos, of these names in `folder`; those of one camera share it. `lens` is the camera,
+    if it is calibrated.
+
+    Raises:
+        InputError: COLMAP cannot read a photo, or photos of different sizes are to share a camera.
+    """
+    pycolmap.Database.open(database).close()  # makes it
+    for names in _names_by_camera(numbered, config):  # in order, so that photos have the same numbers in every run
+        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, names, _reader(config, lens))
+    with pycolmap.Database.open(database) as opened:
+        for name, photo in numbered.items():
+            if opened.read_image_with_name(name) is None:
+                raise InputError(f"{photo.name}: COLMAP cannot read this photo, expected JPEG or PNG")
+
+
+def find_features(
+    database: Path, folder: Path, names: Sequence[str], *, image_size: int, progress: bool = False
+) -> NDArray[np.int64]:
+    """Find up to QUICK_MOST features in each photo of the database, at QUICK_SIZE or `image_size` pixels if that is
+    less.
+
+    Returns:
+        (V, V) how alike the photos are, see `count_alike`.
+    """
+    coarse = []
+    with pycolmap.Database.open(database) as opened:
+        number_of = {image.name: image.image_id for image in opened.read_all_images()}
+        for name in tqdm(names, desc="features", unit="photo", disable=not progress):
+            grey = np.asarray(cv2.cvtColor(read_rgb(folder / name), cv2.COLOR_RGB2GRAY), np.uint8)
+            sift = find_sift(grey, image_size=min(image_size, QUICK_SIZE), most=QUICK_MOST)
+            number = number_of[name]
+            opened.write_keypoints(number, np.column_stack([sift.px, sift.scale, sift.angle]))
+            bytes_of = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, sift.descriptors)
+            opened.write_descriptors(number, bytes_of)
+            coarse.append(coarsest(sift))
+    return count_alike(coarse)
+
+
 def extract_features(
     database: Path,
     folder: Path,
@@ -83,28 +100,10 @@ def extract_features(
     lens: pycolmap.Camera | None = None,
     progress: bool = False,
 ) -> None:
-    """Find the features of all photos, of these names in `folder`; photos of one camera share it in the database, which
-    is made here. `lens` is the camera, if it is calibrated.
-
-    Raises:
-        InputError: COLMAP cannot read a photo, or photos of different sizes are to share a camera.
-    """
+    """Find COLMAP's features of all photos of the database, which was made with the same arguments."""
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=config.image_size)
-    reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
-    if lens is not None:
-        reader.camera_model, reader.camera_params = lens.model_name, ",".join(map(repr, map(float, lens.params)))
-    name_of = {photo: name for name, photo in numbered.items()}
-    groups = group_by_camera(list(numbered.values()), shared=config.shared_camera)
-    of_cameras = [[name_of[photo] for photo in group] for group in groups]
-    pycolmap.Database.open(database).close()  # makes it
-    for names in of_cameras:  # first, so that photos have the same numbers in every run, whichever thread ends first
-        pycolmap.import_images(database, folder, pycolmap.CameraMode.SINGLE, names, reader)
-    with pycolmap.Database.open(database) as opened:
-        for name, photo in numbered.items():
-            if opened.read_image_with_name(name) is None:
-                raise InputError(f"{photo.name}: COLMAP cannot read this photo, expected JPEG or PNG")
-    with tqdm(total=len(numbered), desc="features", unit="photo", disable=not progress) as bar:
-        for names in of_cameras:
+    with tqdm(total=len(numbered), desc="more features", unit="photo", disable=not progress) as bar:
+        for names in _names_by_camera(numbered, config):
             for start in range(0, len(names), PHOTOS_AT_ONCE):
                 some = names[start : start + PHOTOS_AT_ONCE]
                 run_cancellable(
@@ -113,10 +112,23 @@ def extract_features(
                     folder,
                     image_names=some,
                     camera_mode=pycolmap.CameraMode.SINGLE,
-                    reader_options=reader,
+                    reader_options=_reader(config, lens),
                     extraction_options=options,
                 )
                 bar.update(len(some))
+
+
+def _reader(config: PoseConfig, lens: pycolmap.Camera | None) -> pycolmap.ImageReaderOptions:
+    reader = pycolmap.ImageReaderOptions(camera_model=config.camera_model)
+    if lens is not None:
+        reader.camera_model, reader.camera_params = lens.model_name, ",".join(map(repr, map(float, lens.params)))
+    return reader
+
+
+def _names_by_camera(numbered: Mapping[str, PhotoFile], config: PoseConfig) -> list[list[str]]:
+    name_of = {photo: name for name, photo in numbered.items()}
+    groups = group_by_camera(list(numbered.values()), shared=config.shared_camera)
+    return [[name_of[photo] for photo in group] for group in groups]
 
 
 def match_features(

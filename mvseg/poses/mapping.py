@@ -1,4 +1,7 @@
-"""Structure from motion: matched features become cameras and points (COLMAP's incremental mapping)."""
+"""Structure from motion: matched features become cameras and points (COLMAP's incremental mapping).
+
+COLMAP's global mapping is no quicker here, and where photos share few features it places all of them, wrongly.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +17,13 @@ from mvseg.errors import InputError
 from mvseg.formats.opencv_yaml import Calibration
 from mvseg.poses.cancellable import run_cancellable
 from mvseg.poses.config import LEAST, LEAST_SHARE, PoseConfig
-from mvseg.poses.features import SEED, choose_pairs, extract_features, match_features, number_photos
+from mvseg.poses.features import SEED, extract_features, find_features, make_database, match_features, number_photos
+from mvseg.poses.pairs import Pair, choose_pairs, pairs_with
 from mvseg.poses.photo_files import PhotoFile
 
 FEW_FEATURES = 300  # of a photo, below which it has too little texture
+ENOUGH = 0.9  # of the photos: with fewer, all is done again with more features; at 1, one blurred photo costs minutes
+PHOTOS = "photos"  # folder of the photos that COLMAP sees
 NEXT_STEPS = (
     "more photos with more overlap (every 5 to 10 degrees), sharper and brighter ones, a textured background or table "
     "(newspaper) that stays with the plant, or a turntable calibrated from a board"
@@ -77,20 +83,12 @@ def find_structure(
     lens = None if calibration is None else _fixed_lens(calibration, photos)
     if lens is not None:
         config = replace(config, shared_camera=True)
-    models: list[pycolmap.Reconstruction] = []
     with tempfile.TemporaryDirectory(dir=work, prefix="colmap-") as folder:
-        database, numbered = Path(folder) / "features.db", Path(folder) / "photos"
-        photo_of = number_photos(images, photos, numbered)
-        extract_features(database, numbered, photo_of, config=config, lens=lens, progress=progress)
-        plain = _photos_with_few_features(database, photo_of)
-        pairs = choose_pairs([photo.name for photo in photos], config.pairs)
-        match_features(database, list(photo_of), pairs, progress=progress)
-        for few in (False, True):  # strict first: it is right where it succeeds
-            options = _mapping_options(fix_lens=lens is not None, few_matches=few)
-            models = [*models, *_map(database, numbered, options, num_photos=len(photos), progress=progress)]
-            models.sort(key=lambda model: -model.num_reg_images())
-            if models and models[0].num_reg_images() == len(photos):
-                break
+        task = _Task(Path(folder), number_photos(images, photos, Path(folder) / PHOTOS), config, lens, progress)
+        models, pairs, plain = _map_quickly(task)
+        if not models or models[0].num_reg_images() < ENOUGH * len(photos):
+            models = _sorted([*models, *_map_thoroughly(task, pairs)])
+        photo_of = task.photo_of
     found = models[0].num_reg_images() if models else 0
     least = config.min_registered or max(LEAST, round(LEAST_SHARE * len(photos)))
     if found < min(least, len(photos)):
@@ -113,6 +111,58 @@ def find_structure(
     )
 
 
+@dataclass(frozen=True, eq=False)
+class _Task:
+    """What all attempts share: `work` holds databases, and below PHOTOS the photos under the names of `photo_of`."""
+
+    work: Path
+    photo_of: Mapping[str, PhotoFile]
+    config: PoseConfig
+    lens: pycolmap.Camera | None
+    progress: bool
+
+
+def _map_quickly(task: _Task) -> tuple[list[pycolmap.Reconstruction], list[Pair], tuple[str, ...]]:
+    """Models from few features of chosen pairs, the largest first; the pairs; and photos with hardly any texture.
+
+    Photos that this leaves out are compared with all others, unless the pairs were asked for.
+    """
+    database, names, images = task.work / "quick.db", list(task.photo_of), task.work / PHOTOS
+    make_database(database, images, task.photo_of, config=task.config, lens=task.lens)
+    alike = find_features(database, images, names, image_size=task.config.image_size, progress=task.progress)
+    plain = _photos_with_few_features(database, task.photo_of)
+    pairs = choose_pairs([photo.name for photo in task.photo_of.values()], task.config.pairs, alike=alike)
+    match_features(database, names, pairs, progress=task.progress)
+    models = _map(task, database, few_matches=False)
+    if not _is_whole(models, task):
+        found = {image.name for image in models[0].images.values() if image.has_pose} if models else set()
+        lost = [index for index, name in enumerate(names) if name not in found]
+        more = [] if task.config.pairs else sorted({*pairs_with(lost, len(names))} - {*pairs})
+        match_features(database, names, more, progress=task.progress)
+        pairs = sorted([*pairs, *more])
+        models = _sorted([*models, *_map(task, database, few_matches=True)])
+    return models, pairs, plain
+
+
+def _map_thoroughly(task: _Task, pairs: Sequence[Pair]) -> list[pycolmap.Reconstruction]:
+    """Models from all features that COLMAP finds."""
+    database, images = task.work / "thorough.db", task.work / PHOTOS
+    make_database(database, images, task.photo_of, config=task.config, lens=task.lens)
+    extract_features(database, images, task.photo_of, config=task.config, lens=task.lens, progress=task.progress)
+    match_features(database, list(task.photo_of), pairs, progress=task.progress)
+    models = _map(task, database, few_matches=False)  # strict first: it is right where it succeeds
+    return models if _is_whole(models, task) else [*models, *_map(task, database, few_matches=True)]
+
+
+def _sorted(models: Sequence[pycolmap.Reconstruction]) -> list[pycolmap.Reconstruction]:
+    """The largest first; of equal ones those that were found first."""
+    return sorted(models, key=lambda model: -model.num_reg_images())
+
+
+def _is_whole(models: Sequence[pycolmap.Reconstruction], task: _Task) -> bool:
+    return bool(models) and models[0].num_reg_images() == len(task.photo_of)
+
+
 def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.IncrementalPipelineOptions:
     """COLMAP's own, on one thread. With `few_matches` a photo needs less to register: plants that fill photos taken 30
     degrees apart share few features."""
@@ -129,11 +179,10 @@ def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.Increment
     return options
 
 
-def _map(
-    database: Path, folder: Path, options: pycolmap.IncrementalPipelineOptions, *, num_photos: int, progress: bool
-) -> list[pycolmap.Reconstruction]:
-    """All models, each in a frame of its own."""
-    with tqdm(total=num_photos, desc="mapping", unit="photo", disable=not progress) as bar:
+def _map(task: _Task, database: Path, *, few_matches: bool) -> list[pycolmap.Reconstruction]:
+    """All models, each in a frame of its own, the largest first."""
+    num_photos = len(task.photo_of)
+    with tqdm(total=num_photos, desc="mapping", unit="photo", disable=not task.progress) as bar:
 
         def count(photos: int) -> None:  # attempts that fail count as well: at most to the end of the bar
             bar.update(min(photos, num_photos - bar.n))
@@ -141,13 +190,13 @@ def _map(
         models = run_cancellable(
             pycolmap.incremental_mapping,
             database,
-            folder,
-            database.parent,
-            options,
+            task.work / PHOTOS,
+            task.work,
+            _mapping_options(fix_lens=task.lens is not None, few_matches=few_matches),
             initial_image_pair_callback=lambda: count(2),
             next_image_callback=lambda: count(1),
         )
-    return list(models.values())
+    return _sorted(list(models.values()))
 
 
 def _photos_with_few_features(database: Path, photo_of: Mapping[str, PhotoFile]) -> tuple[str, ...]:

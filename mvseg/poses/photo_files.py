@@ -68,7 +68,7 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
     """
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "no such folder"
-        raise InputError(f"{folder}: {problem}, expected a folder of photos")
+        raise InputError(f"{folder}: {problem}, expected a folder of photos or a video (MP4, MOV, AVI, MKV, WebM)")
     files = _files_in(folder)
     if not _are_photos(files) and _are_photos(_files_in(folder / "images")):
         folder, files = folder / "images", _files_in(folder / "images")

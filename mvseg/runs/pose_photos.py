@@ -1,8 +1,9 @@
-"""Photos of one plant, from their folder to a scene folder."""
+"""Photos or a video of one plant, from their folder or file to a scene folder."""
 
 from __future__ import annotations
 
 import sys
+import tempfile
 import time
 import warnings
 from collections.abc import Sequence
@@ -22,6 +23,7 @@ from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
+from mvseg.poses.video import is_video, write_frames
 from mvseg.results.earlier import check_out, replace_result
 from mvseg.scene import Scene
 from mvseg.system.atomic import sweep_abandoned
@@ -45,7 +47,8 @@ def pose_photos(
     An earlier scene of this kind at `out` is replaced; files that the user put there (masks, notes) stay.
 
     Args:
-        photos: folder of photos, with one folder per camera below it or none.
+        photos: folder of photos, with one folder per camera below it or none; or a video, of which sharp frames become
+            the photos.
         out: the scene folder: images/ (upright copies), cameras.json, sparse/0 and pose.json.
         config: how cameras are estimated.
         known: where scale and axes come from.
@@ -53,10 +56,12 @@ def pose_photos(
         quiet: no progress bars and no line at the end.
 
     Raises:
-        InputError: a photo is broken, too few photos register, what is known does not fit them, or `out` holds
-            something other than an earlier scene of this kind.
+        InputError: a photo or the video is broken, the video shows too little motion, too few photos register, what is
+            known does not fit them, or `out` holds something other than an earlier scene of this kind.
     """
-    source, names = check_folders(photos, out)
+    is_clip = is_video(photos)
+    check_place(out)
+    source, names = (photos, []) if is_clip else check_folders(photos, out)
     file = config.calibration
     calibration = None if file is None else read_calibration(file.parent, file.name)
     if known.positions is not None:
@@ -64,7 +69,10 @@ def pose_photos(
     start, run = time.perf_counter(), dict[str, Any](made_by())
     with warnings.catch_warnings(record=True) as caught, replace_result(out, run, POSE_FILE) as folder:
         warnings.simplefilter("always", InputWarning)
-        files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
+        if is_clip:
+            files = _copy_frames(photos, folder, config=config, progress=not quiet)
+        else:
+            files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
         structure = find_structure(
             folder / IMAGES, files, config=config, calibration=calibration, work=folder, progress=not quiet
         )
@@ -89,12 +97,28 @@ def check_folders(photos: Path, out: Path) -> tuple[Path, list[str]]:
     Raises:
         InputError: no photos, photos inside `out`, or `out` holds something other than an earlier scene of this kind.
     """
-    sweep_abandoned(out)
-    check_out(out, POSE_FILE)
+    check_place(out)
     source, names = list_photos(photos)
     if out.resolve() in (source.resolve(), *source.resolve().parents):
         raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
     return source, names
+
+
+def check_place(out: Path) -> None:
+    """Check that a scene may be written to `out`, after taking away what a killed run left beside it.
+
+    Raises:
+        InputError: `out` holds something other than an earlier scene of this kind.
+    """
+    sweep_abandoned(out)
+    check_out(out, POSE_FILE)
+
+
+def _copy_frames(clip: Path, folder: Path, *, config: PoseConfig, progress: bool) -> list[PhotoFile]:
+    """The frames of a video as photos of a scene folder."""
+    with tempfile.TemporaryDirectory(dir=folder, prefix="frames-") as work:
+        names = write_frames(clip, Path(work) / "frames", most=config.frames, progress=progress)
+        return copy_photos(Path(work) / "frames", names, folder / IMAGES)
 
 
 def describe_poses(structure: Structure, placement: Placement, files: Sequence[PhotoFile]) -> dict[str, Any]:

@@ -15,6 +15,7 @@ from mvseg.formats.image_file import write_png
 from mvseg.formats.opencv_yaml import Calibration
 from mvseg.formats.photos import read_photo
 from mvseg.formats.rig import read_rig
+from mvseg.poses import features, mapping
 from mvseg.poses.alignment import fit_similarity
 from mvseg.poses.config import PoseConfig
 from mvseg.poses.mapping import find_structure
@@ -78,6 +79,53 @@ def test_a_calibrated_camera_stays_and_a_photo_without_texture_is_left_out(room,
     np.testing.assert_array_equal(camera.calibration_matrix(), K)
 
 
+def watch_stages(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The steps that find_structure takes, in order."""
+    steps: list[str] = []
+
+    def watched(name: str):
+        function = getattr(mapping, name)
+
+        def call(*args, **options):
+            steps.append(f"{name} {len(args[2])}" if name == "match_features" else name)
+            return function(*args, **options)
+
+        return call
+
+    for name in ("find_features", "extract_features", "match_features", "_map"):
+        monkeypatch.setattr(mapping, name, watched(name))
+    return steps
+
+
+def test_one_quick_mapping_where_it_succeeds(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = watch_stages(monkeypatch)
+    structure = find_structure(room.folder / IMAGES, room.files, config=PoseConfig())
+    assert steps == ["find_features", "match_features 21", "_map"]
+    assert structure.registered == room.structure.registered
+
+
+def test_photos_that_chosen_pairs_leave_out_are_compared_with_all(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = watch_stages(monkeypatch)
+    monkeypatch.setattr(mapping, "choose_pairs", lambda names, how, alike: [(0, 1), (0, 2), (1, 2), (4, 5)])
+    structure = find_structure(room.folder / IMAGES, room.files, config=PoseConfig())
+    assert steps == ["find_features", "match_features 4", "_map", "match_features 17", "_map"]
+    assert structure.registered == tuple(photo.name for photo in room.files)
+    asked = PoseConfig(pairs="sequential", min_registered=3)  # pairs that were asked for stay
+    assert len(find_structure(room.folder / IMAGES, room.files, config=asked).registered) == 3
+
+
+def test_too_few_matches_ask_for_more_features(room, monkeypatch: pytest.MonkeyPatch) -> None:
+    steps = watch_stages(monkeypatch)
+    monkeypatch.setattr(features, "QUICK_MOST", 12)
+    structure = find_structure(room.folder / IMAGES, room.files, config=PoseConfig())
+    assert steps[-3:] == ["extract_features", "match_features 21", "_map"]
+    assert structure.registered == tuple(photo.name for photo in room.files)
+    centers = np.array([image.projection_center() for image in structure.model.images.values()])
+    order = [int(Path(image.name).stem) for image in structure.model.images.values()]
+    true_centers = room.truth.centers.numpy()[order]
+    assert np.abs(fit_similarity(centers, true_centers) * centers - true_centers).max() < 2  # mm
+
+
 def test_too_few_photos_are_one_sentence(tmp_path: Path) -> None:
     files = []
     for name in ("a.png", "b.png", "c.png"):
@@ -105,6 +153,7 @@ def test_a_calibration_of_other_photos_is_refused(tmp_path: Path) -> None:
     [
         ({"image_size": 10}, "image_size is 10"),
         ({"min_registered": 1}, "min_registered is 1"),
+        ({"frames": 2}, "frames is 2"),
         ({"calibration": Path("c.yaml"), "shared_camera": False}, "beside a calibration"),
     ],
 )

@@ -1,0 +1,81 @@
+"""Which photos are compared: neighbours in the order in which they were taken, a few further away, and those alike."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.poses.config import Pairs
+
+FEW = 30  # photos up to which all pairs are compared: 435 pairs, 10 to 20 s of one core; a third more takes double
+OVERLAP = 4  # neighbours on either side in a sequence; one fewer saves a tenth of the pairs: bridges of blurred photos
+FAR = 2  # neighbours further away are 2 x OVERLAP, 4 x OVERLAP, ... steps off
+MOST_ALIKE = 6  # further photos that each photo is compared with; a third more are an eighth more pairs
+# Coarse features that must match. Of the pairs of a plant that so many choose, half have 30 good matches; at 6 a third
+# of them have, at 10 three quarters, but a few good pairs more are missed.
+LEAST_ALIKE = 8
+
+Pair = tuple[int, int]
+
+
+def choose_pairs(
+    names: Sequence[str], pairs: Pairs | None = None, *, alike: NDArray[np.int64] | None = None
+) -> list[Pair]:
+    """Pairs of photos to compare, as indices i < j, each once, in order; every photo is in one of them.
+
+    "exhaustive" are all pairs. "sequential" is for walks round a plant and turntables: each photo with its OVERLAP
+    next neighbours on either side and with some further away, the last photos being neighbours of the first. Photos of
+    different folders (one per camera) are neighbours if their places in their sequences are. By default each photo is
+    also compared with the MOST_ALIKE others that look most like it, wherever they are in the order: a walk that comes
+    back to where it was closes, and photos in no order find each other.
+
+    Args:
+        names: paths of the photos, "/" between folders, in the order in which they were taken.
+        pairs: None: exhaustive for FEW photos; sequential and alike for more.
+        alike: (V, V) how alike the photos are, see `count_alike`; without it the order alone counts.
+    """
+    if pairs == "exhaustive" or (pairs is None and len(names) <= FEW):
+        return list(combinations(range(len(names)), 2))
+    sequences: dict[str, list[int]] = defaultdict(list)
+    for index, name in enumerate(names):
+        sequences[name.rpartition("/")[0]].append(index)
+    found: set[Pair] = set()
+    for one in sequences.values():
+        for other in sequences.values():
+            for place, index in enumerate(one):
+                same = round(place * len(other) / len(one))  # the place of this photo in the other sequence
+                near = {other[(same + step) % len(other)] for step in _steps(len(other))}
+                found |= {(min(index, each), max(index, each)) for each in near if each != index}
+    if pairs is None and alike is not None:
+        found |= _most_alike(alike, found)
+    return sorted(found)
+
+
+def pairs_with(some: Iterable[int], num_photos: int) -> list[Pair]:
+    """All pairs of these photos with any other, as indices i < j, each once, in order."""
+    return sorted({(min(i, j), max(i, j)) for i in some for j in range(num_photos) if i != j})
+
+
+def _steps(num_photos: int) -> list[int]:
+    """How far off the neighbours of a photo are, in a sequence."""
+    steps = list(range(OVERLAP + 1))
+    while steps[-1] * FAR <= num_photos // 2:
+        steps.append(steps[-1] * FAR)
+    return [sign * step for step in steps for sign in (1, -1)]
+
+
+def _most_alike(alike: NDArray[np.int64], known: set[Pair]) -> set[Pair]:
+    """The MOST_ALIKE photos for each photo, not counting known pairs."""
+    left = alike.copy()
+    for i, j in known:
+        left[i, j] = left[j, i] = 0
+    found = set()
+    for i, row in enumerate(left):
+        for j in np.argsort(-row, kind="stable")[:MOST_ALIKE]:
+            if row[j] >= LEAST_ALIKE and i != j:
+                found.add((min(i, int(j)), max(i, int(j))))
+    return found

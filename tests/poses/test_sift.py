@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from mvseg.poses.sift import COARSE, RATIO, UNIT, coarsest, count_alike, find_sift
+from room_scene import texture
+
+
+def grey(seed: int = 0) -> np.ndarray:
+    return cv2.cvtColor(texture(seed, grains=(5, 12, 40)), cv2.COLOR_RGB2GRAY)[:400, :500]
+
+
+def test_features_move_with_the_picture() -> None:
+    """By whole pixels, away from the border, nearly all are found again where they must be."""
+    picture = grey()
+    one = find_sift(picture[:360, :460], image_size=1000, most=4000)
+    other = find_sift(picture[10:370, 24:484], image_size=1000, most=4000)
+    is_inside = ((one.px > 80) & (one.px < [380, 280])).all(1)
+    apart = np.linalg.norm(one.px[is_inside, None] - [24, 10] - other.px[None], axis=2).min(1)
+    assert is_inside.sum() > 100
+    assert (apart < 0.1).mean() > 0.9
+
+
+def test_pixels_are_of_the_photo_whatever_the_size() -> None:
+    """A photo that is scaled down gives the same features, but for the finest: no shift and no scale."""
+    large = cv2.resize(grey(), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    one = find_sift(large, image_size=2000, most=4000)
+    small = find_sift(large, image_size=500, most=4000)
+    gaps = one.px[None] - small.px[:, None]
+    nearest = np.take_along_axis(gaps, np.linalg.norm(gaps, axis=2).argmin(1)[:, None, None], axis=1)[:, 0]
+    is_same = np.linalg.norm(nearest, axis=1) < 1
+    assert is_same.mean() > 0.8
+    np.testing.assert_allclose(np.median(nearest[is_same], axis=0), 0, atol=0.1)
+
+
+def test_descriptors_have_one_length_and_no_more_are_kept_than_asked_for() -> None:
+    sift = find_sift(grey(), image_size=1000, most=200)
+    assert len(sift) == 200
+    assert sift.descriptors.dtype == np.uint8
+    np.testing.assert_allclose(np.linalg.norm(sift.descriptors.astype(float), axis=1), UNIT, rtol=0.02)
+
+
+def test_a_photo_without_texture() -> None:
+    sift = find_sift(np.full((60, 80), 120, np.uint8), image_size=1000, most=100)
+    assert (len(sift), sift.px.shape, sift.descriptors.shape) == (0, (0, 2), (0, 128))
+    assert count_alike([coarsest(sift), coarsest(find_sift(grey(), image_size=500, most=100))]).tolist() == [[0, 0]] * 2
+
+
+def test_alike_is_what_a_plain_count_says() -> None:
+    """And pictures of one thing are alike, those of others are not."""
+    pictures = [grey(0)[:300, :400], grey(0)[60:360, 80:480], grey(1)[:300, :400]]
+    coarse = [coarsest(find_sift(picture, image_size=1000, most=4000)) for picture in pictures]
+    assert all(len(each) == COARSE for each in coarse)
+    alike = count_alike(coarse)
+    assert (alike == alike.T).all()
+    assert (alike.diagonal() == 0).all()
+    assert alike[0, 1] > 10 * max(alike[0, 2], 1)
+    for i, j in ((0, 1), (0, 2)):
+        apart = np.linalg.norm(coarse[i][:, None].astype(float) - coarse[j][None], axis=2)
+        count = 0
+        for row, distances in enumerate(apart):
+            column = int(distances.argmin())
+            nearest, second = np.sort(distances)[:2]
+            back = np.sort(apart[:, column])[:2]
+            is_mutual = int(apart[:, column].argmin()) == row
+            count += is_mutual and nearest <= RATIO * second and back[0] <= RATIO * back[1]
+        assert alike[i, j] == pytest.approx(count, abs=1)  # float32 rounds
