@@ -2,7 +2,8 @@
 
 A simulated person (`simulated_person.py`) corrects a scene in rounds, and the stages of `mvseg infer --corrections` run
 again after each. An outline counts 3, any other edit 1. Beside it, the same edits to the masks of the first result
-alone: what the cameras bring is the difference. Of "degraded" masks (`label_maps.py`) the ids are
+alone: what the cameras bring is the difference. And harm: leaves that were right, that no edit of the round was about,
+and that are wrong after it. Of "degraded" masks (`label_maps.py`) the ids are
 corrected, as `mvseg match` gives them; "detected" are the same scenes from pixels; --scenes are folders with photos and
 `truth/`. Rounds that are in the folder are not run again.
 """
@@ -172,6 +173,7 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
     if records:
         edits = load_corrections(path.with_suffix(".json")).edits
     first = compute(case, Corrections()).masks.to("cpu") if edits else None
+    right, touched = frozenset[int](), frozenset[int]()  # leaves, after the round before, and that its edits are about
     while True:
         begun = time.process_time()
         state = compute(case, Corrections(edits))
@@ -189,6 +191,8 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
         alone = judge(change_masks_alone(first, edits, state.scene), case.truth)
         record = about | {"edits": len(edits), "worth": count_worth(edits)} | judge(masks, case.truth)
         record |= {f"alone_{name}": value for name, value in alone.items()}
+        record["harmed"] = len(right - look.right - touched)
+        right, touched = look.right, frozenset[int]().union(*(each.leaves for each in chosen))
         record |= {"idle": sum(fate.fate != APPLIED for fate in state.fates), "seconds": round(seconds, 1)}
         records.append(record | {"is_last": int(not chosen)})
         for each in chosen:
@@ -262,7 +266,10 @@ def print_table(runs: Sequence[Sequence[Record]]) -> None:
             f"{w or 0:.0f} of {run[0]['leaves']:.0f}" if w is not None else "never"
             for w, run in zip(when, group, strict=True)
         )
-        print(f"{'':47} {NEARLY_ALL:.0%} of the leaves right with edits worth {shown}")
+        harmed = sum(each["harmed"] for run in group for each in run)
+        edits = sum(run[-1]["edits"] for run in group)
+        print(f"{'':47} {NEARLY_ALL:.0%} of the leaves right with edits worth {shown}; "
+              f"{harmed:.0f} leaves harmed by {edits:.0f} edits")  # fmt: skip
 
 
 def plot(runs: Sequence[Sequence[Record]], path: Path) -> None:

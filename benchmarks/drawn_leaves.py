@@ -50,10 +50,6 @@ def draw_from(case: Case, views: list[int], number: int) -> list[int]:
     return chosen
 
 
-def right_leaves(look: Look) -> set[int]:
-    return {leaf for leaf, iou in look.iou.items() if iou > RIGHT_IOU}
-
-
 def shown_in(masks: Masks, truth: list[np.ndarray], leaf: int, drawn: list[int], view: int) -> bool:
     """Whether a view has a mask of the instance of a leaf that was drawn in others, with an IoU above one half."""
     is_leaf = torch.zeros(len(masks), dtype=torch.bool)
@@ -93,10 +89,10 @@ def main() -> None:
                     others = [view for view in views_of[leaf] if view not in drawn]
                     found = sum(shown_in(masks, case.truth, leaf, drawn, view) for view in others)
                     here[number - 2, 0] += found, len(others)
-                    if leaf not in right_leaves(before):
+                    if leaf not in before.right:
                         here[number - 2, 1] += found, len(others)
-                after = right_leaves(Look(masks, case.truth, case.found.scene, ()))
-                harmed += len(right_leaves(before) - after - set(chosen))
+                after = Look(masks, case.truth, case.found.scene, ()).right
+                harmed += len(before.right - after - set(chosen))
                 drawn_leaves += len(chosen)
         total, harm = total + here, harm + harmed
         print(describe(folder.name, here, harmed), f"{time.process_time() - begun:6.0f} s", flush=True)

@@ -189,6 +189,11 @@ class Look:
         lens = self.scene.views[view].lens
         return xy if lens is None else photo_from_pinhole(lens, self.scene.cameras.K[view].numpy(), xy)
 
+    @property
+    def right(self) -> frozenset[int]:
+        """The leaves that are right."""
+        return frozenset(leaf for leaf, iou in self.iou.items() if iou > RIGHT_IOU)
+
     def worth(self, leaf: int, share: float) -> float:
         """What more of a leaf is worth: a leaf that becomes right counts half a leaf more."""
         before = self.iou.get(leaf, 0.0)
@@ -300,7 +305,8 @@ def cut_line(labels: Labels, first: int, second: int) -> NDArray[np.float64]:
 
 
 def _draw(look: Look) -> list[Repair]:
-    """Leaves that no mask of their photo shows well enough; one without any instance is drawn in two photos."""
+    """Leaves that no mask of their photo shows well enough; one without any instance is drawn in two photos, and then
+    in others."""
     found = []
     for leaf in np.flatnonzero(look.size).tolist():
         covered = np.zeros(len(look.visible))
@@ -312,7 +318,8 @@ def _draw(look: Look) -> list[Repair]:
         gaps.sort(key=lambda view: -look.visible[view, leaf])
         anchor = look.anchor(leaf)
         iou, two = look.iou.get(leaf, 0.0), _far_apart(look, gaps)
-        if iou < LOST and two:
+        is_drawn = bool(((look.leaf == leaf) & look.masks.is_corrected.numpy()).any())
+        if iou < LOST and two and not is_drawn:  # where the first outlines did not suffice, another view is drawn
             edits: tuple[Edit, ...] = tuple(look.outline(leaf, view) for view in two)
             found.append(Repair(f"draw {leaf}", edits, look.worth(leaf, 1 - iou), 0.0, frozenset({leaf})))
             continue

@@ -153,9 +153,10 @@ def test_the_order_and_the_worth_of_repairs() -> None:
 
 def test_records_are_read_as_they_were_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     values = {f"{of}{name}": 0.5 for of in ("", "alone_") for name in ("ari", "pair_f1", "mv_pq", "right")}
-    about = {"scene": "degraded_a", "order": "repair", "leaves": 8.0, "seconds": 1.0}
+    about = {"scene": "degraded_a", "order": "repair", "leaves": 8.0, "seconds": 1.0, "edits": 3.0, "harmed": 1.0}
     records = [about | {"worth": 0.0} | values, about | {"worth": 4.0} | values | {"right": 1.0}]
     write_records(tmp_path / "a.csv", records)
     assert read_records(tmp_path / "a.csv") == records
     print_table([records])
-    assert "right with edits worth 4 of 8" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "right with edits worth 4 of 8; 2 leaves harmed by 3 edits" in said

@@ -394,7 +394,14 @@ def test_one_key_makes_a_leaf_of_what_was_not_chosen(
     assert opened.page.evaluate(asks) == 0
     opened.page.keyboard.press("u")
     assert opened.page.evaluate(asks) == 1
-    opened.page.evaluate("modes.work.ask(modes.work.open.find((doubt) => doubt.kind === 'leaf'))")
+    place = """() => {
+      const [, { view, outline }] = modes.work.open.find((doubt) => doubt.kind === "leaf").outlines;
+      modes.work.drop();
+      modes.work.panes[1].show(view);
+      return insidePoint(outline);
+    }"""
+    opened.page.mouse.click(*opened.at(1, opened.page.evaluate(place)))  # a click where no mask is offers it, too
+    assert "may show a leaf here" in opened.page.locator("#correct-ask").inner_text()
     opened.page.keyboard.press("r")
     (edit,) = opened.save(tmp_path)
     assert (edit["op"], edit["everywhere"]) == ("reject", True)

@@ -95,7 +95,7 @@ class Work {
   // --- picking
 
   pick(pane, path, at) {
-    if (!path) return;
+    if (!path) return this.offer(pane.view, at);
     const isDrawn = path.dataset.edit !== undefined;
     const name = isDrawn ? `e${path.dataset.edit}` : `r${path.dataset.region}`;
     const mask = isDrawn ? null : this.data.views[pane.view].masks.find((one) => `r${one.region}` === name);
@@ -104,6 +104,12 @@ class Work {
     this.picks = others.length < this.picks.length ? others : [...others, this.pickOf(pane.view, name, mask, at)];
     this.note = "";
     this.changed();
+  }
+
+  // Where no mask is, the best of what was not taken for a leaf, or of what should be there, is asked about.
+  offer(view, at) {
+    const here = this.open.filter((doubt) => doubt.outlines.some((one) => one.view === view && isInside(at, one.outline)));
+    if (here.length) this.ask(here[0]);
   }
 
   // A mask is named by the middle of its thickest place, unless another mask lies there.
