@@ -7,7 +7,8 @@ starts: the likeliest alignments, and all frames alike. The likelier outcome cou
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 
 import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
@@ -32,6 +33,7 @@ TRIED = 3  # poses of each pair, the likeliest; with five, nothing changes
 SPREAD = 1.3  # of the costs, for poses by way of other dates are less exact
 ROUNDS = 6  # at most; two or three are enough
 Looked = Mapping[tuple[int, int], Poses]
+Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
 
 
 def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, np.ndarray, Floats]:
@@ -51,13 +53,15 @@ def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, n
         return np.tile(np.eye(4), (num_dates, 1, 1)), np.zeros(num_dates, int), np.ones(num_dates - 1)
     chained, roots = chain_dates(num_dates, {pair: judge(poses, habit) for pair, poses in looked.items()})
     starts = chained, np.tile(np.eye(4), (num_dates, 1, 1))
-    found = [_search(start, roots, looked, habit) for start in starts]
-    totals = [sum(_likeliness(poses, pair, looked, habit) for pair in looked) for poses in found]
+    likeliness = _remembered(looked, habit)
+    suggested = {pair: _likeliest(poses, habit) for pair, poses in looked.items()}
+    found = [_search(start, roots, suggested, likeliness) for start in starts]
+    totals = [sum(likeliness(poses, pair) for pair in looked) for poses in found]
     poses = found[int(np.argmax(np.round(totals, DIGITS)))]
-    return poses, roots, weigh_turns(poses, looked, habit)
+    return poses, roots, weigh_turns(poses, looked, likeliness)
 
 
-def weigh_turns(poses: Floats, looked: Looked, habit: Habit) -> Floats:
+def weigh_turns(poses: Floats, looked: Looked, likeliness: Likeliness) -> Floats:
     """(T - 1,) probability that the plant stands on all later dates as the poses (T, 4, 4) say, against the likeliest
     other turn between a date and the next: of a plant that looks the same from two sides, one half."""
     chances = np.ones(len(poses) - 1)
@@ -71,9 +75,9 @@ def weigh_turns(poses: Floats, looked: Looked, habit: Habit) -> Floats:
         for other in every[pose_distances(step.pair, now, every) >= 1]:
             moved = poses.copy()
             moved[later:] = poses[later - 1] @ np.linalg.inv(other) @ np.linalg.inv(poses[later]) @ poses[later:]
-            rivals.append(sum(_likeliness(moved, pair, looked, habit) for pair in across))
+            rivals.append(sum(likeliness(moved, pair) for pair in across))
         if rivals:
-            ours = sum(_likeliness(poses, pair, looked, habit) for pair in across)
+            ours = sum(likeliness(poses, pair) for pair in across)
             chances[later - 1] = expit(np.round(ours - max(rivals), DIGITS))
     return chances
 
@@ -95,42 +99,51 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
     return poses, roots
 
 
-def _search(poses: Floats, roots: np.ndarray, looked: Looked, habit: Habit) -> Floats:
-    """One date after the other takes the pose that agrees best with the others."""
+def _search(
+    poses: Floats, roots: np.ndarray, suggested: Mapping[tuple[int, int], Floats], likeliness: Likeliness
+) -> Floats:
+    """One date after the other takes the pose that agrees best with the others, of those that its pairs suggest."""
     poses = poses.copy()
     for _ in range(ROUNDS):
         before = poses.copy()
         for date in np.flatnonzero(roots != np.arange(len(roots))).tolist():
-            pairs = [pair for pair in looked if date in pair]
-            options = [poses[date], *(pose for pair in pairs for pose in _suggested(poses, date, pair, looked, habit))]
+            pairs = [pair for pair in suggested if date in pair]
+            options = [poses[date], *(
+                poses[earlier] @ np.linalg.inv(step) if date == later else poses[later] @ step
+                for earlier, later in pairs for step in suggested[earlier, later]
+            )]  # fmt: skip
             totals = []
             for option in options:
                 moved = poses.copy()
                 moved[date] = option
-                totals.append(sum(_likeliness(moved, pair, looked, habit) for pair in pairs))
+                totals.append(sum(likeliness(moved, pair) for pair in pairs))
             poses[date] = options[int(np.argmax(np.round(totals, DIGITS)))]
         if np.array_equal(poses, before):
             break
     return poses
 
 
-def _suggested(
-    poses: Floats, date: int, pair: tuple[int, int], looked: Looked, habit: Habit
-) -> list[Floats]:
-    """The poses of a date under which the other date of a pair stands as one of the likeliest poses of the two says."""
-    earlier, later = pair
-    of_pair = looked[pair]
-    order = np.argsort(-np.round(of_pair.scores(habit), DIGITS), kind="stable")[:TRIED]
-    steps = [of_pair.refined[place].pose for place in order]
-    return [poses[earlier] @ np.linalg.inv(step) if date == later else poses[later] @ step for step in steps]
+def _likeliest(poses: Poses, habit: Habit) -> Floats:
+    """(TRIED, 4, 4) the likeliest poses of two dates, or all there are."""
+    order = np.argsort(-np.round(poses.scores(habit), DIGITS), kind="stable")[:TRIED]
+    return np.stack([poses.refined[place].pose for place in order])
 
 
-def _likeliness(poses: Floats, pair: tuple[int, int], looked: Looked, habit: Habit) -> float:
-    """Log odds of two dates standing as the poses (T, 4, 4) say."""
-    of_pair, pose = looked[pair].pair, np.linalg.inv(poses[pair[1]]) @ poses[pair[0]]
-    gain = 0.0
-    if of_pair.fewer:
-        costs = pair_costs(of_pair.moved(pose), spread=SPREAD)
-        pairs = best_pairs(costs)
-        gain = float(-costs[pairs[:, 0], pairs[:, 1]].sum()) - large_new(of_pair, pairs)
-    return TEMPER * gain + habit.world_prior * float(near_world(of_pair, pose[None])[0])
+def _remembered(looked: Looked, habit: Habit) -> Likeliness:
+    """The log odds of two dates standing as poses say; the same step between two dates is looked at once."""
+
+    @cache
+    def of_step(pair: tuple[int, int], step: bytes) -> float:
+        of_pair, pose = looked[pair].pair, np.frombuffer(step).reshape(4, 4)
+        gain = 0.0
+        if of_pair.fewer:
+            costs = pair_costs(of_pair.moved(pose), spread=SPREAD)
+            pairs = best_pairs(costs)
+            gain = float(-costs[pairs[:, 0], pairs[:, 1]].sum()) - large_new(of_pair, pairs)
+        return TEMPER * gain + habit.world_prior * float(near_world(of_pair, pose[None])[0])
+
+    def likeliness(poses: Floats, pair: tuple[int, int]) -> float:
+        step = np.linalg.inv(poses[pair[1]]) @ poses[pair[0]]
+        return of_step(pair, step.tobytes())
+
+    return likeliness
