@@ -19,7 +19,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.tracking import read_series, see_series
 from mvseg.simulation.series import draw_specs
-from mvseg.tracking.align import Habit, judge, list_poses, refine
+from mvseg.tracking.align import Habit, judge, link_gain, list_poses, refine
 from mvseg.tracking.associate import MOST_GAP
 from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
@@ -49,7 +49,7 @@ def judge_plant(plant: list[Dated], *, is_other: bool) -> list[tuple[float, bool
         is_known = (one > 0) & (other > 0)
         if roots[earlier] == roots[later] and len(one) and (is_other or is_known.any()):
             is_right = not is_other and bool((one == other)[is_known].mean() > 0.5)
-            found.append((refined.gain / of_pair.pair.fewer, is_right))
+            found.append((link_gain(of_pair.pair, refined.pose) / of_pair.pair.fewer, is_right))
     return found
 
 

@@ -18,23 +18,24 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from mvseg.tracking.config import Pots
-from mvseg.tracking.costs import Pair, pair_costs
+from mvseg.tracking.costs import Pair
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 
 NUM_REFINED = 20  # hypotheses, of those that look best
 UPRIGHT = 2.0  # weight of "up stays up", in leaves
 MOST_LEAN = np.radians(20.0)
 COARSE = (0.18, 0.45, 0.5)  # scales of base (median lengths), direction (radians) and log length while searching
-ROUNDS = (2.5, 1.8, 1.3, 1.0, 1.0)  # scales of the costs while refining
+ROUNDS = 5  # of pairing and fitting, at most
 PARTS = (0.7, 0.7, 0.3)  # weights of base, middle and tip: growing petioles carry bases, and tips sway
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
 TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
-TEMPER = 0.3  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
-GUESS = (-1.46, 0.69)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
+TEMPER = 0.4  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
+GUESS = (-1.56, 0.77)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
 DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
-LARGE_NEW = 4.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
+LARGE_NEW = 3.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
 NEARLY_ALL = 0.9  # of the leaves of the date with fewer: where these are paired, large ones were missed there
 
 
@@ -108,13 +109,13 @@ class Poses:
         weights = np.exp(TEMPER * (scores - scores.max()))
         return np.asarray(weights / weights.sum())
 
-    def chance(self, gain: float, habit: Habit) -> float:
-        """How likely a pose is right under which the pairs have a gain."""
+    def chance(self, pose: Floats, habit: Habit) -> float:
+        """How likely a pose (4, 4) is right."""
         if habit.still == 1:
             return 1.0
         if not self.pair.fewer:
             return habit.still
-        return guess_chance(gain / self.pair.fewer)
+        return guess_chance(link_gain(self.pair, pose), self.pair.fewer)
 
 
 def list_poses(pair: Pair) -> Poses:
@@ -141,22 +142,29 @@ def judge(poses: Poses, habit: Habit) -> Alignment:
     place = int(np.round(poses.scores(habit), DIGITS).argmax()) if habit.still < 1 else 0
     best, weights = poses.refined[place], poses.weights(habit)
     still = float(weights[poses.near > np.exp(-0.5)].sum()) if poses.pair.fewer else habit.still
-    return replace(best, still=still, probability=poses.chance(best.gain, habit))
+    return replace(best, still=still, probability=poses.chance(best.pose, habit))
 
 
-def guess_chance(gain: float) -> float:
+def guess_chance(gain: float, leaves: int) -> float:
     """How likely a pose is right.
 
     Args:
-        gain: `Alignment.gain`, by leaf of the date with fewer: that of another plant is low. (Once all dates are
-            placed, how likely the pose is among others of the two dates says nothing more.)
+        gain: see `link_gain`; that of another plant is low. (Once all dates are placed, how likely the pose is among
+            others of the two dates says nothing more.)
+        leaves: of the date with fewer, >= 1.
     """
-    return float(expit(GUESS[0] + GUESS[1] * gain))
+    return float(expit(GUESS[0] + GUESS[1] * gain / leaves))
+
+
+def link_gain(pair: Pair, pose: Floats) -> float:
+    """How much likelier the pairs under a pose (4, 4) are the same leaves than strangers, by all that links count."""
+    costs = fitted_costs(pair.moved(pose), LINKS)
+    return float(-costs[tuple(best_pairs(costs).T)].sum())
 
 
 def _as_it_stood(pair: Pair) -> Alignment:
     """The frames agree."""
-    costs = pair_costs(pair)
+    costs = fitted_costs(pair)
     pairs = best_pairs(costs)
     return Alignment(np.eye(4), pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
 
@@ -240,16 +248,13 @@ def alikeness(pair: Pair, poses: Floats) -> Floats:
 
 def refine(pair: Pair, pose: Floats) -> Alignment:
     """From a pose (4, 4) that is nearly right: pair the leaves, fit it to the pairs, and again with stricter costs."""
-    for spread in ROUNDS:
-        costs = pair_costs(pair.moved(pose), spread=spread)
+    pairs = np.zeros((0, 2), int)
+    for _ in range(ROUNDS):
+        costs, before = fitted_costs(pair.moved(pose)), pairs
         pairs = best_pairs(costs)
-        if not len(pairs):
-            return Alignment(pose, pairs)
-        if spread > ROUNDS[-1] or len(pairs) > 1:
-            weights = np.minimum(-costs[pairs[:, 0], pairs[:, 1]], 6.0)
-            pose = _fit(pair, pairs, weights, start=pose[:3, :3])
-    costs = pair_costs(pair.moved(pose))
-    pairs = best_pairs(costs)
+        if not len(pairs) or np.array_equal(pairs, before):
+            break
+        pose = _fit(pair, pairs, -costs[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
     return Alignment(pose, pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
 
 

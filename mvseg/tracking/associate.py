@@ -16,10 +16,11 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.align import Alignment, Habit, guess_chance, judge, list_poses, refine
+from mvseg.tracking.align import Alignment, Habit, guess_chance, judge, link_gain, list_poses, refine
 from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import ACROSS, Leaves, Pair, cloud_costs, pair_costs
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 from mvseg.tracking.motions import Motion, find_motion
 from mvseg.tracking.place_dates import place_dates
 
@@ -30,7 +31,9 @@ CLOUD_COUNTS = 0.3  # of the points of two surfaces, whose midribs say most alre
 MOST_HELP = 8.0
 IN_PART = 0.3  # change of log length from which one of two surfaces may show a part of the leaf only
 ASKED = 1e4  # gain of what a person says
-CALIBRATION = (0.25, 2.8)  # slope and offset of the log odds of a link, fitted on simulated series (docs/tracking.md)
+ENOUGH = 6  # pairs, from which the others say how the plant bent where a leaf is; with 7 all is the same, 5 are too few
+CALIBRATION = (0.3, 3.3)  # slope and offset of the log odds of a link, fitted on growth-series and simulated series
+BY_CHANCE = 0.5  # how likely a link is right where the pose is wrong: no better than even (a definition)
 LIKE_RIGID = 0.3  # weight of "the plant moved as a whole", in leaves
 ROUNDS = 10  # of joining anew, at most; two or three are enough
 
@@ -84,23 +87,31 @@ def compare_dates(
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
         pair, pose = pairs[earlier, later], np.linalg.inv(poses[later]) @ poses[earlier]
         alignment = refine(pair, pose) if pair.fewer else Alignment(pose, np.zeros((0, 2), int))
-        trust[earlier, later] = steady[earlier:later].min() * looked[earlier, later].chance(alignment.gain, habit)
+        trust[earlier, later] = steady[earlier:later].min() * looked[earlier, later].chance(alignment.pose, habit)
         if not len(alignment.pairs):
             continue
-        costs[earlier, later] = _bent_costs(pair, alignment)
+        costs[earlier, later] = _link_costs(pair, alignment)
         is_step = roots[later] not in roots[earlier + 1 : later]
         if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
             motion = find_motion(pair, alignment.pose)
             if motion is not None:
-                both = (alignment.gain + motion.gain) / pair.fewer
+                both = link_gain(pair, alignment.pose) + motion.gain
                 if motion.is_sure:  # the other turn is that of a second plant
-                    trust[earlier, later] = max(trust[earlier, later], guess_chance(both))
+                    trust[earlier, later] = max(trust[earlier, later], guess_chance(both, pair.fewer))
                 motions[earlier, later] = motion
                 costs[earlier, later] = _parted_costs(pair, motion, costs[earlier, later])
     trust = np.maximum(trust, trust.T)
     for date in range(len(dates)):  # by way of others
         trust = np.maximum(trust, np.minimum(trust[:, date, None], trust[None, date]))
     return Comparison(costs, poses, roots, trust, motions)
+
+
+def _link_costs(pair: Pair, alignment: Alignment) -> Floats:
+    """(N, M) costs of leaves of two aligned dates being the same. Where few leaves are paired, they do not tell how the
+    plant bent."""
+    if len(alignment.pairs) < ENOUGH:
+        return fitted_costs(pair.moved(alignment.pose), LINKS)
+    return _bent_costs(pair, alignment)
 
 
 def _bent_costs(pair: Pair, alignment: Alignment) -> Floats:
@@ -140,7 +151,7 @@ def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:
         part = pair.take(rows, columns)
         alignment = refine(part, motion.pose)
         if len(alignment.pairs):
-            parted[np.ix_(rows, columns)] = _bent_costs(part, alignment)
+            parted[np.ix_(rows, columns)] = _link_costs(part, alignment)
     return parted
 
 
@@ -183,7 +194,7 @@ def link_leaves(
                 before, chance = known[-1], chances[tracks[after]]
                 is_asked = gains[known, after].max() >= ASKED
                 both = [(int(date_of[n]), int(n - starts[date_of[n]])) for n in (before, after)]
-                chance *= 1.0 if trust is None else float(trust[both[0][0], later])
+                chance *= 1.0 if trust is None else BY_CHANCE + (1 - BY_CHANCE) * float(trust[both[0][0], later])
                 links.append(Link(both[0], both[1], 1.0 if is_asked else chance))
     return links
 

@@ -164,7 +164,7 @@ def cloud_costs(pair: Pair, *, spread: float = 1.0) -> Floats:
     ways = apart.min(3).mean(2), apart.min(2).mean(2)
     near, far = np.minimum(*ways) / pair.scale, np.maximum(*ways) / pair.scale
     wide = CLOUDS * spread + RISE * pair.days
-    return 0.5 * (_tail(near / wide, 2) + _tail(far / (3 * wide), 1)) - APART
+    return 0.5 * (student_tail(near / wide, 2) + student_tail(far / (3 * wide), 1)) - APART
 
 
 def _directed_costs(pair: Pair, spread: float) -> Floats:
@@ -179,8 +179,8 @@ def _directed_costs(pair: Pair, spread: float) -> Floats:
     loose = np.where(first.is_surface[:, None] & second.is_surface[None], 0.0, LOOSE)
     bend = _bends(first, second) / np.hypot(BEND, loose)
     return 0.5 * (
-        _tail(across, 2) + _tail(along, 1) + _tail(turn, 2) + _tail(bend, 2)
-        + _tail(_growth(first, second, days=days, loose=loose), 1)
+        student_tail(across, 2) + student_tail(along, 1) + student_tail(turn, 2) + student_tail(bend, 2)
+        + student_tail(_growth(first, second, days=days, loose=loose), 1)
     ) - PARTING  # fmt: skip
 
 
@@ -218,6 +218,6 @@ def _growth(first: Leaves, second: Leaves, *, days: float, loose: Floats) -> Flo
     return np.where(ratio < 0, ratio, np.maximum(ratio - expected, 0)) / wide
 
 
-def _tail(x: Floats, dimensions: int) -> Floats:
+def student_tail(x: Floats, dimensions: int) -> Floats:
     """Minus twice the log of Student's density in units of its peak."""
     return (TAIL + dimensions) * np.log1p(np.square(x) / TAIL)

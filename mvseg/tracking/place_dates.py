@@ -26,11 +26,10 @@ from mvseg.tracking.align import (
     near_world,
     pose_distances,
 )
-from mvseg.tracking.costs import pair_costs
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.fitted_costs import fitted_costs
 
 TRIED = 3  # poses of each pair, the likeliest; with five, nothing changes
-SPREAD = 1.3  # of the costs, for poses by way of other dates are less exact
 ROUNDS = 6  # at most; two or three are enough
 Looked = Mapping[tuple[int, int], Poses]
 Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
@@ -137,7 +136,7 @@ def _remembered(looked: Looked, habit: Habit) -> Likeliness:
         of_pair, pose = looked[pair].pair, np.frombuffer(step).reshape(4, 4)
         gain = 0.0
         if of_pair.fewer:
-            costs = pair_costs(of_pair.moved(pose), spread=SPREAD)
+            costs = fitted_costs(of_pair.moved(pose))
             pairs = best_pairs(costs)
             gain = float(-costs[pairs[:, 0], pairs[:, 1]].sum()) - large_new(of_pair, pairs)
         return TEMPER * gain + habit.world_prior * float(near_world(of_pair, pose[None])[0])
