@@ -21,6 +21,7 @@ from mvseg.errors import InputError
 from mvseg.formats.json_file import Vector3, read_json
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE
 from mvseg.results.read import find_result
+from mvseg.traits.filters import STEM
 from mvseg.traits.leaf import BASE_UNKNOWN, Measurement, cell_normals
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
@@ -59,6 +60,7 @@ class SeenLeaf:
             midrib.
         is_oriented: the first point of the midrib is known to be the base.
         numbers: {trait: number} of what was measured.
+        is_doubted: it looks like a stem, as rolled leaves of seedlings do: it counts if another date shows the leaf.
     """
 
     leaf: int
@@ -67,6 +69,7 @@ class SeenLeaf:
     points: Floats | None
     is_oriented: bool
     numbers: Mapping[str, Number]
+    is_doubted: bool = False
 
     @property
     def length(self) -> float:
@@ -84,7 +87,7 @@ class PlantOnDate:
         written: the time as the user gave it.
         unit: of its lengths, "" when unknown.
         knows_up: +z of its frame is up.
-        leaves: those that count as leaves, by id.
+        leaves: those that count as leaves, or may do so, by id.
         whole: {trait: number} of the plant.
         folder: of the result; None in memory.
     """
@@ -130,13 +133,15 @@ def read_date(folder: Path, time: str | float) -> PlantOnDate:
     by_leaf, methods = _read_traits(folder / "traits.csv")
     frame, leaves = None if world.up is None else level_frame(world.up), []
     for number, method in sorted(methods.items()):
-        if number and not any(each.startswith(REJECTED) for each in method.values()):
+        rejections = {each for each in method.values() if REJECTED in each}
+        if number and all(STEM in each for each in rejections):
             name = f"leaves/leaf_{number:03d}.ply"
             if name in run.files and not (folder / name).is_file():
                 raise InputError(f"{folder / name}: is missing, expected the whole result that run.json lists")
             vertices = _read_vertices(folder / name)
             is_oriented = BASE_UNKNOWN.method not in method.get("azimuth", "")
-            leaves.append(_leaf_of(number, vertices, by_leaf[number], frame, is_oriented=is_oriented))
+            leaf = _leaf_of(number, vertices, by_leaf[number], frame, is_oriented=is_oriented)
+            leaves.append(replace(leaf, is_doubted=bool(rejections)))
     return PlantOnDate(
         scene=folder.name, time=read_time(time), written=str(time).strip(), unit=world.unit or "",
         knows_up=frame is not None, leaves=tuple(leaves), whole=by_leaf[0], folder=folder,
@@ -161,11 +166,12 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
         return {name: Number(m.value, m.sd, units[name]) for name, m in found.items() if m.exists}
 
     for leaf in traits.leaves:
-        if leaf.rejection is None:
+        if leaf.rejection is None or leaf.rejection.kind == "stem":
             shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
             vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
             is_oriented = bool(getattr(shape, "is_oriented", False))
-            leaves.append(_leaf_of(leaf.leaf, vertices, numbers_of(leaf.numbers), frame, is_oriented=is_oriented))
+            seen = _leaf_of(leaf.leaf, vertices, numbers_of(leaf.numbers), frame, is_oriented=is_oriented)
+            leaves.append(replace(seen, is_doubted=leaf.rejection is not None))
     return PlantOnDate(
         scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,
         knows_up=frame is not None, leaves=tuple(leaves), whole=numbers_of(traits.whole),

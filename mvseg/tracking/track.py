@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -120,17 +120,42 @@ def track_leaves(
         else date_of(result, time)
         for result, time in zip(results, written, strict=True)
     ]))  # fmt: skip
-    leaves = [leaves_of(date) for date in dates]
-    knows_up = all(date.knows_up for date in dates)
-    compared = compare_dates(leaves, [date.time for date in dates], knows_up=knows_up, pots=pots)
-    same, different = _sights_of(links, dates)
-    counts = [len(each) for each in leaves]
-    found = link_leaves(counts, compared.costs, trust=compared.trust, same=same, different=different)
+    compared, found = _link_dates(dates, links, pots)
+    believed = _without_stems(dates, found)
+    if believed != dates:
+        dates = believed
+        compared, found = _link_dates(dates, links, pots)
     return Tracks(
         plant=plant, dates=dates, rows=_rows(dates, found, compared.roots),
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
         warnings=tuple(_warnings(dates, compared)),
     )  # fmt: skip
+
+
+def _link_dates(
+    dates: Sequence[PlantOnDate], links: Sequence[LeafLink], pots: Pots
+) -> tuple[Comparison, list[Link]]:
+    leaves = [leaves_of(date) for date in dates]
+    knows_up = all(date.knows_up for date in dates)
+    compared = compare_dates(leaves, [date.time for date in dates], knows_up=knows_up, pots=pots)
+    same, different = _sights_of(links, dates)
+    counts = [len(each) for each in leaves]
+    return compared, link_leaves(counts, compared.costs, trust=compared.trust, same=same, different=different)
+
+
+def _without_stems(dates: tuple[PlantOnDate, ...], links: Sequence[Link]) -> tuple[PlantOnDate, ...]:
+    """The dates without what looks like a stem wherever it is seen."""
+    sights = [(n, row) for n, date in enumerate(dates) for row in range(len(date.shaped))]
+    track = {sight: sight for sight in sights}
+    for link in links:  # by their earlier sight
+        track[link.after] = track[link.before]
+    sure = {track[n, row] for n, row in sights if not dates[n].leaves[dates[n].shaped[row]].is_doubted}
+    believed = []
+    for n, date in enumerate(dates):
+        in_tracks = {date.leaves[place].leaf for row, place in enumerate(date.shaped) if track[n, row] in sure}
+        left = tuple(leaf for leaf in date.leaves if not leaf.is_doubted or leaf.leaf in in_tracks)
+        believed.append(date if len(left) == len(date.leaves) else replace(date, leaves=left))
+    return tuple(believed)
 
 
 def _sights_of(

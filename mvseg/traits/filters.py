@@ -29,6 +29,9 @@ FEWEST = 3  # instances, for floor and distance to be told
 NUM_POINTS = 400  # of a shape, for distances
 
 
+STEM = "looks like a stem"  # begins the reason of a rejection
+
+
 @dataclass(frozen=True)
 class Rejection:
     """Why an instance is not measured: the kind, which is counted, and a sentence."""
@@ -128,7 +131,7 @@ def find_stems(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
         elongation = body.deviations[0] / max(body.deviations[1], 1e-12)
         steepness = np.degrees(np.arcsin(min(1.0, abs(float(body.axis @ up)))))
         if elongation > LONG and steepness > STEEP_DEG and body.iou < TUBE_IOU:
-            reason = f"looks like a stem: {elongation:.0f} times longer than wide, {steepness:.0f} degrees steep"
+            reason = f"{STEM}: {elongation:.0f} times longer than wide, {steepness:.0f} degrees steep"
             found[instance] = Rejection("stem", reason)
     return found
 

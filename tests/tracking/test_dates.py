@@ -109,6 +109,9 @@ def test_leaves_without_a_shape_and_rejected_ones(tmp_path: Path) -> None:
     date = read_date(tmp_path / "day", 0)
     assert [(leaf.leaf, leaf.midrib is None) for leaf in date.leaves] == [(1, False), (2, True)]
     assert date.shaped == [0]
+    (tmp_path / "day" / "traits.csv").write_text(table.replace("flat", "looks like a stem: 14 times longer than wide"))
+    doubted = {leaf.leaf: leaf.is_doubted for leaf in read_date(tmp_path / "day", 0).leaves}
+    assert doubted == {1: False, 2: False, 3: True}
 
 
 def test_what_is_no_result_with_surfaces_is_refused(tmp_path: Path) -> None:

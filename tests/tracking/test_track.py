@@ -142,6 +142,26 @@ def test_a_leaf_without_a_shape_is_a_track_of_one_date() -> None:
     assert tracks.num_tracks == 11
 
 
+def test_what_looks_like_a_stem_counts_where_another_date_shows_a_leaf() -> None:
+    """A leaf that is rolled on one day keeps its track; what is a stem on all days, or on one alone, has none."""
+    blades = grow_blades(5, 3)
+    young = {leaf: blade for leaf, blade in blades.items() if leaf != 5}
+    seen = [see(young, 0), see(blades, 1), see(blades, 2)]
+    doubted = {0: {2, 4}, 1: {2, 3}, 2: {2, 5}}  # true leaves; 2 on all days
+    dates = [
+        replace(date, leaves=tuple(
+            replace(leaf, is_doubted=true in doubted[n]) for leaf, true in zip(date.leaves, truth, strict=True)
+        ))
+        for n, (date, truth) in enumerate(seen)
+    ]  # fmt: skip
+    tracks = track_leaves(dates)
+    found = true_tracks(tracks, [truth for _, truth in seen])
+    assert sorted(map(sorted, found.values())) == [[1], [3], [4], [5]]
+    assert [len(date.leaves) for date in tracks.dates] == [3, 4, 4]
+    assert all(sum(row.track == track and row.leaf is not None for row in tracks.rows) == 3 - (5 in true)
+               for track, true in found.items())  # fmt: skip
+
+
 def test_other_units_are_the_same_plant() -> None:
     first, _ = see(BLADES, 0)
     second, _ = see(grown({leaf: blade / 10 for leaf, blade in BLADES.items()}, 1.0), 1, unit="cm")
