@@ -209,7 +209,7 @@ def settle(
     Returns:
         The candidates that are left, and the same with the final fates.
     """
-    from mvseg.verification.evidence import paint_view
+    from mvseg.verification.evidence import paint_view  # loads what matching alone does not need
 
     gone: set[int] = set()
     answers: set[int] = set()

@@ -1,0 +1,20 @@
+"""Every script of `benchmarks/` still finds what it imports from mvseg: nobody runs most of them for weeks."""
+
+from __future__ import annotations
+
+import importlib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SCRIPTS = sorted(
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for path in (ROOT / "benchmarks").rglob("*.py")
+    if path.stem not in ("__init__", "__main__")
+)
+
+
+@pytest.mark.parametrize("name", SCRIPTS)
+def test_it_is_imported(name: str) -> None:
+    assert importlib.import_module(name).__doc__
