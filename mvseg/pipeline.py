@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import apply, apply_everywhere, settle
+from mvseg.corrections.apply import apply, apply_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.errors import InputWarning
@@ -373,6 +373,8 @@ def reconstruct(state: State, *, with_voxels: bool = True) -> State:
 def settle_edits(state: State) -> State:
     """Edits that say "no leaf" where no mask is may answer a question of the page, see `settle`; warns (InputWarning)
     of each that does not."""
+    from mvseg.corrections.settle import settle
+
     assert state.corrected is not None
     surfaces = state.surfaces or state.instances.starts
     left, corrected = settle(state.corrected, state.left, surfaces, cameras=state.scene.cameras)

@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 import torch
 
-from mvseg.corrections.apply import Corrected, apply, apply_everywhere, settle
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere
 from mvseg.corrections.file import FORMAT, parse_corrections
+from mvseg.corrections.settle import settle
 from mvseg.formats.lens import distort, opencv_lens, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.regions import regions_from_label_maps
