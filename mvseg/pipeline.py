@@ -296,7 +296,9 @@ def say_what_is_missing(state: State) -> State:
     from mvseg.detection.config import SURE_SCORE
     from mvseg.verification.unexplained import describe_missing
 
-    if len(state.masks) and (said := describe_missing(state.masks, state.photos, sure_score=SURE_SCORE)):
+    if state.corrected is not None and not len(state.masks):  # a person says that there is none
+        return state
+    if said := describe_missing(state.masks, state.photos, sure_score=SURE_SCORE):
         warnings.warn(said, InputWarning, stacklevel=3)
     return state
 

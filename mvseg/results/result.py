@@ -56,7 +56,6 @@ class Instances:
             voxels=voxels,
         )
 
-
     def renumber(self, numbers: Mapping[int, int]) -> Instances:
         """Instance k by the id `numbers[k]`."""
 

@@ -62,13 +62,12 @@ class Corrector:
         scene's."""
         self.opened = opened
         self.written, self.marks = self._stamp(), mark_photos(opened.found.scene)
-        self.corrections, said = self._read_edits()
+        self.corrections, self.notice = self._read_edits()
         self.shown = opened.matched()
         photos, views = opened.found.photos, range(len(opened.found.scene.views))
         self.pictures = [draw_picture(photos(view), self.shown.masks, view=view) for view in views]
         self.news = threading.Condition()
         self.wanted, self.computed = 1, 0
-        self.notice = " ".join(filter(None, (opened.notice, said)))
         self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
         self.is_closing = False
@@ -114,7 +113,7 @@ class Corrector:
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", InputWarning)
             check_made_for(found, self.opened.found.scene)
-        return found, " ".join(f"{each.message}." for each in caught)
+        return found, " ".join(filter(None, (self.opened.notice, *(f"{each.message}." for each in caught))))
 
     def _stamp(self) -> tuple[int, int] | None:
         """What changes when the file of the edits does; None without one."""

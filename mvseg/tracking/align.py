@@ -31,7 +31,7 @@ PARTS = (0.7, 0.7, 0.3)  # weights of base, middle and tip: growing petioles car
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
 TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
 TEMPER = 0.4  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
-GUESS = (-1.56, 0.77)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
+GUESS = (-1.45, 0.73)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
 DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
@@ -247,7 +247,7 @@ def alikeness(pair: Pair, poses: Floats) -> Floats:
 
 
 def refine(pair: Pair, pose: Floats) -> Alignment:
-    """From a pose (4, 4) that is nearly right: pair the leaves, fit it to the pairs, and again with stricter costs."""
+    """From a pose (4, 4) that is nearly right: pair the leaves and fit it to the pairs, until these stay."""
     pairs = np.zeros((0, 2), int)
     for _ in range(ROUNDS):
         costs, before = fitted_costs(pair.moved(pose)), pairs
@@ -255,6 +255,9 @@ def refine(pair: Pair, pose: Floats) -> Alignment:
         if not len(pairs) or np.array_equal(pairs, before):
             break
         pose = _fit(pair, pairs, -costs[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
+    else:
+        costs = fitted_costs(pair.moved(pose))
+        pairs = best_pairs(costs)
     return Alignment(pose, pairs, gain=float(-costs[pairs[:, 0], pairs[:, 1]].sum()))
 
 

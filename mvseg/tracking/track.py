@@ -102,7 +102,7 @@ def track_leaves(
         plant: its name.
 
     Returns:
-        The tracks. Of each two dates the likeliest alignment is taken, links have its probability at most, and
+        The tracks. Of each two dates the likeliest alignment is taken, the probability of a link follows from its, and
         `Tracks.warnings` names those that are guesses. Leaves without a shape get a track of that date alone.
 
     Raises:

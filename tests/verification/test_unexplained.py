@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from blade_scene import SIZE, as_regions
+from leafy_scene import write_leafy_scene
+from mvseg.config import RunConfig
+from mvseg.corrections.apply import apply
+from mvseg.corrections.file import Corrections
+from mvseg.errors import InputWarning
+from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
+from mvseg.pipeline import State, say_what_is_missing
 from mvseg.verification.unexplained import describe_missing, share_unexplained
 from three_leaves import true_maps
 
@@ -57,3 +65,13 @@ def test_what_is_missing_is_said_once() -> None:
     assert "no leaf" in describe_missing(nothing, photo, sure_score=0.3)
     by_hand = replace(found((1, 2, 3)), detection_scores=torch.full((len(IDS),), torch.nan))
     assert describe_missing(by_hand, photo, sure_score=0.3) == ""
+
+
+def test_a_run_that_finds_no_leaf_says_so(tmp_path: Path) -> None:
+    """Unless a person has rejected them all."""
+    leafy = write_leafy_scene(tmp_path, num_leaves=1, num_views=3, size=64, span_deg=120)
+    state = State(config=RunConfig(), scene=leafy.scene, photos=Photos(leafy.scene))
+    with pytest.warns(InputWarning, match="no leaf was found"):
+        say_what_is_missing(state)
+    rejected = apply(Corrections(), state.masks, state.scene)
+    assert say_what_is_missing(replace(state, corrected=rejected)).corrected is rejected
