@@ -35,9 +35,9 @@ lint: $(VENV)/installed
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m mypy
 
-# the site, in build/site; a warning is an error
+# the site, in build/site; a warning is an error (with --quiet, it would not be)
 docs: $(VENV)/installed
-	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --quiet --config-file .ci/mkdocs.yml
+	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --config-file .ci/mkdocs.yml
 
 $(VENV)/installed: pyproject.toml
 	python3 -m venv $(VENV)

@@ -32,7 +32,6 @@ ORDER = {
     "Notes": (
         "notes/matching.md",
         "notes/detector.md",
-        "notes/surfaces.md",
         "notes/check.md",
         "notes/tracking.md",
         "notes/performance.md",

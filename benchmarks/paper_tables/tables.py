@@ -14,8 +14,8 @@ from benchmarks.paper_tables.number_of_leaves import RULES
 from benchmarks.paper_tables.shapes import DEFAULT_SHARE, SHAPES, THRESHOLDS
 from mvseg.simulation.dataset import plant_index
 
-MEASURES = {"s_match": ("s_match", 3), "e_k": ("e_k", 2), "ARI": ("ari", 3), "pair F1": ("f1", 3)}
-TOGETHER = "s_match, untied together"
+MEASURES = {"s_match": ("s_match", 3), "e_k": ("e_k", 2), "ARI": ("ari", 3)}
+HALVES = ("d", "excess", "gaps")
 
 
 def axes(plan: Plan) -> tuple[list[int], list[int]]:
@@ -65,26 +65,23 @@ def row_name(method: str, records: Sequence[Record]) -> str:
 
 
 def table_1(plan: Plan, kind: str) -> str:
-    """Every measure of every method, per number of cameras and leaves; the paper's rows in italics."""
+    """Every measure of every method, per number of cameras and leaves; the paper's rows, in italics, once: in the
+    table of true masks."""
     views, leaves = axes(plan)
     matches = read_matches(plan, kind)
     most = max(len(records) for records in matches.values())
     rows = []
-    for name, (key, decimals) in {TOGETHER: ("s_together", 3), **MEASURES}.items():
+    for name, (key, decimals) in MEASURES.items():
         beside = set()
         for method, records in matches.items():
-            if name == TOGETHER and not any(record.get("untied") for record in records):
-                continue
             columns = average_columns(records, measure(key), views=views, leaves=leaves)
             label = row_name(method, records) + (f", {len(records)} scenes" if len(records) < most else "")
             rows.append([name, label, *(column.text(decimals) for column in columns)])
             beside.add(PRINTED[method])
-        for method, values in printed.TABLE_1.get(name, {}).items():
+        for method, values in (printed.TABLE_1.get(name, {}) if kind == "true" else {}).items():
             if method in beside:
                 digits = 3 if name == "s_match" else 2
                 rows.append([name, f"*paper: {method}*", *printed_cells(values, plan, digits)])
-    order = [*list(MEASURES)[:1], TOGETHER, *list(MEASURES)[1:]]
-    rows.sort(key=lambda row: order.index(row[0]))
     header = ["measure", "method", *(f"{n} cams" for n in views), *(f"{n} leaves" for n in leaves), "average"]
     return markdown_table(header, rows)
 
@@ -101,7 +98,7 @@ def count_masks(plan: Plan, kind: str) -> str:
 
 
 def table_2(plan: Plan) -> str:
-    """Every method on every real scene; the paper's own scenes for orientation."""
+    """Every method on every real scene; the paper's own plant for orientation."""
     rows = []
     for folder in plan.real:
         for method in plan.methods:
@@ -111,10 +108,8 @@ def table_2(plan: Plan) -> str:
                 values = [measure(key)(record) for key, _ in MEASURES.values()]
                 texts = ["N/A" if value is None else f"{value:.3f}" for value in values]
                 rows.append([folder.resolve().name, row_name(method, [record]), *texts])
-    for column, scene in enumerate(("real plant", "balloon", "ornament", "average")):
-        for method, scores in printed.TABLE_2.items():
-            s_match, e_k = scores[column]
-            rows.append([f"*paper: {scene}*", f"*{method}*", f"{s_match:.3f}", f"{e_k:g}", "-", "-"])
+    for method, (s_match, e_k) in printed.TABLE_2.items():
+        rows.append(["*paper: real plant*", f"*{method}*", f"{s_match:.3f}", f"{e_k}", "-"])
     return markdown_table(["scene", "method", *MEASURES], rows)
 
 
@@ -158,7 +153,7 @@ def count_scenes(groups: dict[str, list[Record]], plan: Plan) -> str:
 
 
 def table_error(plan: Plan) -> str:
-    """What d consists of: one thing is changed at a time; d (excess / gaps) per number of cameras."""
+    """What d consists of, over all scenes: one thing is changed at a time."""
     wanted = [
         ("voxels that hold the true points", "voxels of the truth"),
         ("true masks and ids, 25 voxels per leaf length", "true ids, 25 voxels"),
@@ -169,16 +164,14 @@ def table_error(plan: Plan) -> str:
         ("degraded masks, ids of nview", "MVIS (nview), degraded masks"),
         ("degraded masks, ids of the paper's clustering", "MVIS (paper), degraded masks"),
     ]
-    views, _ = axes(plan)
     shapes = read_shapes(plan, [name for _, name in wanted])
-    rows = [[label, *split_cells(shapes[name], "0.5", views)] for label, name in wanted if name in shapes]
-    table = markdown_table(["changed", *(f"{n} cams" for n in views), "average"], rows)
+    rows = [[label, *split_cells(shapes[name], "0.5")] for label, name in wanted if name in shapes]
+    table = markdown_table(["changed", *HALVES], rows)
     return f"{count_scenes(shapes, plan)}\n\n{table}"
 
 
 def table_rules(plan: Plan) -> str:
-    """d (excess / gaps) per number of cameras, for every threshold of both rules."""
-    views, _ = axes(plan)
+    """d and its halves, over all scenes, for every threshold of both rules."""
     wanted = [
         ("share of the masks", "true", "MVIS (nview), true masks"),
         ("hidden parts", "true", "MVIS (nview), true masks, hidden parts"),
@@ -191,19 +184,14 @@ def table_rules(plan: Plan) -> str:
         if name in shapes:
             for threshold in THRESHOLDS:
                 text = f"{threshold:g}"
-                rows.append([kind, rule, f"> {text}", *split_cells(shapes[name], text, views)])
-    table = markdown_table(["masks", "rule", "threshold", *(f"{n} cams" for n in views), "average"], rows)
+                rows.append([kind, rule, f"> {text}", *split_cells(shapes[name], text)])
+    table = markdown_table(["masks", "rule", "threshold", *HALVES], rows)
     return f"{count_scenes(shapes, plan)}\n\n{table}"
 
 
-def split_cells(records: Sequence[Record], threshold: str, views: Sequence[int]) -> list[str]:
-    """ "d (excess / gaps)" per number of cameras, and over all."""
-    columns = [[r for r in records if r["views"] == number] for number in views] + [list(records)]
-    cells = []
-    for column in columns:
-        d, excess, gaps = (average(column, measure(threshold, key)).text(3) for key in ("d", "excess", "gaps"))
-        cells.append(f"{d} ({excess} / {gaps})" if column else "-")
-    return cells
+def split_cells(records: Sequence[Record], threshold: str) -> list[str]:
+    """The averages of `HALVES`."""
+    return [average(records, measure(threshold, key)).text(3) for key in HALVES]
 
 
 def table_numbers(plan: Plan) -> str:
