@@ -1,11 +1,10 @@
-"""What surfaces correct in the ids: `python benchmarks/checked_ids.py --cache DIR [--masks degraded true drawn ...]`
+"""What surfaces correct in the ids: `python benchmarks/checked_ids.py --cache DIR [--masks degraded true pieces]`
 
 For each scene: ARI and e_k of the ids found and of those that the surfaces correct
 (`mvseg.verification.checked_ids`), how many masks are moved, how many of the moved were right before and are right
 afterwards, and CPU seconds of matching, of surfaces, of the check and of the surfaces that are fitted again.
-"degraded" and "true" are the masks of the evaluation scenes, "pieces" those of `straps.py`, "drawn" those of
-`dense_plants.py` and "drawn-pieces" their connected parts; the numbers of leaves of the last three do not depend on
---leaves.
+"degraded" and "true" are the masks of the evaluation scenes, "pieces" those of `straps.py`, whose numbers of leaves do
+not depend on --leaves.
 """
 
 from __future__ import annotations
@@ -23,7 +22,6 @@ from torch import Tensor
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks import dense_plants
 from benchmarks.confidence import has_right_id
 from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps, visible_ids
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
@@ -37,32 +35,13 @@ from mvseg.scene import Cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.verification.checked_ids import check_ids, unchanged_surfaces
 
-KINDS_HERE = (*KINDS, "pieces", "drawn", "drawn-pieces")
+KINDS_HERE = (*KINDS, "pieces")
 STRAPS = 8, 12  # leaves
-
-
-DENSE = {"basil": 32, "mint": 24, "coffee": 20}  # leaves
-
-
-def list_dense(kind: str, num_plants: int) -> Iterator[tuple[str, Regions, Tensor, Cameras]]:
-    """As `list_masks`."""
-    for number in range(num_plants):
-        for habit, num_leaves in DENSE.items():
-            seed = dense_plants.FIRST_SEED + number
-            plant, cameras = dense_plants.grow_dense(habit, num_leaves, seed)
-            true = visible_ids(plant, cameras)
-            drawn = [dense_plants.draw_masks(labels, 1000 * seed + view) for view, labels in enumerate(true)]
-            regions = regions_from_label_maps([cut_pieces(labels) for labels in drawn] if kind != "drawn" else drawn)
-            leaf = shown_instances(regions, true, count_background=False)
-            yield f"{kind} {habit} {num_leaves}x{len(cameras)} {number}", regions, leaf, cameras
 
 
 def list_masks(args: argparse.Namespace) -> Iterator[tuple[str, Regions, Tensor, Cameras]]:
     """Name, regions, the leaf that each of them shows, and cameras of each scene."""
     for kind in args.masks:
-        if kind.startswith("drawn"):
-            yield from list_dense(kind, args.plants)
-            continue
         if kind != "pieces":
             for spec in chosen_scenes(args):
                 scene = load_maps(spec, args.cache)
@@ -75,7 +54,7 @@ def list_masks(args: argparse.Namespace) -> Iterator[tuple[str, Regions, Tensor,
                 cameras = strap_cameras(plant)
                 true = visible_ids(plant, cameras)
                 regions = regions_from_label_maps([cut_pieces(labels) for labels in true])
-                leaf = shown_instances(regions, true, count_background=False)
+                leaf = shown_instances(regions, list(true), count_background=False)
                 yield f"pieces {num_leaves}x{len(cameras)} {number}", regions, leaf, cameras
 
 
