@@ -57,6 +57,7 @@ SLENDER = 4.0  # length over width of what is no leaf of the rosette
 ROSETTE = 0.85  # of the photo's height: the rosette lies below
 
 Figures = dict[str, float]
+Draw = Callable[[DetectConfig, Scene, str], tuple[Masks, Masks]]  # `find_leaves` with some weights
 
 
 def mirror_scene(scene: Scene, folder: Path) -> Scene:
@@ -112,7 +113,7 @@ def count(found: Masks, masks: Masks) -> Figures:
     }
 
 
-def judge_basil(folder: Path, draw: Callable[[DetectConfig, Scene, str], tuple[Masks, Masks]], args) -> Figures:
+def judge_basil(folder: Path, draw: Draw, args: argparse.Namespace) -> Figures:
     scene = load_scene(folder)
     sizes = zip(scene.views, scene.cameras.sizes.tolist(), strict=True)
     truth = [read_label_png(folder / "truth" / f"{view.name}.png", *size) for view, size in sizes]
@@ -131,7 +132,7 @@ def judge_basil(folder: Path, draw: Callable[[DetectConfig, Scene, str], tuple[M
     return figures
 
 
-def judge_unlabelled(folder: Path, draw: Callable[[DetectConfig, Scene, str], tuple[Masks, Masks]], args) -> Figures:
+def judge_unlabelled(folder: Path, draw: Draw, args: argparse.Namespace) -> Figures:
     scene = load_scene(folder)
     every = 2 if folder.name.startswith("fern") else 1
     views = list(range(0, len(scene.views), every))
@@ -158,7 +159,7 @@ def count_outside(folder: Path, scene: Scene, **stages: Masks) -> Figures:
 
 
 @torch.no_grad()
-def judge_siliques(folder: Path, weights: str, args) -> Figures:
+def judge_siliques(folder: Path, weights: str, args: argparse.Namespace) -> Figures:
     detector = load_detector(weights, min_score=DetectConfig.min_score)
     photos = sorted((folder / "images").iterdir())[::10]
     total, slender = 0, 0
@@ -176,7 +177,7 @@ def judge_siliques(folder: Path, weights: str, args) -> Figures:
     return {"masks per photo": total / len(photos), "slender ones above the rosette": slender / len(photos)}
 
 
-def judge_rosettes(folder: Path, weights: str, args) -> Figures:
+def judge_rosettes(folder: Path, weights: str, args: argparse.Namespace) -> Figures:
     samples = list_samples(folder / "images", folder / "labels")
     samples = samples.select([index for index in range(len(samples)) if index % 5 in (1, 3)])
     detector = load_detector(weights)
@@ -184,7 +185,7 @@ def judge_rosettes(folder: Path, weights: str, args) -> Figures:
     figures = average_precision(truth, found, len(samples))
     dice = count_and_dice(truth, found, len(samples), min_score=DetectConfig.min_score)
     return {
-        "mask AP50": figures["mask_AP50"],
+        "mask AP50": float("nan") if figures["mask_AP50"] is None else figures["mask_AP50"],
         "best Dice": dice["sbd"],
         "count off by": dice["absolute_count_difference"],
     }

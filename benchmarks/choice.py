@@ -137,7 +137,9 @@ def fit(studies: list[Study]) -> LeafScores:
     """The numbers of greatest likelihood."""
     fitted = FITTED
     for _ in range(ROUNDS):
-        shows, matched, leaves = ([], []), ([], []), {True: ([], []), False: ([], [])}
+        shows: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+        matched: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+        leaves: dict[bool, tuple[list[np.ndarray], list[bool]]] = {True: ([], []), False: ([], [])}
         for each in studies:
             for (x, y), into in zip(mask_samples(each, fitted), (shows, matched), strict=True):
                 into[0].append(x)
@@ -188,7 +190,7 @@ def leaf_samples(
 
 def ceiling(each: Study, least: float) -> float:
     """MV-PQ of the best proposals."""
-    rows, best = [], {}
+    best: dict[tuple[int, int], tuple[float, int]] = {}
     for row in ((each.table.detection_scores >= least).numpy() & (each.leaf > 0)).nonzero()[0].tolist():
         view, leaf = int(each.table.view_index[row]), int(each.leaf[row])
         x1, y1, x2, y2 = each.table.regions.boxes[row].tolist()

@@ -94,7 +94,7 @@ def run_scene(spec: SceneSpec, *, cache: Path, num_draws: int, is_fit: bool) -> 
     for number, kind in enumerate(KINDS):
         if kind == "detected":
             regions = load_detected(spec, cache)
-            truth = shown_instances(regions, scene.true)
+            truth = shown_instances(regions, list(scene.true))
         else:
             regions, truth = scene.masks(kind)
         rng = np.random.default_rng([spec.seed, spec.num_views, number])

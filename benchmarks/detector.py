@@ -78,7 +78,7 @@ def visible_share(folder: Path, cameras: Cameras, truth: Regions) -> np.ndarray:
     for index, (view, leaf) in enumerate(zip(truth.view_index.tolist(), truth.labels.tolist(), strict=True)):
         path = folder / "truth" / "leaves" / f"leaf_{leaf:03d}.ply"
         if path.is_file():
-            mesh = trimesh.load(path, process=False)
+            mesh = trimesh.load_mesh(path, process=False)
             share[index] = min(1.0, int(truth.areas[index]) / max(1, silhouette_area(mesh, cameras, view)))
     return share
 

@@ -13,6 +13,7 @@ import argparse
 import sys
 import time
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -50,7 +51,7 @@ def draw_from(case: Case, views: list[int], number: int) -> list[int]:
     return chosen
 
 
-def shown_in(masks: Masks, truth: list[np.ndarray], leaf: int, drawn: list[int], view: int) -> bool:
+def shown_in(masks: Masks, truth: Sequence[np.ndarray], leaf: int, drawn: list[int], view: int) -> bool:
     """Whether a view has a mask of the instance of a leaf that was drawn in others, with an IoU above one half."""
     is_leaf = torch.zeros(len(masks), dtype=torch.bool)
     for row in range(len(masks)):

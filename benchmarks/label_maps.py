@@ -50,7 +50,7 @@ class LabelledScene:
     def masks(self, kind: str) -> tuple[Regions, Tensor]:
         """The D regions of one of `KINDS`, and (D,) int64, the leaf that each of them shows."""
         regions = regions_from_label_maps(list(self.true if kind == "true" else self.degraded))
-        return regions, shown_instances(regions, self.true, count_background=False)
+        return regions, shown_instances(regions, list(self.true), count_background=False)
 
 
 def load_maps(spec: SceneSpec, cache: Path) -> LabelledScene:

@@ -51,7 +51,7 @@ def list_kinds(cache: Path) -> Iterator[tuple[str, Regions, torch.Tensor, Camera
             faulty = [degrade_labels(labels, Faults(), seed=view) for view, labels in enumerate(pieces)]
             for maps in (list(true), pieces, faulty):
                 regions = regions_from_label_maps(maps)
-                leaf = shown_instances(regions, true, count_background=False)
+                leaf = shown_instances(regions, list(true), count_background=False)
                 yield f"strap {num_leaves} {number}", regions, leaf, cameras
     for spec in list_scenes(PRESETS["paper-eval"], 0):
         is_asked = spec.num_leaves in LEAVES and spec.num_views in VIEWS and plant_index(spec) < PLANTS

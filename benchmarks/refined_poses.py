@@ -115,7 +115,7 @@ def main() -> None:
     names = MEASURES if args.area else MEASURES[:-1]
     print(f"{'masks':9} {'poses':12} {'scenes':>6} {'refined':>8}" + "".join(f"{name:>20}" for name in names))
     for (kind, fault), rows in groups.items():
-        before, after = (np.nanmean([row[side] for row in rows], 0) for side in (3, 4))
+        before, after = (np.nanmean(values, 0) for values in ([row[3] for row in rows], [row[4] for row in rows]))
         cells = "".join(f"{a:10.3f} -> {b:6.3f}" for a, b in zip(before, after, strict=True))
         print(f"{kind:9} {fault:12} {len(rows):6} {sum(row[2] for row in rows):8}{cells}")
 

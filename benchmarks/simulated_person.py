@@ -185,7 +185,7 @@ class Look:
         polygon = [(float(x), float(y)) for x, y in self._to_photo(view, points)]
         return Outline(view=self.scene.views[view].name, polygon=tuple(polygon), leaf=f"leaf {leaf}")
 
-    def _to_photo(self, view: int, xy: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _to_photo(self, view: int, xy: NDArray[np.floating]) -> NDArray[np.floating]:
         lens = self.scene.views[view].lens
         return xy if lens is None else photo_from_pinhole(lens, self.scene.cameras.K[view].numpy(), xy)
 

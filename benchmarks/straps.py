@@ -69,7 +69,7 @@ def main() -> None:
             faulty = [degrade_labels(labels, Faults(), seed=view) for view, labels in enumerate(pieces)]
             for kind, maps in (("whole", list(true)), ("pieces", pieces), ("degraded", faulty)):
                 regions = regions_from_label_maps(maps)
-                leaf = shown_instances(regions, true, count_background=False)
+                leaf = shown_instances(regions, list(true), count_background=False)
                 ids = match_regions(regions, cameras).instance_ids
                 metrics = matching_metrics(ids, leaf)
                 is_wrong = ~torch.from_numpy(has_right_id(ids.numpy(), leaf.numpy()))

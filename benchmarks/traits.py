@@ -71,7 +71,7 @@ def run_scene(spec: SceneSpec, *, cache: Path, kinds: list[str]) -> list[dict[st
 def detect_masks(spec: SceneSpec, scene: LabelledScene, cache: Path) -> tuple[Regions, Tensor]:
     """The D masks of the shipped detector, and (D,) the leaf that each of them shows, 0 = none."""
     photos = torch.from_numpy(load_photos(spec, cache)).permute(0, 3, 1, 2)
-    found = find_masks((photo.float() / 255 for photo in photos), scene.true, detector="leaf-lite")
+    found = find_masks((photo.float() / 255 for photo in photos), list(scene.true), detector="leaf-lite")
     return found.regions, found.true_ids
 
 

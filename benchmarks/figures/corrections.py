@@ -28,7 +28,7 @@ from mvseg.formats.label_png import read_labels, write_label_png
 DOCS = Path(__file__).parents[2] / "docs"
 SEED = 5
 PAIR, LINKED = (2, 5), 6  # photos, and the leaf that is clicked at in both
-SIZE = {"width": 1180, "height": 700}
+WIDTH, HEIGHT = 1180, 700
 OPTIONS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 
 
@@ -99,7 +99,7 @@ def main() -> None:
         run(["infer", str(scene), "--masks", "masks", "--out", str(result)])
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=OPTIONS)
-        page = browser.new_page(viewport=SIZE)
+        page = browser.new_page(viewport={"width": WIDTH, "height": HEIGHT})
         page.goto((result / "report.html").as_uri())
         page.locator("#mode-correct").click()
         person = Person(page)

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import trimesh
 from trimesh.ray.ray_pyembree import RayMeshIntersector
+
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from mvseg.formats.image_file import read_rgb
+from mvseg.formats.label_png import read_labels
 
 ROOT = Path(__file__).parents[2]
 VIEWS = ("001", "004", "007")
@@ -30,7 +37,7 @@ def find_box(labels: np.ndarray) -> tuple[slice, slice]:
 
 def read_cropped(path: Path, labels: np.ndarray) -> np.ndarray:
     """(HEIGHT, W, 3) BGR, around the plant."""
-    image = cv2.imread(str(path), cv2.IMREAD_COLOR)
+    image = np.ascontiguousarray(read_rgb(path)[..., ::-1])
     width = round(HEIGHT * image.shape[1] / image.shape[0])
     return cv2.resize(image[find_box(labels)], (width, HEIGHT), interpolation=cv2.INTER_CUBIC)
 
@@ -38,12 +45,12 @@ def read_cropped(path: Path, labels: np.ndarray) -> np.ndarray:
 def draw_meshes(path: Path, azimuth_deg: float, elevation_deg: float = 25.0) -> np.ndarray:
     """(HEIGHT, HEIGHT, 3) BGR: the meshes of a GLB in parallel projection, shaded by their normals, +y up."""
     scene = trimesh.load_scene(path)
-    parts = [scene.geometry[scene.graph[name][1]].copy() for name in scene.graph.nodes_geometry]
+    parts: list[Any] = [scene.geometry[scene.graph[name][1]].copy() for name in scene.graph.nodes_geometry]
     for part, name in zip(parts, scene.graph.nodes_geometry, strict=True):
         part.apply_transform(scene.graph[name][0])
     colors = np.array([part.visual.material.baseColorFactor[:3] for part in parts], dtype=float)
     owner = np.repeat(np.arange(len(parts)), [len(part.faces) for part in parts])
-    mesh = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
+    mesh: Any = trimesh.util.concatenate([trimesh.Trimesh(part.vertices, part.faces, process=False) for part in parts])
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
     level = np.array([np.cos(azimuth), 0, -np.sin(azimuth)])
     away = level * np.cos(elevation) + np.array([0, np.sin(elevation), 0])
@@ -71,7 +78,7 @@ def draw_meshes(path: Path, azimuth_deg: float, elevation_deg: float = 25.0) -> 
 
 def main() -> None:
     result = ROOT / "results" / "demo_plant"
-    labels = [cv2.imread(str(result / "labels" / f"{view}.png"), cv2.IMREAD_UNCHANGED) for view in VIEWS]
+    labels = [read_labels(result / "labels" / f"{view}.png") for view in VIEWS]
     places = list(zip(VIEWS, labels, strict=True))
     images = ROOT / "mvseg" / "demo_plant" / "images"
     photos = [read_cropped(images / f"{view}.jpg", label) for view, label in places]

@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.figures.demo import HEIGHT, ROOT, draw_meshes, read_cropped
 from mvseg.cli import main as run
 from mvseg.demo import demo_scene
+from mvseg.formats.label_png import read_labels
 from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
@@ -41,7 +42,7 @@ def make_result(name: str, folder: Path) -> Path:
 
 def draw_tile(result: Path) -> np.ndarray:
     """(HEIGHT, W, 3) BGR: a photo with its leaves, and all of them in 3D."""
-    labels = cv2.imread(str(result / "labels" / f"{VIEW}.png"), cv2.IMREAD_UNCHANGED)
+    labels = read_labels(result / "labels" / f"{VIEW}.png")
     photo = read_cropped(result / "overlay" / f"{VIEW}.png", labels)
     return np.concatenate([photo, draw_meshes(result / "scene.glb", 30)], 1)
 

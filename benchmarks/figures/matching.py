@@ -117,8 +117,8 @@ def draw_hypotheses(example: Example) -> list[np.ndarray]:
 
 def draw_cluster(example: Example) -> list[np.ndarray]:
     """The epipolar map of the leaf's cluster, and the cluster in other views."""
-    heat = (example.epipolar_map(example.members, SOURCE) * 255).astype(np.uint8)
-    heat = cv2.cvtColor(cv2.applyColorMap(heat[..., None], cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
+    share = (example.epipolar_map(example.members, SOURCE) * 255).astype(np.uint8)
+    heat = cv2.cvtColor(cv2.applyColorMap(share[..., None], cv2.COLORMAP_INFERNO), cv2.COLOR_BGR2RGB)
     example.outline(heat, example.leaf, WHITE, thickness=1)
     tiles = [caption(heat, f"view {SOURCE}: the map of its cluster")]
     ids = torch.where(example.members, example.matching.instance_ids, -1)

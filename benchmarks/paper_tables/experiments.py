@@ -78,10 +78,11 @@ def run_real(folder: Path, plan: Plan) -> None:
     masks = remember(partial(make_masks, cell, plan))
     for method in plan.methods:
         path = real_record(plan, folder, method)
-        keep_record(path, lambda method=method: score_method(cell, masks("true"), method, cache=plan.cache))
+        keep_record(path, partial(score_kind, cell, masks, kind="true", method=method, cache=plan.cache))
 
 
-Maker = Callable[[Cell, Callable[[str], Masks]], Record]
+MaskSource = Callable[[str], Masks]  # the masks of a kind
+Maker = Callable[[Cell, MaskSource], Record]
 
 
 def list_records(spec: SceneSpec, plan: Plan) -> Iterator[tuple[Path, Maker]]:
@@ -92,15 +93,23 @@ def list_records(spec: SceneSpec, plan: Plan) -> Iterator[tuple[Path, Maker]]:
         for kind in plan.kinds:
             for method in plan.methods:
                 path = plan.match_records(kind) / slug(method) / file
-                yield path, lambda cell, masks, k=kind, m=method: score_method(cell, masks(k), m, cache=plan.cache)
+                yield path, partial(score_kind, kind=kind, method=method, cache=plan.cache)
     if "k" in plan.tables:
         for kind in ("true", "degraded"):
             path = plan.records / "numbers" / slug(kind) / file
-            yield path, lambda cell, masks, k=kind: score_numbers(cell, masks(k))
+            yield path, partial(score_numbers_of, kind=kind)
     if "3" in plan.tables and plant_index(spec) < plan.shape_plants:
         for name in plan.shapes:
             path = plan.records / "shapes" / slug(name) / file
-            yield path, lambda cell, masks, n=name: measure_shape(cell, masks, n, cache=plan.cache)
+            yield path, partial(measure_shape, name=name, cache=plan.cache)
+
+
+def score_kind(cell: Cell, masks: MaskSource, *, kind: str, method: str, cache: Path) -> Record:
+    return score_method(cell, masks(kind), method, cache=cache)
+
+
+def score_numbers_of(cell: Cell, masks: MaskSource, *, kind: str) -> Record:
+    return score_numbers(cell, masks(kind))
 
 
 def read_records(folder: Path, specs: list[SceneSpec]) -> list[Record]:
