@@ -27,7 +27,7 @@ from benchmarks.tracking import Labels, labels_of, measure, read_series, see_ser
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.series import SeriesSpec, draw_specs
 from mvseg.tracking.align import _fit
-from mvseg.tracking.associate import MOST_GAP
+from mvseg.tracking.compare import MOST_GAP
 from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.fitted_costs import LINKS, POSES, Scales, fitted_costs
@@ -108,7 +108,7 @@ def track_with(series: tuple[list[PlantOnDate], Labels], poses: Scales, links: S
     with (
         patch("mvseg.tracking.align.fitted_costs", costs),
         patch("mvseg.tracking.place_dates.fitted_costs", costs),
-        patch("mvseg.tracking.associate.fitted_costs", costs),
+        patch("mvseg.tracking.compare.fitted_costs", costs),
     ):
         found = measure(truth, labels_of(track_leaves(dates)))
     return found["short"], found["long"]

@@ -29,10 +29,10 @@ from mvseg.system.file_hash import hash_files
 
 UNSURE = 0.5  # share of the masks that are surely matched: with fewer, leaves may be too large for the detector
 SURE_MATCH = 0.9  # match score
-# Root of the area of masks, in pixels as the detector sees them, from which both sizes are better than either. The
-# medians of plants that fill the photo are about 40, of close-ups 83 to 100 (docs/notes/detector.md): a third more or
-# less changes none of them.
-LARGE = 64.0
+# Root of the area of masks, in pixels as the detector sees them, from which both sizes are better than either: nine in
+# ten leaves that detectors train on are smaller (`python benchmarks/training_leaves.py`). The medians of plants that
+# fill the photo are about 40, of close-ups 83 to 100 (docs/notes/detector.md).
+LARGE = 72.0
 
 
 def detect_scene(

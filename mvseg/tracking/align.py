@@ -30,8 +30,8 @@ ROUNDS = 5  # of pairing and fitting, at most
 PARTS = (0.7, 0.7, 0.3)  # weights of base, middle and tip: growing petioles carry bases, and tips sway
 LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
 TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
-TEMPER = 0.4  # of a gain, that counts as log odds: the differences of one leaf go together (docs/notes/tracking.md)
-GUESS = (-1.45, 0.73)  # see `guess_chance`; `python benchmarks/pose_chances.py` fits them
+TEMPER = 0.41  # of a gain, that counts as log odds; `python benchmarks/fit_chances.py` fits it
+GUESS = (-1.11, 0.53, 0.87)  # see `guess_chance`; `python benchmarks/fit_chances.py` fits them
 NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
 SAME = 0.5  # distance of hypotheses of which one is refined, in these
 DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
@@ -151,9 +151,11 @@ def guess_chance(gain: float, leaves: int) -> float:
     Args:
         gain: see `link_gain`; that of another plant is low. (Once all dates are placed, how likely the pose is among
             others of the two dates says nothing more.)
-        leaves: of the date with fewer, >= 1.
+        leaves: of the date with fewer, >= 1. What they say is neither independent, then the sum would count, nor all
+            the same, then the mean would: the sum counts over the root of their number.
     """
-    return float(expit(GUESS[0] + GUESS[1] * gain / leaves))
+    offset, own, strange = GUESS
+    return float(expit(offset + (own * gain / leaves - strange) * math.sqrt(leaves)))
 
 
 def link_gain(pair: Pair, pose: Floats) -> float:

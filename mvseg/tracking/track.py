@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mvseg.errors import InputError
-from mvseg.tracking.associate import Comparison, Link, Sight, compare_dates, link_leaves
+from mvseg.tracking.associate import Link, Sight, link_leaves, sum_over_poses
+from mvseg.tracking.compare import Comparison, compare_dates
 from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import leaves_of
 from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
@@ -132,15 +133,14 @@ def track_leaves(
     )  # fmt: skip
 
 
-def _link_dates(
-    dates: Sequence[PlantOnDate], links: Sequence[LeafLink], pots: Pots
-) -> tuple[Comparison, list[Link]]:
+def _link_dates(dates: Sequence[PlantOnDate], links: Sequence[LeafLink], pots: Pots) -> tuple[Comparison, list[Link]]:
     leaves = [leaves_of(date) for date in dates]
     knows_up = all(date.knows_up for date in dates)
     compared = compare_dates(leaves, [date.time for date in dates], knows_up=knows_up, pots=pots)
     same, different = _sights_of(links, dates)
     counts = [len(each) for each in leaves]
-    return compared, link_leaves(counts, compared.costs, trust=compared.trust, same=same, different=different)
+    linked = link_leaves(counts, compared.costs, same=same, different=different)
+    return compared, sum_over_poses(linked, compared)
 
 
 def _without_stems(dates: tuple[PlantOnDate, ...], links: Sequence[Link]) -> tuple[PlantOnDate, ...]:
@@ -215,7 +215,8 @@ def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[st
         chance = compared.trust[later - 1, later]
         if chance < TOLD:
             pair = f"{dates[later - 1].scene} and {dates[later].scene}"
-            yield f"{pair}: how the pot stands is a guess, right with {chance:.0%}"
+            likely = f"{chance:.0%}" if chance >= 0.01 else "less than 1%"
+            yield f"{pair}: how the pot stands is a guess, {likely} likely to be right"
     for (earlier, later), motion in sorted(compared.motions.items()):
         if compared.roots[later] not in compared.roots[earlier + 1 : later]:
             pair = f"{dates[earlier].scene} and {dates[later].scene}"

@@ -62,7 +62,7 @@ def test_a_repotted_plant_is_linked_by_guesses_that_say_so() -> None:
     dates, _ = days(set(BLADES), set(BLADES))
     other = see(grow_blades(9, 77), 2, scene="other")[0]
     tracks = track_leaves([*dates, other])
-    assert tracks.warnings[0].startswith("day-1 and other: how the pot stands is a guess, right with ")
+    assert tracks.warnings[0].startswith("day-1 and other: how the pot stands is a guess, ")
     guessed = [row.probability for row in tracks.rows if row.date == 2 and not math.isnan(row.probability)]
     sure = [row.probability for row in tracks.rows if row.date == 1]
     assert max(guessed, default=0) < 0.9 < min(sure)

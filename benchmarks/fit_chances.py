@@ -1,0 +1,165 @@
+"""How often is a pose right, and how often a link? `python benchmarks/fit_chances.py SERIES.csv RESULTS`
+
+The table and the results of real seedlings are those of `benchmarks/tracking.py results`; beside them, simulated plants
+of few leaves and of 12 to 30. Of two dates at most three apart, a pose is right where more than half of the leaves that
+it pairs are the same. Prints, each of greatest likelihood,
+
+- `TEMPER` of `mvseg/tracking/align.py`, by the poses of two dates alone: that a right one is taken among all;
+- `GUESS` of the same file, by the poses of all dates placed together; beside them two dates of different plants of a
+  kind, where no pose is right, weighted by a third: they are rarer, but must be noticed;
+- `CALIBRATION` of `mvseg/tracking/associate.py`, by links, with the chances of poses as they are in the code.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.special import expit, logit, logsumexp
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.fit_costs import small_specs
+from benchmarks.tracking import read_series, see_series
+from mvseg.simulation.series import draw_specs
+from mvseg.tracking.align import Alignment, Habit, Poses, judge, link_gain, list_poses, refine
+from mvseg.tracking.associate import link_leaves
+from mvseg.tracking.compare import MOST_GAP, compare_dates
+from mvseg.tracking.costs import Leaves, Pair, leaves_of
+from mvseg.tracking.dates import PlantOnDate
+from mvseg.tracking.place_dates import place_dates
+
+NUM_OTHER, OTHER_WEIGHT, RIDGE, EPS = 60, 1 / 3, 0.01, 1e-6
+Dated = tuple[PlantOnDate, list[int]]
+Looked = dict[tuple[int, int], Poses]
+Placed = tuple[float, int, bool]  # gain of links, number of leaves, whether the pose is right
+Seen = tuple[list[Leaves], list[np.ndarray], list[float]]  # by date: leaves, their true ids (0: unknown), days
+
+
+def see(plant: list[Dated]) -> Seen:
+    leaves = [leaves_of(date) for date, _ in plant]
+    true = [np.array(ids, int)[each.index] for (_, ids), each in zip(plant, leaves, strict=True)]
+    return leaves, true, [date.time for date, _ in plant]
+
+
+def look(seen: Seen) -> Looked:
+    """The poses of each two dates that have leaves."""
+    leaves, _, times = seen
+    pairs = {
+        (earlier, later): Pair.of(leaves[earlier], leaves[later], days=abs(times[later] - times[earlier]) or 2.0,
+                                  knows_up=True)
+        for later in range(len(leaves)) for earlier in range(max(0, later - MOST_GAP), later)
+    }  # fmt: skip
+    return {place: list_poses(pair) for place, pair in pairs.items() if pair.fewer}
+
+
+def is_right(seen: Seen, place: tuple[int, int], alignment: Alignment) -> bool | None:
+    """Whether more than half of the pairs are of one leaf; None where no true id is known."""
+    one, other = (seen[1][date][alignment.pairs[:, side]] for side, date in enumerate(place))
+    is_known = (one > 0) & (other > 0)
+    return bool((one == other)[is_known].mean() > 0.5) if is_known.any() else None
+
+
+def fit_temper(plants: list[tuple[Seen, Looked]]) -> float:
+    choices = []
+    for seen, looked in plants:
+        habit = Habit.of([judge(poses, Habit()) for poses in looked.values()], "auto")
+        for place, poses in looked.items():
+            right = np.array([bool(is_right(seen, place, each)) for each in poses.refined])
+            if right.any() and not right.all():
+                choices.append((poses.gains, habit.world_prior * poses.near, right))
+
+    def loss(x: np.ndarray) -> float:
+        odds = [(float(np.exp(x[0])) * gains + prior, right) for gains, prior, right in choices]
+        return float(sum(logsumexp(each) - logsumexp(each[right]) for each, right in odds))
+
+    return float(np.exp(minimize(loss, np.zeros(1), method="Nelder-Mead").x[0]))
+
+
+def judge_placed(seen: Seen, looked: Looked, *, is_other: bool) -> list[Placed]:
+    """Of each two dates, placed with all others: the gain of links, the number of leaves, and whether the pose is
+    right."""
+    habit = Habit.of([judge(poses, Habit()) for poses in looked.values()], "auto")
+    poses, roots, _ = place_dates(len(seen[0]), looked, habit)
+    found: list[Placed] = []
+    for (earlier, later), of_pair in looked.items():
+        refined = refine(of_pair.pair, np.linalg.inv(poses[later]) @ poses[earlier])
+        right = False if is_other else is_right(seen, (earlier, later), refined)
+        if roots[earlier] == roots[later] and len(refined.pairs) and right is not None:
+            pair = of_pair.pair
+            found.append((link_gain(pair, refined.pose), pair.fewer, right))
+    return found
+
+
+def fit_guess(plants: list[tuple[Seen, Looked]], others: list[tuple[Seen, Looked]]) -> list[float]:
+    known: list[Placed] = [each for plant in plants for each in judge_placed(*plant, is_other=False)]
+    strange = [each for plant in others for each in judge_placed(*plant, is_other=True)]
+    gain, leaves, right = np.array(known + strange).T
+    weight = np.repeat([1.0, OTHER_WEIGHT], [len(known), len(strange)])
+    sign = np.where(right > 0, 1, -1)
+
+    def loss(b: np.ndarray) -> float:
+        odds = b[0] + (b[1] * gain / leaves - b[2]) * np.sqrt(leaves)
+        return float((weight * np.logaddexp(0, -sign * odds)).sum() + RIDGE * float(b[1:] @ b[1:]))
+
+    return [float(each) for each in minimize(loss, np.zeros(3)).x]
+
+
+def fit_calibration(groups: list[list[Seen]]) -> list[float]:
+    """Slope and offset, under which what `sum_over_poses` says of links is likeliest; each group counts the same."""
+    odds, sure, under_others, right, weight = np.concatenate([_list_links(group) for group in groups]).T
+
+    def loss(b: np.ndarray) -> float:
+        chance = np.clip(sure * expit(b[0] * odds + b[1]) + (1 - sure) * under_others, EPS, 1 - EPS)
+        return float(-(weight * np.log(np.where(right > 0, chance, 1 - chance))).sum())
+
+    return [float(each) for each in minimize(loss, (0.3, 3.0), method="Nelder-Mead").x]
+
+
+def _list_links(plants: list[Seen]) -> np.ndarray:
+    """(L, 5) log odds under the pose that was taken, its chance, that of the link under the others, whether the link is
+    right, and one over their number."""
+    rows = []
+    for leaves, true, times in plants:
+        compared = compare_dates(leaves, times, knows_up=True)
+        with patch("mvseg.tracking.associate.CALIBRATION", (1.0, 0.0)):
+            links = link_leaves([len(each) for each in leaves], compared.costs)
+        for link in links:
+            (earlier, row), (later, column) = link.before, link.after
+            others = compared.otherwise.get((earlier, later))
+            under_others = 0.0 if others is None else others[row, column]
+            if true[earlier][row] and true[later][column]:
+                odds = logit(np.clip(link.probability, 1e-15, 1 - 1e-15))
+                same = true[earlier][row] == true[later][column]
+                rows.append((odds, compared.trust[earlier, later], under_others, same))
+    return np.column_stack([np.array(rows, float), np.full(len(rows), 1 / len(rows))])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", type=Path)
+    parser.add_argument("results", type=Path)
+    args = parser.parse_args()
+    groups = [list(read_series(args.table, args.results).values())]
+    groups += [[see_series(spec) for spec in specs] for specs in (small_specs(), draw_specs(4, seed=3))]
+    dated: list[list[list[Dated]]] = [[list(zip(*each, strict=True)) for each in group] for group in groups]
+    plants = [(seen, look(seen)) for group in dated for seen in map(see, group)]
+    print("TEMPER =", round(fit_temper(plants), 2), flush=True)
+    rng, others = np.random.default_rng(0), []
+    for group in dated * NUM_OTHER:
+        one, other = (group[index] for index in rng.choice(len(group), 2, replace=False))
+        seen = see([one[rng.integers(len(one))], other[rng.integers(len(other))]])
+        others.append((seen, look(seen)))
+    print("GUESS =", [round(each, 2) for each in fit_guess(plants, others)], flush=True)
+    print(
+        "CALIBRATION =",
+        [round(each, 2) for each in fit_calibration([[see(plant) for plant in group] for group in dated])],
+    )
+
+
+if __name__ == "__main__":
+    main()

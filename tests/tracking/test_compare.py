@@ -1,0 +1,70 @@
+"""Links under more than one pose: their probability is the sum over all of them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from mvseg.tracking.associate import Link, link_leaves, sum_over_poses
+from mvseg.tracking.compare import Comparison, compare_dates
+from mvseg.tracking.costs import leaves_of
+from tests.plants_over_days import Blades, grow_blades, see
+
+HALF_TURN = Rotation.from_euler("z", 180, degrees=True)
+
+
+def opposite_leaves(count: int) -> Blades:
+    """Pairs of leaves that stand opposite each other: the plant looks the same from behind."""
+    blades = grow_blades(count, 5)
+    behind = {
+        leaf + count: HALF_TURN.apply(blade.reshape(-1, 3)).reshape(blade.shape) for leaf, blade in blades.items()
+    }
+    return blades | behind
+
+
+def link_two(blades: Blades) -> tuple[list[Link], Comparison]:
+    leaves = [leaves_of(see(blades, day, turn=40 * day)[0]) for day in (0, 1)]
+    compared = compare_dates(leaves, [0.0, 1.0], knows_up=True, pots="turned")
+    return link_leaves([len(each) for each in leaves], compared.costs), compared
+
+
+def test_leaves_of_a_plant_that_looks_the_same_from_behind_are_linked_with_half_a_chance() -> None:
+    links, compared = link_two(opposite_leaves(3))
+    assert len(links) == 6
+    chances = np.array([link.probability for link in sum_over_poses(links, compared)])
+    assert chances == pytest.approx(np.full(6, 0.5), abs=0.15)
+    assert min(link.probability for link in links) > 0.9  # under the pose that was taken
+
+
+def test_one_leaf_that_breaks_the_symmetry_makes_them_sure() -> None:
+    links, compared = link_two({leaf: blade for leaf, blade in opposite_leaves(3).items() if leaf != 6})
+    assert min(link.probability for link in sum_over_poses(links, compared)) > 0.8
+
+
+def test_the_sum_is_that_of_a_loop() -> None:
+    rng, links = (
+        np.random.default_rng(0),
+        [Link((0, 1), (1, 0), 0.8), Link((0, 0), (2, 1), 0.6), Link((0, 2), (2, 0), 1.0)],
+    )
+    trust, others = rng.uniform(size=(3, 3)), {(0, 1): rng.uniform(size=(3, 2)), (0, 2): rng.uniform(size=(3, 2))}
+    compared = replace(link_two(grow_blades(3, 1))[1], trust=trust, otherwise=others)
+    found = sum_over_poses(links, compared)
+    for link, summed in zip(links, found, strict=True):
+        (earlier, row), (later, column) = link.before, link.after
+        expected = 0.0
+        for weight, chance in ((trust[earlier, later], link.probability),
+                               (1 - trust[earlier, later], others[earlier, later][row, column])):  # fmt: skip
+            expected += weight * chance
+        assert summed.probability == pytest.approx(expected)
+    assert sum_over_poses(links, replace(compared, trust=np.ones((3, 3)))) == links
+    alone = sum_over_poses(links, replace(compared, otherwise={}))
+    assert [link.probability for link in alone] == pytest.approx([trust[0, 1] * 0.8, trust[0, 2] * 0.6, trust[0, 2]])
+
+
+def test_what_a_person_says_holds_under_every_pose() -> None:
+    said = Link((0, 0), (1, 0), 1.0, is_asked=True)
+    compared = replace(link_two(grow_blades(3, 1))[1], trust=np.zeros((2, 2)))
+    assert sum_over_poses([said], compared) == [said]
