@@ -43,8 +43,7 @@ from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.nview.match_nview import find_clusters
 from mvseg.matching.nview.match_scores import collect_evidence, scene_features
-from mvseg.matching.one_per_view import ViewGraph
-from mvseg.matching.partition import drop_singletons
+from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import SceneSpec
@@ -134,10 +133,9 @@ def judge(regions: Regions, truth: Tensor, cameras: Cameras, *, kind: str, fault
 def clusters_and_features(regions: Regions, cameras: Cameras) -> tuple[Tensor, NDArray[np.floating]]:
     """(D,) int64 ids, -1 for regions alone, and (D, 4) `scene_features`; the regions are ordered by view."""
     affinity = region_affinity(regions, cameras)
-    found = find_clusters(regions, cameras, ViewGraph.of(affinity, regions.view_index, len(cameras)))
+    found = find_clusters(regions, cameras, ViewGraph.of(affinity, regions))
     evidence = collect_evidence(found.scores, found.clusters, found.pairwise)
-    clusters = drop_singletons(found.clusters)
-    return torch.from_numpy(np.where(clusters < 0, -1, clusters + 1)), scene_features(evidence)
+    return found.clusters.drop_singletons().instance_ids(), scene_features(evidence)
 
 
 def fit(outcomes: list[Outcome]) -> NDArray[np.float64]:

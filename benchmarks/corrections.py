@@ -20,7 +20,6 @@ import time
 import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,7 +49,6 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
-from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import State, detect, list_stages, load
 from mvseg.regions import IGNORE_LABEL
@@ -123,7 +121,6 @@ def degraded_case(spec: SceneSpec, cache: Path) -> Case:
         config=config,
         scene=scene,
         photos=Photos(scene),
-        match=partial(match_regions, regions, config=config.match),
         matching=Matching(Masks.of(regions), MatchReport("none")),
         mask_kind="label images",
     )

@@ -29,6 +29,7 @@ from mvseg.matching.nview.config import Gains, HypothesisCosts, NViewConfig, Thr
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.symnmf import cluster_affinity
+from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import SceneSpec
@@ -42,13 +43,13 @@ def symnmf_ids(regions: Regions, cameras: Cameras, affinity: Affinity) -> torch.
 
 
 def one_per_view_ids(regions: Regions, cameras: Cameras, affinity: Affinity) -> torch.Tensor:
-    return one_per_view_clusters(affinity, regions.view_index, len(cameras))
+    return one_per_view_clusters(ViewGraph.of(affinity, regions)).drop_singletons().instance_ids()
 
 
 def nview_ids(
     regions: Regions, cameras: Cameras, affinity: Affinity, *, config: NViewConfig = NViewConfig()
 ) -> torch.Tensor:
-    return match_nview(regions, cameras, affinity, config=config).instance_ids
+    return match_nview(regions, cameras, ViewGraph.of(affinity, regions), config=config).instance_ids
 
 
 METHODS: dict[str, Method] = {"symnmf": symnmf_ids, "one-per-view": one_per_view_ids, "nview": nview_ids}

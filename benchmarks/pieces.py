@@ -28,7 +28,7 @@ from mvseg.evaluation.truth import shown_instances
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.match_nview import find_clusters
 from mvseg.matching.nview.pieces import piece_features
-from mvseg.matching.one_per_view import ViewGraph
+from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, list_scenes, plant_index
@@ -67,14 +67,14 @@ def judge(
     """(P, 4) features of the pieces, of those beside region `lone` only if there is one, and (P,) whether they show
     the leaf of their cluster."""
     affinity = region_affinity(regions, cameras)
-    found = find_clusters(regions, cameras, ViewGraph.of(affinity, regions.view_index, len(cameras)))
+    found = find_clusters(regions, cameras, ViewGraph.of(affinity, regions))
     rows, features = piece_features(found.scores, found.clusters)
     if lone is not None:
-        place = found.clusters * len(cameras) + regions.view_index.numpy()
+        place = found.clusters.ids * len(cameras) + regions.view_index.numpy()
         is_asked = place[rows] == place[lone]
         rows, features = rows[is_asked], features[is_asked]
-    shown = leaf.numpy()
-    main = np.array([np.bincount(shown[found.clusters == k]).argmax() for k in found.clusters[rows]], np.int64)
+    shown, ids = leaf.numpy(), found.clusters.ids
+    main = np.array([np.bincount(shown[ids == k]).argmax() for k in ids[rows]], np.int64)
     return features, (shown[rows] == main) & (shown[rows] > 0) & (lone is None)
 
 

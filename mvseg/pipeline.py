@@ -25,7 +25,8 @@ from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, require_photos
 from mvseg.formats.scene_folder import load_scene, read_masks
 from mvseg.masks import Masks, Origin
-from mvseg.matching.match import check_baselines, match_masks, match_regions
+from mvseg.matching.links import NO_LINKS
+from mvseg.matching.match import check_baselines, match_masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.split import split_merged
 from mvseg.poses.refine_poses import refine_scene
@@ -55,7 +56,6 @@ class State(Result):
         config: the options of all stages.
         photos: of the scene.
         matching: the masks as they were given, until they are matched.
-        match: from cameras to the masks, matched; what `load`, `detect` or `correct` leaves.
         found: by the detector; None: the masks were given.
         cache, workers, progress: see `run_scene`.
         colors: of leaves, see `leaf_colors`; None: those of the masks, wherever a stage asks.
@@ -65,7 +65,6 @@ class State(Result):
     config: RunConfig
     photos: Photos
     matching: Matching = NOTHING_FOUND
-    match: Callable[[Cameras], Matching] | None = None
     found: Found | None = None
     cache: Path | None = None
     workers: ProcessPoolExecutor | None = None
@@ -183,9 +182,7 @@ def load(folder: Path, masks: Path | None, config: RunConfig, **how: Any) -> Sta
         return state
     found = recognise_masks(scene, masks)
     regions = read_masks(scene, found, crowd=config.coco_crowd, categories=config.category_names)
-    matcher = partial(match_regions, regions, config=config.match, progress=state.progress)
-    given = Matching(Masks.of(regions), MatchReport("none"))
-    return replace(state, matching=given, match=matcher, mask_kind=found.kind)
+    return replace(state, matching=Matching(Masks.of(regions), MatchReport("none")), mask_kind=found.kind)
 
 
 def detect(state: State) -> State:
@@ -194,7 +191,7 @@ def detect(state: State) -> State:
 
     config = state.config
     found = detect_scene(state.photos, config.detect, match=config.match, cache=state.cache, progress=state.progress)
-    return replace(state, found=found, match=found.match)
+    return replace(state, found=found)
 
 
 def correct(state: State) -> State:
@@ -202,9 +199,8 @@ def correct(state: State) -> State:
 
     Warns (InputWarning) of each edit that points at nothing, or that a later one contradicts.
     """
-    assert state.match is not None
     assert state.corrections is not None
-    masks = state.masks if state.mask_kind else state.match(state.scene.cameras).masks
+    masks = state.masks if state.found is None else state.found.match(state.scene.cameras).masks
     corrected = apply(state.corrections, masks, state.scene)
     waits = {number for number, *_ in corrected.refused}  # for `settle_edits`
     for fate in corrected.fates:
@@ -212,15 +208,12 @@ def correct(state: State) -> State:
             warnings.warn(fate.message, InputWarning, stacklevel=3)
     if len(masks) and not len(corrected.masks):
         warnings.warn(NOTHING_LEFT, InputWarning, stacklevel=3)
-    options = state.config.match
-    matcher = partial(match_masks, corrected.masks, config=options, links=corrected.links, progress=state.progress)
-    return replace(state, match=matcher, corrected=corrected)
+    return replace(state, corrected=corrected)
 
 
 def match(state: State) -> State:
-    """The same id for masks of the same instance, see `match_regions`."""
-    assert state.match is not None
-    matching = state.match(state.scene.cameras)
+    """The same id for masks of the same instance, see `match_masks`."""
+    matching = _match_with(state, state.scene.cameras)
     if not len(matching) and not state.mask_kind:
         message = f"the detector finds nothing that scores {state.config.detect.min_score:g} or more"
         warnings.warn(message, InputWarning, stacklevel=3)
@@ -229,9 +222,16 @@ def match(state: State) -> State:
 
 def match_refined(state: State) -> State:
     """The same with refined poses, see `refine_scene`."""
-    assert state.match is not None
-    scene, poses = refine_scene(state.scene, state.match)
+    scene, poses = refine_scene(state.scene, partial(_match_with, state))
     return match(replace(state, scene=scene, poses=poses))
+
+
+def _match_with(state: State, cameras: Cameras) -> Matching:
+    """The masks as they are given, or as edits leave them, or those that a detector finds with these cameras."""
+    if state.corrected is None and state.found is not None:
+        return state.found.match(cameras)
+    given = (state.masks, NO_LINKS) if state.corrected is None else (state.corrected.masks, state.corrected.links)
+    return match_masks(given[0], cameras, state.config.match, links=given[1], progress=state.progress)
 
 
 def correct_instances(state: State) -> State:

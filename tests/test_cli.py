@@ -32,7 +32,7 @@ from mvseg.errors import InputWarning
 from mvseg.formats.coco import encode_mask
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import read_label_png, write_label_png
-from mvseg.matching.match import match_regions
+from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
 from mvseg.system.worker_pool import default_workers
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
@@ -933,9 +933,9 @@ def test_a_repeated_warning_is_given_once(
     def warn_twice(*args: Any, **options: Any) -> Matching:
         for _ in range(2):
             warnings.warn("look here", InputWarning, stacklevel=1)
-        return match_regions(*args, **options)
+        return match_masks(*args, **options)
 
-    monkeypatch.setattr("mvseg.pipeline.match_regions", warn_twice)
+    monkeypatch.setattr("mvseg.pipeline.match_masks", warn_twice)
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 0
     assert capsys.readouterr().err == "mvseg: warning: look here\n"
     assert json.loads((tmp_path / "out" / "plant" / "run.json").read_text())["warnings"] == ["look here"]
@@ -1027,7 +1027,7 @@ def test_too_little_memory_is_one_sentence(
     def fail(*_: object, **__: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr("mvseg.pipeline.match_regions", fail)
+    monkeypatch.setattr("mvseg.pipeline.match_masks", fail)
     assert main(["match", str(plant), "--out", str(tmp_path / "out"), "--quiet"]) == 2
     assert complaint(capsys).startswith("there is not enough memory")
 

@@ -36,6 +36,7 @@ from mvseg.detection.detect_scene import detect_scene
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import Photos, read_photo
 from mvseg.masks import Masks, MergedMask
+from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
 from mvseg.pipeline import State
 from mvseg.poses.refine_poses import RefinedPoses
@@ -273,12 +274,12 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
         return show_two(masks)
 
     def match(*args: Any, **kwargs: Any) -> Matching:
-        matching = match_regions(*args, **kwargs)
+        matching = match_masks(*args, **kwargs)
         return matching.with_masks(show_two(matching.masks))
 
     monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
-    monkeypatch.setattr("mvseg.pipeline.match_regions", match)
+    monkeypatch.setattr("mvseg.pipeline.match_masks", match)
     config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
     ids = result.matching.instance_ids.tolist()
@@ -301,7 +302,7 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
     def detect(state: State) -> State:
         matching = match_regions(regions, state.scene.cameras)
         found = FoundMasks.of(matching.with_masks(show_two(matching.masks)))
-        return replace(state, match=found.match, found=found)
+        return replace(state, found=found)
 
     def choose(matched: Masks, proposals: Masks, **_: object) -> Leaves:
         asked.append(matched)

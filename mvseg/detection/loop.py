@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from dataclasses import replace
-from types import MappingProxyType
+from functools import partial
 
 import torch
 from torch import Tensor
@@ -13,9 +11,9 @@ from torch import Tensor
 from mvseg.detection.assignment import EpipolarAssignment
 from mvseg.detection.nms import cluster_aware_nms, confirmed
 from mvseg.detection.proposals import Proposals
-from mvseg.masks import Masks, Origin
+from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match import match_regions
+from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.scene import Cameras
 
@@ -45,27 +43,23 @@ def match_proposals(
         The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns of
         what `match_regions` says of it; what that said of earlier rounds is forgotten.
     """
+    masks = proposals.as_masks()
+    if not len(masks):
+        return Matching(masks, MatchReport(match.resolved_method))
     assignment = EpipolarAssignment()
-    per_class = torch.stack((proposals.regions.view_index, proposals.classes), 1)
+    per_class = torch.stack((masks.view_index, masks.classes), 1)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         keep = _suppress(proposals, per_class, cluster_iou, detections_per_view=detections_per_view)
-        matching, num_instances = _match_classes(proposals.select(keep), cameras, match, progress=progress)
-        if match.resolved_method != "symnmf":
-            num_instances = {}
-        residual_px = matching.residual_px  # of the poses, which stay the same
-
-        def rematch(kept: Tensor) -> Matching:
-            caught.clear()
-            return _match_classes(
-                proposals.select(kept),
-                cameras,
-                match,
-                num_instances=num_instances,
-                residual_px=residual_px,
-                progress=progress,
-            )[0]
-
+        matching = match_masks(masks.select(keep), cameras, match, progress=progress)
+        rematch = partial(
+            match_masks,
+            cameras=cameras,
+            config=match,
+            num_instances=_count_instances(matching.masks) if match.resolved_method == "symnmf" else {},
+            residual_px=matching.residual_px,  # of the poses, which stay the same
+            progress=progress,
+        )
         for _ in range(num_iterations):
             matched = matching.masks
             ids, _ = assignment(
@@ -73,7 +67,8 @@ def match_proposals(
             )
             groups = torch.cat((per_class, ids[:, None]), 1)
             keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
-            matching = rematch(keep)
+            caught.clear()
+            matching = rematch(masks.select(keep))
         if num_iterations and matching.report.has_probabilities:
             stays = confirmed(
                 proposals.boxes[keep],
@@ -83,10 +78,17 @@ def match_proposals(
                 iou_threshold=cluster_iou,
             )
             if not stays.all():
-                matching = rematch(keep[stays])
+                caught.clear()
+                matching = rematch(masks.select(keep[stays]))
     for each in caught:
         warnings.warn(each.message, stacklevel=2)
     return matching
+
+
+def _count_instances(masks: Masks) -> dict[int, int]:
+    """{class: number of its instances}."""
+    of_class = {label: masks.instance_ids[masks.classes == label] for label in masks.classes.unique().tolist()}
+    return {label: len(ids[ids > 0].unique()) for label, ids in of_class.items()}
 
 
 def _suppress(
@@ -97,46 +99,3 @@ def _suppress(
     view = proposals.regions.view_index[keep]
     earlier = (view[:, None] == view).tril(-1).sum(1)
     return keep[earlier < detections_per_view]
-
-
-def _match_classes(
-    proposals: Proposals,
-    cameras: Cameras,
-    match: MatchConfig,
-    *,
-    num_instances: Mapping[int, int] = MappingProxyType({}),
-    residual_px: int | None = None,
-    progress: bool = False,
-) -> tuple[Matching, dict[int, int]]:
-    """Match proposals class by class; instances of different classes get different ids.
-
-    `num_instances` maps classes to their numbers of instances; those of the other classes are estimated.
-    For `residual_px` see `match_regions`. Returns the matching and the number of instances of each
-    class.
-    """
-    parts, indices, counts = [], [], {}
-    for label in proposals.classes.unique().tolist():
-        members = (proposals.classes == label).nonzero()[:, 0]
-        config = replace(match, num_instances=num_instances.get(label) or match.num_instances)
-        part = match_regions(
-            proposals.regions.select(members), cameras, config, residual_px=residual_px, progress=progress
-        )
-        parts.append(part)
-        indices.append(members)
-        counts[label] = parts[-1].num_instances
-    if not parts:
-        return Matching(Masks.of(proposals.regions, origin=Origin.DETECTED), MatchReport(match.resolved_method)), counts
-    order = torch.cat(indices).argsort()
-    joined = Masks.concatenate([part.masks for part in parts]).select(order)
-    masks = replace(
-        joined,
-        detection_scores=proposals.scores,
-        classes=proposals.classes,
-        origin=torch.full_like(proposals.classes, Origin.DETECTED),
-    )
-    report = MatchReport.join(
-        [part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts]
-    )
-    if len({part.method for part in parts}) > 1:
-        report = replace(report, method=match.resolved_method)
-    return Matching(masks, report), counts

@@ -18,7 +18,7 @@ from mvseg.detection.loop import match_proposals
 from mvseg.detection.proposals import Proposals, gather_proposals
 from mvseg.detectors.run import run_heads
 from mvseg.errors import InputError
-from mvseg.masks import Masks, Origin
+from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
@@ -227,10 +227,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 def list_proposals(detections: list[dict[str, Tensor]], cameras: Cameras) -> Masks:
     """The excessive set of V images, as `MultiViewMaskRCNN.detect` gives it, as masks on the CPU that are matched to
     nothing; those that are empty are in it, too."""
-    proposals = gather_proposals(detections, cameras.sizes.tolist())
-    return Masks.of(
-        proposals.regions, detection_scores=proposals.scores, classes=proposals.classes, origin=Origin.DETECTED
-    )
+    return gather_proposals(detections, cameras.sizes.tolist()).as_masks()
 
 
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:

@@ -10,6 +10,7 @@ from torchvision.models.detection.roi_heads import expand_boxes, expand_masks, p
 from torchvision.models.detection.transform import resize_boxes
 
 from mvseg.detectors.mask_cut import CUT
+from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions, stack_regions
 
 
@@ -36,6 +37,12 @@ class Proposals:
             boxes=self.boxes[index],
             scores=self.scores[index],
             classes=self.classes[index],
+        )
+
+    def as_masks(self) -> Masks:
+        """The table of these masks, matched to nothing."""
+        return Masks.of(
+            self.regions, detection_scores=self.scores, classes=self.classes, origin=Origin.DETECTED
         )
 
 

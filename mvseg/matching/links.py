@@ -1,13 +1,12 @@
 """What a person knows of masks: that they show one leaf, or different ones. Not in the paper.
 
 Masks that must be together are one node of the graph, and those that cannot never join one cluster: the search itself
-honours both (`ViewGraph`), so that a link pulls the rest of its leaf. Where what is found without links agrees with all
-of them, it stays: it is the best partition under them, too.
+honours both (`ViewGraph`), so that a link pulls the rest of its leaf.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -17,8 +16,7 @@ from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.matching.one_per_view import ViewGraph
-from mvseg.matching.partition import renumber
+from mvseg.matching.partition import Clusters
 
 Ints = NDArray[np.int64]
 
@@ -57,18 +55,11 @@ class Links:
         is_named[torch.cat((self.must, self.cannot)).flatten()] = True
         return is_named
 
-    def agree(self, clusters: Ints) -> bool:
-        """Whether clusters (D,), -1 for a region in none, say the same."""
-        must, cannot = clusters[self.must.cpu().numpy()], clusters[self.cannot.cpu().numpy()]
+    def agree(self, clusters: Clusters) -> bool:
+        """Whether clusters of the D regions say the same."""
+        must, cannot = clusters.ids[self.must.cpu().numpy()], clusters.ids[self.cannot.cpu().numpy()]
         is_together = [(pairs[:, 0] == pairs[:, 1]) & (pairs[:, 0] >= 0) for pairs in (must, cannot)]
         return bool(is_together[0].all() and not is_together[1].any())
-
-    def hold(self, graph: ViewGraph) -> ViewGraph:
-        """The graph in which they hold: regions that must be together are one node."""
-        node, pairs = self.components(len(graph.view_index)), self.cannot.cpu().numpy()
-        apart = np.zeros((int(node.max(initial=-1)) + 1,) * 2, bool)
-        apart[node[pairs[:, 0]], node[pairs[:, 1]]] = True
-        return replace(graph, node=node, apart=(apart | apart.T)[node][:, node])
 
     def components(self, num_regions: int) -> Ints:
         """(D,) number of the regions that must be together, transitively.
@@ -81,9 +72,12 @@ class Links:
             if not 0 <= region < num_regions:
                 raise InputError(f"a link names region {region}, expected one of 0 to {num_regions - 1}")
         edges = coo_array((np.ones(len(pairs)), pairs.T), shape=(num_regions, num_regions))
-        component = renumber(connected_components(edges, directed=False)[1].astype(np.int64))
+        component = Clusters.of(connected_components(edges, directed=False)[1]).ids
         both = np.flatnonzero(component[apart[:, 0]] == component[apart[:, 1]])
         if len(both):
             first, second = apart[both[0]].tolist()
             raise InputError(f"links say that regions {first} and {second} are the same and that they are different")
         return component
+
+
+NO_LINKS = Links.of()

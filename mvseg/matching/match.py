@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
+from types import MappingProxyType
 
 import torch
 from torch import Tensor
@@ -12,12 +15,14 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.links import Links
+from mvseg.matching.links import NO_LINKS, Links
 from mvseg.matching.nview.match_nview import DILATIONS, match_nview
-from mvseg.matching.one_per_view import ViewGraph, cluster_graph, one_per_view_clusters
+from mvseg.matching.one_per_view import one_per_view_clusters
+from mvseg.matching.partition import Clusters
 from mvseg.matching.pencil import is_coincident
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.matching.symnmf import cluster_affinity
+from mvseg.matching.symnmf import cluster_weights
+from mvseg.matching.view_graph import ViewGraph, first_without_links
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -60,7 +65,7 @@ def match_regions(
             one place, a region that reaches beyond the image of its camera, another `residual_px`, or links that
             contradict each other.
     """
-    links = Links.of() if links is None else links
+    links = NO_LINKS if links is None else links
     links.components(len(regions))
     if residual_px is not None and residual_px not in DILATIONS:
         raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, DILATIONS))}")
@@ -70,79 +75,85 @@ def match_regions(
     _check_sizes(regions, cameras)
     _warn_of_gaps(regions, cameras)
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
-    method = config.resolved_method
-    if method == "nview":
-        matching = match_nview(regions, cameras, affinity, residual_px=residual_px, links=links, progress=progress)
+    graph = ViewGraph.of(affinity, regions, links)
+    if config.resolved_method == "nview":
+        matching = match_nview(regions, cameras, graph, residual_px=residual_px, progress=progress)
         if len(cameras) > 2 and len(regions):
             _warn_of_disagreement(matching)
         return matching
-    if method == "one-per-view":
-        ids = one_per_view_clusters(affinity, regions.view_index, len(cameras))
-        if not links.agree(ids.cpu().numpy()):
-            ids = cluster_graph(links.hold(ViewGraph.of(affinity, regions.view_index, len(cameras)))).to(ids)
-        return matching_of_ids(ids, regions, affinity, method=method)
-    matching = match_graph(affinity, regions, config, method=method, progress=progress)
-    if links.agree(matching.instance_ids.cpu().numpy()):
-        return matching
-    return match_graph(affinity, regions, config, method=method, links=links, progress=progress)
+    if config.resolved_method == "one-per-view":
+        clusters = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph)).drop_singletons()
+    else:
+        clusters = first_without_links(graph, partial(_factorise, regions, config=config, progress=progress))
+    return matching_of_ids(clusters.instance_ids().to(regions.device), regions, affinity, method=config.resolved_method)
 
 
 def match_masks(
-    masks: Masks, cameras: Cameras, config: MatchConfig = MatchConfig(), *, links: Links, progress: bool = False
+    masks: Masks,
+    cameras: Cameras,
+    config: MatchConfig = MatchConfig(),
+    *,
+    links: Links = NO_LINKS,
+    num_instances: Mapping[int, int] = MappingProxyType({}),
+    residual_px: int | None = None,
+    progress: bool = False,
 ) -> Matching:
-    """Match the masks of a table with links, class by class; what else is known of them stays.
+    """Match the masks of a table, class by class; what else is known of them stays.
 
     Args:
         masks: D masks; their ids are forgotten.
         cameras: V cameras.
         config: method and options.
         links: of their rows; those between masks of different classes have no effect.
+        num_instances: {class: number of instances}, where an earlier matching has found it; "symnmf" only.
+        residual_px: see `match_regions`.
         progress: show progress bars.
+
+    Returns:
+        The matching; instances of different classes have different ids. Its method is that of the config where it is
+        not the same for all classes.
     """
     parts, rows = [], []
     for label in masks.classes.unique().tolist() or [1]:
         members = (masks.classes == label).nonzero()[:, 0]
         part = match_regions(
-            masks.regions.select(members), cameras, config, links=links.select(members), progress=progress
+            masks.regions.select(members),
+            cameras,
+            replace(config, num_instances=num_instances.get(label) or config.num_instances),
+            residual_px=residual_px,
+            links=links.select(members),
+            progress=progress,
         )
         parts.append(part)
         rows.append(members)
     joined = Masks.concatenate([part.masks for part in parts]).select(torch.cat(rows).argsort())
     kept = replace(joined, detection_scores=masks.detection_scores, classes=masks.classes, origin=masks.origin)
     report = MatchReport.join([part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts])
+    if any(part.method != report.method for part in parts):
+        report = replace(report, method=config.resolved_method)
     return Matching(kept, report)
 
 
-def match_graph(
-    graph: Affinity,
-    regions: Regions,
-    config: MatchConfig,
-    *,
-    method: str,
-    links: Links | None = None,
-    progress: bool = False,
-) -> Matching:
+def _factorise(
+    regions: Regions, graph: ViewGraph, _: Clusters | None, *, config: MatchConfig, progress: bool
+) -> Clusters:
+    """SymNMF of the nodes of the graph; of nodes that links keep apart, see `ViewGraph.part`."""
+    weights = torch.from_numpy(graph.contract()).float().to(regions.device)
+    clustering = cluster_weights(weights, regions.num_per_view, config, progress=progress)
+    return graph.part(Clusters.of(clustering.instance_ids.cpu().numpy()[graph.node]))
+
+
+def match_graph(affinity: Affinity, regions: Regions, config: MatchConfig, *, method: str) -> Matching:
     """Cluster any graph of the regions with SymNMF, |k| by Eq. 7.
 
     Args:
-        graph: of D regions.
+        affinity: the graph of D regions.
         regions: whose numbers per view set the default range for the number of instances.
         config: num_instances, search_range, num_restarts and seed are used; the rest concerns the epipolar weights.
         method: the `Matching.method` of the result.
-        links: of the regions, see `cluster_affinity`.
-        progress: show a progress bar.
     """
-    clustering = cluster_affinity(
-        graph,
-        regions.num_per_view,
-        num_instances=config.num_instances,
-        search_range=config.search_range,
-        num_restarts=config.num_restarts,
-        seed=config.seed,
-        links=links,
-        progress=progress,
-    )
-    return matching_of_ids(clustering.instance_ids, regions, graph, method=method)
+    clustering = cluster_weights(affinity.to_dense(), regions.num_per_view, config)
+    return matching_of_ids(clustering.instance_ids, regions, affinity, method=method)
 
 
 def matching_of_ids(instance_ids: Tensor, regions: Regions, graph: Affinity, *, method: str) -> Matching:

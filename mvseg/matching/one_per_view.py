@@ -7,17 +7,14 @@ power iteration, Chen and Candes 2016, with the Hungarian method as the projecti
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import squareform
-from torch import Tensor
 
-from mvseg.matching.affinity import Affinity
-from mvseg.matching.partition import drop_singletons, members_of, number_instances, renumber
+from mvseg.matching.partition import Clusters
+from mvseg.matching.view_graph import ViewGraph
 
 STOP = 0.2  # mean weight below which two clusters are not joined
 ALONE = 0.1  # gain of a region that stays alone, comparable to its mean weight to the V - 1 other views
@@ -29,139 +26,22 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True, eq=False)
-class ViewGraph:
-    """A graph of D regions as a matrix, with the view of each region.
-
-    Attributes:
-        weights: (D, D) symmetric, >= 0.
-        view_index: (D,) int64 in [0, V).
-        num_views: V.
-        node: (D,) int64: regions with one number stay together, as a person says; None: each is by itself.
-        apart: (D, D) bool, symmetric: regions that are never together; None: there are none.
-    """
-
-    weights: Floats
-    view_index: Ints
-    num_views: int
-    node: Ints | None = None
-    apart: NDArray[np.bool_] | None = None
-
-    @staticmethod
-    def of(affinity: Affinity, view_index: Tensor, num_views: int) -> ViewGraph:
-        """The graph of D regions, nothing known of them; `view_index` (D,) int64."""
-        weights = np.zeros((affinity.num_regions, affinity.num_regions))
-        first, second = affinity.edges.T.cpu().numpy()
-        weights[first, second] = weights[second, first] = affinity.weights.cpu().numpy()
-        return ViewGraph(weights, view_index.cpu().numpy(), num_views)
-
-    def select(self, index: Ints) -> ViewGraph:
-        """The graph of some regions."""
-        node = None if self.node is None else self.node[index]
-        apart = None if self.apart is None else self.apart[np.ix_(index, index)]
-        return ViewGraph(self.weights[np.ix_(index, index)], self.view_index[index], self.num_views, node, apart)
-
-    def sum_partners(self, values: Floats, clusters: Ints) -> NDArray[np.float64]:
-        """(D,) sums of `values` (D, D) between each region and its partners: the members of its cluster (D,) in other
-        views; clusters in [0, K)."""
-        sums = np.zeros(len(clusters))
-        for members in members_of(clusters):
-            is_partner = self.view_index[members][:, None] != self.view_index[members]
-            sums[members] = (values[np.ix_(members, members)] * is_partner).sum(1)
-        return sums
-
-    @property
-    def is_linked(self) -> NDArray[np.bool_]:
-        """(D,) whether a person says anything of a region."""
-        if self.node is None or self.apart is None:
-            return np.zeros(len(self.view_index), bool)
-        return self.is_joined | self.apart.any(1)
-
-    @property
-    def is_joined(self) -> NDArray[np.bool_]:
-        """(D,) whether a person says of a region that it stays with another one."""
-        if self.node is None:
-            return np.zeros(len(self.view_index), bool)
-        is_joined: NDArray[np.bool_] = np.bincount(self.node)[self.node] > 1
-        return is_joined
-
-    def movers(self, view: int) -> Movers:
-        """The nodes that a view shows."""
-        here = self.view_index == view
-        if self.node is None:
-            return Movers(np.flatnonzero(here), np.arange(int(here.sum())))
-        rows = np.flatnonzero(np.isin(self.node, self.node[here]))
-        _, first, owner = np.unique(self.node[rows], return_index=True, return_inverse=True)
-        return Movers(rows, np.argsort(np.argsort(first))[owner])
-
-    def forbidden(self, movers: Movers, clusters: Ints, numbers: Ints) -> NDArray[np.bool_]:
-        """(N, K) bool: the clusters `numbers` (K,) that each mover cannot join: the others hold a region that it is
-        apart from, or, but for the cluster (D,) that it is in, one in its view."""
-        is_forbidden = np.zeros((movers.num, len(numbers)), bool)
-        if self.node is None or self.apart is None:
-            return is_forbidden
-        stays = np.ones(len(clusters), bool)
-        stays[movers.rows] = False
-        members = (clusters[:, None] == numbers) & stays[:, None]
-        same_view = self.view_index[movers.rows][:, None] == self.view_index
-        is_elsewhere = clusters[movers.rows][:, None] != numbers
-        conflicts = (self.apart[movers.rows] @ members) | ((same_view @ members) & is_elsewhere)
-        np.logical_or.at(is_forbidden, movers.owner, conflicts)
-        return is_forbidden
-
-
-@dataclass(frozen=True, eq=False)
-class Movers:
-    """N nodes of regions, each of which moves as one.
-
-    Attributes:
-        rows: (R,) int64, their regions.
-        owner: (R,) int64 in [0, N), the node of each.
-    """
-
-    rows: Ints
-    owner: Ints
-
-    @property
-    def num(self) -> int:
-        """N."""
-        return int(self.owner.max(initial=-1)) + 1
-
-    @property
-    def sizes(self) -> Ints:
-        """(N,) regions of each."""
-        return np.bincount(self.owner, minlength=self.num)
-
-    def total(self, values: Floats) -> Floats:
-        """(N, K) sums over the regions of each node; `values` (R, K)."""
-        summed = np.zeros((self.num, values.shape[1]), values.dtype)
-        np.add.at(summed, self.owner, values)
-        return summed
-
-
-def one_per_view_clusters(affinity: Affinity, view_index: Tensor, num_views: int) -> Tensor:
-    """Cluster the graph so that no cluster holds two regions of one view.
+def one_per_view_clusters(graph: ViewGraph) -> Clusters:
+    """Cluster the graph so that no cluster holds two regions of one view, but for regions that links join.
 
     Average linkage, then sweeps of one assignment problem per view until nothing changes.
 
     Args:
-        affinity: the graph of D regions.
-        view_index: (D,) int64 in [0, V), the view of each region.
-        num_views: V.
+        graph: of D regions.
 
     Returns:
-        (D,) int64 instance ids in [1, K], numbered in the order of their first region; -1 for a region that is alone in
-        its cluster. The partition does not depend on the order of views and regions unless weights tie.
+        The clusters, those of one region included. They do not depend on the order of views and regions unless weights
+        tie.
     """
-    return cluster_graph(ViewGraph.of(affinity, view_index, num_views)).to(view_index.device)
+    return power_iteration(graph, link_average(graph))
 
 
-def cluster_graph(graph: ViewGraph) -> Tensor:
-    """(D,) int64 instance ids on the CPU, see `one_per_view_clusters`; nodes of the graph are one region each."""
-    return number_instances(drop_singletons(power_iteration(graph, link_average(graph))))
-
-
-def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
+def link_average(graph: ViewGraph, stop: float = STOP) -> Clusters:
     """Average linkage in which clusters that share a view are never joined, nor those that are apart.
 
     Nodes of several regions are joined first: from then on linkage is that of the contracted graph, whose weights are
@@ -173,24 +53,22 @@ def link_average(graph: ViewGraph, stop: float = STOP) -> Ints:
         stop: two clusters with a smaller mean weight, or with mean weight 0, are not joined.
 
     Returns:
-        (D,) cluster of each region in [0, K), numbered by their first region.
+        The clusters, those of one region included.
     """
     if len(graph.weights) < 2:
-        return np.arange(len(graph.weights))
+        return Clusters.of(np.arange(len(graph.weights)))
     farthest = graph.weights.max(initial=1.0)  # the distance between two regions without an edge
     distances = farthest - graph.weights
     distances[graph.view_index[:, None] == graph.view_index] = FORBIDDEN
-    if graph.apart is not None:
-        distances[graph.apart] = FORBIDDEN
+    distances[graph.apart] = FORBIDDEN
     distance = squareform(distances, checks=False)
     distance += TIE * np.linspace(0, 1, len(distance))
-    if graph.node is not None:
-        distance[squareform(graph.node[:, None] == graph.node, checks=False)] = 0
+    distance[squareform(graph.node[:, None] == graph.node, checks=False)] = 0
     cut = min(farthest - stop + TIE, np.nextafter(farthest, 0))
-    return renumber(fcluster(linkage(distance, "average"), cut, "distance").astype(np.int64))
+    return Clusters.of(fcluster(linkage(distance, "average"), cut, "distance"))
 
 
-def power_iteration(graph: ViewGraph, clusters: Ints) -> Ints:
+def power_iteration(graph: ViewGraph, clusters: Clusters) -> Clusters:
     """Re-assign the regions of one view after another to the clusters of the others, one to one.
 
     The gain of a region from a cluster is its summed weight to the members, divided by V - 1; a region may also stay
@@ -198,54 +76,48 @@ def power_iteration(graph: ViewGraph, clusters: Ints) -> Ints:
     are their sums. The views with the largest total weight come first, whatever their numbers.
 
     Returns:
-        (D,) cluster of each region in [0, K), regions that stay alone included.
+        The clusters, those of one region included.
     """
-    order, clusters = view_order(graph), renumber(clusters)
+    order = view_order(graph)
     for _ in range(MAX_SWEEPS):
-        before = clusters
+        before, ids = clusters.ids, clusters.ids
         for view in order:
             movers = graph.movers(view)
-            rest = clusters.copy()
+            rest = ids.copy()
             rest[movers.rows] = -1
             others = np.argsort(rest, kind="stable")[len(movers.rows) :]  # cluster by cluster
             start = np.flatnonzero(np.diff(rest[others], prepend=-1))
             numbers = rest[others[start]]
             weights = np.add.reduceat(graph.weights[movers.rows].take(others, 1), start, 1)
             gain = movers.total(weights) / max(graph.num_views - 1, 1)
-            gain[graph.forbidden(movers, clusters, numbers)] = -np.inf
+            gain[graph.forbidden(movers, ids, numbers)] = -np.inf
             chosen = assign_one_to_one(gain, ALONE * movers.sizes)
-            fresh = clusters.max(initial=-1) + 1 + np.arange(movers.num)
+            fresh = ids.max(initial=-1) + 1 + np.arange(movers.num)
             rest[movers.rows] = np.append(numbers, fresh)[chosen][movers.owner]
-            clusters = rest
-        clusters = renumber(clusters)
-        if (clusters == before).all():
+            ids = rest
+        clusters = Clusters.of(ids)
+        if (clusters.ids == before).all():
             break
     return clusters
 
 
-def join_alone(graph: ViewGraph, clusters: Ints, *, stop: float) -> Ints:
+def join_alone(graph: ViewGraph, clusters: Clusters, *, stop: float) -> Clusters:
     """Give regions that are alone a second chance, judged by weights only.
 
     They are linked with each other (average linkage); those still alone join the cluster of largest mean weight that
     has no region in their view. Nothing is joined at a mean weight below `stop`. Other regions stay where they are.
-
-    Returns:
-        (D,) cluster of each region in [0, K).
     """
-    clusters = clusters.copy()
-    alone = np.flatnonzero(np.bincount(clusters, minlength=1)[clusters] == 1)
-    clusters[alone] = clusters.max(initial=0) + 1 + link_average(graph.select(alone), stop)
+    ids, alone = clusters.ids.copy(), np.flatnonzero(clusters.is_alone)
+    ids[alone] = len(clusters) + link_average(graph.select(alone), stop).ids
     best_weight = graph.weights[alone].max(1, initial=0)
     for region in alone[np.argsort(-best_weight, kind="stable")].tolist():
-        clusters = renumber(clusters)
-        sizes = np.bincount(clusters)
-        is_apart = graph.view_index == graph.view_index[region]
-        taken = np.unique(clusters[is_apart if graph.apart is None else is_apart | graph.apart[region]])
-        mean = np.bincount(clusters, graph.weights[region]) / sizes
-        mean[taken] = -1
-        if sizes[clusters[region]] == 1 and mean.max() >= stop:
-            clusters[region] = mean.argmax()
-    return renumber(clusters)
+        clusters = Clusters.of(ids)
+        ids = clusters.ids.copy()
+        mean = np.bincount(ids, graph.weights[region]) / clusters.sizes
+        mean[ids[(graph.view_index == graph.view_index[region]) | graph.apart[region]]] = -1
+        if clusters.is_alone[region] and mean.max() >= stop:
+            ids[region] = mean.argmax()
+    return Clusters.of(ids)
 
 
 def assign_one_to_one(gain: Floats, alone: float | Floats) -> Ints:

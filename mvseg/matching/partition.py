@@ -1,4 +1,4 @@
-"""Partitions of regions: what several rooms do with cluster numbers and instance ids.
+"""Partitions of regions, numbered in one way.
 
 A *cluster* number is an array index: 0, 1, ... in NumPy. An *instance id* is what users and files see: 1, 2, ..., in a
 tensor, so that 0 can mean "nothing" in a label image. In both, -1 is a region that was matched to nothing.
@@ -6,6 +6,8 @@ tensor, so that 0 can mean "nothing" in a label image. In both, -1 is a region t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 
 import numpy as np
@@ -16,35 +18,62 @@ from torch import Tensor
 Ints = NDArray[np.int64]
 
 
-def renumber(clusters: Ints) -> Ints:
-    """(D,) the same partition, numbered from 0 in the order of the first members; negative numbers become -1."""
-    values, first, inverse = np.unique(clusters, return_index=True, return_inverse=True)
-    first = np.where(values < 0, -1, first)  # the unmatched rank before all clusters, and get -1
-    rank = first.argsort(kind="stable").argsort(kind="stable") - int((values < 0).sum())
-    return np.maximum(rank, -1)[inverse].astype(np.int64)
+@dataclass(frozen=True, eq=False)
+class Clusters:
+    """A partition of D regions into K clusters, made by `of`.
+
+    Attributes:
+        ids: (D,) int64, the cluster of each region in [0, K), numbered in the order of their first members; -1 for a
+            region in none.
+    """
+
+    ids: Ints
+
+    @staticmethod
+    def of(numbers: Ints) -> Clusters:
+        """Regions with the same number (D,) form a cluster; those with a negative one are in none."""
+        values, first, inverse = np.unique(numbers, return_index=True, return_inverse=True)
+        first = np.where(values < 0, -1, first)  # the unmatched rank before all clusters, and get -1
+        rank = first.argsort(kind="stable").argsort(kind="stable") - int((values < 0).sum())
+        return Clusters(np.maximum(rank, -1)[inverse].astype(np.int64))
+
+    def __len__(self) -> int:
+        """K."""
+        return int(self.ids.max(initial=-1)) + 1
+
+    @cached_property
+    def members(self) -> list[Ints]:
+        """The regions of each cluster, ascending."""
+        return members_of(self.ids, len(self))
+
+    @cached_property
+    def sizes(self) -> Ints:
+        """(K,) number of regions of each."""
+        return np.bincount(self.ids[self.ids >= 0], minlength=len(self))
+
+    @property
+    def is_alone(self) -> NDArray[np.bool_]:
+        """(D,) whether no other region is in the cluster of a region, or it is in none."""
+        is_alone: NDArray[np.bool_] = np.append(self.sizes, 1)[self.ids] < 2
+        return is_alone
+
+    def drop_singletons(self) -> Clusters:
+        """The same clusters but for those of one region."""
+        return Clusters.of(np.where(self.is_alone, -1, self.ids))
+
+    def instance_ids(self) -> Tensor:
+        """(D,) int64 on the CPU, from 1 on; -1 stays -1."""
+        return torch.from_numpy(np.where(self.ids < 0, -1, self.ids + 1))
 
 
-def number_instances(clusters: Ints) -> Tensor:
-    """(D,) int64 instance ids on the CPU, numbered from 1 in the order of the first members; -1 stays -1."""
-    ids = renumber(clusters)
-    return torch.from_numpy(np.where(ids < 0, -1, ids + 1))
-
-
-def drop_singletons(clusters: Ints) -> Ints:
-    """(D,) the same clusters (numbers >= 0), with -1 for the only member of its cluster."""
-    return np.where(np.bincount(clusters, minlength=1)[clusters] > 1, clusters, -1)
-
-
-def separate_unmatched(clusters: Ints) -> Ints:
+def separate_unmatched(numbers: Ints) -> Ints:
     """(D,) the same numbers, with an unused one of its own for every region that has a negative one."""
-    fresh = int(clusters.max(initial=-1)) + 1 + np.arange(len(clusters))
-    return np.where(clusters < 0, fresh, clusters)
+    fresh = int(numbers.max(initial=-1)) + 1 + np.arange(len(numbers))
+    return np.where(numbers < 0, fresh, numbers)
 
 
-def members_of(clusters: Ints, num_clusters: int | None = None) -> list[Ints]:
-    """The members of clusters 0 .. K - 1 in ascending order; an unused number has none, -1 is left out. Without K, up
-    to the largest number."""
-    num_clusters = int(clusters.max(initial=-1)) + 1 if num_clusters is None else num_clusters
-    order = np.argsort(clusters, kind="stable")
-    starts = np.searchsorted(clusters[order], np.arange(num_clusters + 1))
+def members_of(numbers: Ints, num_clusters: int) -> list[Ints]:
+    """The regions with the numbers 0 .. K - 1 (D,), ascending; an unused number has none, and -1 is left out."""
+    order = np.argsort(numbers, kind="stable")
+    starts = np.searchsorted(numbers[order], np.arange(num_clusters + 1))
     return [order[start:stop] for start, stop in pairwise(starts)]

@@ -15,10 +15,9 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
-from mvseg.matching.links import Links
-from mvseg.matching.partition import number_instances
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.partition import Clusters
 
 KS_AT_ONCE = 8
 DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
@@ -48,7 +47,6 @@ def cluster_affinity(
     search_range: tuple[int, int] | None = None,
     num_restarts: int = 2,
     seed: int = 0,
-    links: Links | None = None,
     progress: bool = False,
 ) -> Clustering:
     """Cluster the graph with SymNMF; without `num_instances`, |k| is the one with the least Eq. 7 in a range.
@@ -61,8 +59,6 @@ def cluster_affinity(
             wins a tie.
         num_restarts: random starts per factorisation; the best objective wins.
         seed: for the starts.
-        links: of the regions. Those that must be together are one node of the graph, see `contract`. Those that cannot
-            have weight 0, and where they get one cluster all the same, see `choose_apart`.
         progress: show a progress bar over k.
 
     Returns:
@@ -72,78 +68,36 @@ def cluster_affinity(
     Raises:
         InputError: a k or a range that is not positive and ordered.
     """
+    config = MatchConfig(
+        method="symnmf", num_instances=num_instances, search_range=search_range, num_restarts=num_restarts, seed=seed
+    )
+    return cluster_weights(affinity.to_dense(), num_per_view, config, progress=progress)
+
+
+def cluster_weights(W: Tensor, num_per_view: Tensor, config: MatchConfig, *, progress: bool = False) -> Clustering:
+    """`cluster_affinity` of the weights W (D, D), symmetric, >= 0."""
     largest_view = int(num_per_view.max()) if len(num_per_view) else 0
-    low, high = search_range or (max(1, largest_view), max(1, 2 * largest_view))
-    if num_instances is not None:
-        low = high = num_instances
-    if not 1 <= low <= high:
-        raise InputError(f"the number of instances is searched in [{low}, {high}], expected 1 <= low <= high")
-    W, links = affinity.to_dense(), Links.of() if links is None else links
-    node = torch.from_numpy(links.components(len(W))).to(W.device)
-    apart = torch.zeros((int(node.max()) + 1 if len(node) else 0,) * 2, dtype=torch.bool, device=W.device)
-    ends = node[links.cannot.to(W.device)]
-    apart[ends[:, 0], ends[:, 1]] = apart[ends[:, 1], ends[:, 0]] = True
-    W = contract(W, node).masked_fill(apart, 0) if len(links) else W
+    low, high = config.search_range or (max(1, largest_view), max(1, 2 * largest_view))
+    if config.num_instances is not None:
+        low = high = config.num_instances
     is_linked = W.sum(1) > 0
     labels = torch.full((len(W),), -1, dtype=torch.int64, device=W.device)
-    is_alone = ~is_linked & (node.bincount(minlength=len(W)) > 1)  # fits nothing, but must be together
-    labels[is_alone] = torch.arange(int(is_alone.sum()), device=W.device)
     if not is_linked.any():
-        return Clustering(number_instances(labels[node].cpu().numpy()).to(W.device), 0, {})
-    place = (is_linked.cumsum(0) - 1)[node[is_linked[node]]]  # of each region that has an edge
-    linked_W = W[is_linked][:, is_linked]
+        return Clustering(labels, 0, {})
     candidates: dict[int, Tensor] = {}
     criterion: dict[int, float] = {}
     with tqdm(total=high - low + 1, desc="number of instances", unit="k", disable=not progress or low == high) as bar:
         for ks in torch.arange(low, high + 1).split(KS_AT_ONCE):
-            factors = factorise(linked_W, ks.tolist(), num_restarts=num_restarts, seed=seed)
+            linked_W = W[is_linked][:, is_linked]
+            factors = factorise(linked_W, ks.tolist(), num_restarts=config.num_restarts, seed=config.seed)
             for k, H in zip(ks.tolist(), factors, strict=True):
-                candidates[k] = choose_apart(H, apart[is_linked][:, is_linked])
-                criterion[k] = size_spread(candidates[k][place], k)
+                candidates[k] = H.argmax(1)
+                criterion[k] = size_spread(candidates[k], k)
             bar.update(len(ks))
     best = min(criterion, key=lambda k: (criterion[k], k))
     labels[is_linked] = candidates[best]
-    labels[is_alone] += int(candidates[best].max()) + 1
-    ids = number_instances(labels[node].cpu().numpy()).to(labels.device)
+    ids = Clusters.of(labels.cpu().numpy()).instance_ids().to(W.device)
     return Clustering(instance_ids=ids, num_clusters=best, criterion=criterion)
-
-
-def contract(W: Tensor, node: Tensor) -> Tensor:
-    """The graph whose nodes are regions that must be together, so that SymNMF of it is that of W under this condition.
-
-    With equal rows of H for the regions of one node, H = Q G. Q, 1 / sqrt(size) where a region is in a node, is
-    orthonormal, so |W - H H^T|^2 is |Q^T W Q - G G^T|^2 and a constant.
-
-    Args:
-        W: (D, D) symmetric, >= 0.
-        node: (D,) int64 in [0, N), none of them empty.
-
-    Returns:
-        (N, N) symmetric, >= 0: Q^T W Q.
-    """
-    Q = torch.nn.functional.one_hot(node).to(W)
-    Q = Q / Q.sum(0).sqrt()
-    return Q.T @ W @ Q
-
-
-def choose_apart(H: Tensor, apart: Tensor) -> Tensor:
-    """(D,) int64, the cluster of each node: the arg max of its row of H (D, k).
-
-    Where nodes that are `apart` (D, D) bool choose the same, those with the larger share of their row in it choose
-    first, and the others take the next best that is left, or a cluster of their own, from k on.
-    """
-    labels = H.argmax(1)
-    share = H.max(1).values / H.sum(1).clamp(min=torch.finfo(H.dtype).tiny)
-    some = apart.any(1).nonzero()[:, 0]
-    fresh = H.shape[1]
-    labels[some] = -1
-    for row in some[share[some].argsort(descending=True, stable=True)].tolist():
-        taken = labels[apart[row]]
-        free = H[row].clone()
-        free[taken[(taken >= 0) & (taken < H.shape[1])]] = -1
-        labels[row] = free.argmax() if free.max() > 0 else fresh
-        fresh += int(labels[row] == fresh)
-    return labels
 
 
 def factorise(

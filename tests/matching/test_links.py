@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -20,9 +21,9 @@ from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.plane_sweep import sweep_planes
 from mvseg.matching.nview.search import search
-from mvseg.matching.one_per_view import ViewGraph, cluster_graph, link_average, power_iteration
-from mvseg.matching.partition import renumber, separate_unmatched
-from mvseg.matching.symnmf import choose_apart, contract
+from mvseg.matching.one_per_view import link_average, one_per_view_clusters
+from mvseg.matching.partition import Clusters, separate_unmatched
+from mvseg.matching.view_graph import ViewGraph
 from mvseg.simulation.dataset import SceneSpec
 from synthetic import ball_scene
 
@@ -70,7 +71,8 @@ def test_links_against_the_views_hold_in_any_order(method: str) -> None:
 
 
 def clusters_of(graph: ViewGraph, links: Links) -> list[int]:
-    return cluster_graph(links.hold(graph)).tolist()
+    found: list[int] = one_per_view_clusters(replace(graph, links=links)).ids.tolist()
+    return found
 
 
 def test_average_linkage_is_that_of_the_contracted_graph() -> None:
@@ -84,8 +86,8 @@ def test_average_linkage_is_that_of_the_contracted_graph() -> None:
         node = Links.of(must).components(16)
         cannot = [(a, b) for a, b in rng.integers(0, 16, (4, 2)).tolist() if node[a] != node[b]]
         links = Links.of(must, cannot)
-        linked = link_average(links.hold(ViewGraph(W, views, 6)), 0.3)
-        np.testing.assert_array_equal(linked, renumber(contracted_reference(W, views, links, stop=0.3)))
+        linked = link_average(ViewGraph(W, views, 6, links), 0.3)
+        np.testing.assert_array_equal(linked.ids, Clusters.of(contracted_reference(W, views, links, stop=0.3)).ids)
         assert links.agree(linked)
 
 
@@ -114,14 +116,13 @@ def contracted_reference(W: np.ndarray, views: np.ndarray, links: Links, *, stop
 def test_the_order_of_regions_does_not_matter(seed: int) -> None:
     rng = np.random.default_rng(seed)
     views, W = rng.integers(0, 5, 20), rng.random((20, 20))
-    graph = ViewGraph((W + W.T) / 2 * (views[:, None] != views), views, 5)
     must = [(int(a), int(b)) for a, b in rng.integers(0, 20, (3, 2))]
     node = Links.of(must).components(20)
     links = Links.of(must, [(a, b) for a, b in rng.integers(0, 20, (5, 2)).tolist() if node[a] != node[b]])
-    found, order = cluster_graph(links.hold(graph)), rng.permutation(20)
-    moved = cluster_graph(links.select(torch.from_numpy(order)).hold(graph.select(order)))
-    assert links.agree(found.numpy())
-    np.testing.assert_array_equal(renumber(moved.numpy()), renumber(found.numpy()[order]))
+    graph = ViewGraph((W + W.T) / 2 * (views[:, None] != views), views, 5, links)
+    found, order = one_per_view_clusters(graph), rng.permutation(20)
+    assert links.agree(found)
+    np.testing.assert_array_equal(one_per_view_clusters(graph.select(order)).ids, Clusters.of(found.ids[order]).ids)
 
 
 def test_nodes_of_one_region_are_no_links_to_the_bit() -> None:
@@ -132,12 +133,11 @@ def test_nodes_of_one_region_are_no_links_to_the_bit() -> None:
     weights = affinity.to_dense().double().numpy()
     weights[3] = weights[:, 3] = 0  # not too easy
     graph = ViewGraph(weights, regions.view_index.numpy(), 6)
-    trivial = Links.of().hold(graph)
-    np.testing.assert_array_equal(link_average(graph), link_average(trivial))
-    pairwise = power_iteration(graph, link_average(graph))
-    np.testing.assert_array_equal(pairwise, power_iteration(trivial, link_average(trivial)))
+    trivial = replace(graph, links=Links.of([(0, 0)]))
+    pairwise = one_per_view_clusters(graph)
+    np.testing.assert_array_equal(pairwise.ids, one_per_view_clusters(trivial).ids)
     table = sweep_planes(regions, scene.cameras)
-    found = [search(ClusterScores(table, each, NViewConfig()), pairwise) for each in (graph, trivial)]
+    found = [search(ClusterScores(table, each, NViewConfig()), pairwise).ids for each in (graph, trivial)]
     np.testing.assert_array_equal(*found)
 
 
@@ -155,38 +155,43 @@ def test_links_are_never_violated(method: str, seed: int) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # views that do not agree: these links are nonsense
         ids = match_regions(scene.regions, scene.cameras, config, links=links).instance_ids
-        assert links.agree(ids.numpy())
+        assert links.agree(Clusters.of(ids.numpy()))
         if method != "nview":  # SymNMF's random starts depend on the order, and weights of 1 tie
             return
         order = torch.from_numpy(rng.permutation(num))
         moved = match_regions(scene.regions.select(order), scene.cameras, config, links=links.select(order))
-    np.testing.assert_array_equal(renumber(moved.instance_ids.numpy()), renumber(ids[order].numpy()))
+    np.testing.assert_array_equal(*(Clusters.of(each.numpy()).ids for each in (moved.instance_ids, ids[order])))
 
 
 def test_a_contracted_graph_is_exact_for_symnmf() -> None:
     """|W - H H^T|^2 of any H with equal rows in a node differs from that of the contracted graph by a constant."""
     rng = np.random.default_rng(0)
-    W = torch.from_numpy(rng.random((7, 7)))
-    W = W + W.T
-    node = torch.tensor([0, 1, 0, 2, 1, 1, 3])
-    small, differences = contract(W, node), []
+    W = rng.random((7, 7))
+    graph = ViewGraph(W + W.T, np.arange(7), 7, Links.of([(0, 2), (1, 4), (4, 5)]))
+    assert graph.node.tolist() == [0, 1, 0, 2, 1, 1, 3]
+    small, differences = graph.contract(), []
     for _ in range(4):
-        rows = torch.from_numpy(rng.random((4, 3)))
-        H, G = rows[node], rows * node.bincount().double().sqrt()[:, None]
-        differences.append(float((W - H @ H.T).square().sum() - (small - G @ G.T).square().sum()))
+        rows = rng.random((4, 3))
+        H, G = rows[graph.node], rows * np.sqrt(np.bincount(graph.node))[:, None]
+        differences.append(np.square(graph.weights - H @ H.T).sum() - np.square(small - G @ G.T).sum())
     np.testing.assert_allclose(differences, differences[0])
 
 
-def test_clusters_of_symnmf_that_must_differ_do_so_at_the_least_cost() -> None:
-    H = torch.tensor([[9.0, 1, 0], [5, 4, 0], [0, 1, 3], [2, 0, 0]])
-    apart = torch.zeros(4, 4, dtype=torch.bool)
-    assert choose_apart(H, apart).tolist() == [0, 0, 2, 0]
-    apart[0, 1] = apart[1, 0] = True
-    assert choose_apart(H, apart).tolist() == [0, 1, 2, 0]
-    apart[3, 0] = apart[0, 3] = True
-    assert choose_apart(H, apart).tolist() == [1, 0, 2, 0]  # region 3 knows nothing else
-    assert choose_apart(H[[0, 0]], apart[:2, :2]).tolist() == [0, 1]
-    assert choose_apart(H[[3, 3]], apart[:2, :2]).tolist() == [0, 3]  # there is no other: one of its own
+def test_clusters_that_contradict_links_are_parted_at_the_least_cost() -> None:
+    """Regions 0 to 3 are one cluster, 4 is in none; region 2 fits worst."""
+    weights = np.full((6, 6), 0.9)
+    weights[2] = weights[:, 2] = 0.5
+    found = Clusters.of(np.array([0, 0, 0, 0, -1, -1]))
+
+    def parted(links: Links) -> list[int]:
+        ids: list[int] = ViewGraph(weights, np.arange(6), 6, links).part(found).ids.tolist()
+        return ids
+
+    assert parted(Links.of()) == found.ids.tolist()
+    assert parted(Links.of(None, [(0, 2), (4, 5)])) == [0, 0, 1, 0, -1, -1]
+    assert parted(Links.of(None, [(0, 2), (2, 3)])) == [0, 0, 1, 0, -1, -1]
+    assert parted(Links.of([(0, 2)], [(1, 2)])) == [0, 1, 0, 1, -1, -1]  # those that must be together leave together
+    assert parted(Links.of([(4, 5)])) == [0, 0, 0, 0, 1, 1]  # none fits them, but they are one
 
 
 def test_a_mask_of_the_wrong_instance_changes_alone() -> None:
@@ -196,21 +201,21 @@ def test_a_mask_of_the_wrong_instance_changes_alone() -> None:
     weights[0, 1:4] = weights[1:4, 0] = weights[4, 5:] = weights[5:, 4] = 0.1
     weights[0, 5:] = weights[5:, 0] = weights[4, 1:4] = weights[1:4, 4] = 0.3
     wrong = ViewGraph(weights, graph.view_index, 4)
-    assert clusters_of(wrong, Links.of()) == [1, 2, 2, 2, 2, 1, 1, 1]
-    assert clusters_of(wrong, Links.of([(0, 1)])) == [1, 1, 1, 1, 2, 2, 2, 2]
+    assert clusters_of(wrong, Links.of()) == [0, 1, 1, 1, 1, 0, 0, 0]
+    assert clusters_of(wrong, Links.of([(0, 1)])) == [0, 0, 0, 0, 1, 1, 1, 1]
 
 
 def test_an_instance_of_two_leaves_is_divided() -> None:
     leaf, view = np.arange(8) // 4, np.arange(8)
     graph = ViewGraph(np.where(leaf[:, None] == leaf, 0.9, 0.4) * (view[:, None] != view), view, 8)
-    assert clusters_of(graph, Links.of()) == [1] * 8
-    assert clusters_of(graph, Links.of(None, [(0, 5)])) == [1, 1, 1, 1, 2, 2, 2, 2]
+    assert clusters_of(graph, Links.of()) == [0] * 8
+    assert clusters_of(graph, Links.of(None, [(0, 5)])) == [0, 0, 0, 0, 1, 1, 1, 1]
 
 
 def test_pieces_in_one_photo_are_one_instance() -> None:
     graph, _ = two_leaves()
     found = clusters_of(graph, Links.of([(1, 5)]))
-    assert found[1] == found[5] > 0
+    assert found[1] == found[5]
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.nview.merged_masks import second_part
 from mvseg.matching.nview.plane_sweep import sweep_planes
-from mvseg.matching.one_per_view import ViewGraph
-from mvseg.matching.partition import renumber
+from mvseg.matching.partition import Clusters
+from mvseg.matching.view_graph import ViewGraph
 from synthetic import ball_scene, merged_balls
 
 
@@ -21,7 +21,7 @@ def test_a_mask_that_covers_two_instances_is_found_and_no_other() -> None:
     scene = ball_scene(6, 8, seed=3)
     regions, numbers, region = merged_balls(scene)
     rest = torch.arange(len(regions)) != region
-    matching = match_nview(regions, scene.cameras, region_affinity(regions, scene.cameras))
+    matching = match_nview(regions, scene.cameras, ViewGraph.of(region_affinity(regions, scene.cameras), regions))
     assert adjusted_rand_score(matching.instance_ids[rest], regions.labels[rest]) == 1
     assert matching.num_instances == 6
     instances = [int(matching.instance_ids[rest][regions.labels[rest] == number][0]) for number in numbers]
@@ -44,8 +44,8 @@ def test_either_ball_is_the_part_that_the_true_image_shows() -> None:
     for own, other in (numbers, numbers[::-1]):
         labels = regions.labels.clone()
         labels[region] = own
-        clusters = renumber(labels.numpy())
-        second = int(clusters[(labels == other).nonzero()[0, 0]])
+        clusters = Clusters.of(labels.numpy())
+        second = int(clusters.ids[(labels == other).nonzero()[0, 0]])
         part = second_part(scores, clusters, regions, region=region, second=second)
         assert not part[~mask].any()
         assert ((true == other) == part)[mask].double().mean() > 0.9

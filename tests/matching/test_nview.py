@@ -28,9 +28,10 @@ from mvseg.matching.nview.plane_sweep import (
     sweep_planes,
 )
 from mvseg.matching.nview.search import refine, search
-from mvseg.matching.one_per_view import ViewGraph, one_per_view_clusters
-from mvseg.matching.partition import members_of, renumber
+from mvseg.matching.one_per_view import one_per_view_clusters
+from mvseg.matching.partition import Clusters
 from mvseg.matching.result import Matching
+from mvseg.matching.view_graph import ViewGraph
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
 from reference import soft_affinity_reference
@@ -48,7 +49,7 @@ COSTS = NViewConfig().costs
 
 
 def solve(regions: Regions, cameras: Cameras) -> Matching:
-    return match_nview(regions, cameras, region_affinity(regions, cameras))
+    return match_nview(regions, cameras, ViewGraph.of(region_affinity(regions, cameras), regions))
 
 
 def same_partition(first: torch.Tensor, second: torch.Tensor) -> bool:
@@ -98,31 +99,31 @@ def score_reference(sweep: PlaneSweep, region: int, members: set[int]) -> float:
     return float(np.mean(scores))
 
 
-def some_ids(sweep: PlaneSweep, seed: int) -> np.ndarray:
-    return renumber(np.random.default_rng(seed).integers(0, 6, len(sweep.view_index)))
+def some_clusters(sweep: PlaneSweep, seed: int) -> Clusters:
+    return Clusters.of(np.random.default_rng(seed).integers(0, 6, len(sweep.view_index)))
 
 
 def test_scores_agree_with_the_definition(sweep: PlaneSweep, scores: ClusterScores) -> None:
-    clusters = some_ids(sweep, 0)
+    clusters = some_clusters(sweep, 0)
     for view in (0, 3):
-        view_scores = scores.scores(view, clusters)
+        view_scores = scores.scores(view, clusters.ids)
         for row, region in enumerate(np.flatnonzero(sweep.view_index == view).tolist()):
-            for cluster in range(clusters.max() + 1):
-                members = set(np.flatnonzero((clusters == cluster) & (sweep.view_index != view)).tolist())
+            for cluster in range(len(clusters)):
+                members = set(np.flatnonzero((clusters.ids == cluster) & (sweep.view_index != view)).tolist())
                 assert view_scores[row, cluster] == pytest.approx(score_reference(sweep, region, members), abs=1e-5)
 
 
 def test_own_scores_agree_with_the_definition(sweep: PlaneSweep, scores: ClusterScores) -> None:
-    ids = some_ids(sweep, 1)
-    own_scores = scores.own(ids)
+    clusters = some_clusters(sweep, 1)
+    own_scores, ids = scores.own(clusters), clusters.ids
     for region in range(0, len(ids), 3):
         members = {m for m in np.flatnonzero(ids == ids[region]).tolist() if m != region}
         assert own_scores[region] == pytest.approx(score_reference(sweep, region, members | {region}), abs=1e-5)
 
 
 def test_coverage_agrees_with_the_definition(sweep: PlaneSweep, scores: ClusterScores) -> None:
-    ids = some_ids(sweep, 2)
-    cluster_coverages = scores.coverages(ids)
+    clusters = some_clusters(sweep, 2)
+    cluster_coverages, ids = scores.coverages(clusters), clusters.ids
     view, cluster = 2, int(ids[0])
     hits, pixels = np.zeros(len(ids)), 0
     members = set(np.flatnonzero(ids == cluster).tolist())
@@ -149,20 +150,21 @@ def test_coverage_agrees_with_the_definition(sweep: PlaneSweep, scores: ClusterS
 
 def test_cached_scores_are_what_computing_again_gives(sweep: PlaneSweep, scores: ClusterScores) -> None:
     """Scores are cached by members; between the steps, some regions change their cluster."""
-    clusters = some_ids(sweep, 3)
+    clusters = some_clusters(sweep, 3)
     for step in range(3):
-        clusters = renumber(np.where(np.arange(len(clusters)) % 7 == step, np.roll(clusters, 1), clusters))
+        ids = clusters.ids
+        clusters = Clusters.of(np.where(np.arange(len(ids)) % 7 == step, np.roll(ids, 1), ids))
         fresh = ClusterScores(sweep, scores.graph, scores.config)
         np.testing.assert_allclose(scores.coverages(clusters), fresh.coverages(clusters), atol=1e-6)
         for _ in range(2):
             np.testing.assert_array_equal(scores.own(clusters), fresh.own(clusters))
             assert scores.value(clusters) == fresh.value(clusters)
         for view in range(sweep.num_views):
-            np.testing.assert_allclose(scores.scores(view, clusters), fresh.scores(view, clusters), atol=1e-6)
+            np.testing.assert_allclose(scores.scores(view, clusters.ids), fresh.scores(view, clusters.ids), atol=1e-6)
 
 
 def test_regions_of_the_view_itself_do_not_matter(sweep: PlaneSweep, scores: ClusterScores) -> None:
-    clusters = some_ids(sweep, 4)
+    clusters = some_clusters(sweep, 4).ids
     reassigned = np.where(sweep.view_index == 1, 0, clusters)
     np.testing.assert_array_equal(scores.scores(1, clusters), scores.scores(1, reassigned))
     left_out = np.where(clusters == 0, -1, clusters)
@@ -203,13 +205,6 @@ def test_pixels_are_spread_evenly_and_never_more_than_asked(balls: BallScene) ->
         assert len(torch.unique(xy[region == index], dim=0)) == counts[index]
 
 
-def test_members_are_in_rising_order_and_the_unmatched_are_left_out() -> None:
-    members = members_of(np.array([2, -1, 0, 2]))
-    assert [cluster.tolist() for cluster in members] == [[2], [], [0, 3]]
-    assert [len(each) for each in members_of(np.array([0]), 2)] == [1, 0]
-    assert members_of(np.zeros(0, np.int64)) == []
-
-
 def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvseg.matching.nview.plane_sweep.BLOCK_SIZE", 10)
     runs = np.repeat(np.arange(40), np.random.default_rng(0).integers(1, 9, 40))
@@ -224,7 +219,7 @@ def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.M
 def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
     scores: ClusterScores, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    clusters = some_ids(scores.sweep, 5)
+    clusters = some_clusters(scores.sweep, 5)
     expected = scores.own(clusters), scores.coverages(clusters), em_affinities(scores.sweep)[-1]
     monkeypatch.setattr("mvseg.matching.nview.plane_sweep.BLOCK_SIZE", 50)
     monkeypatch.setattr("mvseg.matching.nview.initialisation.BLOCK_SIZE", 7)
@@ -235,9 +230,9 @@ def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
 
 
 def test_own_scores_are_kept_cluster_by_cluster(scores: ClusterScores) -> None:
-    clusters = some_ids(scores.sweep, 6)
+    clusters = some_clusters(scores.sweep, 6)
     scores.own(clusters)
-    moved_on = renumber(np.where(np.arange(len(clusters)) == 3, clusters.max() + 1, clusters))
+    moved_on = Clusters.of(np.where(np.arange(len(clusters.ids)) == 3, len(clusters), clusters.ids))
     fresh = ClusterScores(scores.sweep, scores.graph, scores.config)
     np.testing.assert_array_equal(scores.own(moved_on), fresh.own(moved_on))
 
@@ -378,10 +373,10 @@ def test_a_region_that_nobody_else_sees_is_unmatched(balls: BallScene) -> None:
 
 
 def test_refinement_never_ends_below_the_truth_on_clear_scenes(balls: BallScene, scores: ClusterScores) -> None:
-    truth = renumber(balls.regions.labels.numpy())
-    np.testing.assert_array_equal(refine(scores, truth), truth)
-    partition = search(scores, np.arange(len(truth)))
-    np.testing.assert_array_equal(search(scores, truth), truth)
+    truth = Clusters.of(balls.regions.labels.numpy())
+    np.testing.assert_array_equal(refine(scores, truth).ids, truth.ids)
+    partition = search(scores, Clusters.of(np.arange(len(truth.ids))))
+    np.testing.assert_array_equal(search(scores, truth).ids, truth.ids)
     assert scores.value(partition) >= scores.value(truth) - 1e-6
 
 
@@ -499,9 +494,10 @@ def test_large_pose_errors_are_measured_and_tolerated() -> None:
 def test_the_reprojection_error_may_be_known_from_an_earlier_matching(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.1)
     cameras = turned_a_little(scene.cameras, 0.008)
-    first, affinity = solve(scene.regions, cameras), region_affinity(scene.regions, cameras)
+    first = solve(scene.regions, cameras)
+    graph = ViewGraph.of(region_affinity(scene.regions, cameras), scene.regions)
     monkeypatch.setattr("mvseg.matching.nview.match_nview.sweep_dilated", None)  # nothing is tried
-    again = match_nview(scene.regions, cameras, affinity, residual_px=first.residual_px)
+    again = match_nview(scene.regions, cameras, graph, residual_px=first.residual_px)
     assert torch.equal(again.instance_ids, first.instance_ids)
     assert again.residual_px == first.residual_px
     with pytest.raises(InputError, match="residual_px is 3, expected one of 1, 2, 4, 8"):
@@ -526,9 +522,9 @@ def test_where_the_views_agree_on_nothing_the_pairs_answer() -> None:
     matching = solve(scene.regions, cameras)
     assert matching.method == "one-per-view"
     assert matching.explained < 0.3
-    affinity = region_affinity(scene.regions, cameras)
-    pairwise = one_per_view_clusters(affinity, scene.regions.view_index, 4)
-    assert same_partition(matching.instance_ids, pairwise)
+    graph = ViewGraph.of(region_affinity(scene.regions, cameras), scene.regions)
+    pairwise = one_per_view_clusters(graph).drop_singletons()
+    assert same_partition(matching.instance_ids, pairwise.instance_ids())
 
 
 def test_regions_without_a_pixel_and_very_many_views(balls: BallScene, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -7,24 +7,25 @@ import pytest
 import torch
 from sklearn.metrics import adjusted_rand_score
 
-from mvseg.matching.affinity import Affinity, region_affinity
+from mvseg.matching.affinity import region_affinity
 from mvseg.matching.one_per_view import (
-    ViewGraph,
     assign_one_to_one,
     join_alone,
     link_average,
     one_per_view_clusters,
     power_iteration,
 )
-from mvseg.matching.partition import renumber
+from mvseg.matching.partition import Clusters
+from mvseg.matching.view_graph import ViewGraph
+from mvseg.regions import Regions
 from reference import link_average_reference
 from synthetic import ball_scene
 
 
-def graph_of(W: np.ndarray) -> Affinity:
-    first, second = np.nonzero(np.triu(W))
-    edges = torch.from_numpy(np.stack([first, second], 1))
-    return Affinity(edges, torch.from_numpy(W[first, second]).float(), len(W))
+def ids_of(W: np.ndarray, views: list[int]) -> list[int]:
+    graph = ViewGraph(W, np.array(views, np.int64), max(views, default=0) + 1)
+    ids: list[int] = one_per_view_clusters(graph).drop_singletons().instance_ids().tolist()
+    return ids
 
 
 def random_weights(views: np.ndarray, seed: int) -> np.ndarray:
@@ -56,7 +57,7 @@ def mean_weights_reference(W: np.ndarray, views: np.ndarray, stop: float) -> np.
 def test_hand_made_triangle() -> None:
     """0 and 1 are in one view, 2 in another; 2 prefers 1."""
     W = np.array([[0, 0, 0.5], [0, 0, 0.6], [0.5, 0.6, 0]])
-    assert one_per_view_clusters(graph_of(W), torch.tensor([0, 0, 1]), 2).tolist() == [-1, 1, 1]
+    assert ids_of(W, [0, 0, 1]) == [-1, 1, 1]
 
 
 def test_the_whole_view_decides_not_the_single_best_edge() -> None:
@@ -65,8 +66,8 @@ def test_the_whole_view_decides_not_the_single_best_edge() -> None:
     W[0, 2], W[0, 3], W[1, 2], W[1, 3] = 0.9, 0.8, 0.8, 0.1
     W += W.T
     views = np.array([0, 0, 1, 1])
-    assert link_average(ViewGraph(W, views, 2)).tolist() == [0, 1, 0, 2]
-    assert one_per_view_clusters(graph_of(W), torch.from_numpy(views), 2).tolist() == [1, 2, 2, 1]
+    assert link_average(ViewGraph(W, views, 2)).ids.tolist() == [0, 1, 0, 2]
+    assert ids_of(W, views.tolist()) == [1, 2, 2, 1]
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -74,17 +75,17 @@ def test_the_whole_view_decides_not_the_single_best_edge() -> None:
 def test_average_linkage_agrees_with_its_definition(seed: int, stop: float) -> None:
     views = np.random.default_rng(seed).integers(0, 4, 14)
     W = random_weights(views, seed)
-    linked = link_average(ViewGraph(W, views, 4), stop)
-    np.testing.assert_array_equal(linked, renumber(link_average_reference(W, views, stop)))
-    np.testing.assert_array_equal(linked, renumber(mean_weights_reference(W, views, stop)))
+    linked = link_average(ViewGraph(W, views, 4), stop).ids
+    np.testing.assert_array_equal(linked, Clusters.of(link_average_reference(W, views, stop)).ids)
+    np.testing.assert_array_equal(linked, Clusters.of(mean_weights_reference(W, views, stop)).ids)
 
 
 def test_of_equal_weights_the_first_regions_win() -> None:
     W = np.zeros((4, 4))
     W[0, 2] = W[0, 3] = W[1, 2] = W[1, 3] = 0.5
     views = np.array([0, 0, 1, 1])
-    assert link_average(ViewGraph(W + W.T, views, 2)).tolist() == [0, 1, 0, 1]
-    assert link_average(ViewGraph(W + W.T, views, 2), stop=0.5).tolist() == [0, 1, 0, 1]  # as large as asked for
+    assert link_average(ViewGraph(W + W.T, views, 2)).ids.tolist() == [0, 1, 0, 1]
+    assert link_average(ViewGraph(W + W.T, views, 2), stop=0.5).ids.tolist() == [0, 1, 0, 1]  # as large as asked for
 
 
 def test_assignment_agrees_with_trying_everything() -> None:
@@ -106,8 +107,7 @@ def test_never_two_regions_of_one_view() -> None:
     for seed in range(5):
         views = np.random.default_rng(seed).integers(0, 5, 40)
         W = random_weights(views, seed)
-        ids = one_per_view_clusters(graph_of(W), torch.from_numpy(views), 5).numpy()
-        pairs = [(i, v) for i, v in zip(ids, views, strict=True) if i > 0]
+        pairs = [(i, v) for i, v in zip(ids_of(W, views.tolist()), views, strict=True) if i > 0]
         assert len(pairs) == len(set(pairs))
 
 
@@ -115,16 +115,16 @@ def test_second_chance_for_those_alone() -> None:
     """Cluster 0 holds views 0 and 1. Region 2 fits it; 3 is in a taken view; 4 and 5 only fit each other; 6 nothing."""
     views, W = np.array([0, 1, 2, 0, 1, 2, 3]), np.zeros((7, 7))
     W[0, 1], W[0, 2], W[1, 2], W[1, 3], W[4, 5], W[6, 0] = 0.9, 0.8, 0.6, 0.9, 0.5, 0.3
-    joined = join_alone(ViewGraph(W + W.T, views, 4), np.array([0, 0, 1, 2, 3, 4, 5]), stop=0.4)
-    assert joined.tolist() == [0, 0, 0, 1, 2, 2, 3]
+    joined = join_alone(ViewGraph(W + W.T, views, 4), Clusters.of(np.array([0, 0, 1, 2, 3, 4, 5])), stop=0.4)
+    assert joined.ids.tolist() == [0, 0, 0, 1, 2, 2, 3]
 
 
 def test_of_two_alone_in_one_view_the_one_with_the_largest_weight_to_anybody_comes_first() -> None:
     """Cluster 0 holds views 0 and 1; regions 2 and 3, of one view, both fit it, and only one can join."""
     views, W = np.array([0, 1, 2, 2]), np.zeros((4, 4))
     W[0, 1], W[0, 2], W[1, 2], W[0, 3], W[1, 3] = 0.9, 0.6, 0.6, 0.9, 0.5
-    joined = join_alone(ViewGraph(W + W.T, views, 3), np.array([0, 0, 1, 2]), stop=0.4)
-    assert joined.tolist() == [0, 0, 1, 0]
+    joined = join_alone(ViewGraph(W + W.T, views, 3), Clusters.of(np.array([0, 0, 1, 2])), stop=0.4)
+    assert joined.ids.tolist() == [0, 0, 1, 0]
 
 
 def test_sweeps_settle() -> None:
@@ -132,22 +132,21 @@ def test_sweeps_settle() -> None:
     W = random_weights(views, 1)
     graph = ViewGraph(W, views, 4)
     once = power_iteration(graph, link_average(graph))
-    np.testing.assert_array_equal(power_iteration(graph, once), once)
+    np.testing.assert_array_equal(power_iteration(graph, once).ids, once.ids)
 
 
 def test_balls_are_solved_in_any_order() -> None:
     scene = ball_scene(9, 6, seed=3)
-    affinity = region_affinity(scene.regions, scene.cameras)
-    ids = one_per_view_clusters(affinity, scene.regions.view_index, 6)
+
+    def ids_of_regions(regions: Regions) -> np.ndarray:
+        return one_per_view_clusters(ViewGraph.of(region_affinity(regions, scene.cameras), regions)).ids
+
+    ids = ids_of_regions(scene.regions)
     assert adjusted_rand_score(scene.regions.labels, ids) == 1
     order = torch.randperm(len(ids), generator=torch.Generator().manual_seed(0))
-    shuffled = scene.regions.select(order)
-    again = one_per_view_clusters(region_affinity(shuffled, scene.cameras), shuffled.view_index, 6)
-    assert adjusted_rand_score(ids[order], again) == 1
+    assert adjusted_rand_score(ids[order], ids_of_regions(scene.regions.select(order))) == 1
 
 
 def test_no_edges_and_no_regions() -> None:
-    none = Affinity(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 2)
-    assert one_per_view_clusters(none, torch.tensor([0, 1]), 2).tolist() == [-1, -1]
-    empty = Affinity(torch.zeros(0, 2, dtype=torch.int64), torch.zeros(0), 0)
-    assert one_per_view_clusters(empty, torch.zeros(0, dtype=torch.int64), 3).tolist() == []
+    assert ids_of(np.zeros((2, 2)), [0, 1]) == [-1, -1]
+    assert ids_of(np.zeros((0, 0)), []) == []

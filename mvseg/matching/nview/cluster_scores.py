@@ -8,7 +8,7 @@ counts.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TypeVar
 
@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.hypothesis_index import pack_views
 from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_of_runs, run_starts
-from mvseg.matching.one_per_view import ViewGraph
-from mvseg.matching.partition import members_of
+from mvseg.matching.partition import Clusters, members_of
+from mvseg.matching.view_graph import ViewGraph
 
 # Log-odds that two regions show one instance, by epipolar weight; measured on degraded masks of development plants.
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
@@ -54,7 +54,7 @@ class ClusterScores:
     """Scores of any clusters of the D regions of one sweep.
 
     Results depend only on the members of a cluster and are cached by members: while the search moves some regions,
-    unchanged clusters cost nothing.
+    unchanged clusters cost nothing. `replace` with a graph of other links keeps what is cached.
 
     Attributes:
         sweep: hypotheses of D regions, ordered by view.
@@ -65,16 +65,9 @@ class ClusterScores:
     sweep: PlaneSweep
     graph: ViewGraph
     config: NViewConfig
-    _scores: dict[tuple[int, bytes], Floats] = field(default_factory=dict, init=False, repr=False)
-    _coverages: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False)
-    _own: dict[bytes, Floats] = field(default_factory=dict, init=False, repr=False)
-
-    def with_graph(self, graph: ViewGraph) -> ClusterScores:
-        """The same scores, with all that is cached, for a graph of other links."""
-        scores = replace(self, graph=graph)
-        for name in ("_scores", "_coverages", "_own"):
-            getattr(scores, name).update(getattr(self, name))
-        return scores
+    _scores: dict[tuple[int, bytes], Floats] = field(default_factory=dict, repr=False)
+    _coverages: dict[bytes, Floats] = field(default_factory=dict, repr=False)
+    _own: dict[bytes, Floats] = field(default_factory=dict, repr=False)
 
     @cached_property
     def evidence(self) -> Floats:
@@ -82,7 +75,7 @@ class ClusterScores:
         weight."""
         return ((np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + PRIOR) / SPAN).astype(np.float32)
 
-    def scores(self, view: int, clusters: Ints) -> Floats:
+    def scores(self, view: int, numbers: Ints) -> Floats:
         """Leave-one-out scores of the regions of one view in clusters, S(n, c).
 
         A hypothesis scores (views that show c - hidden * views that show others - missing or absent * views that show
@@ -91,98 +84,97 @@ class ClusterScores:
 
         Args:
             view: the view.
-            clusters: (D,) cluster of each region in [0, K), -1 for regions to leave out. Regions of the view itself do
+            numbers: (D,) cluster of each region in [0, K), -1 for regions to leave out. Regions of the view itself do
                 not count.
 
         Returns:
             (N, K) float32 in [-hidden, 1].
         """
-        return self._region_scores(view, self._members_elsewhere(view, clusters))
+        return self._region_scores(view, self._members_elsewhere(view, numbers))
 
-    def pixel_scores(self, view: int, clusters: Ints) -> Floats:
+    def pixel_scores(self, view: int, numbers: Ints) -> Floats:
         """(K, P) float32: the scores of the view's P sampled pixels, see `scores`."""
-        return self._score_pixels(view, self._members_elsewhere(view, clusters))
+        return self._score_pixels(view, self._members_elsewhere(view, numbers))
 
-    def coverages(self, clusters: Ints) -> Floats:
+    def coverages(self, clusters: Clusters) -> Floats:
         """Where clusters expect to be seen in each view, R(c, n).
 
         Args:
-            clusters: (D,) cluster of each region in [0, K).
+            clusters: of all D regions.
 
         Returns:
             (K, D) float32 in [0, 1]: of the pixels of c in other views than n's, the share whose best hypothesis shows
             n. The best hypothesis is chosen without n's view; pixels whose best hypothesis scores below 0 do not count,
             and hypotheses that tie share the pixel.
         """
-        keys = [members.tobytes() for members in members_of(clusters)]
+        keys = [members.tobytes() for members in clusters.members]
         found = _look_up(self._coverages, keys, lambda new: self._cover(clusters, np.array(new)))
-        return np.stack(found) if found else np.zeros((0, len(clusters)), np.float32)
+        return np.stack(found) if found else np.zeros((0, len(clusters.ids)), np.float32)
 
     def covered_clusters(self) -> list[Ints]:
         """The members of every cluster whose coverages were asked for: all that a search has seen."""
         return [np.frombuffer(key, np.int64) for key in self._coverages]
 
-    def own(self, clusters: Ints) -> Floats:
-        """(D,) score of each region in its own cluster, its own view left out; `clusters` (D,) in [0, K)."""
-        members = members_of(clusters)
+    def own(self, clusters: Clusters) -> Floats:
+        """(D,) score of each region in its own cluster, its own view left out."""
+        members = clusters.members
 
         def score(new: list[int]) -> list[Floats]:
             fresh = self._score_own(clusters, np.array(new))
             return [fresh[members[k]] for k in new]
 
-        own, found = np.zeros(len(clusters)), _look_up(self._own, [each.tobytes() for each in members], score)
+        own, found = np.zeros(len(clusters.ids)), _look_up(self._own, [each.tobytes() for each in members], score)
         for cluster, of_cluster in zip(members, found, strict=True):
             own[cluster] = of_cluster
         return own
 
-    def value(self, clusters: Ints) -> float:
+    def value(self, clusters: Clusters) -> float:
         """What a partition is worth: the scores of all regions that are not alone, and the epipolar evidence for all
-        pairs in one cluster; `clusters` (D,) in [0, K)."""
-        is_alone = np.bincount(clusters)[clusters] < 2
+        pairs in one cluster."""
         pairs = self.pair_factor * float(self.graph.sum_partners(self.evidence, clusters).sum()) / 2
-        return float(self.own(clusters)[~is_alone].sum()) + pairs
+        return float(self.own(clusters)[~clusters.is_alone].sum()) + pairs
 
-    def explained(self, clusters: Ints) -> float:
+    def explained(self, clusters: Clusters) -> float:
         """Mean score of the regions that are not alone in their cluster; 0 without any."""
-        is_together = np.bincount(clusters, minlength=1)[clusters] > 1
+        is_together = ~clusters.is_alone
         return float(self.own(clusters)[is_together].mean()) if is_together.any() else 0.0
 
-    def explained_per_view(self, clusters: Ints) -> Floats:
+    def explained_per_view(self, clusters: Clusters) -> Floats:
         """(V,) float64: `explained` of the regions of each view; NaN without any."""
-        is_together = np.bincount(clusters, minlength=1)[clusters] > 1
+        is_together = ~clusters.is_alone
         views, scores = self.sweep.view_index[is_together], self.own(clusters)[is_together]
         counts, total = (np.bincount(views, weights, self.sweep.num_views) for weights in (None, scores))
         return np.where(counts > 0, total / np.maximum(counts, 1), np.nan)
 
-    def gains(self, view: int, clusters: Ints, coverages: Floats) -> ViewGains:
+    def gains(self, view: int, numbers: Ints, coverages: Floats) -> ViewGains:
         """What the regions of one view would gain by joining the clusters of the other views.
 
         Args:
             view: the view.
-            clusters: (D,) cluster of each region in [0, K), -1 for regions to leave out.
+            numbers: (D,) cluster of each region in [0, K), -1 for regions to leave out.
             coverages: `coverages` of an earlier partition; newer clusters, which it does not have, cover nothing.
         """
-        here, members = self.sweep.bounds.regions(view), self._members_elsewhere(view, clusters)
+        here, members = self.sweep.bounds.regions(view), self._members_elsewhere(view, numbers)
         sizes = np.array([len(each) for each in members], np.int64)
-        numbers = np.flatnonzero(sizes)
-        score = self._region_scores(view, [members[number] for number in numbers])
+        clusters = np.flatnonzero(sizes)
+        score = self._region_scores(view, [members[number] for number in clusters])
         coverage = np.zeros_like(score)
-        has_coverage = numbers < len(coverages)
-        coverage[:, has_coverage] = coverages[numbers[has_coverage], here].T
-        evidence = self.evidence[here].take(np.concatenate([*members, numbers[:0]]), 1)
-        pairs = np.add.reduceat(evidence, (sizes.cumsum() - sizes)[numbers], 1)
+        has_coverage = clusters < len(coverages)
+        coverage[:, has_coverage] = coverages[clusters[has_coverage], here].T
+        evidence = self.evidence[here].take(np.concatenate([*members, clusters[:0]]), 1)
+        pairs = np.add.reduceat(evidence, (sizes.cumsum() - sizes)[clusters], 1)
         total = score + self.config.gains.coverage * coverage + self.pair_factor * pairs
-        return ViewGains(numbers, score, coverage, total)
+        return ViewGains(clusters, score, coverage, total)
 
     @property
     def pair_factor(self) -> float:
         """Gain per unit of epipolar evidence for a pair, in this number of views."""
         return self.config.gains.pair_factor(self.sweep.num_views)
 
-    def _members_elsewhere(self, view: int, clusters: Ints) -> list[Ints]:
+    def _members_elsewhere(self, view: int, numbers: Ints) -> list[Ints]:
         """The members of clusters 0 .. K - 1 in other views."""
-        elsewhere = np.where(self.sweep.view_index == view, -1, clusters)
-        return members_of(elsewhere, int(clusters.max(initial=-1)) + 1)
+        elsewhere = np.where(self.sweep.view_index == view, -1, numbers)
+        return members_of(elsewhere, int(numbers.max(initial=-1)) + 1)
 
     def _region_scores(self, view: int, members: list[Ints]) -> Floats:
         """(N, C) float32: the scores of the view's regions in C clusters, cached."""
@@ -245,12 +237,12 @@ class ClusterScores:
             has_region[number, self.sweep.view_index[regions]] = True
         return has_region
 
-    def _cover(self, clusters: Ints, asked: Ints) -> Floats:
+    def _cover(self, clusters: Clusters, asked: Ints) -> Floats:
         """(C, D) float32: the coverages of the C clusters in `asked`."""
-        sweep, costs, num_regions, num_views = self.sweep, self.config.costs, len(clusters), self.sweep.num_views
-        index_of = np.full(int(clusters.max(initial=-1)) + 1, -1)
+        sweep, costs, num_regions, num_views = self.sweep, self.config.costs, len(clusters.ids), self.sweep.num_views
+        index_of = np.full(len(clusters), -1)
         index_of[asked] = np.arange(len(asked))
-        has_region = self._has_region(members_of(clusters))
+        has_region = self._has_region(clusters.members)
         empty = np.where(has_region, np.float32(-costs.missing), np.float32(-costs.absent))
         num_pixels, covered = np.zeros((len(asked), num_views)), np.zeros((len(asked), num_regions))
         for hypotheses, score, is_own in self._own_hypotheses(clusters, asked):
@@ -258,10 +250,10 @@ class ClusterScores:
             pixel, labels = sweep.pixel[hypotheses[keep]], sweep.labels[hypotheses[keep]]
             region = sweep.pixel_region[pixel]
             gain = np.where(is_own[keep], np.float32(1), np.float32(-costs.hidden))
-            np.copyto(gain, empty[clusters[region]], where=labels == EMPTY)
+            np.copyto(gain, empty[clusters.ids[region]], where=labels == EMPTY)
             np.copyto(gain, 0, where=labels == OUTSIDE)
             hypothesis, view, share = best_elsewhere(gain, labels != OUTSIDE, pixel, own_view=sweep.view_index[region])
-            cluster, label = index_of[clusters[region[hypothesis]]], labels[hypothesis, view]
+            cluster, label = index_of[clusters.ids[region[hypothesis]]], labels[hypothesis, view]
             num_pixels += np.bincount(cluster * num_views + view, share, num_pixels.size).reshape(num_pixels.shape)
             hit = label >= 0
             place = cluster[hit] * num_regions + label[hit]
@@ -278,7 +270,7 @@ class ClusterScores:
         best = np.maximum(np.maximum.reduceat(least, start), 0)
         return most + SLACK >= np.repeat(best, np.diff(start, append=len(pixel)))
 
-    def _score_own(self, clusters: Ints, asked: Ints) -> Floats:
+    def _score_own(self, clusters: Clusters, asked: Ints) -> Floats:
         """(D,) score of each region in its own cluster, for those in the clusters `asked`."""
         sweep, hidden = self.sweep, self.config.costs.hidden
         best = np.full(len(sweep.pixel_region), -hidden)
@@ -286,19 +278,19 @@ class ClusterScores:
             pixel = sweep.pixel[hypotheses]
             start = run_starts(pixel)
             best[pixel[start]] = np.maximum(np.maximum.reduceat(score, start), -hidden)
-        counts = np.bincount(sweep.pixel_region, minlength=len(clusters))
-        return np.bincount(sweep.pixel_region, best, len(clusters)) / np.maximum(counts, 1)
+        counts = np.bincount(sweep.pixel_region, minlength=len(clusters.ids))
+        return np.bincount(sweep.pixel_region, best, len(clusters.ids)) / np.maximum(counts, 1)
 
-    def _own_hypotheses(self, clusters: Ints, asked: Ints) -> Iterator[tuple[Ints, Floats, NDArray[np.bool_]]]:
+    def _own_hypotheses(self, clusters: Clusters, asked: Ints) -> Iterator[tuple[Ints, Floats, NDArray[np.bool_]]]:
         """The hypotheses (R,) on rays of the regions of the clusters `asked`, some pixels at a time; their scores (R,)
         in the region's own cluster, and (R, V) which views show it."""
         sweep = self.sweep
-        is_asked = np.zeros(int(clusters.max(initial=-1)) + 1, bool)
+        is_asked = np.zeros(len(clusters), bool)
         is_asked[asked] = True
-        every = np.flatnonzero(is_asked[clusters][sweep.pixel_region][sweep.pixel])
+        every = np.flatnonzero(is_asked[clusters.ids][sweep.pixel_region][sweep.pixel])
         kind = np.int16 if len(is_asked) < 2**15 else np.int32
-        cluster_of: Ints = np.append(clusters, [-1, -1]).astype(kind)  # the last two for EMPTY and OUTSIDE
-        views = pack_views(self._has_region(members_of(clusters)))
+        cluster_of: Ints = np.append(clusters.ids, [-1, -1]).astype(kind)  # the last two for EMPTY and OUTSIDE
+        views = pack_views(self._has_region(clusters.members))
         for block in blocks_of_runs(run_starts(sweep.pixel[every]), len(every)):
             hypotheses = every[block]
             own = cluster_of[sweep.pixel_region[sweep.pixel[hypotheses]]]

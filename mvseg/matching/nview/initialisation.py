@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.matching.nview.plane_sweep import BLOCK_SIZE, EMPTY, PLENTY, PlaneSweep, blocks_of_runs, run_starts
-from mvseg.matching.one_per_view import ViewGraph, link_average
+from mvseg.matching.one_per_view import link_average
+from mvseg.matching.partition import Clusters
+from mvseg.matching.view_graph import ViewGraph
 
 SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the hypotheses of a pixel, one per iteration
 EMPTY_COST = 0.7  # of a hypothesis in which all views show no region
@@ -26,18 +28,17 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-def initial_partitions(sweep: PlaneSweep, links: ViewGraph) -> list[Ints]:
-    """One or, with few views, two partitions (D,) to start the search from; clusters in [0, K). Of `links`, only what
-    must stay together and apart counts."""
-    history = em_affinities(sweep, links)
-    partitions = []
-    for iteration, stop in INITIALISATIONS[: 1 if sweep.num_views > MANY_VIEWS else None]:
-        graph = replace(links, weights=history[iteration].astype(np.float64))
-        partitions.append(link_average(graph, stop))
-    return partitions
+def initial_partitions(sweep: PlaneSweep, graph: ViewGraph) -> list[Clusters]:
+    """One or, with few views, two partitions of D regions to start the search from. Of the graph, only what must stay
+    together and apart counts."""
+    history = em_affinities(sweep, graph)
+    return [
+        link_average(replace(graph, weights=history[iteration].astype(np.float64)), stop)
+        for iteration, stop in INITIALISATIONS[: 1 if sweep.num_views > MANY_VIEWS else None]
+    ]
 
 
-def em_affinities(sweep: PlaneSweep, links: ViewGraph | None = None) -> list[NDArray[np.floating]]:
+def em_affinities(sweep: PlaneSweep, graph: ViewGraph | None = None) -> list[NDArray[np.floating]]:
     """How likely two regions are one instance, from the hypotheses alone, by expectation maximisation.
 
     E step: the hypotheses of a pixel share one unit of belief by a soft maximum of their mean affinity between all
@@ -48,7 +49,7 @@ def em_affinities(sweep: PlaneSweep, links: ViewGraph | None = None) -> list[NDA
 
     Args:
         sweep: hypotheses of D regions.
-        links: what must stay together and apart; its weights do not count. None: nothing.
+        graph: what must stay together and apart; its weights do not count. None: nothing.
 
     Returns:
         The affinity after each iteration: (D, D) float32 in [0, 1], symmetric, 0 within a view.
@@ -71,9 +72,9 @@ def em_affinities(sweep: PlaneSweep, links: ViewGraph | None = None) -> list[NDA
         belief /= np.repeat(np.add.reduceat(belief, start), run_lengths)
         is_believed = belief > NEGLIGIBLE
         affinity = _symmetric(_share_belief(sweep, hypotheses[is_believed], belief[is_believed]) / num_pixels)
-        if links is not None and links.node is not None and links.apart is not None:
-            affinity[links.apart] = 0
-            affinity[(links.node[:, None] == links.node) & (sweep.view_index[:, None] != sweep.view_index)] = 1
+        if graph is not None and len(graph.links):
+            affinity[graph.apart] = 0
+            affinity[(graph.node[:, None] == graph.node) & (sweep.view_index[:, None] != sweep.view_index)] = 1
         history.append(affinity)
     return history
 

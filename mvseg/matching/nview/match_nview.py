@@ -13,11 +13,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from mvseg.masks import Masks
-from mvseg.matching.affinity import Affinity
-from mvseg.matching.links import Links
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
@@ -25,13 +22,12 @@ from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.pieces import part_pieces
 from mvseg.matching.nview.plane_sweep import PlaneSweep, rays_per_region, sweep_dilated, sweep_planes
 from mvseg.matching.nview.search import search
-from mvseg.matching.one_per_view import ViewGraph, link_average, power_iteration
-from mvseg.matching.partition import drop_singletons, number_instances
+from mvseg.matching.one_per_view import one_per_view_clusters
+from mvseg.matching.partition import Clusters
 from mvseg.matching.result import Matching, MatchReport
+from mvseg.matching.view_graph import ViewGraph, first_without_links
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-
-Ints = NDArray[np.int64]
 
 DILATIONS = (1, 2, 4, 8)  # reprojection errors that are tried, pixels
 PROBE_RAYS = 1500  # tell whether a dilation helps, at least about this many
@@ -41,11 +37,10 @@ EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean score above which the poses are sound;
 def match_nview(
     regions: Regions,
     cameras: Cameras,
-    affinity: Affinity,
+    graph: ViewGraph,
     *,
     config: NViewConfig = NViewConfig(),
     residual_px: int | None = None,
-    links: Links | None = None,
     progress: bool = False,
 ) -> Matching:
     """Match the regions of V >= 2 views by what all views show.
@@ -53,10 +48,9 @@ def match_nview(
     Args:
         regions: D regions in V views, in any order.
         cameras: V cameras.
-        affinity: the epipolar weights of the regions.
+        graph: the epipolar weights of the regions, and their links.
         config: costs, gains and thresholds.
         residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
-        links: of the regions. Where what is found without them contradicts one, all of them hold in a second search.
         progress: show progress bars.
 
     Returns:
@@ -65,24 +59,20 @@ def match_nview(
         views and regions unless two choices tie exactly. Without regions or edges all ids are -1.
     """
     order = regions.view_index.argsort(stable=True)
-    ordered = regions.select(order)
-    graph = ViewGraph.of(affinity, regions.view_index, len(cameras)).select(order.cpu().numpy())
+    ordered, graph = regions.select(order), graph.select(order.cpu().numpy())
     found = find_clusters(ordered, cameras, graph, config=config, residual_px=residual_px, progress=progress)
-    scores, clusters = found.scores, found.clusters
-    if links is not None and not links.select(order).agree(clusters):
-        scores, clusters = search_again(found, links.select(order), progress=progress)
-    clusters, chance = part_pieces(scores, clusters)
-    evidence = collect_evidence(scores, clusters, found.pairwise)
+    clusters, chance = part_pieces(found.scores, found.clusters)
+    evidence = collect_evidence(found.scores, clusters, found.pairwise)
     report = MatchReport(
         method=found.method,
         has_probabilities=True,
         residual_px=found.residual_px,
-        explained=scores.explained(clusters),
-        view_explained=torch.from_numpy(scores.explained_per_view(clusters)).float().to(regions.device),
+        explained=found.scores.explained(clusters),
+        view_explained=torch.from_numpy(found.scores.explained_per_view(clusters)).float().to(regions.device),
     )
     probabilities = torch.from_numpy(np.minimum(match_scores(evidence), chance)).float()
-    masks = Masks.of(ordered.to("cpu"), torch.from_numpy(clusters + 1), probabilities)
-    masks = masks.with_merged(find_merged(scores, clusters, ordered)).select(order.argsort().cpu())
+    masks = Masks.of(ordered.to("cpu"), clusters.instance_ids(), probabilities)
+    masks = masks.with_merged(find_merged(found.scores, clusters, ordered)).select(order.argsort().cpu())
     masks = masks.relabel(_final_numbers(masks.instance_ids))
     return Matching(replace(masks.to(regions.device), regions=regions), report)
 
@@ -92,15 +82,15 @@ class FoundClusters:
     """The clusters of D regions that are ordered by view, and what they were found with.
 
     Attributes:
-        clusters: (D,) int64 in [0, K), regions alone included.
-        pairwise: (D,) int64, likewise, from the weights alone.
+        clusters: those of one region included.
+        pairwise: likewise, from the weights alone, without links.
         scores: of the hypotheses.
         residual_px: see `select_dilation`.
-        method: "nview", or "one-per-view" where these are the pairwise clusters.
+        method: "nview", or "one-per-view" where the clusters are from the weights alone.
     """
 
-    clusters: Ints
-    pairwise: Ints
+    clusters: Clusters
+    pairwise: Clusters
     scores: ClusterScores
     residual_px: int
     method: str
@@ -120,35 +110,30 @@ def find_clusters(
     Args:
         regions: D regions, ordered by view.
         cameras: V cameras.
-        graph: their epipolar weights.
+        graph: their epipolar weights, and their links.
         config: costs, gains and thresholds.
         residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
         progress: show progress bars.
     """
-    pairwise = power_iteration(graph, link_average(graph))
+    pairwise = one_per_view_clusters(graph.without_links)
     scores, residual_px = select_dilation(
         regions, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
     )
-    clusters, method = pairwise, "one-per-view"
-    if len(cameras) > 2:
-        searched = search(scores, pairwise, progress=progress)
-        if scores.explained(searched) >= UNEXPLAINED:
-            clusters, method = searched, "nview"
+
+    def cluster(graph: ViewGraph, unlinked: Clusters | None) -> Clusters:
+        weighed = pairwise if unlinked is None else one_per_view_clusters(graph)
+        starts = [] if unlinked is None else [_free_linked(unlinked, graph)]
+        return search(replace(scores, graph=graph), weighed, more_starts=starts, progress=progress)
+
+    clusters, method = first_without_links(graph, cluster) if len(cameras) > 2 else pairwise, "nview"
+    if len(cameras) < 3 or scores.explained(clusters) < UNEXPLAINED:
+        clusters, method = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph)), "one-per-view"
     return FoundClusters(clusters, pairwise, scores, residual_px, method)
 
 
-def search_again(found: FoundClusters, links: Links, *, progress: bool = False) -> tuple[ClusterScores, Ints]:
-    """The clusters that explain all views best and agree with links; and their scores.
-
-    What was found without links is one more start; but each node that links name begins by itself.
-    """
-    linked = links.hold(found.scores.graph)
-    scores, pairwise = found.scores.with_graph(linked), power_iteration(linked, link_average(linked))
-    if found.method != "nview":
-        return scores, pairwise
-    assert linked.node is not None
-    start = np.where(linked.is_linked, found.clusters.max() + 1 + linked.node, found.clusters)
-    return scores, search(scores, pairwise, more_starts=[start], progress=progress)
+def _free_linked(clusters: Clusters, graph: ViewGraph) -> Clusters:
+    """The clusters without the nodes that links name: each of these begins by itself."""
+    return Clusters.of(np.where(graph.is_linked, len(clusters) + graph.node, clusters.ids))
 
 
 def select_dilation(
@@ -156,7 +141,7 @@ def select_dilation(
     cameras: Cameras,
     graph: ViewGraph,
     *,
-    pairwise: Ints,
+    pairwise: Clusters,
     config: NViewConfig,
     residual_px: int | None = None,
     progress: bool = False,
@@ -186,7 +171,5 @@ def select_dilation(
 
 def _final_numbers(ids: torch.Tensor) -> torch.Tensor:
     """(K,) int64: number of each instance by its first region; -1 for one with a single region."""
-    clusters = ids.numpy() - 1
-    ids = number_instances(drop_singletons(clusters))
-    _, first = np.unique(clusters, return_index=True)
-    return ids[torch.from_numpy(first)]
+    _, first = np.unique(ids.numpy(), return_index=True)
+    return Clusters.of(ids.numpy()).drop_singletons().instance_ids()[torch.from_numpy(first)]

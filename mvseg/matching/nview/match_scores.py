@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.matching.nview.cluster_scores import ClusterScores
+from mvseg.matching.partition import Clusters
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -54,28 +55,23 @@ class IdEvidence:
     num_views: int
 
 
-def collect_evidence(scores: ClusterScores, clusters: Ints, pairwise: Ints) -> IdEvidence:
-    """The evidence for the cluster of each region; there is none for regions alone in theirs.
-
-    Args:
-        scores: of D regions.
-        clusters: (D,) int64, the cluster of each region in [0, K).
-        pairwise: (D,) int64, likewise, from the epipolar weights alone: a second opinion.
-    """
+def collect_evidence(scores: ClusterScores, clusters: Clusters, pairwise: Clusters) -> IdEvidence:
+    """The evidence for the cluster of each region; there is none for regions alone in theirs. `pairwise`, from the
+    epipolar weights alone, is a second opinion."""
     sweep, alone = scores.sweep, scores.config.gains.alone
     coverages = scores.coverages(clusters)
-    score, own_gain, rival_gain, coverage = (np.zeros(len(clusters)) for _ in range(4))
+    score, own_gain, rival_gain, coverage = (np.zeros(len(clusters.ids)) for _ in range(4))
     for view in np.unique(sweep.view_index).tolist():
         here = sweep.bounds.regions(view)
-        gains = scores.gains(view, clusters, coverages)
-        is_own = clusters[here][:, None] == gains.clusters
+        gains = scores.gains(view, clusters.ids, coverages)
+        is_own = clusters.ids[here][:, None] == gains.clusters
         score[here] = (gains.score * is_own).sum(1)
         own_gain[here] = (gains.total * is_own).sum(1)
         rival_gain[here] = np.where(is_own, alone, gains.total).max(1, initial=alone)
         coverage[here] = (gains.coverage * is_own).sum(1)
-    num_partners, num_fragments = _count_partners(clusters, sweep.view_index)
-    num_paired, _ = _count_partners(pairwise, sweep.view_index)
-    joint = np.unique(np.stack((clusters, pairwise)), axis=1, return_inverse=True)[1]
+    num_partners, num_fragments = _count_partners(clusters.ids, sweep.view_index)
+    num_paired, _ = _count_partners(pairwise.ids, sweep.view_index)
+    joint = np.unique(np.stack((clusters.ids, pairwise.ids)), axis=1, return_inverse=True)[1]
     num_in_both, _ = _count_partners(joint, sweep.view_index)
     return IdEvidence(
         score=score,

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from mvseg.masks import MergedMask
 from mvseg.matching.nview.cluster_scores import ClusterScores
-from mvseg.matching.partition import members_of
+from mvseg.matching.partition import Clusters
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]
@@ -17,7 +17,7 @@ NEIGHBOURS = 3  # nearest sampled pixels that decide for a pixel
 HALF_AS_GOOD = 0.5  # share of a cluster's median score from which it explains a pixel
 
 
-def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tuple[MergedMask, ...]:
+def find_merged(scores: ClusterScores, clusters: Clusters, regions: Regions) -> tuple[MergedMask, ...]:
     """Masks that cover two instances: two clusters explain disjoint parts of them.
 
     A cluster that has no region in a view, but covers one that belongs to another cluster, may share it. A pixel is
@@ -26,7 +26,7 @@ def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tupl
 
     Args:
         scores: of D regions, ordered by view.
-        clusters: (D,) cluster of each region in [0, K).
+        clusters: their partition.
         regions: the D regions.
 
     Returns:
@@ -37,39 +37,39 @@ def find_merged(scores: ClusterScores, clusters: Ints, regions: Regions) -> tupl
     for view in range(scores.sweep.num_views):
         for region, second in _shared_in_view(scores, clusters, view, is_second=is_second):
             part = second_part(scores, clusters, regions, region=region, second=second)
-            merged.append(MergedMask(region=region, own=int(clusters[region]) + 1, other=second + 1, part=part))
+            merged.append(MergedMask(region=region, own=int(clusters.ids[region]) + 1, other=second + 1, part=part))
     return tuple(merged)
 
 
-def _may_be_second(scores: ClusterScores, clusters: Ints) -> NDArray[np.bool_]:
+def _may_be_second(scores: ClusterScores, clusters: Clusters) -> NDArray[np.bool_]:
     """(K, D) bool: the cluster is seen in enough views, has no region in the region's view, and covers the region."""
     views, thresholds = scores.sweep.view_index, scores.config.thresholds
     coverages = scores.coverages(clusters)
-    is_shown = np.zeros((len(coverages), scores.sweep.num_views), bool)
-    is_shown[clusters, views] = True
+    is_shown = np.zeros((len(clusters), scores.sweep.num_views), bool)
+    is_shown[clusters.ids, views] = True
     is_seen_enough = is_shown.sum(1) >= max(2, thresholds.few * scores.sweep.num_views)
-    is_second = (coverages >= thresholds.merged_coverage) & is_seen_enough[:, None] & is_seen_enough[clusters]
+    is_second = (coverages >= thresholds.merged_coverage) & is_seen_enough[:, None] & is_seen_enough[clusters.ids]
     return is_second & ~is_shown[:, views]
 
 
 def _shared_in_view(
-    scores: ClusterScores, clusters: Ints, view: int, *, is_second: NDArray[np.bool_]
+    scores: ClusterScores, clusters: Clusters, view: int, *, is_second: NDArray[np.bool_]
 ) -> list[tuple[int, int]]:
     """Regions of one view that two clusters share, with the second cluster."""
     here = np.flatnonzero(scores.sweep.view_index == view)
     shared = here[is_second[:, here].any(0)]
     if not len(shared):
         return []
-    asked = np.union1d(np.flatnonzero(is_second[:, here].any(1)), clusters[shared])
+    asked = np.union1d(np.flatnonzero(is_second[:, here].any(1)), clusters.ids[shared])
     column = np.full(len(is_second), -1)
     column[asked] = np.arange(len(asked))
-    own, members = scores.own(clusters), members_of(clusters)
-    median_score = np.array([np.median(own[members[number]]) for number in asked])
-    is_explained = scores.pixel_scores(view, column[clusters]) >= HALF_AS_GOOD * median_score[:, None]
+    own = scores.own(clusters)
+    median_score = np.array([np.median(own[clusters.members[number]]) for number in asked])
+    is_explained = scores.pixel_scores(view, column[clusters.ids]) >= HALF_AS_GOOD * median_score[:, None]
     pixel_region = scores.sweep.pixel_region[scores.sweep.bounds.pixels(view)]
     pairs = []
     for region in shared.tolist():
-        candidates = np.append(clusters[region], np.flatnonzero(is_second[:, region]))
+        candidates = np.append(clusters.ids[region], np.flatnonzero(is_second[:, region]))
         part = is_explained[column[candidates]][:, pixel_region == region]
         share = (part & ~part[0]).mean(1)
         best = int(share.argmax())
@@ -78,12 +78,12 @@ def _shared_in_view(
     return pairs
 
 
-def second_part(scores: ClusterScores, clusters: Ints, regions: Regions, *, region: int, second: int) -> Tensor:
+def second_part(scores: ClusterScores, clusters: Clusters, regions: Regions, *, region: int, second: int) -> Tensor:
     """Where a merged mask shows its second instance: where its cluster explains the nearest sampled pixels better.
 
     Args:
         scores: of D regions, ordered by view.
-        clusters: (D,) cluster of each region in [0, K).
+        clusters: their partition.
         regions: the D regions.
         region: the merged one.
         second: the other cluster.
@@ -99,7 +99,8 @@ def second_part(scores: ClusterScores, clusters: Ints, regions: Regions, *, regi
     part, mask_pixels = torch.zeros_like(mask), mask.nonzero()
     if not is_here.any():
         return part
-    pair = np.where(clusters == clusters[region], 0, np.where(clusters == second, 1, -1))
+    ids = clusters.ids
+    pair = np.where(ids == ids[region], 0, np.where(ids == second, 1, -1))
     pixel_scores = scores.pixel_scores(view, pair)[:, is_here]
     sampled = torch.from_numpy(sweep.pixel_xy[pixels][is_here]) - regions.boxes[region, :2].cpu()
     nearest = torch.cdist(mask_pixels.flip(1) + 0.5, sampled).topk(min(NEIGHBOURS, len(sampled)), largest=False).indices

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.special import expit
 
 from mvseg.matching.nview.cluster_scores import ClusterScores
-from mvseg.matching.partition import renumber
+from mvseg.matching.partition import Clusters
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -21,26 +21,22 @@ COEFFICIENTS = (1.28, 0.84, 3.69, 4.37, -3.93)  # intercept, then one for each c
 LEAST = 0.3  # probability below which a mask leaves: higher, and ids of degraded masks lose more than strangers go
 
 
-def part_pieces(scores: ClusterScores, clusters: Ints) -> tuple[Ints, Floats]:
+def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Floats]:
     """Strangers leave their clusters and are alone.
 
-    Args:
-        scores: of D regions.
-        clusters: (D,) int64 in [0, K), regions alone included.
-
     Returns:
-        (D,) int64 likewise, numbered by their first region. What a person joined stays. And (D,) float64: how likely
-        each region that is still a piece shows the leaf of its cluster; 1 for all others.
+        The clusters, those of one region included. What a person joined stays. And (D,) float64: how likely each region
+        that is still a piece shows the leaf of its cluster; 1 for all others.
     """
-    chance = np.ones(len(clusters))
+    chance = np.ones(len(clusters.ids))
     rows, features = piece_features(scores, clusters)
     chance[rows] = expit(COEFFICIENTS[0] + features @ np.array(COEFFICIENTS[1:]))
     leaves = (chance < LEAST) & ~scores.graph.is_joined
-    parted = np.where(leaves, clusters.max(initial=-1) + 1 + np.arange(len(clusters)), clusters)
-    return renumber(parted), np.where(leaves, 1.0, chance)
+    parted = np.where(leaves, len(clusters) + np.arange(len(leaves)), clusters.ids)
+    return Clusters.of(parted), np.where(leaves, 1.0, chance)
 
 
-def piece_features(scores: ClusterScores, clusters: Ints) -> tuple[Ints, Floats]:
+def piece_features(scores: ClusterScores, clusters: Clusters) -> tuple[Ints, Floats]:
     """The P regions that are not the best one of their cluster in their view, by leave-one-out score.
 
     Returns:
@@ -49,10 +45,9 @@ def piece_features(scores: ClusterScores, clusters: Ints) -> tuple[Ints, Floats]
         of the cluster's pixels in other views that show the region; and its mean epipolar weight to the members there,
         which is low for a piece.
     """
-    num_views = scores.sweep.num_views
-    place, is_shared = clusters * num_views + scores.sweep.view_index, np.bincount(clusters, minlength=1)[clusters] > 1
+    place = clusters.ids * scores.sweep.num_views + scores.sweep.view_index
     count = np.bincount(place, minlength=1)
-    num_split, num_places = int((count > 1).sum()), len(np.unique(place[is_shared]))
+    num_split, num_places = int((count > 1).sum()), len(np.unique(place[~clusters.is_alone]))
     own = scores.own(clusters)
     several = np.flatnonzero(count[place] > 1)
     order = several[np.lexsort((several, -own[several], place[several]))]
@@ -61,7 +56,7 @@ def piece_features(scores: ClusterScores, clusters: Ints) -> tuple[Ints, Floats]
     rows, best = order[~is_best], best[~is_best]
     share = np.log((num_split - 0.5) / max(num_places, 1)) if len(rows) else 0.0
     ratio = np.clip(own[rows] / np.maximum(own[best], 0.05), 0, 1)
-    coverage = np.clip(scores.coverages(clusters)[clusters[rows], rows], 0, 1) if len(rows) else np.zeros(0)
+    coverage = np.clip(scores.coverages(clusters)[clusters.ids[rows], rows], 0, 1) if len(rows) else np.zeros(0)
     partners = np.maximum(scores.graph.sum_partners(np.ones_like(scores.graph.weights), clusters), 1)
     weight = scores.graph.sum_partners(scores.graph.weights, clusters) / partners
     return rows, np.column_stack((np.full(len(rows), share), ratio, coverage, weight[rows]))

@@ -16,8 +16,9 @@ from tqdm import tqdm
 from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.initialisation import initial_partitions
-from mvseg.matching.one_per_view import Movers, assign_one_to_one, join_alone, view_order
-from mvseg.matching.partition import renumber
+from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_order
+from mvseg.matching.partition import Clusters
+from mvseg.matching.view_graph import Movers
 
 MAX_SWEEPS = 3
 AS_GOOD = 0.99  # share of the best value that pairwise clusters must reach to be kept
@@ -27,7 +28,9 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-def search(scores: ClusterScores, pairwise: Ints, *, more_starts: Sequence[Ints] = (), progress: bool = False) -> Ints:
+def search(
+    scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[Clusters] = (), progress: bool = False
+) -> Clusters:
     """The best partition that refinement finds from one start, or, with few views, two.
 
     What the graph of the scores says must stay together, or apart, does so all the way.
@@ -37,12 +40,9 @@ def search(scores: ClusterScores, pairwise: Ints, *, more_starts: Sequence[Ints]
 
     Args:
         scores: of D regions in three views or more.
-        pairwise: (D,) int64, clusters from the weights alone, in [0, K).
+        pairwise: clusters from the weights alone, those of one region included, as in all partitions here.
         more_starts: partitions to start from as well.
         progress: show a progress bar over the views of each sweep.
-
-    Returns:
-        (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
     refined = []
     for start in (*initial_partitions(scores.sweep, scores.graph), *more_starts):
@@ -55,93 +55,79 @@ def search(scores: ClusterScores, pairwise: Ints, *, more_starts: Sequence[Ints]
     return join_few(scores, best)
 
 
-def refine(scores: ClusterScores, clusters: Ints, *, join_fragments: bool = False, progress: bool = False) -> Ints:
+def refine(
+    scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = False, progress: bool = False
+) -> Clusters:
     """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
 
     Args:
         scores: of D regions.
-        clusters: (D,) clusters to start from.
+        clusters: to start from.
         join_fragments: left-over regions may join a cluster that has a region in their view already.
         progress: show a progress bar over the views of each sweep.
-
-    Returns:
-        (D,) int64 cluster of each region in [0, K), numbered by their first region; regions alone included.
     """
-    clusters = renumber(clusters)
     order = view_order(scores.graph)
     for _ in range(MAX_SWEEPS):
-        before, coverages = clusters, scores.coverages(clusters)
-        clusters = before.copy()
+        ids, coverages = clusters.ids.copy(), scores.coverages(clusters)
         for view in tqdm(order.tolist(), desc="search", unit="view", leave=False, disable=not progress):
             movers = scores.graph.movers(view)
             if not movers.num:
                 continue
-            gains = _gains(scores, movers, clusters, coverages)
+            gains = _gains(scores, movers, ids, coverages)
             chosen = assign_one_to_one(gains.total, scores.config.gains.alone * movers.sizes)
             if join_fragments:
                 is_free = np.ones(movers.num, bool)
-                if scores.graph.apart is not None:  # what a person keeps apart is no fragment
-                    is_free[movers.owner[scores.graph.apart[movers.rows].any(1)]] = False
+                is_free[movers.owner[scores.graph.apart[movers.rows].any(1)]] = False  # as a person says
                 chosen = _join_fragments(chosen, gains, scores.config, is_free=is_free)
-            fresh = clusters.max() + 1 + np.arange(len(chosen))
-            clusters[movers.rows] = np.append(gains.clusters, fresh)[chosen][movers.owner]
-        clusters = renumber(clusters)
-        if (clusters == before).all():
+            fresh = ids.max() + 1 + np.arange(len(chosen))
+            ids[movers.rows] = np.append(gains.clusters, fresh)[chosen][movers.owner]
+        before, clusters = clusters, Clusters.of(ids)
+        if (clusters.ids == before.ids).all():
             break
     return clusters
 
 
-def join_few(scores: ClusterScores, clusters: Ints) -> Ints:
+def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
     """Dissolve clusters that few views show into larger ones that cover their regions.
 
     Fragments of over-segmented masks, and masks that are merged with something else, find each other across views and
     form spurious instances. A region of such a cluster joins the larger one that covers most of it and explains some of
     it, if there is one, whether or not that one has a region in the view already. With fewer than four views nothing is
     dissolved, and never what a person has linked.
-
-    Args:
-        scores: of D regions.
-        clusters: (D,) cluster of each region in [0, K), numbered by their first region.
-
-    Returns:
-        (D,) int64, the remaining clusters, numbered likewise.
     """
     sweep, thresholds = scores.sweep, scores.config.thresholds
-    is_shown = np.zeros((int(clusters.max(initial=-1)) + 1, sweep.num_views), bool)
-    is_shown[clusters, sweep.view_index] = True
+    is_shown = np.zeros((len(clusters), sweep.num_views), bool)
+    is_shown[clusters.ids, sweep.view_index] = True
     is_few = is_shown.sum(1) <= max(1, thresholds.few * sweep.num_views)
     if sweep.num_views < 4 or not is_few.any():
         return clusters
-    coverages, joined, is_linked = scores.coverages(clusters), clusters.copy(), scores.graph.is_linked
-    for view in np.unique(sweep.view_index[is_few[clusters]]).tolist():
+    coverages, joined, is_linked = scores.coverages(clusters), clusters.ids.copy(), scores.graph.is_linked
+    for view in np.unique(sweep.view_index[is_few[clusters.ids]]).tolist():
         here = sweep.bounds.regions(view)
-        gains = scores.gains(view, clusters, coverages)
+        gains = scores.gains(view, clusters.ids, coverages)
         fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.few_coverage) & (gains.score > 0)
-        moves = is_few[clusters[here]] & fits.any(1) & ~is_linked[here]
+        moves = is_few[clusters.ids[here]] & fits.any(1) & ~is_linked[here]
         if moves.any():
             joined[here][moves] = gains.clusters[np.where(fits, gains.coverage, -1)[moves].argmax(1)]
-    return renumber(joined)
+    return Clusters.of(joined)
 
 
-def _gains(scores: ClusterScores, movers: Movers, clusters: Ints, coverages: Floats) -> ViewGains:
+def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Floats) -> ViewGains:
     """What the movers would gain by joining the clusters of the other regions; -inf where they cannot. Of a node of
     several regions, gains are summed up, scores and coverages are means."""
-    graph, rest = scores.graph, clusters.copy()
+    graph, rest = scores.graph, ids.copy()
     rest[movers.rows] = -1
-    views = np.unique(graph.view_index[movers.rows]).tolist()
-    if graph.node is None:
-        return scores.gains(views[0], rest, coverages)
     numbers = np.unique(rest[rest >= 0])
     shape = len(movers.rows), len(numbers)
     score, coverage, total = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(shape)
-    for view in views:
+    for view in np.unique(graph.view_index[movers.rows]).tolist():
         gains = scores.gains(view, rest, coverages)
         here, place = graph.view_index[movers.rows] == view, np.searchsorted(numbers, gains.clusters)
         own = movers.rows[here] - scores.sweep.bounds.regions(view).start
         for to, values in ((score, gains.score), (coverage, gains.coverage), (total, gains.total)):
             to[np.ix_(here, place)] = values[own]
     sums = movers.total(total)
-    sums[graph.forbidden(movers, clusters, numbers)] = -np.inf
+    sums[graph.forbidden(movers, ids, numbers)] = -np.inf
     sizes = movers.sizes[:, None].astype(np.float32)
     return ViewGains(numbers, movers.total(score) / sizes, movers.total(coverage) / sizes, sums)
 
