@@ -13,6 +13,7 @@ from typing import Any, TypeVar
 import torch
 from torch import Tensor
 
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.regions import Regions, stack_regions
 
@@ -215,15 +216,9 @@ class Masks:
         return seen.sum(1)
 
 
-def replace_crops(masks: Masks, boxes: Sequence[tuple[int, int, int, int]], crops: Sequence[Tensor]) -> Masks:
-    """The same rows with other pixels, on the CPU.
-
-    Args:
-        masks: D masks.
-        boxes: D boxes, xyxy, half-open.
-        crops: D times (h, w) bool, the pixels in the box.
-    """
+def replace_crops(masks: Masks, crops: Sequence[Crop]) -> Masks:
+    """The same D rows with other pixels, on the CPU."""
     labels, num_views = masks.regions.labels.tolist(), masks.regions.num_views
-    pixels = [crop.flatten() for crop in crops]
+    boxes, pixels = [each.box for each in crops], [each.pixels.flatten() for each in crops]
     regions = stack_regions(masks.view_index.tolist(), boxes, pixels, labels=labels, num_views=num_views)
     return replace(masks.to("cpu"), regions=regions)

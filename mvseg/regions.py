@@ -11,6 +11,7 @@ import torch
 from scipy import ndimage
 from torch import Tensor
 
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 
 IGNORE_LABEL = 65535  # in label maps: pixels that belong to no region and are left out of every score
@@ -94,23 +95,19 @@ class Regions:
         width, height = self.crop_sizes[index].tolist()
         return self.crops[start:end].reshape(height, width)
 
-    def union(self, indices: Sequence[int]) -> tuple[tuple[int, int, int, int], Tensor]:
-        """The box x1, y1, x2, y2 around one or more regions of one view, and (y2 - y1, x2 - x1) bool, what they cover
-        in it."""
-        boxes = self.boxes[indices]
-        x1, y1 = boxes[:, :2].amin(0).tolist()
-        x2, y2 = boxes[:, 2:].amax(0).tolist()
-        covered = torch.zeros(y2 - y1, x2 - x1, dtype=torch.bool, device=self.device)
-        for index, (a, b, c, d) in zip(indices, boxes.tolist(), strict=True):
-            covered[b - y1 : d - y1, a - x1 : c - x1] |= self.crop(index)
-        return (x1, y1, x2, y2), covered
+    def placed(self, index: int) -> Crop:
+        """The crop of one region, with its box."""
+        x1, y1, x2, y2 = self.boxes[index].tolist()
+        return Crop((x1, y1, x2, y2), self.crop(index))
+
+    def union(self, indices: Iterable[int]) -> Crop:
+        """What one or more regions of one view cover."""
+        first, *others = map(self.placed, indices)
+        return first.union(*others)
 
     def mask(self, index: int, width: int, height: int) -> Tensor:
         """(height, width) bool: one region as a full frame, for drawing and writing."""
-        frame = torch.zeros(height, width, dtype=torch.bool, device=self.device)
-        x1, y1, x2, y2 = self.boxes[index].tolist()
-        frame[y1:y2, x1:x2] = self.crop(index)
-        return frame
+        return self.placed(index).paste((width, height))
 
     def select(self, index: Tensor) -> Regions:
         """The regions at an int64 index or a bool mask, in that order."""
@@ -225,8 +222,8 @@ class Regions:
         members = (self.view_index == view).nonzero()[:, 0]
         members = members[self.areas[members].argsort(descending=True, stable=True)]
         for index in members[values[members] > 0].tolist():
-            x1, y1, x2, y2 = self.boxes[index].tolist()
-            frame[y1:y2, x1:x2][self.crop(index)] = values[index]
+            crop = self.placed(index)
+            crop.cut(frame)[crop.pixels] = values[index]
         return frame
 
 

@@ -35,7 +35,7 @@ PACKAGE = ROOT / "mvseg"
 FLOORS = (
     ("errors", "_version"),
     ("system",),
-    ("scene",),
+    ("scene", "crop"),
     ("regions",),
     ("masks", "demo"),
     ("formats", "detectors", "matching", "reconstruction"),

@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from matched import matched
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.masks import Masks, MergedMask, Origin, replace_crops
 from mvseg.matching.result import Matching, MatchReport
@@ -120,7 +121,7 @@ def test_sure_views_are_counted_once_each() -> None:
 def test_new_pixels_keep_all_else() -> None:
     masks = table()
     boxes = [(x1, y1, x1 + 1, y1 + 1) for x1, y1, _, _ in masks.regions.boxes.tolist()]
-    cut = replace_crops(masks, boxes, [torch.ones(1, 1, dtype=torch.bool)] * 5)
+    cut = replace_crops(masks, [Crop(box, torch.ones(1, 1, dtype=torch.bool)) for box in boxes])
     assert cut.regions.areas.tolist() == [1] * 5
     assert torch.equal(cut.instance_ids, masks.instance_ids)
     assert torch.equal(cut.view_index, masks.view_index)

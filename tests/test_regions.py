@@ -66,7 +66,8 @@ def test_runs_are_the_pixels_of_the_masks(longest: int) -> None:
 
 def test_a_union_is_that_of_whole_frames() -> None:
     regions = regions_from_label_maps(random_maps())
-    (x1, y1, x2, y2), covered = regions.union([0, 2])
+    union = regions.union([0, 2])
+    (x1, y1, x2, y2), covered = union.box, union.pixels
     whole = regions.mask(0, 24, 24) | regions.mask(2, 24, 24)
     assert torch.equal(covered, whole[y1:y2, x1:x2])
     assert covered.sum() == whole.sum()

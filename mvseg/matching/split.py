@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import torch
 
+from mvseg.crop import Crop
 from mvseg.masks import Masks, replace_crops
-from mvseg.regions import mask_box
 
 
 def split_merged(masks: Masks) -> Masks:
@@ -22,19 +22,17 @@ def split_merged(masks: Masks) -> Masks:
         person corrected it.
     """
     masks = masks.with_merged([each for each in masks.merged if not masks.is_corrected[each.region]])
-    rows, boxes, crops, ids = [], [], [], []
-    columns = zip(masks.instance_ids.tolist(), masks.second_ids.tolist(), masks.regions.boxes.tolist(), strict=True)
-    for row, (own_id, other_id, box) in enumerate(columns):
-        crop, second = masks.regions.crop(row).cpu(), masks.second_parts[row]
-        parts = [(own_id, crop)]
-        if second is not None and (second & crop).any() and (crop & ~second).any():
-            parts = [(own_id, crop & ~second), (other_id, second & crop)]
+    device, masks = masks.regions.device, masks.to("cpu")
+    rows, crops, ids = [], [], []
+    for row, (own, other) in enumerate(zip(masks.instance_ids.tolist(), masks.second_ids.tolist(), strict=True)):
+        whole, second = masks.regions.placed(row), masks.second_parts[row]
+        parts = [(own, whole)]
+        if second is not None and (second & whole.pixels).any() and (whole.pixels & ~second).any():
+            pairs = (own, whole.pixels & ~second), (other, whole.pixels & second)
+            parts = [(instance, Crop(whole.box, part).tighten()) for instance, part in pairs]
         for instance, part in parts:
-            x1, y1, x2, y2 = mask_box(part) if len(parts) > 1 else (0, 0, crop.shape[1], crop.shape[0])
             rows.append(row)
-            boxes.append((box[0] + x1, box[1] + y1, box[0] + x2, box[1] + y2))
-            crops.append(part[y1:y2, x1:x2])
+            crops.append(part)
             ids.append(instance)
-    repeated = masks.select(torch.tensor(rows, dtype=torch.int64, device=masks.regions.device)).with_merged(())
-    cut = replace_crops(repeated, boxes, crops)
-    return replace(cut, instance_ids=torch.tensor(ids, dtype=torch.int64)).to(masks.regions.device)
+    cut = replace_crops(masks.select(torch.tensor(rows, dtype=torch.int64)).with_merged(()), crops)
+    return replace(cut, instance_ids=torch.tensor(ids, dtype=torch.int64)).to(device)

@@ -210,8 +210,9 @@ class _ViewMask:
 
     @staticmethod
     def union(members: Regions, view: int, cameras: Cameras) -> _ViewMask:
-        (x1, y1, x2, y2), mask = members.union((members.view_index == view).nonzero()[:, 0].tolist())
-        rows, columns = mask.nonzero().double().mean(0) + 0.5
+        crop = members.union((members.view_index == view).nonzero()[:, 0].tolist())
+        x1, y1, x2, y2 = crop.box
+        rows, columns = crop.pixels.nonzero().double().mean(0) + 0.5
         ray = cameras.world_from_px[view] @ torch.stack((columns + x1, rows + y1, torch.ones_like(rows)))
         ray = ray / torch.linalg.vector_norm(ray)
         K = cameras.K[view]
@@ -219,7 +220,7 @@ class _ViewMask:
         slant = float(torch.linalg.vector_norm(corners @ torch.linalg.inv(K).T, dim=1).max())
         focal = float(K.diagonal()[:2].max())
         return _ViewMask(
-            mask=mask,
+            mask=crop.pixels,
             corner=(x1, y1),
             px_from_world=cameras.px_from_world[view],
             focal=focal,

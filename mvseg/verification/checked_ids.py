@@ -279,9 +279,9 @@ def find_shared(
         painted = paint_view(surfaces, cameras, view)
         for region in np.flatnonzero(is_explained & (views == view)).tolist():
             pair = int(own[region]), int(second[region])
-            x1, y1, x2, y2 = regions.boxes[region].tolist()
-            mask = regions.crop(region).numpy()
-            seen = np.where(mask, painted[y1:y2, x1:x2], 0)
+            crop = regions.placed(region)
+            mask = crop.pixels.numpy()
+            seen = np.where(mask, crop.cut(painted), 0)
             if (region, *pair) in pairs or (seen == pair[1]).sum() >= MOST * (painted == pair[1]).sum():
                 to_first, to_second = (distance_transform_edt(seen != instance) for instance in pair)
                 part = torch.from_numpy(mask & (to_second < to_first))

@@ -17,14 +17,16 @@ import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
+from mvseg.crop import Crop
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import back_project
-from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
 from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
@@ -101,7 +103,7 @@ def _fit(
     alone = torch.where(masks.instance_ids == leaf, leaf, -1)
     own = regions.select(alone == leaf)
 
-    def fit(parts: Mapping[int, Frame], start: LeafSurface | None) -> LeafSurface:
+    def fit(parts: Mapping[int, Crop], start: LeafSurface | None) -> LeafSurface:
         ids = torch.cat((alone, torch.full((len(parts),), leaf)))
         more = _with_parts(regions, parts)
         starts = {} if start is None else {leaf: start}
@@ -110,11 +112,11 @@ def _fit(
     if colored is None:
         return fit({}, None)
     best = None
-    left = {view: colored[view] & ~_others(masks, leaf, view, cameras) for view in _views_without(masks, leaf)}
+    left = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in _views_without(masks, leaf)}
     around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in left})
     for _ in range(ROUNDS):
         found = {view: _largest_part(left[view] & around[view]) for view in left if view in around}
-        parts = {view: part for view, part in found.items() if int(part.sum()) >= LEAST_PIXELS}
+        parts = {view: Crop.of(part) for view, part in found.items() if int(part.sum()) >= LEAST_PIXELS}
         if not parts:
             break
         best = fit(parts, best)
@@ -132,24 +134,20 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
     places = surface.project_parts(cameras)
     ids, parts = masks.instance_ids.clone(), {}
     for view in _views_without(masks, leaf):
-        (x1, y1, x2, y2), covered = places[view]
-        visible = covered & ~_others(masks, leaf, view, cameras)[y1:y2, x1:x2]
-        leaf_colored, size = visible & colored[view][y1:y2, x1:x2], int(visible.sum())
-        is_open = size >= max(LEAST_PIXELS, LEAST_VISIBLE * int(covered.sum()))
-        if not is_open or int(leaf_colored.sum()) < LEAST_COLORED * size:
+        box, covered = places[view]
+        whole = Crop(box, torch.from_numpy(covered))
+        visible = replace(whole, pixels=whole.pixels & ~whole.cut(_others(masks, leaf, view, cameras)))
+        leaf_colored = replace(visible, pixels=visible.pixels & whole.cut(torch.from_numpy(colored[view])))
+        is_open = visible.area >= max(LEAST_PIXELS, LEAST_VISIBLE * whole.area)
+        if not is_open or leaf_colored.area < LEAST_COLORED * visible.area:
             continue
-        frame = np.zeros_like(colored[view])
-        frame[y1:y2, x1:x2] = visible
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
-        fits = {
-            row: _iou(masks.regions.boxes[row].tolist(), masks.regions.crop(row).numpy(), frame) for row in free
-        }
+        fits = {row: masks.regions.placed(row).iou(visible) for row in free}
         best = max(fits, key=lambda row: fits[row], default=-1)
         if best >= 0 and fits[best] >= AGREES:
             ids[best] = leaf
         else:
-            parts[view] = np.zeros_like(colored[view])
-            parts[view][y1:y2, x1:x2] = leaf_colored
+            parts[view] = leaf_colored.tighten()
     first = int((ids == leaf).nonzero()[0, 0])
     rows = torch.cat((torch.arange(len(masks)), torch.full((len(parts),), first)))
     more = replace(masks, instance_ids=ids).with_merged(masks.merged).select(rows)
@@ -163,35 +161,25 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
     )
 
 
-def _iou(box: list[int], mask: Frame, frame: Frame) -> float:
-    """Of a mask in its box (x1, y1, x2, y2) with one in the whole frame."""
-    x1, y1, x2, y2 = box
-    both = int((mask & frame[y1:y2, x1:x2]).sum())
-    return both / max(int(mask.sum()) + int(frame.sum()) - both, 1)
-
-
-def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Frame:
+def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:
     """(H, W) bool: what masks of other instances, or that a person drew, show."""
     is_other = (masks.instance_ids != leaf) & ((masks.instance_ids > 0) | masks.is_corrected)
     width, height = cameras.sizes[view].tolist()
-    return masks.regions.label_map(view, is_other.long(), (width, height)).numpy() > 0
+    return masks.regions.label_map(view, is_other.long(), (width, height)) > 0
 
 
 def _with_hiding(masks: Masks, leaf: int, cameras: Cameras) -> Regions:
     """One region for each view that has masks of a leaf: these, and those of others that touch them and may hide more
     of it."""
-    frames, regions = {}, masks.regions
+    shown, regions = {}, masks.regions
     for view in masks.view_index[masks.instance_ids == leaf].unique().tolist():
         here = (masks.view_index == view).nonzero()[:, 0].tolist()
         size, is_leaf = tuple(cameras.sizes[view].tolist()), masks.instance_ids == leaf
-        frames[view] = regions.label_map(view, is_leaf.long(), size).numpy() > 0
-        near = _dilate(frames[view], BESIDE_PX)
-        for row in (row for row in here if not is_leaf[row]):
-            x1, y1, x2, y2 = regions.boxes[row].tolist()
-            crop = regions.crop(row).numpy()
-            if (near[y1:y2, x1:x2] & crop).any():
-                frames[view][y1:y2, x1:x2] |= crop
-    return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), frames)
+        frame = regions.label_map(view, is_leaf.long(), size).numpy() > 0
+        near = _dilate(frame, BESIDE_PX)
+        others = [regions.placed(row) for row in here if not is_leaf[row]]
+        shown[view] = Crop.of(frame).union(*(each for each in others if (each.cut(near) & each.pixels.numpy()).any()))
+    return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), shown)
 
 
 def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Frame]) -> dict[int, Frame]:
@@ -226,10 +214,10 @@ def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Fram
 def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame]) -> dict[int, Frame]:
     """{view: (H, W) bool} where a surface is, and around it."""
     around = {}
-    for view, ((x1, y1, x2, y2), covered) in enumerate(surface.project_parts(cameras)):
+    for view, (box, covered) in enumerate(surface.project_parts(cameras)):
         if view in frames:
-            frame = np.zeros_like(frames[view])
-            frame[y1:y2, x1:x2] = covered
+            height, width = frames[view].shape
+            frame = Crop(box, torch.from_numpy(covered)).paste((width, height)).numpy()
             around[view] = _dilate(frame, max(BESIDE_PX, round(AROUND * float(covered.sum()) ** 0.5)))
     return around
 
@@ -250,13 +238,9 @@ def _dilate(frame: Frame, radius: int) -> Frame:
     return dilated
 
 
-def _with_parts(regions: Regions, parts: Mapping[int, Frame]) -> Regions:
+def _with_parts(regions: Regions, parts: Mapping[int, Crop]) -> Regions:
     """The regions and, after them, one of each view."""
-    boxes = [mask_box(torch.from_numpy(part)) for part in parts.values()]
-    crops = [
-        torch.from_numpy(part[y1:y2, x1:x2].copy()).flatten()
-        for part, (x1, y1, x2, y2) in zip(parts.values(), boxes, strict=True)
-    ]
-    new = stack_regions(list(parts), boxes, crops, labels=[0] * len(boxes), num_views=regions.num_views)
+    boxes, pixels = [each.box for each in parts.values()], [each.pixels.flatten() for each in parts.values()]
+    new = stack_regions(list(parts), boxes, pixels, labels=[0] * len(boxes), num_views=regions.num_views)
     columns: dict[str, Any] = {name: torch.cat((getattr(regions, name), getattr(new, name))) for name in COLUMNS}
     return replace(regions, **columns)

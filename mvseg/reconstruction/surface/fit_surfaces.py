@@ -284,11 +284,11 @@ def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, inst
     views = members.view_index.unique().tolist()
     united = [members.union((members.view_index == view).nonzero()[:, 0].tolist()) for view in views]
     return stack_masks(
-        [mask.numpy() for _, mask in united],
+        [crop.pixels.numpy() for crop in united],
         [frames[view] for view in views],
         views,
         px_from_world=cameras.px_from_world[views].numpy(),
-        mask_corners=[box[:2] for box, _ in united],
+        mask_corners=[crop.box[:2] for crop in united],
         own=instance,
     )
 

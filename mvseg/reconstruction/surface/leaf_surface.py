@@ -12,6 +12,7 @@ import trimesh
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.crop import Crop
 from mvseg.reconstruction.surface.leaf_patch import (
     NUM_COEFFICIENTS,
     Floats,
@@ -176,14 +177,10 @@ class LeafSurface:
 
         Parts behind a camera are left out.
         """
-        masks = []
-        for (width, height), ((x1, y1, x2, y2), part) in zip(
-            cameras.sizes.tolist(), self.project_parts(cameras), strict=True
-        ):
-            mask = torch.zeros(height, width, dtype=torch.bool)
-            mask[y1:y2, x1:x2] = torch.from_numpy(part)
-            masks.append(mask.to(cameras.device))
-        return masks
+        return [
+            Crop(box, torch.from_numpy(part)).paste((width, height)).to(cameras.device)
+            for (width, height), (box, part) in zip(cameras.sizes.tolist(), self.project_parts(cameras), strict=True)
+        ]
 
     def project_parts(self, cameras: Cameras) -> list[Part]:
         """V boxes x1, y1, x2, y2 that hold what `project` shows, and these parts (y2 - y1, x2 - x1) of its masks.
