@@ -54,7 +54,7 @@ def nview_ids(
 
 METHODS: dict[str, Method] = {"symnmf": symnmf_ids, "one-per-view": one_per_view_ids, "nview": nview_ids}
 ABLATIONS = {
-    "no weights": NViewConfig(gains=Gains(weight=0, weight_few=0)),
+    "no weights": NViewConfig(gains=Gains(weight=0)),
     "no coverage": NViewConfig(gains=Gains(coverage=0)),
     "missed=absent": NViewConfig(costs=HypothesisCosts(absent=HypothesisCosts.missing)),
     "hidden is free": NViewConfig(costs=HypothesisCosts(hidden=0)),

@@ -24,12 +24,13 @@ from mvseg.matching.samples import Samples, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
+LINE_PX = 2.0  # thickness of an epipolar line (Sec. 3.1)
+# Limits of the computation: a third more or less of any changes no id of "nview" on degraded masks of 8 to 16 leaves.
 BINS_PER_PIXEL = 2  # a bin is half a pixel wide, so that a line of two pixels is resolved
 MIN_BINS, MAX_BINS = 64, 8192
 PITCH_PIXELS = 1024  # of a view's pixels tell how thick a line is, at least about this many
-WIDE = 0.25  # change of the angle up to which it is even along a run; near an epipole and across the jump it is not
-SHARE = 4096  # of a pixel: what whole numbers count
-LINE_PX = 2.0  # thickness of an epipolar line (Sec. 3.1)
+WIDE = 0.25  # radians: a run becomes pixels if the angle changes by more along it, near an epipole or across the jump
+SHARE = 4096  # whole numbers count such shares of a pixel
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,11 +16,13 @@ from scipy.spatial.distance import squareform
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
 
-STOP = 0.2  # mean weight below which two clusters are not joined
-ALONE = 0.1  # gain of a region that stays alone, comparable to its mean weight to the V - 1 other views
-MAX_SWEEPS = 20
-TIE = 1e-9  # what equal weights differ by: less than two float32 weights do that differ at all
-FORBIDDEN = 1e9  # distance between two regions of one view: a mean that includes it is never small enough
+# A third less and more changes the pair F1 of "one-per-view" on degraded masks of 32 leaves in 5 views as each line
+# says, and that of 8 and 16 leaves by 0.005 at most; of "nview" it changes no id.
+STOP = 0.2  # two clusters are joined if their mean weight is at least this: -0.015, +0.031
+ALONE = 0.1  # a region stays alone if its summed weight, over V - 1, is less than this everywhere: +0.009, +0.033
+MAX_SWEEPS = 20  # limit: nearly always, nothing changes any more before
+TIE = 1e-9  # limit: equal weights differ by this, which is less than what float32 weights that differ at all do
+FORBIDDEN = 1e9  # limit: distance between regions of one view; a mean that includes it is never small enough
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]

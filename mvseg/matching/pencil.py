@@ -11,7 +11,7 @@ from torch import Tensor
 from mvseg.errors import InputError
 from mvseg.scene import Cameras
 
-COINCIDENT = 1e-6  # baselines shorter than this fraction of the longest one have no epipolar geometry
+COINCIDENT = 1e-6  # limit: baselines shorter than this share of the longest one have no epipolar geometry
 
 
 @dataclass(frozen=True, eq=False)

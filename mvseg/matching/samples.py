@@ -11,7 +11,7 @@ from torch import Tensor
 
 from mvseg.regions import Regions
 
-RUN_PX = 16  # of a row of a mask at most: along so few pixels an epipolar angle changes evenly
+RUN_PX = 16  # limit: a run along a row of a mask has at most so many pixels: epipolar angles change evenly on it
 
 
 @dataclass(frozen=True, eq=False)

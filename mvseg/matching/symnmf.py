@@ -19,7 +19,7 @@ from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.partition import Clusters
 
-KS_AT_ONCE = 8
+KS_AT_ONCE = 8  # limit: factorised together
 DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
 
 

@@ -21,8 +21,8 @@ from mvseg.matching.pencil import epipolar_pencils, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-SMALL_COMPONENT = 0.002  # share of a mask's pixels
-WIDEST = 1.5  # radians; a mask that fills more of the pencil holds the epipole and begins and ends nowhere
+SMALL_COMPONENT = 0.002  # a component does not count if it has less than this share of its mask's pixels
+WIDEST = 1.5  # limit, radians: a mask that fills more of the pencil holds the epipole, and begins and ends nowhere
 
 
 @dataclass(frozen=True, eq=False)

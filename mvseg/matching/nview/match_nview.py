@@ -29,9 +29,14 @@ from mvseg.matching.view_graph import ViewGraph, first_without_links
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-DILATIONS = (1, 2, 4, 8)  # reprojection errors that are tried, pixels
-PROBE_RAYS = 1500  # tell whether a dilation helps, at least about this many
-EXPLAINED, UNEXPLAINED = 0.5, 0.3  # mean score above which the poses are sound; below which the hypotheses are useless
+DILATIONS = (1, 2, 4, 8)  # definition: the reprojection errors that are tried, pixels
+PROBE_RAYS = 1500  # limit: at least about so many tell whether a dilation helps
+# No dilation is tried if clusters from the weights alone have at least this mean score. A third less: pair F1 -0.022 on
+# degraded masks of 32 leaves in 5 views; a third more only tries dilations more often.
+EXPLAINED = 0.5
+# Clusters from the weights alone are the answer if those of all views have a mean score below this: poses are far off.
+# A third more or less changes nothing where poses are exact, or off by 2 pixels.
+UNEXPLAINED = 0.3
 
 
 def match_nview(

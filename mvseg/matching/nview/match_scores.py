@@ -27,7 +27,7 @@ Ints = NDArray[np.int64]
 COEFFICIENTS = (1.24, 1.20, 2.96, -0.69, 1.26, -0.90, -1.59, -0.95)
 # Intercept, then one for each column of `scene_features`.
 SCENE_COEFFICIENTS = (-2.889, 0.050, 0.303, 0.173, 2.911)
-SUREST = 0.999, 0.99  # the most that the first regression says of a region, and of a scene
+SUREST = 0.999, 0.99  # limit: the most that the first regression says of a region, and of a scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,7 @@ class IdEvidence:
 def collect_evidence(scores: ClusterScores, clusters: Clusters, pairwise: Clusters) -> IdEvidence:
     """The evidence for the cluster of each region; there is none for regions alone in theirs. `pairwise`, from the
     epipolar weights alone, is a second opinion."""
-    sweep, alone = scores.sweep, scores.config.gains.alone
-    coverages = scores.coverages(clusters)
+    sweep, coverages = scores.sweep, scores.coverages(clusters)
     score, own_gain, rival_gain, coverage = (np.zeros(len(clusters.ids)) for _ in range(4))
     for view in np.unique(sweep.view_index).tolist():
         here = sweep.bounds.regions(view)
@@ -67,7 +66,7 @@ def collect_evidence(scores: ClusterScores, clusters: Clusters, pairwise: Cluste
         is_own = clusters.ids[here][:, None] == gains.clusters
         score[here] = (gains.score * is_own).sum(1)
         own_gain[here] = (gains.total * is_own).sum(1)
-        rival_gain[here] = np.where(is_own, alone, gains.total).max(1, initial=alone)
+        rival_gain[here] = np.where(is_own, 0, gains.total).max(1, initial=0)
         coverage[here] = (gains.coverage * is_own).sum(1)
     num_partners, num_fragments = _count_partners(clusters.ids, sweep.view_index)
     num_paired, _ = _count_partners(pairwise.ids, sweep.view_index)

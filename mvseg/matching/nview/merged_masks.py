@@ -13,8 +13,9 @@ from mvseg.matching.partition import Clusters
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]
-NEIGHBOURS = 3  # nearest sampled pixels that decide for a pixel
-HALF_AS_GOOD = 0.5  # share of a cluster's median score from which it explains a pixel
+# They decide which masks are listed as merged, and where they are cut; a third more or less changes no id.
+NEIGHBOURS = 3  # a pixel goes to the cluster that explains so many of its nearest sampled pixels better
+HALF_AS_GOOD = 0.5  # a cluster explains a pixel if that scores at least this share of the median score of its regions
 
 
 def find_merged(scores: ClusterScores, clusters: Clusters, regions: Regions) -> tuple[MergedMask, ...]:

@@ -25,15 +25,17 @@ from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hyp
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-EMPTY, OUTSIDE = (
-    -1,
-    -2,
-)  # labels of a hypothesis: no region there; outside the image, behind the camera, or the own view
+# Labels of a hypothesis: no region there; outside the image, behind the camera, or the own view.
+EMPTY, OUTSIDE = -1, -2
+# A hypothesis is left out if more than this share of the views that its point lies in show no region. A third less:
+# pair F1 -0.005 on degraded masks of 32 leaves in 5 views; a third more changes no id.
+MAX_EMPTY = 0.5
+# Limits of the computation. A third more or less changes one id of degraded masks of 8 and 16 leaves; of 32 leaves in 5
+# views, PIXELS change the pair F1 by +0.001 and +0.007, DEPTHS by -0.034 and -0.019.
 PIXELS = 24  # rays per region, at most
 PLENTY = 10  # with more views than this fewer rays are cast: each shows more
 DEPTHS = 96  # along a ray
-NEAREST = 0.05  # no depth below this fraction of the longest baseline
-MAX_EMPTY = 0.5  # share of the other views that may show no region
+NEAREST = 0.05  # no depth below this share of the longest baseline
 DOMINANCE_PASSES = 3
 BLOCK_SIZE = 2048  # hypotheses at a time: what is computed from them fits into the cache
 CHUNK = 512  # rays at a time: their samples fit into the cache
