@@ -1,11 +1,13 @@
 """How far few corrections bring a result: `python benchmarks/corrections.py --out DIR --cache DIR [--scenes BASIL]`
 
 A simulated person (`simulated_person.py`) corrects a scene in rounds, and the stages of `mvseg infer --corrections` run
-again after each. An outline counts 3, any other edit 1. Beside it, the same edits to the masks of the first result
-alone: what the cameras bring is the difference. And harm: leaves that were right, that no edit of the round was about,
-and that are wrong after it. Of "degraded" masks (`label_maps.py`) the ids are
-corrected, as `mvseg match` gives them; "detected" are the same scenes from pixels; --scenes are folders with photos and
-`truth/`. Rounds that are in the folder are not run again.
+again after each. He makes the edits that repair most ("repair"), or answers the page's questions in their order
+("ask"). An outline that he draws counts 3, any other edit 1, and so does an answer, whatever edits its key makes; a
+question that no answer fits counts nothing. Beside it, the same edits to the masks of the first result alone: what the
+cameras bring is the difference. And harm: leaves that were right, that no edit of the round was about, and that are
+wrong after it. The orders that end in "-learn" learn the plant. Of "degraded" masks (`label_maps.py`) the
+ids are corrected, as `mvseg match` gives them; "detected" are the same scenes from pixels; --scenes are folders with
+photos and `truth/`. Rounds that are in the folder are not run again.
 """
 
 from __future__ import annotations
@@ -37,6 +39,7 @@ from benchmarks.simulated_person import (
     Order,
     choose_repairs,
     count_worth,
+    list_answers,
     list_repairs,
 )
 from mvseg.config import RunConfig
@@ -50,21 +53,26 @@ from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import State, detect, list_stages, load
+from mvseg.pipeline import State, Unedited, choose_unedited, detect, fit_of, list_stages, load
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene, View
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
 from mvseg.system.atomic import write_text_whole
+from mvseg.verification.choose import Fit
+from mvseg.verification.known_surfaces import fit_once
 
 Record = dict[str, Any]
 
 NOT_AGAIN = ("detect", "say_what_is_missing", "check", "measure")  # done once, or not shown
 MOST, ROUNDS = 2.0, 8  # edits' worth per leaf, and in how many rounds, as a rule
+LEARN = "-learn"  # the same person, and `--detect.learn_plant true`
+ORDERS = ("repair", "ask", f"repair{LEARN}", f"ask{LEARN}")
 CURVES = (
     ("corrected, what repairs most first", "repair", "", "C2-"),
-    ("corrected, in the page's order", "doubt", "", "C0-"),
+    ("the page's questions answered", "ask", "", "C0-"),
+    ("these, and the plant is learnt", f"ask{LEARN}", "", "C0:"),
     ("the same edits, masks alone", "repair", "alone_", "C7--"),
 )
 PANELS = (
@@ -85,12 +93,16 @@ class Case:
         found: what `load` or `detect` leaves.
         truth: V label maps.
         has_masks: they were given.
+        fit: of rough surfaces; those of the same masks are kept from round to round, as in `mvseg correct`.
+        unedited: what is known without a person.
     """
 
     name: str
     found: State
     truth: Sequence[Labels]
     has_masks: bool
+    fit: Fit | None = None
+    unedited: Unedited | None = None
 
     @property
     def num_leaves(self) -> int:
@@ -108,7 +120,9 @@ def list_cases(args: argparse.Namespace) -> Iterator[Case]:
 def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -> Case:
     """A scene whose leaves the detector finds."""
     state = detect(load(folder, None, config, cache=cache))
-    return Case(f"detected_{folder.name}", state, true_maps(folder, state.scene), has_masks=False)
+    fit = fit_once(fit_of(state))
+    truth, known = true_maps(folder, state.scene), choose_unedited(replace(state, fit=fit))
+    return Case(f"detected_{folder.name}", state, truth, has_masks=False, fit=fit, unedited=known)
 
 
 def degraded_case(spec: SceneSpec, cache: Path) -> Case:
@@ -141,7 +155,7 @@ def render(spec: SceneSpec, cache: Path) -> Path:
 
 def compute(case: Case, corrections: Corrections) -> State:
     """What a run makes of the scene with these corrections, without traits."""
-    state = replace(case.found, corrections=corrections)
+    state = replace(case.found, corrections=corrections, fit=case.fit, unedited=case.unedited)
     stages = list_stages(state.config, has_masks=case.has_masks, has_edits=len(corrections.edits) > 0)
     for name, stage in stages.items():
         state = state if name in NOT_AGAIN else stage(state)
@@ -161,8 +175,18 @@ def judge(masks: Masks, truth: Sequence[Labels]) -> dict[str, float]:
     }
 
 
-def correct(case: Case, order: Order, out: Path) -> list[Record]:
-    """The records of all rounds, until edits are worth `MOST` for each leaf; those in the folder are read."""
+def with_learning(case: Case) -> Case:
+    """The same scene with `--detect.learn_plant true`; surfaces are shared."""
+    config = case.found.config
+    config = replace(config, detect=replace(config.detect, learn_plant=True))
+    return replace(case, found=replace(case.found, config=config))
+
+
+def correct(case: Case, order: str, out: Path) -> list[Record]:
+    """The records of all rounds, until edits are worth `MOST` for each leaf; those in the folder are read. The order is
+    one of `ORDERS`."""
+    person: Order = "ask" if order.startswith("ask") else "repair"
+    case = with_learning(case) if order.endswith(LEARN) else case
     path = out / f"{case.name}_{order}.csv"
     records, edits = read_records(path), tuple[Edit, ...]()
     if records and records[-1]["is_last"]:
@@ -177,13 +201,14 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
         seconds = time.process_time() - begun
         masks = state.masks.to("cpu")
         first = masks if first is None else first
-        doubts = list_doubts(masks, state.surfaces, cameras=state.scene.cameras)
+        doubts = list_doubts(masks, state.surfaces, cameras=state.scene.cameras, left=state.left)
         look = Look(masks, case.truth, state.scene, doubts, ids_only=case.has_masks)
+        listed = list_answers(look, edits) if person == "ask" else list_repairs(look)
         done = {str(edit.by) for edit in edits}
         most = math.ceil(MOST * case.num_leaves)
         left = most - count_worth(edits)
         step = min(left, math.ceil(most / ROUNDS))
-        chosen = choose_repairs(list_repairs(look), order=order, worth=(step, left), done=done)
+        chosen = choose_repairs(listed, order=person, worth=(step, left), done=done)
         about = {"scene": case.name, "order": order, "leaves": case.num_leaves}
         alone = judge(change_masks_alone(first, edits, state.scene), case.truth)
         record = about | {"edits": len(edits), "worth": count_worth(edits)} | judge(masks, case.truth)
@@ -223,7 +248,7 @@ def describe(record: Record) -> str:
     """One line: what corrections reach, and in brackets the same edits to the masks alone."""
     figures = "  ".join(f"{name} {record[name]:.3f} ({record[f'alone_{name}']:.3f})" for name in MEASURES)
     return (
-        f"{record['scene']:44} {record['order']:7} worth {record['worth']:3.0f}  {figures}  {record['seconds']:.0f} s"
+        f"{record['scene']:44} {record['order']:12} worth {record['worth']:3.0f}  {figures}  {record['seconds']:.0f} s"
     )
 
 
@@ -241,7 +266,7 @@ def along(records: Sequence[Record], name: str, rates: np.ndarray) -> np.ndarray
 def print_table(runs: Sequence[Sequence[Record]]) -> None:
     """For each scene, what is reached with none, a quarter, half and one edit's worth for each leaf; and the means."""
     rates = (0.0, 0.25, 0.5, 1.0, MOST)
-    print(f"{'edits worth, per leaf (masks alone)':63}" + "".join(f"{rate:8.2f}{'':8}" for rate in rates))
+    print(f"{'edits worth, per leaf (masks alone)':68}" + "".join(f"{rate:8.2f}{'':8}" for rate in rates))
     orders = sorted({str(run[0]["order"]) for run in runs})
     kinds = sorted({str(run[0]["scene"]).split("_")[0] for run in runs})
     groups = [[run] for run in runs]
@@ -257,7 +282,7 @@ def print_table(runs: Sequence[Sequence[Record]]) -> None:
                     np.mean([at_rate(run, f"{of}{measure}", rate) for run in group]) for of in ("", "alone_")
                 )
                 cells += f"{value:8.3f} ({alone:.3f})"
-            print(f"{about[:46]:47} {group[0][0]['order']:7} {measure:8}{cells}")
+            print(f"{about[:46]:47} {group[0][0]['order']:12} {measure:8}{cells}")
         when = [min((each["worth"] for each in run if each["right"] >= NEARLY_ALL), default=None) for run in group]
         shown = ", ".join(
             f"{w or 0:.0f} of {run[0]['leaves']:.0f}" if w is not None else "never"
@@ -302,7 +327,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, required=True, help="folder for records and edits")
     parser.add_argument("--masks", nargs="*", choices=("degraded", "detected"), default=["degraded"])
     parser.add_argument("--scenes", nargs="*", type=Path, default=[], help="scene folders with photos and truth/")
-    parser.add_argument("--orders", nargs="+", choices=("repair", "doubt"), default=["repair", "doubt"])
+    parser.add_argument("--orders", nargs="+", choices=ORDERS, default=["repair", "ask"])
     parser.add_argument("--plot", type=Path, help="draw the curves of all records in --out")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)

@@ -15,18 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.corrections.doubtful import Doubt
-from mvseg.corrections.file import Edit, Link, Outline, Reject, Split
+from mvseg.corrections.file import Confirm, Edit, Link, Outline, Reject, Split
 from mvseg.evaluation.panoptic import RIGHT_IOU
 from mvseg.evaluation.truth import region_crops, shown_instances
-from mvseg.formats.lens import photo_from_pinhole
+from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.masks import Masks, Origin
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene
 
-Order = Literal["repair", "doubt"]
+Order = Literal["repair", "ask"]
 Labels = NDArray[np.uint16]
 
 COSTS = {"outline": 3}  # of an edit; any other is 1
+ANSWER = "answer"  # how the name of an answer to a question begins
 LEAST_REPAIR = 0.03  # of a leaf's pixels, from which an edit is worth the while
 LOST = 0.25  # IoU below which a leaf is drawn anew, in two photos
 SHOWN = 0.5  # IoU from which a mask is left as it is; share of a leaf that a mask must cover to be worth a cut
@@ -54,19 +55,20 @@ class Repair:
 
     @property
     def cost(self) -> int:
-        return count_worth(self.edits)
+        return count_worth([edit.model_copy(update={"by": self.name}) for edit in self.edits])
 
 
 def count_worth(edits: Sequence[Edit]) -> int:
-    """What edits cost a person."""
-    return sum(COSTS.get(edit.op, 1) for edit in edits)
+    """What edits cost a person; all those of one answer cost 1."""
+    answers = {edit.by for edit in edits if str(edit.by).startswith(ANSWER)}
+    return len(answers) + sum(COSTS.get(edit.op, 1) for edit in edits if edit.by not in answers)
 
 
 def choose_repairs(
     found: Sequence[Repair], *, order: Order, worth: tuple[int, int], done: Collection[str]
 ) -> list[Repair]:
-    """Repairs for the next round: those that repair most for their cost first, or those that the queue asks for first
-    ("doubt"), and then the others. What they cost together is at most `worth[0]`; a single one may cost `worth[1]`."""
+    """Repairs for the next round: those that repair most for their cost first; answers in the order of their questions
+    ("ask"). What they cost together is at most `worth[0]`; a single one may cost `worth[1]`."""
 
     def key(each: Repair) -> tuple[float, ...]:
         rate = each.gain / each.cost
@@ -116,6 +118,7 @@ class Look:
         if not ids_only:
             self._find_merged()
         self.doubt_of_row = {each.region: each.doubt for each in reversed(doubts) if each.region >= 0}
+        self.doubts = doubts
         self.doubt_of_gap = {(each.view, each.instance): each.doubt for each in doubts if each.kind in GAPS}
 
     def _find_homes(self) -> None:
@@ -178,12 +181,43 @@ class Look:
         """The largest visible piece of a leaf, drawn by hand."""
         shown = (self.truth[view] == leaf).astype(np.uint8)
         lines, _ = cv2.findContours(np.pad(shown, 1), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        points = cv2.approxPolyDP(max(lines, key=len), OUTLINE_PX, True)[:, 0] - 0.5
+        points = np.asarray(cv2.approxPolyDP(max(lines, key=len), OUTLINE_PX, True)[:, 0] - 0.5, np.float64)
         if len(points) < 3:
             x, y, w, h = cv2.boundingRect(max(lines, key=len))
             points = np.array([[x, y], [x + w, y], [x + w, y + h], [x, y + h]]) - 1.0
         polygon = [(float(x), float(y)) for x, y in self._to_photo(view, points)]
         return Outline(view=self.scene.views[view].name, polygon=tuple(polygon), leaf=f"leaf {leaf}")
+
+    def inside(self, view: int, outline: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(H, W) the pixels in an outline of the queue."""
+        frame = np.zeros(self.truth[view].shape, np.uint8)
+        cv2.fillPoly(frame, [np.round(outline - 0.5).astype(np.int32)], 1)
+        return frame > 0
+
+    def middle(self, view: int, outline: NDArray[np.float64]) -> tuple[float, float]:
+        """Where a person clicks in an outline."""
+        inside = np.pad(self.inside(view, outline), 1).astype(np.uint8)
+        depth = np.asarray(cv2.distanceTransform(inside, cv2.DIST_L2, 5))
+        y, x = np.unravel_index(int(depth.argmax()), depth.shape)
+        (xy,) = self._to_photo(view, np.array([[x - 0.5, y - 0.5]]))
+        return float(xy[0]), float(xy[1])
+
+    def pixel(self, view: int, xy: Sequence[float]) -> tuple[int, int, int]:
+        """View, column and row that a point of a photo lies in, within the frame."""
+        lens, (height, width) = self.scene.views[view].lens, self.truth[view].shape
+        point = np.array([xy], np.float64)
+        point = point if lens is None else pinhole_from_photo(lens, self.scene.cameras.K[view].numpy(), point)
+        column, row = np.floor(point[0]).astype(int).clip(0, (width - 1, height - 1)).tolist()
+        return view, column, row
+
+    def draw(self, view: int, outline: NDArray[np.float64], word: str | None = None) -> Outline:
+        """An outline of the queue, kept as it is."""
+        polygon = tuple((float(x), float(y)) for x, y in self._to_photo(view, outline))
+        return Outline(view=self.scene.views[view].name, polygon=polygon, leaf=word)
+
+    def point(self, doubt: Doubt) -> tuple[float, float]:
+        """Where a question points at."""
+        return self.middle(doubt.view, doubt.outlines[0][1]) if doubt.outlines else self.place(doubt.region)[1:]
 
     def _to_photo(self, view: int, xy: NDArray[np.floating]) -> NDArray[np.floating]:
         lens = self.scene.views[view].lens
@@ -352,3 +386,107 @@ def _far_apart(look: Look, views: Sequence[int]) -> list[int]:
     cosines = ahead @ ahead[views[0]]
     far = [view for view in views[1:] if cosines[view] <= np.cos(np.radians(30))]
     return [views[0], *(far or views[1:])[:1]]
+
+
+# --- answers
+
+
+def list_answers(look: Look, edits: Sequence[Edit] = ()) -> list[Repair]:
+    """The true answers to the questions of the page, with the edits that its keys make; as the page does, without those
+    that `edits` point at. Where no answer is quite true, and where a leaf is asked about that has another number
+    already, the person goes on to the next."""
+    found, said = [], _said(look, edits)
+    for each in (doubt for doubt in look.doubts if not _is_answered(look, doubt, said)):
+        made, leaves = _answer_outlines(look, each) if each.outlines else _answer_mask(look, each)
+        if made:
+            at = made[0].polygon[0] if isinstance(made[0], Outline) else look.point(each)
+            name = f"{ANSWER} {each.kind} {look.scene.views[each.view].name} {at[0]:.0f} {at[1]:.0f}"
+            found.append(Repair(name, made, 1.0, each.doubt, frozenset(leaves)))
+    return found
+
+
+def _said(look: Look, edits: Sequence[Edit]) -> list[tuple[int, int, int]]:
+    """View, column and row of all that edits point at."""
+    names, found = [view.name for view in look.scene.views], []
+    for edit in edits:
+        if isinstance(edit, Link):
+            found += [look.pixel(names.index(name), xy) for name, *xy in edit.at]
+        elif isinstance(edit, Outline):
+            view = names.index(edit.view)
+            polygon = np.array([look.pixel(view, point)[1:] for point in edit.polygon], np.float64) + 0.5
+            found.append(look.pixel(view, look.middle(view, polygon)))
+        elif isinstance(edit, Reject | Confirm | Split):
+            found.append(look.pixel(names.index(edit.view), edit.at))
+    return found
+
+
+def _is_answered(look: Look, doubt: Doubt, said: Sequence[tuple[int, int, int]]) -> bool:
+    for view, outline in doubt.outlines:
+        inside = look.inside(view, outline)
+        if any(where == view and inside[row, column] for where, column, row in said):
+            return True
+    if doubt.outlines:
+        return False
+    x1, y1, x2, y2 = look.masks.regions.boxes[doubt.region].tolist()
+    crop = look.masks.regions.crop(doubt.region)
+    return any(
+        view == doubt.view and x1 <= column < x2 and y1 <= row < y2 and bool(crop[row - y1, column - x1])
+        for view, column, row in said
+    )
+
+
+def _answer_mask(look: Look, doubt: Doubt) -> tuple[tuple[Edit, ...], set[int]]:
+    """Of a question about a mask."""
+    leaf, view = int(look.leaf[doubt.region]), look.place(doubt.region)
+    owner, is_few = look.owner.get(doubt.instance, 0), doubt.kind == "few"
+    if leaf == IGNORE_LABEL or (is_few and owner and look.home[owner] != doubt.instance):
+        return (), set()
+    if is_few or doubt.other < 0:
+        is_leaf = owner if is_few else leaf
+        kind = Confirm if is_leaf else Reject
+        return (kind(view=view[0], at=view[1:], everywhere=is_few),), {is_leaf}
+    other = int(look.leaf[doubt.other])
+    if leaf == 0 and doubt.kind != "covered":
+        return (Reject(view=view[0], at=view[1:]),), {owner}
+    if other in (0, IGNORE_LABEL):
+        return (), set()
+    edit = Link(op="same" if leaf == other else "different", at=(view, look.place(doubt.other)))
+    return (edit,), {leaf, other}
+
+
+def _answer_outlines(look: Look, doubt: Doubt) -> tuple[tuple[Edit, ...], set[int]]:
+    """Of a question about what has no mask: a leaf that should be there, or a candidate."""
+    shown = [_leaf_inside(look, view, outline) for view, outline in doubt.outlines]
+    view, outline = doubt.outlines[0]
+    no = Reject(view=look.scene.views[view].name, at=look.middle(view, outline), everywhere=doubt.kind == "leaf")
+    if doubt.kind == "missing":
+        leaf, (share, iou) = look.owner.get(doubt.instance, 0), (0.0, 0.0)
+        if leaf:
+            share, iou = _overlap(look, view, outline, leaf)
+        if leaf and iou > SHOWN and doubt.other >= 0:
+            drawn = look.draw(view, outline)
+            same = Link(op="same", at=((drawn.view, *look.middle(view, outline)), look.place(doubt.other)))
+            return (drawn, same), {leaf}
+        return ((no,), {leaf}) if share < LEAST_REPAIR else ((), set())
+    leaf = max(shown, key=shown.count)
+    if not any(shown):
+        return (no,), {0}
+    if not leaf or 2 * shown.count(leaf) <= len(shown) or leaf in look.home:
+        return (), set()
+    word = f"offered {no.view} {no.at[0]:.0f} {no.at[1]:.0f}"
+    return tuple(look.draw(view, outline, word) for view, outline in doubt.outlines), {leaf}
+
+
+def _overlap(look: Look, view: int, outline: NDArray[np.float64], leaf: int) -> tuple[float, float]:
+    """The share of what an outline holds that is a leaf, and their IoU."""
+    inside, true = look.inside(view, outline), look.truth[view] == leaf
+    both = float((inside & true).sum())
+    return both / max(inside.sum(), 1), both / max((inside | true).sum(), 1)
+
+
+def _leaf_inside(look: Look, view: int, outline: NDArray[np.float64]) -> int:
+    """The leaf that an outline shows; 0 for none."""
+    counts = np.bincount(look.truth[view][look.inside(view, outline)], minlength=IGNORE_LABEL + 1)
+    counts[[0, IGNORE_LABEL]] = 0
+    leaf = int(counts.argmax())
+    return leaf if counts[leaf] and _overlap(look, view, outline, leaf)[1] > SHOWN else 0

@@ -12,6 +12,8 @@ from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.traits.config import ColorCard, TraitsConfig, Up
 
+ENOUGH_VIEWS = 20  # benchmarks/fewer_views.py: more add time, and next to nothing else
+
 
 @dataclass(frozen=True)
 class RunConfig:
@@ -22,6 +24,8 @@ class RunConfig:
         match: how regions are matched across views.
         reconstruct: how instances become shapes; None for ids only.
         traits: which instances count as leaves in the tables of traits.
+        views: take so many views, evenly spread by direction around what the cameras look at; "all" for all; None for
+            all where masks are given, and `ENOUGH_VIEWS` otherwise. Views that corrections name are taken besides.
         scale: factor of all lengths of the world; None for 1. Cameras that state their unit need `unit` with it.
         unit: name of the world's unit after that; None for that of the scene.
         up: the direction that points up in the world, as three numbers; "rig" finds it from cameras that were held
@@ -42,6 +46,7 @@ class RunConfig:
     match: MatchConfig = MatchConfig()
     reconstruct: ReconstructConfig | None = ReconstructConfig()
     traits: TraitsConfig = TraitsConfig()
+    views: int | Literal["all"] | None = None
     scale: float | None = None
     unit: str | None = None
     up: Up | None = None
@@ -53,6 +58,8 @@ class RunConfig:
     categories: str | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.views, int) and self.views < 2:
+            raise InputError(f"views is {self.views}, expected 2 or more, or all")
         if self.scale is not None and not 0 < self.scale < math.inf:
             raise InputError(f"scale is {self.scale:g}, expected a positive number")
         if self.up is not None and not isinstance(self.up, str) and not 0 < math.hypot(*self.up) < math.inf:

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from mvseg.checks.check_scene import warn_of_contradictions
-from mvseg.config import RunConfig
+from mvseg.config import ENOUGH_VIEWS, RunConfig
 from mvseg.corrections.apply import apply, apply_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
-from mvseg.corrections.same_scene import check_made_for
-from mvseg.errors import InputWarning
+from mvseg.corrections.same_scene import check_made_for, named_views
+from mvseg.errors import InputWarning, warn
+from mvseg.formats.find_views import natural_order
 from mvseg.formats.masks.recognise import recognise_masks
 from mvseg.formats.photos import Photos, check_photos, require_photos
 from mvseg.formats.scene_folder import load_scene, read_masks
@@ -30,15 +32,16 @@ from mvseg.matching.match import check_baselines, match_masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.split import split_merged
 from mvseg.poses.refine_poses import refine_scene
+from mvseg.reconstruction.spread_views import spread_views
 from mvseg.regions import stack_regions
 from mvseg.results.result import Instances, Result
-from mvseg.scene import Cameras
+from mvseg.scene import Cameras, Scene
 from mvseg.traits.up import place_scene
 
 if TYPE_CHECKING:
     from mvseg.detection.detect_scene import Found
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-    from mvseg.verification.choose import Fit
+    from mvseg.verification.choose import Fit, Leaves
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
@@ -46,6 +49,19 @@ if TYPE_CHECKING:
 
 NOTHING_LEFT = "the corrections reject every mask: no leaf is left"
 NOTHING_FOUND = Matching(Masks.of(stack_regions([], [], [], labels=[], num_views=0)), MatchReport("none"))
+
+
+@dataclass(frozen=True, eq=False)
+class Unedited:
+    """What is known of a scene whose leaves a detector found, before a person says anything.
+
+    Attributes:
+        leaves: that the views choose.
+        matched: the masks of all matchings that they are chosen from, the sure ones first.
+    """
+
+    leaves: Leaves
+    matched: tuple[Masks, ...]
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -57,6 +73,8 @@ class State(Result):
         photos: of the scene.
         matching: the masks as they were given, until they are matched.
         found: by the detector; None: the masks were given.
+        unedited: what is known without a person's edits; None: `correct` finds it where it is needed.
+        shown: the masks that the edits were applied to.
         cache, workers, progress: see `run_scene`.
         colors: of leaves, see `leaf_colors`; None: those of the masks, wherever a stage asks.
         fit: rough surfaces of masks, see `choose_leaves`; None: `fit_roughly`.
@@ -66,6 +84,8 @@ class State(Result):
     photos: Photos
     matching: Matching = NOTHING_FOUND
     found: Found | None = None
+    unedited: Unedited | None = None
+    shown: Masks | None = None
     cache: Path | None = None
     workers: ProcessPoolExecutor | None = None
     progress: bool = False
@@ -127,8 +147,7 @@ def run_scene(
     if isinstance(corrections, Path | str):
         corrections = load_corrections(corrections)
     has_edits = corrections is not None and len(corrections.edits) > 0
-    state = load(folder, masks, config, cache=cache, workers=workers, progress=progress)
-    state = replace(state, corrections=corrections)
+    state = load(folder, masks, config, corrections=corrections, cache=cache, workers=workers, progress=progress)
     if corrections is not None and not force_corrections:
         check_made_for(corrections, state.scene)
     seconds = {"load": time.perf_counter() - begun}
@@ -171,18 +190,42 @@ def list_stages(config: RunConfig, *, has_masks: bool, has_edits: bool = False) 
 # --- the stages
 
 
-def load(folder: Path, masks: Path | None, config: RunConfig, **how: Any) -> State:
-    """Cameras, and the masks if there are any."""
-    scene = place_scene(load_scene(folder), scale=config.scale, unit=config.unit, up=config.up)
+def load(
+    folder: Path, masks: Path | None, config: RunConfig, *, corrections: Corrections | None = None, **how: Any
+) -> State:
+    """Cameras of the views that are taken, and their masks if there are any.
+
+    Warns (InputWarning) of given masks in views that are left out.
+    """
+    whole = place_scene(load_scene(folder), scale=config.scale, unit=config.unit, up=config.up)
+    taken = _take_views(whole, config.views or ("all" if masks else ENOUGH_VIEWS), corrections)
+    scene = whole.select(taken)
+    left_out = tuple(view.name for index, view in enumerate(whole.views) if index not in taken)
     check_photos(scene)
     check_baselines(scene.cameras)
-    state = State(config=config, scene=scene, photos=Photos(scene), **how)
+    state = State(config=config, scene=scene, photos=Photos(scene), views_left_out=left_out, **how)
+    state = replace(state, corrections=corrections)
     if masks is None:
         require_photos(scene, folder)
         return state
-    found = recognise_masks(scene, masks)
-    regions = read_masks(scene, found, crowd=config.coco_crowd, categories=config.category_names)
+    found = recognise_masks(whole, masks)
+    regions = read_masks(whole, found, crowd=config.coco_crowd, categories=config.category_names)
+    if left_out:
+        num_given, regions = len(regions), regions.of_views(taken)
+        message = f"{len(taken)} of {len(whole.views)} views are taken (views is {config.views})"
+        warn(f"{masks}: {num_given - len(regions)} of {num_given} masks are left out: {message}")
     return replace(state, matching=Matching(Masks.of(regions), MatchReport("none")), mask_kind=found.kind)
+
+
+def _take_views(scene: Scene, most: int | Literal["all"], corrections: Corrections | None) -> Tensor:
+    """(S,) int64, ascending: the views that are taken, see `RunConfig.views`. Their names decide between equally good
+    choices, so that the order of the views does not matter."""
+    if most == "all":
+        return torch.arange(len(scene.views))
+    order = torch.tensor(sorted(range(len(scene.views)), key=lambda view: natural_order(scene.views[view].name)))
+    taken = order[spread_views(scene.cameras[order], most)].tolist()
+    named = [] if corrections is None else named_views(corrections, scene)
+    return torch.tensor(sorted({*taken, *named}))
 
 
 def detect(state: State) -> State:
@@ -197,18 +240,31 @@ def detect(state: State) -> State:
 def correct(state: State) -> State:
     """Edits of a person change the masks and link them, see `apply`; the next stage matches these.
 
+    These are masks that a person sees: where the views choose, those that they choose without edits, and what else was
+    surely detected beside these.
+
     Warns (InputWarning) of each edit that points at nothing, or that a later one contradicts.
     """
-    assert state.corrections is not None
-    masks = state.masks if state.found is None else state.found.match(state.scene.cameras).masks
-    corrected = apply(state.corrections, masks, state.scene)
+    corrections = state.corrections
+    assert corrections is not None
+    if state.found is not None and state.config.detect.verify:
+        from mvseg.verification.choose import add_beside
+        from mvseg.verification.known_surfaces import fit_once
+
+        state = state if state.fit is not None else replace(state, fit=fit_once(fit_of(state)))
+        known = choose_unedited(state) if state.unedited is None else state.unedited
+        state = replace(state, unedited=known)
+        masks = add_beside(known.leaves.masks, known.matched[0], state.scene.cameras)
+    else:
+        masks = state.masks if state.found is None else state.found.match(state.scene.cameras).masks
+    corrected = apply(corrections, masks, state.scene)
     waits = {number for number, *_ in corrected.refused}  # for `settle_edits`
     for fate in corrected.fates:
         if fate.message and fate.edit not in waits:
             warnings.warn(fate.message, InputWarning, stacklevel=3)
     if len(masks) and not len(corrected.masks):
         warnings.warn(NOTHING_LEFT, InputWarning, stacklevel=3)
-    return replace(state, corrected=corrected)
+    return replace(state, corrected=corrected, shown=masks)
 
 
 def match(state: State) -> State:
@@ -257,31 +313,73 @@ def split(state: State) -> State:
 def choose(state: State) -> State:
     """The views choose leaves and masks from the excessive set, see `choose_leaves`; `select_by_views` for the rest."""
     from mvseg.detection.few_views import select_by_views
-    from mvseg.verification.choose import choose_leaves
-    from mvseg.verification.rough_surfaces import fit_roughly
 
-    assert state.found is not None
-    cameras, detect = state.scene.cameras, state.config.detect
-    corrected = state.corrected
-
-    def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> Mapping[int, LeafSurface]:
-        return fit_roughly(masks, cameras, known=known, workers=state.workers, progress=state.progress)
-
-    with warnings.catch_warnings(action="ignore", category=InputWarning):  # the first matching has said it
-        more = state.found.match_more(cameras)
-    leaves = choose_leaves(
-        state.masks,
-        state.found.proposals(cameras),
-        cameras=cameras,
-        more=more,
-        linked=None if corrected is None or corrected.everywhere else _is_linked(state),
-        gone=None if corrected is None else _taken_away(state.found.match(cameras).masks.to("cpu"), state.masks),
-        min_probability=detect.min_probability,
-        fit=fit if state.fit is None else state.fit,
-    )
-    masks = select_by_views(leaves.masks, state.masks, min_views=detect.min_views)
+    is_edited = state.corrected is not None
+    leaves = _choose_corrected(state) if is_edited else _choose(state, _match_more(state))
+    masks = select_by_views(leaves.masks, state.masks, min_views=state.config.detect.min_views)
     instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
     return replace(state, instances=instances, left=leaves.left).with_masks(masks)
+
+
+def choose_unedited(state: State) -> Unedited:
+    """What the views choose of what the detector found; it does not warn."""
+    assert state.found is not None
+    with warnings.catch_warnings(action="ignore", category=InputWarning):
+        sure, more = state.found.match(state.scene.cameras), _match_more(state)
+        leaves = _choose(replace(state, matching=sure), more)
+    return Unedited(leaves, (sure.masks.to("cpu"), *more))
+
+
+def _choose_corrected(state: State) -> Leaves:
+    """The choice after edits. What is known without them stays among the candidates, and says how the scores judge this
+    plant."""
+    from mvseg.verification.learnt_plant import label_leaves, learn_plant
+
+    known, corrected, shown = state.unedited, state.corrected, state.shown
+    assert known is not None
+    assert corrected is not None
+    assert shown is not None
+    masks, is_linked = state.masks.to("cpu"), _is_linked(state)
+    how: dict[str, Any] = {"linked": is_linked, "gone": _taken_away(shown, masks)}
+    if state.config.detect.learn_plant:
+        is_held, cameras = (masks.is_corrected | is_linked).numpy(), state.scene.cameras.to("cpu")
+        labels = label_leaves(known.leaves, masks, is_held=is_held, rejected=corrected.no_leaves, cameras=cameras)
+        how["fitted"] = learn_plant(labels)
+    return _choose(state, known.matched, **how)
+
+
+def _match_more(state: State) -> tuple[Masks, ...]:
+    """Weaker proposals, matched, for more candidates; what there is to warn of, the first matching has said."""
+    assert state.found is not None
+    with warnings.catch_warnings(action="ignore", category=InputWarning):
+        return state.found.match_more(state.scene.cameras)
+
+
+def _choose(state: State, more: Sequence[Masks], **how: Any) -> Leaves:
+    """From the masks of a state, and more that are matched; for `how` see `choose_leaves`."""
+    from mvseg.verification.choose import choose_leaves
+
+    assert state.found is not None
+    return choose_leaves(
+        state.masks,
+        state.found.proposals(state.scene.cameras),
+        cameras=state.scene.cameras,
+        more=more,
+        min_probability=state.config.detect.min_probability,
+        fit=fit_of(state) if state.fit is None else state.fit,
+        **how,
+    )
+
+
+def fit_of(state: State) -> Fit:
+    """How rough surfaces are fitted in a scene, see `fit_roughly`."""
+    from mvseg.verification.rough_surfaces import fit_roughly
+
+    def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> Mapping[int, LeafSurface]:
+        cameras, workers = state.scene.cameras, state.workers
+        return fit_roughly(masks, cameras, known=known, workers=workers, progress=state.progress)
+
+    return fit
 
 
 def snap(state: State) -> State:
@@ -329,9 +427,7 @@ def check_ids(state: State) -> State:
     from mvseg.verification import checked_ids
 
     state = reconstruct(state, with_voxels=False)
-    held = None
-    if state.corrected is not None and not state.corrected.everywhere:  # these edits change the rows that links name
-        held = _is_linked(state)
+    held = None if state.corrected is None else _is_linked(state)
     checked = checked_ids.check_ids(
         state.masks, state.surfaces or {}, cameras=state.scene.cameras, held=held, config=state.config.match
     )

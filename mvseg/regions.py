@@ -119,6 +119,15 @@ class Regions:
         view_index, boxes, labels = self.view_index[keep], self.boxes[keep], self.labels[keep]
         return replace(self, view_index=view_index, boxes=boxes, crops=crops, labels=labels)
 
+    def of_views(self, views: Tensor) -> Regions:
+        """The regions of the views at (S,) int64, each named once, as those of views 0 to S - 1; by view."""
+        place = torch.full((self.num_views,), -1, device=self.device)
+        place[views.to(self.device)] = torch.arange(len(views), device=self.device)
+        view_index = place[self.view_index]
+        kept = (view_index >= 0).nonzero()[:, 0]
+        kept = kept[view_index[kept].argsort(stable=True)]
+        return replace(self.select(kept), view_index=view_index[kept], num_views=len(views))
+
     def pixels(self) -> tuple[Tensor, Tensor]:
         """Centres of the mask pixels.
 

@@ -225,6 +225,11 @@ class Scene:
                 raise InputError(f"views {first_with[view.name]} and {index} have the same name '{view.name}'")
             first_with[view.name] = index
 
+    def select(self, index: Tensor) -> Scene:
+        """The scene with the views at (S,) int64, in that order."""
+        views = tuple(self.views[view] for view in index.tolist())
+        return replace(self, views=views, cameras=self.cameras[index.to(self.cameras.device)])
+
     @property
     def seems_upside_down(self) -> bool:
         """Do the cameras contradict `up`? False where it is not known.

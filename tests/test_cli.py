@@ -208,6 +208,7 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
             "check_ids": True,
         },
         "traits": {"min_sure_views": 2, "min_quality": 0.5, "min_visible_share": 0.05, "leaves_only": True},
+        "views": None,
         "scale": None,
         "unit": None,
         "up": None,

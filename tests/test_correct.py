@@ -31,10 +31,11 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import run_scene
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.result import Instances, Result
-from mvseg.runs.correct_result import OpenResult, Superseded, keep_numbers, name_masks, open_alone
+from mvseg.runs.correct_result import OpenResult, Superseded, keep_numbers, open_alone
 from mvseg.runs.correction_server import CHANGED, CorrectionServer, Corrector
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.scene import Scene, View
+from mvseg.verification.known_surfaces import name_masks
 from room_scene import room_cameras
 from scene_folders import write_scene
 from served_result import WAIT, ask, save, save_text, serve, text_of, wait_until_computed

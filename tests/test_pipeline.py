@@ -202,7 +202,7 @@ class TestDescribeRun:
         assert run["mvseg"] == mvseg.__version__
         assert run["torch"] == torch.__version__
         assert (run["scene"], run["warnings"]) == ("plant", ["odd"])
-        ran = {"match", "refine_poses", "split_merged", "coco_crowd", "categories", "report"}
+        ran = {"views", "match", "refine_poses", "split_merged", "coco_crowd", "categories", "report"}
         assert run["config"].keys() == ran
         assert run["config"]["match"]["seed"] == 3
         rig = plant / "cameras.json"

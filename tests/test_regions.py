@@ -126,6 +126,16 @@ def test_select_keeps_order_and_content() -> None:
     assert len(regions.select(torch.zeros(len(regions), dtype=torch.bool))) == 0
 
 
+def test_regions_of_some_views_are_those_of_their_label_maps() -> None:
+    maps = random_maps()
+    for views in ([2, 0], [1], [0, 1, 2]):
+        some = regions_from_label_maps(maps).of_views(torch.tensor(views))
+        alone = regions_from_label_maps([maps[view] for view in views])
+        assert some.num_views == alone.num_views == len(views)
+        for field in ("view_index", "boxes", "crops", "labels"):
+            assert torch.equal(getattr(some, field), getattr(alone, field))
+
+
 def test_overlapping_regions_are_painted_small_on_top() -> None:
     big, small = torch.ones(16, dtype=torch.bool), torch.ones(4, dtype=torch.bool)
     boxes = torch.tensor([[1, 1, 3, 3], [0, 0, 4, 4]])

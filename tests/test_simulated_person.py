@@ -19,10 +19,11 @@ from benchmarks.simulated_person import (
     choose_repairs,
     count_worth,
     cut_line,
+    list_answers,
     list_repairs,
 )
 from mvseg.corrections.apply import apply
-from mvseg.corrections.doubtful import Doubt
+from mvseg.corrections.doubtful import Doubt, Outlines
 from mvseg.corrections.file import Corrections, Edit, Reject
 from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
@@ -138,6 +139,52 @@ def test_only_the_photos_that_are_named_are_corrected(truth: list[Labels], scene
     assert {edit.op for edit in edits} == {"outline", "reject"}
 
 
+SQUARE = np.array([[10.0, 10], [30, 10], [30, 50], [10, 50]])  # leaf 1
+EMPTY = SQUARE + (90, 0)
+
+
+def answer(doubt: Doubt, masks: Masks, truth: list[Labels], scene: Scene) -> list[Edit]:
+    return [edit for each in list_answers(Look(masks, truth, scene, [doubt])) for edit in each.edits]
+
+
+def test_questions_get_true_answers(truth: list[Labels], scene: Scene) -> None:
+    masks = masks_of(truth)
+    one, two = ((masks.instance_ids == leaf).nonzero()[:, 0].tolist() for leaf in (1, 2))
+
+    def ops(kind: str, region: int = -1, other: int = -1, instance: int = 1, outlines: Outlines = ()) -> list[str]:
+        doubt = Doubt(kind, 0.5, 0, instance, region=region, other=other, outlines=outlines)  # type: ignore[arg-type]
+        said = answer(doubt, masks, truth, scene)
+        return [f"{edit.op}{' everywhere' * getattr(edit, 'everywhere', False)}" for edit in said]
+
+    assert ops("match", one[0], one[1]) == ["same"]
+    assert ops("surface", two[0], one[1]) == ["different"]
+    assert ops("covered", two[0], one[1]) == ["different"]
+    assert ops("match", one[0]) == ["confirm"]
+    assert ops("few", one[0]) == ["confirm everywhere"]
+    assert ops("missing", other=one[1], outlines=((0, SQUARE),)) == ["outline", "same"]
+    assert ops("missing", other=one[1], outlines=((0, EMPTY),)) == ["reject"]
+    assert ops("leaf", instance=-1, outlines=((0, EMPTY), (1, EMPTY))) == ["reject everywhere"]
+    assert ops("leaf", instance=-1, outlines=((0, SQUARE), (1, SQUARE))) == []  # it has a number already
+    masks = masks_of(truth, {1: -1})
+    assert ops("leaf", instance=-1, outlines=((0, SQUARE), (1, SQUARE))) == ["outline", "outline"]
+    masks = masks_of([np.roll(labels, 60, 0) for labels in truth])  # no mask shows a leaf
+    assert ops("match", one[0], one[1]) == ["reject"]
+    assert ops("few", one[0]) == ["reject everywhere"]
+
+
+def test_what_was_answered_is_not_asked_again_and_an_answer_costs_one(truth: list[Labels], scene: Scene) -> None:
+    masks = masks_of(truth, {1: -1})
+    doubt = Doubt("leaf", 0.5, 0, -1, outlines=((0, SQUARE), (1, SQUARE)))
+    (said,) = list_answers(Look(masks, truth, scene, [doubt]))
+    assert said.cost == 1
+    edits = [edit.model_copy(update={"by": said.name}) for edit in said.edits]
+    assert count_worth(edits) == 1
+    assert count_worth(said.edits) == 6  # drawn by hand
+    assert list_answers(Look(masks, truth, scene, [doubt]), edits) == []
+    assert list_answers(Look(masks, truth, scene, [doubt]), [Reject(view="v1", at=(20, 20))]) == []
+    assert list_answers(Look(masks, truth, scene, [doubt]), [Reject(view="v2", at=(20, 20))]) == [said]
+
+
 def test_the_order_and_the_worth_of_repairs() -> None:
     edit = Reject(view="v0", at=(1, 1))
     small = Repair("small", (edit,), gain=0.1, doubt=0.9, leaves=frozenset({1}))
@@ -146,7 +193,7 @@ def test_the_order_and_the_worth_of_repairs() -> None:
     found = [small, large, same_leaf]
     assert count_worth(large.edits) == 2
     assert choose_repairs(found, order="repair", worth=(9, 9), done=()) == [large, small]
-    assert choose_repairs(found, order="doubt", worth=(9, 9), done=()) == [small, large]
+    assert choose_repairs(found, order="ask", worth=(9, 9), done=()) == [small, large]
     assert choose_repairs(found, order="repair", worth=(1, 1), done=()) == [small]
     assert choose_repairs(found, order="repair", worth=(1, 2), done={"small"}) == [large]
 

@@ -112,6 +112,8 @@ def add_matching_options(parser: ArgumentParser, masks: Path | None = None) -> N
 def add_run_options(parser: ArgumentParser) -> None:
     """The options of a whole run, from photos or masks to traits; `build_run` reads them."""
     add_matching_options(parser)
+    help_views = "take so many views, evenly spread around the plant, or 'all' (default: all with --masks, or else 20)"
+    parser.add_argument("--views", type=int | Literal["all"] | None, help=help_views)
     parser.add_class_arguments(DetectConfig, "detect")
     parser.add_class_arguments(ReconstructConfig, "reconstruct")
     parser.add_class_arguments(TraitsConfig, "traits")
@@ -131,7 +133,7 @@ def build_run(args: Namespace) -> RunConfig:
         from mvseg.traits.color_correction import read_color_card  # keeps --help quick
 
         card = read_color_card(card)
-    plain = ("scale", "unit", "refine_poses", "split_merged", "report", "coco_crowd", "categories")
+    plain = ("views", "scale", "unit", "refine_poses", "split_merged", "report", "coco_crowd", "categories")
     return RunConfig(
         detect=build_options(DetectConfig, args.detect, "detect."),
         match=build_options(MatchConfig, args.match, "match."),

@@ -57,11 +57,12 @@ class Corrected:
         masks: D masks on the CPU, by view, matched to nothing.
         links: of their rows.
         is_linked: (D,) bool, masks that a person linked; other links keep outlines apart from what else their photos
-            show.
+            show. After `apply_everywhere`, of the masks that are left.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
         everywhere: (edit number, row, whether its instance is rejected) of each edit about a whole instance.
         refused: (edit number, view, x, y, whether in all photos) of each pixel where a person says that no leaf is,
             and where no mask is: it may be the answer to a question, see `settle`.
+        rejected: the same of all such pixels, whatever is there.
         fates: of the edits, in their order.
     """
 
@@ -71,12 +72,20 @@ class Corrected:
     last_edits: Tensor
     everywhere: tuple[tuple[int, int, bool], ...]
     refused: tuple[tuple[int, int, int, int, bool], ...]
+    rejected: tuple[tuple[int, int, int, int, bool], ...]
     fates: tuple[Fate, ...]
 
     @property
     def messages(self) -> list[str]:
         """A sentence for each edit that was not applied, or is odd."""
         return [each.message for each in self.fates if each.message]
+
+    @property
+    def no_leaves(self) -> list[tuple[int, int, int, bool]]:
+        """View, x, y, and whether in all photos, of each pixel where a person says that no leaf is, but for what later
+        edits contradict."""
+        kept = {each.edit for each in self.fates if each.fate in (APPLIED, NOTHING)}
+        return [(view, x, y, is_about_all) for number, view, x, y, is_about_all in self.rejected if number in kept]
 
 
 @dataclass(eq=False)
@@ -91,6 +100,7 @@ class _Work:
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
     rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
     refused: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
+    said_no: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
@@ -146,6 +156,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         last_edits=last_edits,
         everywhere=everywhere,
         refused=tuple(work.refused),
+        rejected=tuple(work.said_no),
         fates=tuple(work.fates.values()),
     )
 
@@ -184,7 +195,7 @@ def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corre
     )
     origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
     masks = replace(matched, origin=origin).select(goes == 0).close_gaps()
-    return masks, replace(corrected, fates=fates)
+    return masks, replace(corrected, is_linked=corrected.is_linked[goes == 0], fates=fates)
 
 
 def _apply_one(work: _Work, number: int, edit: Edit) -> None:
@@ -192,8 +203,9 @@ def _apply_one(work: _Work, number: int, edit: Edit) -> None:
         _outline(work, number, edit)
     elif isinstance(edit, Reject):
         place = edit.view, *edit.at
+        work.said_no.append((number, *_pixel_at(work, place), edit.everywhere))
         if not _masks_at(work, place, work.masks):
-            work.refused.append((number, *_pixel_at(work, place), edit.everywhere))
+            work.refused.append(work.said_no[-1])
         mask = _mask_at(work, place)
         if edit.everywhere:
             _contradict(work, number, mask.edits)

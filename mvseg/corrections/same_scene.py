@@ -25,13 +25,20 @@ def mark_photos(scene: Scene) -> dict[str, PhotoMark]:
 
 def with_marks(corrections: Corrections, scene: Scene, marks: Mapping[str, PhotoMark]) -> Corrections:
     """The corrections with the marks of the photos that they name, of those of the scene (`mark_photos`)."""
-    found: dict[str, PhotoMark] = {}
+    names = [scene.views[view].name for view in named_views(corrections, scene)]
+    return replace(corrections, photos={name: marks[name] for name in names})
+
+
+def named_views(corrections: Corrections, scene: Scene) -> list[int]:
+    """The indices of the views that edits of single scenes name, each once; names that fit no view, or several, are
+    left to `apply`."""
+    found: dict[int, None] = {}
     for name in views_of(corrections):
         with suppress(InputError):  # it fits several
             (view,) = find_views([name], scene, source=Path("corrections"))
             if view is not None:
-                found[scene.views[view].name] = marks[scene.views[view].name]
-    return replace(corrections, photos=found)
+                found[view] = None
+    return list(found)
 
 
 def views_of(corrections: Corrections) -> list[str]:

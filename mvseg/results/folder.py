@@ -68,6 +68,8 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
 def describe_result(result: Result) -> dict[str, Any]:
     """What run.json says of the outcome of a run: of matching, poses, traits and corrections; counts and timings."""
     said: dict[str, Any] = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
+    names = [view.name for view in result.scene.views]
+    said["views"] = {"taken": names, "left_out": list(result.views_left_out)}
     if (poses := result.poses) is not None:
         residuals = [None if math.isnan(residual) else round(residual, 3) for residual in poses.residual_px]
         said["poses"] = {"refined": poses.is_refined, "residual_px": residuals}

@@ -75,7 +75,7 @@ class Result:
     """Everything known about one scene.
 
     Attributes:
-        scene: the scene, with refined cameras where `poses` has them.
+        scene: the scene with the views that were taken, with refined cameras where `poses` has them.
         matching: the table of its masks, undistorted, with their ids; and what matching says of the scene.
         instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
@@ -85,6 +85,7 @@ class Result:
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
         num_moved: number of masks that the surfaces moved to another instance, see `check_ids`; None without that
             check.
+        views_left_out: names of the scene's other views, see `RunConfig.views`.
         corrections: of a person; None where there were none.
         corrected: what came of them; None without any edits.
     """
@@ -98,6 +99,7 @@ class Result:
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""
     num_moved: int | None = None
+    views_left_out: tuple[str, ...] = ()
     corrections: Corrections | None = None
     corrected: Corrected | None = None
 

@@ -3,12 +3,10 @@ affects."""
 
 from __future__ import annotations
 
-import hashlib
-import json
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -23,16 +21,15 @@ from torch import Tensor
 
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, InputWarning
-from mvseg.masks import Masks
-from mvseg.pipeline import Stage, State, detect, list_stages, load, reconstruct
+from mvseg.pipeline import Stage, State, Unedited, choose_unedited, detect, fit_of, list_stages, load, reconstruct
 from mvseg.reconstruction.shapes import Surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.system.atomic import lock_folder
+from mvseg.verification.known_surfaces import fit_once, fit_unknown, name_each
 from mvseg.verification.leaf_color import colors_of_leaves
-from mvseg.verification.rough_surfaces import fit_roughly
 
 CORRECTIONS_FILE = "corrections.json"
 # Stages whose outcome the page does not show, or that ran.
@@ -65,12 +62,13 @@ class OpenResult:
         self.config, masks = self.run.config, self.run.masks
         changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
         self.notice = " ".join(("What you see is computed anew.", *changes)) if changes else ""
-        state = load(self.run.scene, masks, self.config, workers=workers)
+        saved = self.saved_corrections()  # the views that they name are taken
+        state = replace(load(self.run.scene, masks, self.config, corrections=saved, workers=workers), corrections=None)
         if not state.photos.exist:
             raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
         self.found = state if masks is not None else detect(state)
         self._fitted: dict[str, LeafSurface] = {}
-        self._rough: dict[str, LeafSurface] = {}  # that leaves are chosen by
+        self._fit_roughly = fit_once(fit_of(state))  # what leaves are chosen by
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self.has_masks = masks is not None
 
@@ -95,6 +93,8 @@ class OpenResult:
             InputError: see the stages.
         """
         state = replace(self.found, corrections=corrections, colors=self._colors, fit=self._fit_roughly)
+        if corrections.edits and not self.has_masks and self.config.detect.verify:
+            state = replace(state, unedited=self._unedited)
         messages: list[str] = []
         for stage in self._stages(has_edits=len(corrections.edits) > 0):
             if is_old():
@@ -113,6 +113,11 @@ class OpenResult:
         """The colours of leaves before all edits: they stay, so that an edit changes no mask of other leaves."""
         return colors_of_leaves(self.matched().masks.to("cpu"), self.found.photos)
 
+    @cached_property
+    def _unedited(self) -> Unedited:
+        """What is known without a person; it stays."""
+        return choose_unedited(replace(self.found, fit=self._fit_roughly))
+
     def _stages(self, *, has_edits: bool) -> list[Stage]:
         stages: list[Stage] = []
         for name, stage in list_stages(self.config, has_masks=self.has_masks, has_edits=has_edits).items():
@@ -129,47 +134,8 @@ class OpenResult:
             instances = replace(state.instances, surfaces=known)
             return reconstruct(replace(state, instances=instances), with_voxels=False).surfaces
 
-        surfaces = _fit_unknown(state.masks, self._fitted, fit)
+        surfaces = fit_unknown(state.masks, self._fitted, fit)
         return replace(state, instances=replace(state.instances, surfaces=surfaces))
-
-    def _fit_roughly(self, masks: Masks, known: Mapping[int, LeafSurface]) -> Mapping[int, LeafSurface]:
-        """Surfaces to choose by; those of the same masks are kept."""
-        cameras, workers = self.found.scene.cameras, self.found.workers
-
-        def fit(more: dict[int, LeafSurface]) -> Surfaces:
-            return fit_roughly(masks, cameras, known={**known, **more}, workers=workers)
-
-        return _fit_unknown(masks, self._rough, fit) or {}
-
-
-def _fit_unknown(
-    masks: Masks, before: dict[str, LeafSurface], fit: Callable[[dict[int, LeafSurface]], Surfaces | None]
-) -> Surfaces | None:
-    """The surfaces of all instances: those of `before` by the names of their masks, and what `fit` makes of the others,
-    which is cached there."""
-    ids = masks.instance_ids[masks.instance_ids > 0].unique().tolist()
-    names = {instance: name_masks(masks, instance) for instance in ids}
-    known = {instance: before[name] for instance, name in names.items() if name in before}
-    if known and len(known) == len(names):
-        return known
-    surfaces = fit(known)
-    before.update({names[instance]: surface for instance, surface in (surfaces or {}).items()})
-    return surfaces
-
-
-def name_masks(masks: Masks, instance: int) -> str:
-    """A name that two instances share only if they have the same masks in the same views, whatever their numbers."""
-    return json.dumps(sorted(_name_each(masks.select(masks.instance_ids == instance))))
-
-
-def _name_each(masks: Masks) -> list[str]:
-    """A name of each mask, that it shares with no other."""
-    regions = masks.regions.to("cpu")
-    places = zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
-    return [
-        json.dumps([view, *box, hashlib.sha256(regions.crop(row).numpy().tobytes()).hexdigest()])
-        for row, (view, box) in enumerate(places)
-    ]
 
 
 def keep_numbers(result: Result, known: dict[str, int]) -> Result:
@@ -177,7 +143,7 @@ def keep_numbers(result: Result, known: dict[str, int]) -> Result:
     their order. So ids may have gaps. `known`, {name of a mask: number of its leaf}, learns them."""
     masks = result.masks
     named = [(int(id), int(area), name) for id, area, name in
-             zip(masks.instance_ids, masks.regions.areas, _name_each(masks), strict=True) if id > 0]  # fmt: skip
+             zip(masks.instance_ids, masks.regions.areas, name_each(masks), strict=True) if id > 0]  # fmt: skip
     votes = Counter[tuple[int, int]]()
     for instance, area, name in named:
         if name in known:

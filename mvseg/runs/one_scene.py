@@ -73,6 +73,9 @@ def run_one_scene(
                 workers=workers,
                 progress=not quiet,
             )
+        if left_out := len(result.views_left_out):
+            num_taken, more = len(result.scene.views), "" if config.views else "; --views all takes all"
+            print(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", file=sys.stderr)
         for message in messages:
             print(f"mvseg: warning: {message}", file=sys.stderr)
         save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)

@@ -59,7 +59,8 @@ class Leaves:
 
     Attributes:
         masks: D' masks on the CPU, by view and instance, with ids from 1 on, the likeliest leaf first; match scores are
-            q. At most one of each leaf in a view, but for those of a person; his that show no leaf have -1.
+            q, and `labels` of proposals their rows. At most one of each leaf in a view, but for those of a person; his
+            that show no leaf have -1.
         surfaces: {instance id: surface} of those with a credible one.
         probabilities: {instance id: P}.
         left: the candidates that were not chosen, the most likely first.
@@ -80,21 +81,25 @@ def choose_leaves(
     linked: Tensor | None = None,
     gone: Masks | None = None,
     min_probability: float | None = None,
+    fitted: LeafScores = FITTED,
     fit: Fit | None = None,
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
     Masks that a person corrected or linked are certain: they stay, with their instances, which are leaves; so are masks
-    that no detector found. What else lies there goes, and what the person took away does not come back.
+    that no detector found. What else lies there goes, and what the person took away does not come back. All other
+    candidates are those without him: what he says of one leaf changes no other, unless they compete for masks.
 
     Args:
         matched: D masks, matched; the `labels` of those that a detector found are rows of `proposals`.
         proposals: R masks with detection scores, the excessive set; their ids do not matter.
         cameras: V cameras.
         more: masks of other matchings, of more of the proposals, with such labels, too.
-        linked: (D,) bool, masks that a person linked; None: none.
+        linked: (D,) bool, masks that a person linked; None: nobody edited the masks. Otherwise only the instances of a
+            person's masks are candidates here, and `more` has the others.
         gone: masks that a person took away; None: none.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
+        fitted: the numbers of the two scores.
         fit: from masks and surfaces that are known to {instance id: surface}; None: `fit_roughly`.
 
     Returns:
@@ -102,6 +107,7 @@ def choose_leaves(
         uncertain to judge by: matching and detection scores do it, and a warning (InputWarning) says so.
     """
     matched, proposals, cameras = matched.to("cpu"), proposals.to("cpu"), cameras.to("cpu")
+    proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(proposals))))
     is_held = matched.is_corrected | (matched.origin == Origin.OTHER_VIEWS) | (matched.origin == Origin.GIVEN)
     is_held = is_held if linked is None else is_held | linked.cpu()
     left = _without(proposals, gone)
@@ -113,13 +119,26 @@ def choose_leaves(
     held = np.zeros(len(table), bool)
     held[row_of[is_held].numpy()] = True
     fit = fit or (lambda masks, known: fit_roughly(masks, cameras, known=known))
-    has_shapes = _is_seen_around(matched, cameras)
+    has_shapes, ids = _is_seen_around(matched, cameras), matched.instance_ids
+    if linked is not None:
+        matched = replace(matched, instance_ids=ids.where(torch.isin(ids, ids[is_held]), -1))
     found = [(matched, row_of), *((each.to("cpu"), each.regions.labels.cpu()) for each in more)]
     candidates = gather_candidates(found, fit if has_shapes else None, table=table, is_held=is_held)
     drawn = draw_views(table.regions, candidates.surfaces, cameras)
     usable = np.concatenate((left, np.ones(len(added), bool)))
-    chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability)
+    chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability, fitted=fitted)
     return _take(chosen, candidates, table, is_held=held)
+
+
+def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
+    """The masks, and after them the others that show something else than these: see `SHARED`; by view."""
+    both = Masks.concatenate((masks, others.with_merged(())))
+    is_added = torch.ones(len(both), dtype=torch.bool)
+    for each in draw_views(both.regions, (), cameras.to("cpu")):
+        is_first = each.rows < len(masks)
+        is_added[each.rows] = torch.from_numpy(is_first | ~each.is_shared[:, is_first].any(1))
+    kept = both.select(is_added)
+    return kept.select(kept.view_index.argsort(stable=True))
 
 
 def _are_proposals(matched: Masks, proposals: Masks) -> Tensor:

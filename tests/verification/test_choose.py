@@ -17,7 +17,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.choose import Leaves, assign_masks, choose_leaves, least_chance
+from mvseg.verification.choose import Leaves, add_beside, assign_masks, choose_leaves, least_chance
 from mvseg.verification.evidence import draw_views
 from three_leaves import CAMERAS, LEAVES, true_maps
 
@@ -130,6 +130,29 @@ def test_a_person_is_right() -> None:
     assert len(without.masks) == len(REGIONS) - 1
     boxes = without.masks.regions.boxes[without.masks.view_index == 2]
     assert not (boxes == REGIONS.boxes[row]).all(1).any()
+
+
+def test_an_edit_that_touches_nothing_changes_nothing() -> None:
+    """Bit for bit, if the candidates without a person are there."""
+    matched = matched_of(PROPOSALS, IDS)
+    plain = choose(matched)
+    moved = replace(matched, instance_ids=IDS % 3 + 1)  # what the edited masks are matched to does not matter
+    edited = choose(moved, linked=torch.zeros(len(IDS), dtype=torch.bool), more=(matched,))
+    assert plain.probabilities == edited.probabilities
+    assert torch.equal(plain.masks.instance_ids, edited.masks.instance_ids)
+    assert torch.equal(plain.masks.match_scores, edited.masks.match_scores)
+    assert torch.equal(plain.masks.regions.labels, edited.masks.regions.labels)
+    assert torch.equal(REGIONS.boxes[plain.masks.regions.labels], plain.masks.regions.boxes)
+
+
+def test_masks_are_added_where_the_others_show_nothing() -> None:
+    matched = matched_of(PROPOSALS, IDS)
+    two, third = matched.select(IDS < 3), matched.select(IDS == 3)
+    for others in (matched, third):
+        both = add_beside(two, others, CAMERAS)
+        assert sorted(both.regions.labels.tolist()) == list(range(len(IDS)))
+        assert both.view_index.tolist() == sorted(both.view_index.tolist())
+    assert add_beside(two, two, CAMERAS).regions.labels.tolist() == two.regions.labels.tolist()
 
 
 def test_a_drawn_mask_that_matches_nothing_stays_without_an_id() -> None:

@@ -1,0 +1,83 @@
+"""Some of many views, evenly spread by direction around what the cameras look at.
+
+They are chosen as electric charges would settle: the sum of 1 / d^2 over all pairs of chosen directions, d their
+distance on the unit sphere, is as small as no single exchange makes it smaller.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from mvseg.scene import Cameras
+
+SAME = np.radians(1.0)  # directions that differ by less count as one
+PARALLEL = np.radians(2.0)  # root mean square of the angles between axes and their mean, that tells no common point
+TIE = 1e-6  # of the sum; what differs by less is equal, and of equal ones the first is taken
+
+
+def spread_views(cameras: Cameras, most: int) -> Tensor:
+    """The indices of at most so many views.
+
+    What the cameras look at is the point nearest to their optical axes; where these are parallel, a point as far ahead
+    as the cameras are apart. Distances from it play no part. The order of the views decides between choices that are
+    equally even, and nothing else.
+
+    Args:
+        cameras: V cameras.
+        most: >= 1; all views are taken where there are no more than that.
+
+    Returns:
+        (S,) int64, ascending.
+    """
+    num_views = len(cameras)
+    if num_views <= most:
+        return torch.arange(num_views)
+    ways = _directions(cameras.to("cpu"))
+    crowding = 1 / (((ways[:, None] - ways[None]) ** 2).sum(2) + SAME**2)
+    np.fill_diagonal(crowding, 0)
+    return torch.from_numpy(np.flatnonzero(_exchange(crowding, _drop(crowding, most))))
+
+
+def _directions(cameras: Cameras) -> NDArray[np.float64]:
+    """(V, 3) unit vectors from what the cameras look at to each of them."""
+    axes, centers = cameras.R[:, 2], cameras.centers
+    mean_axis, middle = axes.mean(0), centers.mean(0)
+    if 1 - mean_axis @ mean_axis < PARALLEL**2:
+        target = middle + mean_axis * (centers - middle).norm(dim=1).square().mean().sqrt()
+    else:
+        target = cameras.nearest_point(torch.arange(len(cameras)), axes)
+    ways: NDArray[np.float64] = torch.nn.functional.normalize(centers - target, dim=1).numpy()
+    return ways
+
+
+def _drop(crowding: NDArray[np.float64], most: int) -> NDArray[np.bool_]:
+    """(V,) bool: the views that are left when the most crowded one goes, again and again."""
+    kept = np.ones(len(crowding), bool)
+    load = crowding.sum(1)
+    while kept.sum() > most:
+        goes = _first_least(np.where(kept, -load, np.inf))
+        kept[goes] = False
+        load -= crowding[goes]
+    return kept
+
+
+def _exchange(crowding: NDArray[np.float64], kept: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """The same number of views, better spread: the exchange of two views that helps most, until none helps."""
+    kept = kept.copy()
+    while True:
+        load = crowding @ kept
+        inside, outside = np.flatnonzero(kept), np.flatnonzero(~kept)
+        change = load[outside] - load[inside, None] - crowding[np.ix_(inside, outside)]
+        if change.min() >= -TIE * load[inside].sum():
+            return kept
+        goes, comes = np.unravel_index(_first_least(change.ravel()), change.shape)
+        kept[inside[goes]], kept[outside[comes]] = False, True
+
+
+def _first_least(values: NDArray[np.float64]) -> int:
+    """The index of the least value, or of the first that is nearly as small."""
+    least = values.min()
+    return int(np.flatnonzero(values <= least + TIE * abs(least))[0])

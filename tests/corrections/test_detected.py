@@ -1,0 +1,136 @@
+"""Edits of what a detector found, from the masks that a person sees to the leaves that the views choose after them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from blade_scene import as_regions
+from mvseg.config import RunConfig
+from mvseg.corrections.apply import APPLIED
+from mvseg.corrections.file import Confirm, Corrections, Edit, Reject
+from mvseg.detection.config import DetectConfig
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks, Origin
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline import State, choose, choose_unedited, correct, correct_instances, match
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras, Scene, View
+from mvseg.verification import choose as choosing
+from mvseg.verification.choose import Leaves, choose_leaves
+from mvseg.verification.leaf_scores import FITTED, LeafScores
+from three_leaves import CAMERAS, LEAVES, true_maps
+
+REGIONS, IDS = as_regions(true_maps())
+WEAK = 3  # the leaf whose masks score too low to be matched at first
+PROPOSALS = Masks.of(
+    replace(REGIONS, labels=torch.arange(len(REGIONS))),
+    detection_scores=torch.where(IDS == WEAK, 0.25, 0.8),
+    origin=Origin.DETECTED,
+)
+MATCHED = replace(PROPOSALS, instance_ids=IDS, match_scores=torch.full((len(IDS),), 0.9))
+VIEWS = tuple(View(f"v{view}", Path(f"v{view}.png")) for view in range(len(CAMERAS)))
+SCENE = Scene(name="plant", views=VIEWS, cameras=CAMERAS, unit="mm", up=None)
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a detector would have found: the sure masks are those of two leaves."""
+
+    def match(self, cameras: Cameras) -> Matching:
+        return Matching(MATCHED.select(IDS != WEAK), MatchReport("nview"))
+
+    def match_more(self, cameras: Cameras) -> tuple[Masks, ...]:
+        return (MATCHED,)
+
+    def proposals(self, cameras: Cameras) -> Masks:
+        return PROPOSALS
+
+
+def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> dict[int, LeafSurface]:
+    ids = masks.instance_ids
+    instances = ids[ids > 0].unique().tolist()
+    return {each: LEAVES[int(IDS[masks.regions.labels[ids == each]].mode().values)] for each in instances}
+
+
+def at(leaf: int, view: int) -> tuple[float, float]:
+    """A point of a leaf in a photo."""
+    row = int(((leaf == IDS) & (REGIONS.view_index == view)).nonzero()[0, 0])
+    y, x = np.argwhere(REGIONS.crop(row).numpy())[0] + REGIONS.boxes[row, [1, 0]].numpy()
+    return float(x) + 0.5, float(y) + 0.5
+
+
+def run(*edits: Edit, learn_plant: bool = True) -> State:
+    found = Found()
+    state = State(
+        config=RunConfig(detect=DetectConfig(learn_plant=learn_plant)),
+        scene=SCENE,
+        photos=Photos(SCENE),
+        found=found,  # type: ignore[arg-type]
+        match=found.match,
+        fit=fit,
+        corrections=Corrections(edits) if edits else None,
+    )
+    for stage in (correct, match, correct_instances, choose) if edits else (match, choose):
+        state = stage(state)
+    return state
+
+
+def as_painted(state: State) -> list[np.ndarray]:
+    """V maps of which leaf every pixel shows: the true number."""
+    masks = state.masks
+    leaves = IDS[masks.regions.labels] * (masks.instance_ids > 0)
+    return [masks.regions.label_map(view, leaves, tuple(CAMERAS.sizes[view].tolist())).numpy() for view in range(6)]
+
+
+def test_an_edit_is_about_the_mask_that_is_seen_whatever_it_scores() -> None:
+    """Every mask of the weak leaf is shown, though none was matched at first; and it is gone as a whole."""
+    before = run()
+    assert set(np.unique(as_painted(before))) == {0, 1, 2, WEAK}
+    state = run(Reject(view="v0", at=at(WEAK, 0), everywhere=True))
+    assert [each.fate for each in state.fates] == [APPLIED]
+    assert set(np.unique(as_painted(state))) == {0, 1, 2}
+    for one, other in zip(as_painted(before), as_painted(state), strict=True):
+        assert np.array_equal(np.where(one == WEAK, 0, one), other)
+
+
+@pytest.mark.filterwarnings("ignore:correction 1")
+def test_an_answer_that_changes_nothing_changes_nothing() -> None:
+    before, after = run(), run(Reject(view="v0", at=(1.0, 1.0)))
+    assert before.instances.probabilities == after.instances.probabilities
+    assert torch.equal(before.masks.instance_ids, after.masks.instance_ids)
+    assert torch.equal(before.masks.regions.crops, after.masks.regions.crops)
+
+
+@pytest.mark.parametrize("learn_plant", [True, False])
+def test_the_plant_is_learnt_if_one_wants_it(learn_plant: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    seen: list[LeafScores] = []
+
+    def watched(*args: object, fitted: LeafScores = FITTED, **how: object) -> Leaves:
+        seen.append(fitted)
+        return choose_leaves(*args, fitted=fitted, **how)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(choosing, "choose_leaves", watched)
+    run(
+        Reject(view="v0", at=at(1, 0), everywhere=True), Confirm(view="v1", at=at(2, 1), everywhere=True),
+        learn_plant=learn_plant,
+    )  # fmt: skip
+    first, last = seen
+    assert first == FITTED
+    assert (last == FITTED) is not learn_plant
+    if learn_plant:
+        assert last.leaf[0] < FITTED.leaf[0]  # a sure leaf was none
+
+
+def test_what_is_known_without_a_person_is_found_once() -> None:
+    known = choose_unedited(replace(run(), matching=MatchedNothing))
+    assert len(known.leaves.probabilities) == 3
+    assert [len(each) for each in known.matched] == [int((IDS != WEAK).sum()), len(IDS)]
+
+
+MatchedNothing = Matching(PROPOSALS, MatchReport("none"))
