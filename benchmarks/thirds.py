@@ -86,7 +86,7 @@ def changed(module: ModuleType, name: str, value: Any) -> Iterator[None]:
 
 def match_all(scenes: list[LabelledScene], config: NViewConfig = NViewConfig()) -> list[tuple[np.ndarray, ...]]:
     """Per scene the ids of "nview", its scores, the ids of "one-per-view", and the pair F1 of both."""
-    found = []
+    found: list[tuple[np.ndarray, ...]] = []
     for scene in scenes:
         regions, truth = scene.masks("degraded")
         graph = ViewGraph.of(region_affinity(regions, scene.cameras), regions)

@@ -32,13 +32,16 @@ def spread_views(cameras: Cameras, most: int) -> Tensor:
     Returns:
         (S,) int64, ascending.
     """
-    num_views = len(cameras)
-    if num_views <= most:
-        return torch.arange(num_views)
-    ways = _directions(cameras.to("cpu"))
+    return torch.from_numpy(spread_directions(_directions(cameras.to("cpu")), most))
+
+
+def spread_directions(ways: NDArray[np.float64], most: int) -> NDArray[np.int64]:
+    """The same of directions (V, 3) from what is looked at to the cameras, unit vectors."""
+    if len(ways) <= most:
+        return np.arange(len(ways))
     crowding = 1 / (((ways[:, None] - ways[None]) ** 2).sum(2) + SAME**2)
     np.fill_diagonal(crowding, 0)
-    return torch.from_numpy(np.flatnonzero(_exchange(crowding, _drop(crowding, most))))
+    return np.flatnonzero(_exchange(crowding, _drop(crowding, most)))
 
 
 def _directions(cameras: Cameras) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from mvseg.errors import InputError
+from mvseg.reconstruction.spread_views import spread_directions, spread_views
 from mvseg.reconstruction.surface.fit_patch import (
     FAR_GRID,
     FIRST_HALF,
@@ -46,7 +47,7 @@ WIDE_COST = 0.1  # in IoU, of a patch that is wider than long
 UNCLEAR, MOST_STARTS = 0.05, 3  # starts worse by less than this are as likely, and so many are tried of each hull
 HOPELESS = 0.1  # half way, patches that are worse by more go no farther
 SAME = 0.01  # of the length, that two patches half way are apart by on average: they end as one
-SEARCHED_VIEWS = 12  # of a leaf, spread evenly, that starts are compared in
+SEARCHED_VIEWS = 12  # of a leaf, evenly spread, that starts are compared in
 WRONG_SHARE = 0.25  # of the median share of voxels in a mask: with less of them it is another leaf's
 MOST_WRONG = 0.34  # of a leaf's masks
 BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
@@ -72,7 +73,7 @@ def fit_surfaces(
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
 
-    An instance that more than `most_views` views show is fitted to that many of them, spread evenly over their order.
+    An instance that more than `most_views` views show is fitted to that many of them, see `spread_views`.
     Inputs may be on any device; the work is done on the CPU, and surfaces are there.
 
     Args:
@@ -111,7 +112,7 @@ def fit_surfaces(
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
-        kept = known[instance].views if instance in known else spread_views(views, most_views)
+        kept = known[instance].views if instance in known else views[spread_views(cameras[views], most_views)]
         members = members.select(torch.isin(members.view_index, kept))
         stacks[instance] = _stack(members, cameras, frames, instance=instance)
         if instance in known:
@@ -147,13 +148,6 @@ def _ids(instance_ids: Tensor) -> list[int]:
     return instance_ids[instance_ids > 0].unique().tolist()
 
 
-def spread_views(views: Tensor, most: int) -> Tensor:
-    """At most so many of the views (S,), the first one and others at even distances in their order."""
-    if len(views) <= most:
-        return views
-    return views[torch.arange(most) * len(views) // most]
-
-
 def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -> list[np.ndarray]:
     """V frames (H, W) int32: the instance that each pixel shows, higher numbers for unmatched regions, 0 = none."""
     last = int(instance_ids.max()) if len(instance_ids) else 0
@@ -182,13 +176,23 @@ def _find_start(masks: MaskStack) -> tuple[MaskStack, Floats | None]:
         if not is_right.all():
             masks = masks.select(is_right)
             hull = carve_hull(masks)
-    few = masks.select(np.isin(masks.views, spread_views(torch.from_numpy(masks.views), SEARCHED_VIEWS)))
+    if not len(hull.points):
+        return masks, None
+    few = _few_views(masks, hull.points.mean(0))
     found = _Found()
     for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
         if not found.is_good:
             for starts in _start_groups(few, replace(hull, voxels=hull.voxels[keep])):
                 found = found if found.is_good else _try_starts(few, starts, found)
     return masks, found.patch
+
+
+def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
+    """At most SEARCHED_VIEWS of the views, evenly spread around the middle of the leaf."""
+    matrices, shifts = masks.px_from_world[:, :, :3], masks.px_from_world[:, :, 3:]
+    ways = -np.linalg.solve(matrices, shifts)[..., 0] - middle
+    chosen = spread_directions(ways / np.linalg.norm(ways, axis=1, keepdims=True), SEARCHED_VIEWS)
+    return masks.select(np.isin(np.arange(len(masks)), chosen))
 
 
 @dataclass(frozen=True, eq=False)
