@@ -29,7 +29,7 @@ def write_all(folder: Path) -> None:
         entries = [_sam_entry(mask) for mask in of_view]
         _write(folder / "sam" / f"{scene.views[view].name}.json", _json(entries))
     _write(folder / "cvat" / "instances_default.json", _json(_coco(scene, masks, "{name}.jpg")))
-    roboflow = _coco(scene, masks, "{name}_jpg.rf.0123456789abcdef.jpg")
+    roboflow = _roboflow(_coco(scene, masks, "{name}_jpg.rf.0123456789abcdef.jpg"))
     _write(folder / "roboflow" / "_annotations.coco.json", _json(roboflow))
     cameras, images = _colmap(scene)
     _write(folder / "colmap" / "sparse" / "0" / "cameras.txt", cameras)
@@ -57,7 +57,30 @@ def _sam_entry(mask: np.ndarray) -> dict[str, Any]:
     """One mask of SAM2AutomaticMaskGenerator(output_mode="coco_rle")."""
     encoded = run_lengths.encode(np.asfortranarray(mask))
     entry = {"segmentation": {"size": encoded["size"], "counts": encoded["counts"].decode()}, "area": int(mask.sum())}
-    return entry | {"bbox": run_lengths.toBbox(encoded).tolist(), "predicted_iou": 0.95, "stability_score": 0.97}
+    height, width = mask.shape
+    row, column = np.argwhere(mask)[0].tolist()
+    entry |= {"bbox": run_lengths.toBbox(encoded).tolist(), "predicted_iou": 0.95, "point_coords": [[column, row]]}
+    return entry | {"stability_score": 0.97, "crop_box": [0, 0, width, height]}
+
+
+def sam_entries(labels: np.ndarray) -> list[dict[str, Any]]:
+    """What SAM 2 finds in a photo with these leaves (H, W): background, the whole plant, leaves and halves of them."""
+    masks = [labels == 0, labels > 0]
+    for number in np.unique(labels[labels > 0]):
+        leaf = labels == number
+        masks += [leaf, leaf & (np.arange(leaf.shape[1]) < np.argwhere(leaf)[:, 1].mean())]
+    return [_sam_entry(mask.astype(np.uint8)) for mask in masks]
+
+
+def write_cellpose(folder: Path) -> None:
+    """What `cellpose --save_png --save_outlines` leaves beside the photos of the shipped plant, pickles included."""
+    for path in sorted((demo_scene() / "masks").glob("*.png")):
+        labels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        labels = np.unique(labels, return_inverse=True)[1].reshape(labels.shape).astype(np.uint16)
+        cv2.imwrite(str(folder / f"{path.stem}_cp_masks.png"), labels)
+        (folder / f"{path.stem}_cp_outlines.txt").write_text("12,40,13,40,13,41\n")
+        about: Any = {"filename": f"images/{path.stem}.jpg", "masks": labels, "flows": [], "diameter": 30.0}
+        np.save(folder / f"{path.stem}_seg.npy", about)
 
 
 def _coco(scene: Scene, masks: dict[int, list[np.ndarray]], file_name: str) -> dict[str, Any]:
@@ -73,6 +96,26 @@ def _coco(scene: Scene, masks: dict[int, list[np.ndarray]], file_name: str) -> d
             entry = {"id": len(annotations) + 1, "image_id": number, "category_id": 1, "iscrowd": 0}
             annotations.append(entry | {"segmentation": polygons, "area": int(mask.sum())})
     return {"images": images, "annotations": annotations, "categories": [{"id": 1, "name": "leaf"}]}
+
+
+def _roboflow(coco: dict[str, Any]) -> dict[str, Any]:
+    """The same as Roboflow writes it: all numbers from 0 on, the first category is the project's."""
+    images = [
+        each
+        | {
+            "id": each["id"] - 1,
+            "license": 1,
+            "extra": {"name": each["file_name"].replace("_", ".", 1).partition(".rf")[0]},
+        }
+        for each in coco["images"]
+    ]
+    annotations = [each | {"id": each["id"] - 1, "image_id": each["image_id"] - 1} for each in coco["annotations"]]
+    categories = [
+        {"id": 0, "name": "leaves", "supercategory": "none"},
+        {"id": 1, "name": "leaf", "supercategory": "leaves"},
+    ]
+    about = {"info": {"year": "2026", "version": "1"}, "licenses": [{"id": 1, "name": "CC BY 4.0"}]}
+    return about | {"categories": categories, "images": images, "annotations": annotations}
 
 
 def _colmap(scene: Scene) -> tuple[str, str]:

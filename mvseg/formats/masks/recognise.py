@@ -13,9 +13,10 @@ from mvseg.formats.find_views import base_name, find_views, list_some
 from mvseg.scene import Scene
 
 # Endings of files that are named after their photo; longer ones first, since `_seg.npy` ends on `.npy`.
+CELLPOSE = "cellpose's label images"
 ENDINGS = {
-    "_cp_masks.png": "cellpose's label images",
-    "_cp_masks.tif": "cellpose's label images",
+    "_cp_masks.png": CELLPOSE,
+    "_cp_masks.tif": CELLPOSE,
     "_seg.npy": "cellpose",
     ".png": "label images",
     ".tif": "label images",
@@ -26,9 +27,9 @@ ENDINGS = {
 }
 ONE_PER_MASK = "one image per mask"
 # The first of several that fit as many photos is taken: plain images come late, since they may be photos.
-KINDS = ("NumPy arrays", "cellpose's label images", "cellpose", "JSON", "YOLO", "label images", ONE_PER_MASK)
+KINDS = ("NumPy arrays", CELLPOSE, "cellpose", "JSON", "YOLO", "label images", ONE_PER_MASK)
 # In these kinds, a photo without leaves has a file, too.
-COMPLETE = ("NumPy arrays", "cellpose", "cellpose's label images", "label images")
+COMPLETE = ("NumPy arrays", "cellpose", CELLPOSE, "label images")
 NUMBERED = re.compile(r"(?P<photo>.+?)[_-](?:mask[_-]?)?\d+$", re.IGNORECASE)
 Files = tuple[tuple[Path, ...], ...]  # of each view
 EXPECTED = "expected a folder of label PNGs or a COCO .json file, or another kind of docs/formats.md"
@@ -78,6 +79,8 @@ def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
     if not counts:
         return _lone_coco(scene, masks, paths, unclear=tuple(unclear.values()))
     kind = max(counts, key=lambda each: counts[each])
+    if kind == CELLPOSE and counts.get("cellpose", 0) <= counts[kind]:
+        counts.pop("cellpose", None)  # its own files of the same masks
     others = [f"{each} for {count}" for each, count in counts.items() if each != kind]
     others += [f"{each} ({reason})" for each, reason in unclear.items()]
     if others:
@@ -167,7 +170,7 @@ def _complete(scene: Scene, folder: Path, *, kind: str, files: Files) -> Files:
 def _name_kind(kind: str, files: Files) -> str:
     """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not."""
     if kind != "JSON":
-        return "label images" if kind == "cellpose's label images" else kind
+        return "label images" if kind == CELLPOSE else kind
     first = next(paths[0] for paths in files if paths)
     try:
         return "labelme" if b'"shapes"' in first.read_bytes() else "SAM"
