@@ -17,6 +17,7 @@ from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.results.overlay import instance_color
 from mvseg.results.result import Result
+from mvseg.results.shapes_file import SURFACES_FILE, VOXELS_FILE, write_surfaces, write_voxels
 from mvseg.scene import Scene
 from mvseg.traits.measure import Traits
 from mvseg.traits.table import format_number, write_long, write_wide
@@ -32,11 +33,16 @@ METRES = {
 
 
 def write_plant(result: Result, folder: Path) -> None:
-    """Write leaves/*.ply, scene.glb and, where traits were measured, traits.csv and traits_wide.csv.
+    """Write surfaces.npz, voxels.npz, leaves/*.ply, scene.glb and, where traits were measured, traits.csv and
+    traits_wide.csv.
 
     Meshes are of credible surfaces, for other instances of voxels. The voxels of a leaf that has both get a file of
     their own.
     """
+    if result.surfaces is not None:
+        write_surfaces(folder / SURFACES_FILE, result.surfaces)
+    if result.voxels:
+        write_voxels(folder / VOXELS_FILE, result.voxels)
     (folder / "leaves").mkdir()
     meshes, colors = {}, {}
     for instance in range(1, result.matching.num_instances + 1):

@@ -1,0 +1,128 @@
+"""Shapes as arrays: surfaces.npz and voxels.npz hold them exactly, for programs that read a result.
+
+Nothing is pickled. Arrays of several leaves are stacked in the order of their ids; what has another length for each leaf
+stands one after another, and an array `num_...` says how many are whose.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from mvseg.errors import InputError
+from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.reconstruction.voxels import VoxelGrid
+
+SURFACES_FILE, VOXELS_FILE = "surfaces.npz", "voxels.npz"
+
+
+def write_surfaces(path: Path, surfaces: Mapping[int, LeafSurface]) -> None:
+    """Write surfaces, those that are not credible or do not exist (NaN) included; `read_surfaces` gives them back.
+
+    Arrays of N leaves: `leaf` (N,) int64, their ids; `coefficients` (N, 26, 3) and `covariance` (N, 78, 78) float64,
+    `is_oriented` (N,) bool, see `LeafSurface`; `num_views` (N,) int64, and one after another `views` int64,
+    `residual_px` and `iou` float64; `num_reasons` (N,) int64, and one after another `reasons`, text.
+    """
+    leaves = sorted(surfaces)
+    own = [surfaces[leaf] for leaf in leaves]
+    reasons = [each.quality.reasons for each in own]
+    np.savez_compressed(
+        path,
+        leaf=np.array(leaves, np.int64),
+        coefficients=_stack((each.coefficients for each in own), (NUM_COEFFICIENTS, 3)),
+        covariance=_stack((each.covariance for each in own), (3 * NUM_COEFFICIENTS,) * 2),
+        is_oriented=np.array([each.is_oriented for each in own], bool),
+        num_views=np.array([len(each.views) for each in own], np.int64),
+        views=np.concatenate([np.zeros(0, np.int64), *(each.views.cpu().numpy() for each in own)]),
+        residual_px=np.concatenate([np.zeros(0), *(each.residual_px.cpu().numpy() for each in own)]),
+        iou=np.concatenate([np.zeros(0), *(each.iou.cpu().numpy() for each in own)]),
+        num_reasons=np.array([len(each) for each in reasons], np.int64),
+        reasons=np.array(sum(reasons, ()), np.str_),
+    )
+
+
+def read_surfaces(path: Path) -> dict[int, LeafSurface]:
+    """{instance id: surface} of a file that `write_surfaces` wrote.
+
+    Raises:
+        InputError: it is none.
+    """
+    arrays = _read(path)
+    try:
+        views, residuals, ious = (_split(arrays[name], arrays["num_views"]) for name in ("views", "residual_px", "iou"))
+        reasons = _split(arrays["reasons"], arrays["num_reasons"])
+        coefficients = arrays["coefficients"].reshape(-1, NUM_COEFFICIENTS, 3)
+        covariance = arrays["covariance"].reshape(-1, *(3 * NUM_COEFFICIENTS,) * 2)
+        rows = zip(coefficients, covariance, views, residuals, ious, arrays["is_oriented"], reasons, strict=True)
+        return {
+            int(leaf): LeafSurface(
+                *(torch.from_numpy(numbers.copy()) for numbers in row[:5]),
+                is_oriented=bool(row[5]),
+                quality=Quality(tuple(row[6].tolist())),
+            )
+            for leaf, row in zip(arrays["leaf"], rows, strict=True)
+        }
+    except (KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: holds no surfaces that mvseg wrote ({error})") from None
+
+
+def write_voxels(path: Path, voxels: Mapping[int, VoxelGrid]) -> None:
+    """Write voxels, see `VoxelGrid`; `read_voxels` gives them back. Arrays of N leaves: `leaf`, `num_views` (N,) int64,
+    `origin` (N, 3), `voxel_size`, `threshold` (N,) float64; and `votes_K` (X, Y, Z) float32 of leaf K."""
+    leaves = sorted(voxels)
+    own = [voxels[leaf] for leaf in leaves]
+    votes = {f"votes_{leaf}": voxels[leaf].votes.cpu().numpy() for leaf in leaves}
+    np.savez_compressed(
+        path,
+        leaf=np.array(leaves, np.int64),
+        num_views=np.array([each.num_views for each in own], np.int64),
+        origin=_stack((each.origin for each in own), (3,)),
+        voxel_size=np.array([each.voxel_size for each in own], np.float64),
+        threshold=np.array([each.threshold for each in own], np.float64),
+        **votes,
+    )
+
+
+def read_voxels(path: Path) -> dict[int, VoxelGrid]:
+    """{instance id: voxels} of a file that `write_voxels` wrote.
+
+    Raises:
+        InputError: it is none.
+    """
+    arrays = _read(path)
+    try:
+        return {
+            int(leaf): VoxelGrid(
+                origin=torch.from_numpy(arrays["origin"][row].copy()),
+                voxel_size=float(arrays["voxel_size"][row]),
+                votes=torch.from_numpy(arrays[f"votes_{leaf}"]),
+                num_views=int(arrays["num_views"][row]),
+                threshold=float(arrays["threshold"][row]),
+            )
+            for row, leaf in enumerate(arrays["leaf"].tolist())
+        }
+    except (IndexError, KeyError, TypeError, ValueError) as error:
+        raise InputError(f"{path}: holds no voxels that mvseg wrote ({error})") from None
+
+
+def _stack(tensors: Iterable[torch.Tensor], shape: Sequence[int]) -> NDArray[np.float64]:
+    return np.array([each.cpu().numpy() for each in tensors], np.float64).reshape(-1, *shape)
+
+
+def _split(values: NDArray[np.generic], counts: NDArray[np.int64]) -> list[NDArray[np.generic]]:
+    if counts.sum() != len(values):
+        raise ValueError(f"{len(values)} numbers, expected {counts.sum()}")
+    return np.split(values, counts.cumsum()[:-1]) if len(counts) else []
+
+
+def _read(path: Path) -> dict[str, NDArray[np.generic]]:
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            return dict(file)
+    except Exception as error:  # zipfile, zlib and NumPy raise many kinds at broken files
+        raise InputError(f"{path}: is no NumPy archive that mvseg wrote ({' '.join(str(error).split())})") from None
