@@ -215,7 +215,7 @@ def correct(case: Case, order: str, out: Path) -> list[Record]:
         record |= {f"alone_{name}": value for name, value in alone.items()}
         record["harmed"] = len(right - look.right - touched)
         right, touched = look.right, frozenset[int]().union(*(each.leaves for each in chosen))
-        record |= {"idle": sum(fate.fate != APPLIED for fate in state.fates), "seconds": round(seconds, 1)}
+        record |= {"idle": sum(fate.fate != APPLIED for fate in state.result().fates), "seconds": round(seconds, 1)}
         records.append(record | {"is_last": int(not chosen)})
         for each in chosen:
             edits += tuple(edit.model_copy(update={"by": each.name}) for edit in each.edits)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import json
 import os
 import random
 import signal
@@ -21,6 +20,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
+from mvseg.results.run_record import load_run
 from mvseg.simulation.dataset import Preset, list_scenes, write_dataset
 from mvseg.system.file_hash import hash_files
 
@@ -53,7 +53,7 @@ def check(out: Path, *, was_killed: bool) -> int:
     """How many results are there, all whole."""
     results = [path.parent for path in out.glob("[!._]*/run.json")]
     for result in results:
-        listed = json.loads((result / "run.json").read_text())["files"]
+        listed = load_run(result).files
         assert {name: hash_files(result / name) for name in listed} == listed, result
     whole = {path.name for path in results} | {"_batch"}
     others = [path.name for path in out.iterdir() if path.name not in whole]

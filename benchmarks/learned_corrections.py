@@ -14,7 +14,6 @@ import json
 import sys
 import time
 import warnings
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +34,11 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
-from mvseg.masks import Masks, Origin
+from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import Regions, mask_box, stack_regions
 from mvseg.results.folder import save_result
+from mvseg.results.read import load_result
 from mvseg.results.result import Result
 from mvseg.scene import Scene
 from mvseg.training.data import SampleList, list_samples
@@ -47,17 +47,6 @@ from mvseg.training.validation import detect_and_label
 
 EVERY = 3  # of the photos, one is corrected
 SIZE = 800  # longer side at which photos are looked at, whatever size the weights were trained at
-
-
-def read_masks(result: Path, scene: Scene) -> Masks:
-    """The table of a result, from its instances.json."""
-    content = json.loads((result / "instances.json").read_text(encoding="utf-8"))
-    rows = sorted(content["annotations"], key=lambda row: int(row["image_id"]))
-    regions = _as_regions([row | {"image_id": int(row["image_id"]) - 1} for row in rows], scene.cameras.sizes.tolist())
-    ids, scores = (torch.tensor([row[name] for row in rows]) for name in ("instance_id", "match_score"))
-    masks = Masks.of(regions, ids, scores, origin=Origin.DETECTED)
-    is_shown = torch.tensor([bool(row.get("from_other_views")) for row in rows])
-    return replace(masks, origin=torch.where(is_shown, int(Origin.OTHER_VIEWS), masks.origin))
 
 
 def correct_photos(masks: Masks, truth: list[Labels], *, scene: Scene, names: set[str]) -> tuple[Edit, ...]:
@@ -144,7 +133,7 @@ def main() -> None:
     truth, names = true_maps(args.scene, scene), [view.name for view in scene.views]
     path = args.out / "corrections.json"
     if not (args.out / "corrected").exists():
-        masks = read_masks(args.result, scene)
+        masks = load_result(args.result).masks
         corrections = Corrections(correct_photos(masks, truth, scene=scene, names=set(names[::EVERY])))
         args.out.mkdir(parents=True, exist_ok=True)
         write_corrections(path, corrections)

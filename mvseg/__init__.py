@@ -55,6 +55,8 @@ if TYPE_CHECKING:
     from mvseg.reconstruction.voxels import reconstruct_instances as reconstruct_instances
     from mvseg.regions import Regions as Regions
     from mvseg.regions import regions_from_label_maps as regions_from_label_maps
+    from mvseg.results.read import load_result as load_result
+    from mvseg.results.same_result import assert_same_result as assert_same_result
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
     from mvseg.system.worker_pool import start_workers as start_workers
@@ -101,6 +103,8 @@ _HOME = {
     "checks.check_scene": ("Check", "check_scene"),
     "config": ("RunConfig",),
     "corrections.file": ("Corrections", "load_corrections"),
+    "results.read": ("load_result",),
+    "results.same_result": ("assert_same_result",),
     "pipeline": ("run_scene",),
     "tracking.track": ("LeafLink", "Tracks", "track_leaves"),
     "system.worker_pool": ("start_workers",),

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import ENOUGH_VIEWS, RunConfig
-from mvseg.corrections.apply import apply, apply_everywhere
+from mvseg.corrections.apply import Corrected, apply, apply_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for, named_views
 from mvseg.errors import InputWarning, warn
@@ -75,6 +75,7 @@ class State(Result):
         found: by the detector; None: the masks were given.
         unedited: what is known without a person's edits; None: `correct` finds it where it is needed.
         shown: the masks that the edits were applied to.
+        corrected: what edits left; None without any.
         cache, workers, progress: see `run_scene`.
         colors: of leaves, see `leaf_colors`; None: those of the masks, wherever a stage asks.
         fit: rough surfaces of masks, see `choose_leaves`; None: `fit_roughly`.
@@ -86,6 +87,7 @@ class State(Result):
     found: Found | None = None
     unedited: Unedited | None = None
     shown: Masks | None = None
+    corrected: Corrected | None = None
     cache: Path | None = None
     workers: ProcessPoolExecutor | None = None
     progress: bool = False
@@ -105,7 +107,8 @@ class State(Result):
 
     def result(self) -> Result:
         """What the run gives back."""
-        return Result(**{each.name: getattr(self, each.name) for each in fields(Result)})
+        result = Result(**{each.name: getattr(self, each.name) for each in fields(Result)})
+        return result if self.corrected is None else replace(result, fates=self.corrected.fates)
 
 
 Stage = Callable[[State], State]

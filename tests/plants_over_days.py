@@ -2,17 +2,29 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
-import trimesh
+import torch
 from scipy.spatial.transform import Rotation
 
-from mvseg.reconstruction.surface.leaf_patch import grid_triangles, grid_vertices
+from known_leaves import make_surface
+from mvseg.masks import Masks
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.reconstruction.surface.leaf_patch import patch_grid
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE
+from mvseg.regions import regions_from_label_maps
+from mvseg.results.folder import save_result
+from mvseg.results.result import Instances, Result
+from mvseg.scene import Cameras, Scene, View
 from mvseg.tracking.dates import ROWS, Floats, Number, PlantOnDate, SeenLeaf, resample
 from mvseg.tracking.track import Tracks
+from mvseg.traits.filters import Rejection
+from mvseg.traits.leaf import Measurement, missing
+from mvseg.traits.measure import LeafTraits, Traits
+from mvseg.traits.ontology import LEAF_TRAITS
 
 Blades = dict[int, Floats]  # {true id: (rows, 3, 3) edge, midrib, edge from base to tip}
 
@@ -72,37 +84,50 @@ def true_tracks(tracks: Tracks, truths: Sequence[Sequence[int]]) -> dict[int, se
     return found
 
 
-def write_result(folder: Path, blades: Mapping[int, Floats], *, unit: str = "mm", view: str = "000") -> None:
-    """What tracking reads of a result folder, with leaves numbered as they are."""
-    from mvseg.formats.label_png import write_label_png
-    from mvseg.formats.mesh import write_ply
-
-    (folder / "leaves").mkdir(parents=True)
-    rows = ["plant,leaf,trait,value,sd,unit,method,ontology", f"p,,total_leaf_area,5000,50,{unit}^2,surface,"]
-    labels = np.zeros((40, 20 * len(blades)), np.uint16)
+def write_result(
+    folder: Path,
+    blades: Mapping[int, Floats],
+    *,
+    unit: str = "mm",
+    view: str = "000",
+    shapeless: Collection[int] = (),
+    rejected: Mapping[int, str] = MappingProxyType({}),
+) -> None:
+    """A result folder of one view, with leaves numbered as they are; some have no shape, some are rejected."""
+    labels, surfaces, leaves = np.zeros((40, 20 * len(blades)), np.int64), {}, []
     for number, blade in blades.items():
-        fine = np.stack([np.interp(np.linspace(0, 1, MESH_SHAPE[0]), np.linspace(0, 1, ROWS), blade[:, c, axis])
-                         for c in range(3) for axis in range(3)], 1).reshape(MESH_SHAPE[0], 3, 3)  # fmt: skip
-        across = np.linspace(-1, 1, MESH_SHAPE[1])[None, :, None]
-        grid = fine[:, 1:2] + np.where(
-            across < 0, -across * (fine[:, :1] - fine[:, 1:2]), across * (fine[:, 2:] - fine[:, 1:2])
-        )
-        mesh = trimesh.Trimesh(grid_vertices(grid), grid_triangles(*MESH_SHAPE), process=False)
-        write_ply(folder / "leaves" / f"leaf_{number:03d}.ply", mesh, (0, 255, 0), instance_id=number)
-        length = float(np.linalg.norm(np.diff(blade[:, 1], axis=0), axis=1).sum())
-        for trait, value, of in (
-            ("length", length, unit),
-            ("area", 20 * length, f"{unit}^2"),
-            ("azimuth", 10, "degree"),
-        ):
-            rows.append(f"p,{number},{trait},{value:.6g},{0.02 * value:.6g},{of},surface,")
         labels[10:30, 20 * number - 18 : 20 * number - 2] = number
-    (folder / "traits.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
-    (folder / "run.json").write_text(
-        f'{{"scene": "p", "inputs": {{}}, "traits": {{"unit": "{unit}", "up": [0, 0, 1]}}, "files": {{}}}}',
-        encoding="utf-8",
-    )
-    write_label_png(folder / "labels" / f"{view}.png", labels)
+        if number not in shapeless:
+            surfaces[number] = make_surface(fit_blade(blade), num_views=1)
+        length = float(np.linalg.norm(np.diff(blade[:, 1], axis=0), axis=1).sum())
+        measured = {"length": length, "area": 20 * length, "azimuth": 10.0} if number not in rejected else {}
+        reason = f"rejected: {rejected[number]}" if number in rejected else ""
+        numbers = {trait.name: missing(reason or "not measured") for trait in LEAF_TRAITS}
+        numbers |= {name: Measurement(value, 0.02 * value, "surface") for name, value in measured.items()}
+        leaves.append(LeafTraits(
+            leaf=number, numbers=numbers, method="none" if number in shapeless else "surface",
+            reasons=(reason,) if reason else (), rejection=Rejection.of(rejected[number]) if reason else None,
+        ))  # fmt: skip
+    regions = regions_from_label_maps([labels])
+    whole = {"total_leaf_area": Measurement(5000.0, 50.0, "surface")}
+    traits = Traits(plant="p", unit=unit, leaves=tuple(leaves), whole=whole, up=(0.0, 0.0, 1.0))
     height, width = labels.shape
-    image = f'{{"id": 1, "file_name": "{view}.png", "name": "{view}", "width": {width}, "height": {height}}}'
-    (folder / "instances.json").write_text(f'{{"images": [{image}], "annotations": []}}', encoding="utf-8")
+    K = torch.tensor([[[100.0, 0, width / 2], [0, 100, height / 2], [0, 0, 1]]])
+    sizes = torch.tensor([[width, height]])
+    cameras = Cameras(K=K, R=torch.eye(3)[None], t=torch.zeros(1, 3), sizes=sizes)
+    scene = Scene("p", (View(view, folder.parent / f"{view}.png"),), cameras, unit=unit, up=(0.0, 0.0, 1.0))
+    matching = Matching(Masks.of(regions, regions.labels), MatchReport("truth"))
+    instances = Instances(surfaces=surfaces, voxels={}, traits=traits)
+    save_result(Result(scene=scene, matching=matching, instances=instances), folder, report=False)
+
+
+def fit_blade(blade: Floats) -> Floats:
+    """(26, 3) of the patch nearest to the edges and the midrib (rows, 3, 3) of a leaf."""
+    rows, places = np.linspace(0, 1, MESH_SHAPE[0]), np.linspace(0, 1, len(blade))
+    left, middle, right = (
+        np.stack([np.interp(rows, places, blade[:, column, axis]) for axis in range(3)], 1) for column in range(3)
+    )
+    across = np.linspace(-1, 1, MESH_SHAPE[1])[:, None, None]
+    grid = middle + np.where(across < 0, -across * (left - middle), across * (right - middle))
+    points = grid.swapaxes(0, 1).reshape(-1, 3)
+    return np.linalg.lstsq(patch_grid(*MESH_SHAPE).basis, points, rcond=None)[0]

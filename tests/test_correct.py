@@ -296,7 +296,8 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     assert "the masks of this result are gone" in problem_of({}, masks=str(tmp_path / "nowhere"))
     for options in ({"sparkle": 1}, {"match": {"sparkle": 1}}, {"match": {"method": 7}}):
         assert "options that this version does not have" in problem_of({"mvseg": "9.9"}, **options)
-    assert "does not say which scene" in problem_of({"config": []})
+    assert "does not say which scene" in problem_of({"config": {}})
+    assert "run.json: config: " in problem_of({"config": []})
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(InputError, match="not a whole JSON file"):
         OpenResult(tmp_path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -13,7 +12,7 @@ from mvseg.batch.status import TABLES, Status
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.system.atomic import folder_whole
-from mvseg.traits.table import as_cells, write_csv
+from mvseg.traits.table import COLUMNS, as_cells, read_csv, wide_columns, write_csv
 
 
 def write_tables(
@@ -34,8 +33,8 @@ def write_tables(
     failures = [as_cells(scene.name, str(scene.folder), status.sentence)
                 for scene, status in scenes if status.state == "failed"]  # fmt: skip
     with folder_whole(folder) as partial:
-        for name in ("traits.csv", "traits_wide.csv"):
-            _join(partial / name, done, out, carried=carried)
+        for name, columns in (("traits.csv", COLUMNS), ("traits_wide.csv", wide_columns())):
+            _join(partial / name, columns, done, out, carried=carried)
         write_csv(partial / "summary.csv", ["scene", *carried, *SUMMARY_COLUMNS], summary)
         write_csv(partial / "failures.csv", ("scene", "folder", "sentence"), failures)
         counts = {"scenes": len(scenes), "done": len(done), "failed": len(failures)}
@@ -51,17 +50,9 @@ def read_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str,
         InputError: `batch` is not the --out of a finished batch, or its table is broken.
     """
     path = batch / TABLES / name
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            rows = list(csv.DictReader(file, restkey="", restval=""))
-    except OSError as error:
-        raise InputError(f"{batch}: is not an output of mvseg batch ({TABLES}/{name}: {error.strerror})") from None
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise InputError(f"{path}: is not a CSV table ({error})") from None
-    missing = [column for column in columns if rows and column not in rows[0]]
-    if missing:
-        raise InputError(f"{path}: has no column '{missing[0]}', expected the table of a batch")
-    return rows
+    if not path.is_file():
+        raise InputError(f"{batch}: is not an output of mvseg batch ({TABLES}/{name} is missing)")
+    return read_csv(path, columns)
 
 
 def _about(scene: BatchScene) -> list[str | int]:
@@ -76,20 +67,14 @@ def _outcome(status: Status) -> list[str | int]:
     return as_cells(status.state, *counts, f"{status.seconds:.1f}", peak, *texts)
 
 
-def _join(path: Path, scenes: Sequence[BatchScene], out: Path, *, carried: Sequence[str]) -> None:
-    """Join the tables of the scenes, behind the cells of the batch's table."""
-    columns: list[str] = []
-    rows: list[list[str | int]] = []
-    for scene in scenes:
-        source = out / scene.name / path.name
-        try:
-            with source.open(newline="", encoding="utf-8") as file:
-                found, *lines = csv.reader(file)
-        except (OSError, ValueError, csv.Error) as error:
-            raise InputError(f"{source}: cannot be read ({error}), expected the table of a result") from None
-        kept = [index for index, column in enumerate(found) if column not in carried]
-        if columns and [found[index] for index in kept] != columns:
-            raise InputError(f"{source}: has other columns than the results before it")
-        columns = [found[index] for index in kept]
-        rows += [[*_about(scene), *(line[index] for index in kept)] for line in lines]
-    write_csv(path, ["scene", *carried, *columns], rows)
+def _join(
+    path: Path, columns: Sequence[str], scenes: Sequence[BatchScene], out: Path, *, carried: Sequence[str]
+) -> None:
+    """Join the tables of the scenes, which have these columns, behind the cells of the batch's table."""
+    kept = [column for column in columns if column not in carried]
+    rows = [
+        [*_about(scene), *(row[column] for column in kept)]
+        for scene in scenes
+        for row in read_csv(out / scene.name / path.name, columns)
+    ]
+    write_csv(path, ["scene", *carried, *kept], rows)

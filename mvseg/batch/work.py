@@ -3,7 +3,6 @@ the scene's status."""
 
 from __future__ import annotations
 
-import json
 import threading
 import time
 import traceback
@@ -21,6 +20,7 @@ from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, check_out
+from mvseg.results.run_record import load_run
 from mvseg.runs.one_scene import find_masks, save_scene, solve_scene
 from mvseg.system.atomic import lock_folder, sweep_abandoned
 from mvseg.system.file_hash import hash_files
@@ -71,7 +71,7 @@ def _is_done(status: Status, result: Path) -> bool:
     run = result / RUN_FILE
     if status.state != "done" or not run.is_file() or hash_files(run) != status.result:
         return False
-    return all((result / name).is_file() for name in json.loads(run.read_bytes())["files"])
+    return all((result / name).is_file() for name in load_run(result).files)
 
 
 def _finish(

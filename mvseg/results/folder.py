@@ -8,32 +8,40 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
+from torch import Tensor
 from tqdm import tqdm
 
+from mvseg.corrections.file import dump_edits
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
-from mvseg.formats.lens import distort, opencv_distortion
+from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.photos import Photos
 from mvseg.formats.rig import write_rig
 from mvseg.masks import Origin
 from mvseg.results.earlier import replace_result
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
+from mvseg.results.photo_masks import labels_in_photo, mask_in_photo
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
-from mvseg.scene import Scene
+from mvseg.results.run_record import FORMAT
+from mvseg.scene import Scene, View
 
 REPORT_FILE = "report.html"
 CAMERAS_FILE = "cameras.json"
 CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED: "confirm"}  # the edit that made a mask
 
 
-def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: bool = False, report: bool = True) -> None:
+def save_result(
+    result: Result, out: Path, run: Mapping[str, Any] | None = None, *, progress: bool = False, report: bool = True
+) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
     The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.
@@ -41,7 +49,8 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
     Args:
         result: the result.
         out: the folder.
-        run: what goes into run.json besides timings and counts: version, config, inputs, warnings.
+        run: what goes into run.json besides timings and counts: version, config, inputs, warnings; None: what a result
+            that was loaded knows of its run.
         progress: show a progress bar over the views.
         report: write report.html, too.
 
@@ -49,8 +58,10 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         InputError: `out` cannot be written or holds something that is not a result (see `check_out`), or a photo is
             broken, or missing while others exist.
     """
-    run = run | describe_result(result)
-    with replace_result(out, run) as folder:
+    if run is None:
+        run = {} if result.run is None else result.run.as_json()
+    said = {**run, **describe_result(result)}
+    with replace_result(out, said) as folder:
         pictures = _write_images(result, folder, progress)
         _write_instances(result, folder, progress)
         if result.surfaces is not None or result.voxels is not None:
@@ -62,26 +73,55 @@ def save_result(result: Result, out: Path, run: dict[str, Any], *, progress: boo
         if report:
             from mvseg.results.report.page import write_report  # loads trimesh
 
-            write_report(folder / REPORT_FILE, result, pictures, run=run)
+            write_report(folder / REPORT_FILE, result, pictures, run=said)
 
 
 def describe_result(result: Result) -> dict[str, Any]:
-    """What run.json says of the outcome of a run: of matching, poses, traits and corrections; counts and timings."""
-    said: dict[str, Any] = {"matched_by": result.matching.method, "residual_px": result.matching.residual_px}
-    names = [view.name for view in result.scene.views]
-    said["views"] = {"taken": names, "left_out": list(result.views_left_out)}
+    """What run.json says of the outcome of a run: of the scene, matching, poses, traits and corrections; counts and
+    timings."""
+    report, scene = result.matching.report, result.scene
+    shares = None if report.view_explained is None else [_or_none(share) for share in report.view_explained.tolist()]
+    taken = [view.name for view in scene.views]
+    said: dict[str, Any] = {
+        "format": FORMAT,
+        "scene": scene.name,
+        "unit": scene.unit or None,
+        "up": scene.up,
+        "photos": str(_photos_folder(scene.views[0]).resolve()) if scene.views else None,
+        "views": {"taken": taken, "left_out": list(result.views_left_out)},
+        "mask_kind": result.mask_kind or None,
+        "matched_by": report.method,
+        "residual_px": report.residual_px,
+        "matching": {
+            "has_probabilities": report.has_probabilities,
+            "explained": report.explained,
+            "view_explained": shares,
+        },
+    }
     if (poses := result.poses) is not None:
-        residuals = [None if math.isnan(residual) else round(residual, 3) for residual in poses.residual_px]
+        residuals = [_or_none(round(residual, 3)) for residual in poses.residual_px]
         said["poses"] = {"refined": poses.is_refined, "residual_px": residuals}
     if (traits := result.traits) is not None:
         colors = {"colors": [asdict(correction) for correction in traits.corrections]} if traits.corrections else {}
         said["traits"] = {"unit": traits.unit or None, "up": traits.up, **colors, "rejected": traits.rejected}
+    if result.corrections is not None and result.corrections.edits:
+        said["edits"] = dump_edits(result.corrections.edits)
     if result.fates:
         said["corrections"] = [asdict(each) for each in result.fates]
     said["counts"] = {"regions": len(result.regions), "instances": result.matching.num_instances}
     if result.num_moved is not None:
         said["counts"]["moved"] = result.num_moved
     return said | {"seconds": {stage: round(wall, 3) for stage, wall in result.seconds.items()}}
+
+
+def _or_none(number: float) -> float | None:
+    return None if math.isnan(number) else number
+
+
+def _photos_folder(view: View) -> Path:
+    """The folder that the names of all views start from."""
+    parents = view.path.parents
+    return parents[min(view.name.count("/"), len(parents) - 1)]
 
 
 def _write_images(result: Result, folder: Path, progress: bool) -> list[Picture]:
@@ -92,9 +132,7 @@ def _write_images(result: Result, folder: Path, progress: bool) -> list[Picture]
     views = list(enumerate(scene.views))
     for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
         width, height = scene.cameras.sizes[index].tolist()
-        labels = masks.regions.label_map(index, masks.instance_ids, (width, height)).cpu().numpy().astype(np.uint16)
-        labels = distort(labels, view.lens, scene.cameras.K[index].cpu().numpy())
-        write_label_png(folder / "labels" / f"{view.name}.png", labels)
+        write_label_png(folder / "labels" / f"{view.name}.png", labels_in_photo(result, index))
         photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
         drawn = draw_overlay(photo, masks, view=index)
         tiles.append(draw_tile(photo, masks, view=index))
@@ -112,19 +150,25 @@ def _write_instances(result: Result, folder: Path, progress: bool) -> None:
     for index, view in enumerate(scene.views):
         width, height = scene.cameras.sizes[index].tolist()
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
-        images.append({"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height})
+        image = {"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height}
+        images.append(image | {"camera": _describe_camera(scene, index)})
     shown = tqdm(range(len(result.regions)), desc="masks", unit="mask", disable=not progress)
     write_coco(folder / "instances.json", images, [_annotate(result, region) for region in shown])
+
+
+def _describe_camera(scene: Scene, view: int) -> dict[str, Any]:
+    """The undistorted camera of a view, and the lens of its photo, if it has one."""
+    cameras, lens = scene.cameras, scene.views[view].lens
+    said = {"K": cameras.K[view].tolist(), "R": cameras.R[view].tolist(), "t": cameras.t[view].tolist()}
+    return said if lens is None else said | {"lens": {"model": lens.model_name, "params": list(lens.params)}}
 
 
 def _annotate(result: Result, region: int) -> dict[str, Any]:
     """The entry of one region in instances.json, without what COCO itself requires."""
     masks, view = result.masks, int(result.masks.view_index[region])
-    width, height = result.scene.cameras.sizes[view].tolist()
-    mask = masks.regions.mask(region, width, height).cpu().numpy().astype(np.uint8)
-    K = result.scene.cameras.K[view].cpu().numpy()
     instance, other = int(masks.instance_ids[region]), int(masks.second_ids[region])
     track = {"track_id": instance} if instance > 0 else {}
+    part, kind = masks.second_parts[region], int(masks.classes[region])
     origin, score = Origin(int(masks.origin[region])), float(masks.detection_scores[region])
     source: dict[str, Any] = {}
     if origin == Origin.GIVEN:
@@ -145,9 +189,29 @@ def _annotate(result: Result, region: int) -> dict[str, Any]:
         "match_score": round(float(masks.match_scores[region]), 4),
         **({"probability": round(chance, 4)} if (chance := _chance_of(result, instance)) is not None else {}),
         **source,
-        "segmentation": encode_mask(distort(mask, result.scene.views[view].lens, K)),
+        "segmentation": encode_mask(mask_in_photo(result, region)),
+        **_undistorted(result, region, view),
         **({"other_instance_id": other} if other > 0 else {}),
+        **({} if part is None else {"other_part": encode_mask(_in_frame(result, region, part))}),
+        **({"mask_class": kind} if kind != 1 else {}),
     }
+
+
+def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
+    """Of a photo with a lens, the mask that the stages work with, too: the way there and back moves pixels."""
+    if result.scene.views[view].lens is None:
+        return {}
+    width, height = result.scene.cameras.sizes[view].tolist()
+    return {"undistorted": encode_mask(result.regions.mask(region, width, height).cpu().numpy())}
+
+
+def _in_frame(result: Result, region: int, part: Tensor) -> NDArray[np.bool_]:
+    """(H, W) mask in the undistorted image, of pixels in the box of a region."""
+    width, height = result.scene.cameras.sizes[int(result.masks.view_index[region])].tolist()
+    x1, y1, x2, y2 = result.regions.boxes[region].tolist()
+    frame = np.zeros((height, width), bool)
+    frame[y1:y2, x1:x2] = part.numpy()
+    return frame
 
 
 def _chance_of(result: Result, instance: int) -> float | None:

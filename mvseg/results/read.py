@@ -1,37 +1,100 @@
-"""Reading a result folder back, with the true labels of its views."""
+"""A result folder read back: the only reader of one.
+
+What needs trimesh or scikit-image is imported where it is used: a result of ids alone does not need them.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
+import pycolmap
 import torch
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, FiniteFloat
+from torch import Tensor
 
-from mvseg.errors import InputError
-from mvseg.formats.coco import Rle, decode_rle
+from mvseg.corrections.file import FORMAT as EDITS_FORMAT
+from mvseg.corrections.file import parse_corrections
+from mvseg.errors import InputError, faults_of
+from mvseg.formats.coco import Rle, decode_crop, decode_rle
 from mvseg.formats.image_file import file_name_problem
-from mvseg.formats.json_file import Int64, Items, Pixels, read_json
+from mvseg.formats.json_file import Int64, Items, Matrix3, Pixels, Vector3, read_json
 from mvseg.formats.label_png import read_label_png
+from mvseg.formats.lens import undistort
+from mvseg.masks import Masks, MergedMask, Origin
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.results.folder import CORRECTED
+from mvseg.results.photo_masks import regions_in_photos
+from mvseg.results.result import Instances, Result
+from mvseg.results.run_record import RunRecord, find_place, load_run
+from mvseg.scene import Cameras, Scene, View
+
+if TYPE_CHECKING:  # loads trimesh and scikit-image
+    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+    from mvseg.reconstruction.voxels import VoxelGrid
+    from mvseg.traits.measure import Traits
+
+MOST_INSTANCES = 65534  # that 16 bits of a label image hold
+Box = tuple[int, int, int, int]
+
+
+class _Lens(BaseModel):
+    model: str
+    params: Items[FiniteFloat]
+
+
+class _Camera(BaseModel):
+    K: Matrix3
+    R: Matrix3
+    t: Vector3
+    lens: _Lens | None = None
 
 
 class _Image(BaseModel):
     id: int
     name: str
+    file_name: str
     width: Pixels
     height: Pixels
+    camera: _Camera | None = None
 
 
-class _Instance(BaseModel):
+class _Mask(BaseModel):
     image_id: int
-    instance_id: Int64
+    instance_id: int = Field(ge=-1, le=MOST_INSTANCES)
     segmentation: Rle
+    undistorted: Rle | None = None
+    match_score: float = Field(0.0, ge=0, le=1)
+    score: FiniteFloat = math.nan
+    probability: FiniteFloat | None = None
+    source_label: Int64 | None = None
+    from_other_views: bool = False
+    from_few_views: bool = False
+    corrected: Literal["outline", "split", "confirm"] | None = None
+    other_instance_id: int = Field(-1, ge=-1, le=MOST_INSTANCES)
+    other_part: Rle | None = None
+    mask_class: Int64 = 1
+
+    @property
+    def origin(self) -> Origin:
+        if self.corrected is not None:
+            return {edit: origin for origin, edit in CORRECTED.items()}[self.corrected]
+        if self.source_label is not None:
+            return Origin.GIVEN
+        if self.from_few_views:
+            return Origin.FEW_VIEWS
+        return Origin.OTHER_VIEWS if self.from_other_views else Origin.DETECTED
 
 
 class _Instances(BaseModel):
     images: Items[_Image]
-    annotations: Items[_Instance]
+    annotations: Items[_Mask]
 
 
 def find_result(folder: Path) -> Path:
@@ -49,6 +112,56 @@ def find_result(folder: Path) -> Path:
     return inside[0] if inside else folder
 
 
+def load_result(folder: Path | str) -> Result:
+    """The result in a folder that mvseg wrote; neither the scene folder nor the photos are opened.
+
+    Numbers are as exact as the files: cameras, surfaces, voxels and masks come back as they were, match scores and
+    probabilities with four decimals, traits with six digits. What only the run needed is not in the folder: `starts`
+    of the instances, and the candidates `left` out. `Scene.views` name the photos where they are now, if they moved
+    together with the result.
+
+    A result of mvseg 0.2 is read, too. It holds no cameras, so the scene folder is opened; its surfaces are rebuilt
+    from the meshes in leaves/, without covariance; leaves that have voxels only come without them.
+
+    Args:
+        folder: of one scene, as `mvseg infer`, `mvseg match` and `mvseg batch` write it.
+
+    Returns:
+        The result, on the CPU; `Result.run` is what its run.json says.
+
+    Raises:
+        InputError: this is no result; it has a newer format than this version knows; a file is missing or broken.
+    """
+    folder = Path(folder)
+    path = folder / "instances.json"
+    if not path.is_file():
+        raise InputError(f"{path}: is missing, expected a result folder")
+    run, content = load_run(folder), read_json(path, _Instances)
+    with faults_of(path):
+        scene = _scene_of(folder, run, content.images)
+        masks = _table_of(content, scene)
+    traits = _traits_of(folder, run, scene)
+    poses = None
+    if run.poses is not None:
+        before, after = (math.nan if each is None else each for each in run.poses.residual_px)
+        poses = RefinedPoses(cameras=scene.cameras, is_refined=run.poses.refined, residual_px=(before, after))
+    source = run.config.get("corrections")
+    edits = {"format": EDITS_FORMAT, "edits": run.edits}
+    return Result(
+        scene=scene,
+        matching=Matching(masks, _report_of(run)),
+        instances=_instances_of(folder, run, content, masks=masks, traits=traits),
+        poses=poses,
+        seconds=run.seconds,
+        mask_kind=run.mask_kind or "",
+        num_moved=run.counts.get("moved"),
+        views_left_out=run.views.get("left_out", ()),
+        corrections=parse_corrections(edits, None if source is None else Path(source)) if run.edits else None,
+        fates=run.corrections,
+        run=run,
+    )
+
+
 def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]]:
     """The masks and ids of a result, and the true labels of its views.
 
@@ -63,31 +176,145 @@ def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]
     Raises:
         InputError: the result or the truth is missing or broken.
     """
-    path = folder / "instances.json"
-    if not path.is_file():
-        raise InputError(f"{path}: is missing, expected a result folder")
+    result = load_result(folder)
     if not truth.is_dir():
         raise InputError(f"{truth}: no such folder of true labels")
-    content = read_json(path, _Instances)
-    for image in content.images:
-        problem = file_name_problem(image.name, folder="the folder of true labels")
-        if problem:
-            raise InputError(f"{path}: image {image.name}: {problem}")
-    images = {image.id: image for image in content.images}
-    view_of = {number: view for view, number in enumerate(images)}
-    labels = [read_label_png(truth / f"{image.name}.png", image.width, image.height) for image in images.values()]
-    views, boxes, crops = [], [], []
-    for index, annotation in enumerate(content.annotations):
-        if annotation.image_id not in images:
-            raise InputError(f"{path}: annotations[{index}]: there is no image {annotation.image_id}")
-        image = images[annotation.image_id]
-        try:
-            mask = torch.from_numpy(decode_rle(annotation.segmentation.counts, image.width, image.height))
-        except InputError as error:
-            raise InputError(f"{path}: annotations[{index}]: {error}") from None
-        views.append(view_of[annotation.image_id])
-        boxes.append(mask_box(mask) if mask.any() else (0, 0, 1, 1))
-        x1, y1, x2, y2 = boxes[-1]
-        crops.append(mask[y1:y2, x1:x2].flatten().bool())
-    ids = [annotation.instance_id for annotation in content.annotations]
-    return stack_regions(views, boxes, crops, labels=ids, num_views=len(labels)), labels
+    sizes = result.scene.cameras.sizes.tolist()
+    views = zip(result.scene.views, sizes, strict=True)
+    return regions_in_photos(result), [read_label_png(truth / f"{view.name}.png", *size) for view, size in views]
+
+
+def _scene_of(folder: Path, run: RunRecord, images: Sequence[_Image]) -> Scene:
+    for image in images:
+        for name in (image.name, image.file_name):
+            if problem := file_name_problem(name, folder="the folder of the photos"):
+                raise InputError(f"image {name}: {problem}")
+    cameras = [image.camera for image in images if image.camera is not None]
+    if len(cameras) < len(images):
+        from mvseg.results.format_1 import rebuild_scene
+
+        return rebuild_scene(folder, run, [(each.name, each.file_name, each.width, each.height) for each in images])
+    photos = find_place(folder, run, run.photos or folder)
+    views = []
+    for image, camera in zip(images, cameras, strict=True):
+        lens = None
+        if camera.lens is not None:
+            size = {"width": image.width, "height": image.height}
+            try:
+                lens = pycolmap.Camera(model=camera.lens.model, params=camera.lens.params, **size)
+            except Exception as error:  # of any kind
+                raise InputError(f"image {image.name}: its lens is none of COLMAP's ({error})") from None
+        views.append(View(image.name, photos / image.file_name, lens))
+    return Scene(
+        name=run.scene or folder.name,
+        views=tuple(views),
+        cameras=Cameras(
+            K=_as_tensor([camera.K for camera in cameras], 3, 3),
+            R=_as_tensor([camera.R for camera in cameras], 3, 3),
+            t=_as_tensor([camera.t for camera in cameras], 3),
+            sizes=_as_tensor([(image.width, image.height) for image in images], 2),
+        ),
+        unit=run.unit or "",
+        up=run.up,
+    )
+
+
+def _as_tensor(numbers: object, *shape: int) -> Tensor:
+    return torch.tensor(numbers, dtype=torch.float64).reshape(-1, *shape)
+
+
+def _table_of(content: _Instances, scene: Scene) -> Masks:
+    view_of = {image.id: view for view, image in enumerate(content.images)}
+    views, boxes, crops, merged = [], list[Box](), [], []
+    for row, each in enumerate(content.annotations):
+        with faults_of(f"annotations[{row}]"):
+            if each.image_id not in view_of:
+                raise InputError(f"there is no image {each.image_id}")
+            views.append(view_of[each.image_id])
+            box, crop = _decode(each, scene, views[-1])
+            boxes.append(box)
+            crops.append(torch.from_numpy(crop.copy()).flatten())
+            if each.other_part is not None:
+                frame = decode_rle(each.other_part.counts, *scene.cameras.sizes[views[-1]].tolist())
+                part = torch.from_numpy(frame[box[1] : box[3], box[0] : box[2]].copy())
+                merged.append(MergedMask(region=row, own=each.instance_id, other=each.other_instance_id, part=part))
+    rows = content.annotations
+    labels = [row if each.source_label is None else each.source_label for row, each in enumerate(rows, start=1)]
+    masks = Masks.of(
+        stack_regions(views, boxes, crops, labels=labels, num_views=len(content.images)),
+        torch.tensor([each.instance_id for each in rows], dtype=torch.int64),
+        torch.tensor([each.match_score for each in rows], dtype=torch.float32),
+        detection_scores=torch.tensor([each.score for each in rows], dtype=torch.float32),
+        classes=torch.tensor([each.mask_class for each in rows], dtype=torch.int64),
+    ).with_merged(merged)
+    others = torch.tensor([each.other_instance_id for each in rows], dtype=torch.int64)
+    return replace(masks, origin=torch.tensor([int(each.origin) for each in rows]).long(), second_ids=others)
+
+
+def _decode(mask: _Mask, scene: Scene, view: int) -> tuple[Box, np.ndarray]:
+    """The box and the pixels of a mask in the undistorted image."""
+    (width, height), lens = scene.cameras.sizes[view].tolist(), scene.views[view].lens
+    rle = mask.undistorted or mask.segmentation
+    if lens is None or mask.undistorted is not None:
+        return decode_crop(rle.counts, width, height)
+    found = decode_rle(rle.counts, width, height).astype(np.uint8)
+    pixels = torch.from_numpy(undistort(found, lens, scene.cameras.K[view].numpy())).bool()
+    x1, y1, x2, y2 = mask_box(pixels) if pixels.any() else (0, 0, 1, 1)
+    return (x1, y1, x2, y2), pixels[y1:y2, x1:x2].numpy()
+
+
+def _report_of(run: RunRecord) -> MatchReport:
+    matching, shares = run.matching, run.matching.view_explained
+    is_known = matching.has_probabilities is not None
+    return MatchReport(
+        method=run.matched_by,
+        has_probabilities=bool(matching.has_probabilities) if is_known else run.matched_by == "nview",
+        residual_px=run.residual_px,
+        explained=matching.explained,
+        view_explained=None if shares is None else torch.tensor([math.nan if n is None else n for n in shares]),
+    )
+
+
+def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:
+    if run.traits is None or _find_file(folder, run, "traits.csv") is None:
+        return None
+    from mvseg.traits.table import read_traits
+
+    world, paths = run.traits, (folder / "traits.csv", folder / "traits_wide.csv")
+    return read_traits(*paths, plant=scene.name, unit=world.unit or "", up=world.up, corrections=world.colors)
+
+
+def _instances_of(
+    folder: Path, run: RunRecord, content: _Instances, *, masks: Masks, traits: Traits | None
+) -> Instances:
+    chances = {each.instance_id: each.probability for each in content.annotations if each.probability is not None}
+    surfaces: dict[int, LeafSurface] | None = None
+    voxels: dict[int, VoxelGrid] | None = None
+    if (path := _find_file(folder, run, "surfaces.npz")) is not None:
+        from mvseg.results.shapes_file import read_surfaces
+
+        surfaces, voxels = read_surfaces(path), {}
+    elif run.format == 1 and traits is not None:
+        from mvseg.results.format_1 import rebuild_surfaces
+
+        surfaces, voxels = rebuild_surfaces(folder, traits.leaves, masks), {}
+    if (path := _find_file(folder, run, "voxels.npz")) is not None:
+        from mvseg.results.shapes_file import read_voxels
+
+        voxels = read_voxels(path)
+    return Instances(
+        probabilities=dict(sorted(chances.items())), surfaces=surfaces, voxels=voxels, traits=traits
+    )
+
+
+def _find_file(folder: Path, run: RunRecord, name: str) -> Path | None:
+    """A file of the folder; None where the run wrote none.
+
+    Raises:
+        InputError: run.json lists it, and it is gone.
+    """
+    if (folder / name).is_file():
+        return folder / name
+    if name in run.files:
+        raise InputError(f"{folder / name}: is missing, expected the whole result that run.json lists")
+    return None

@@ -14,10 +14,11 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 if TYPE_CHECKING:  # loads trimesh and scikit-image
-    from mvseg.corrections.apply import Corrected, Fate
+    from mvseg.corrections.apply import Fate
     from mvseg.corrections.file import Corrections
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
     from mvseg.reconstruction.voxels import VoxelGrid
+    from mvseg.results.run_record import RunRecord
     from mvseg.traits.measure import Traits
     from mvseg.verification.choose import LeftOut
 
@@ -87,7 +88,8 @@ class Result:
             check.
         views_left_out: names of the scene's other views, see `RunConfig.views`.
         corrections: of a person; None where there were none.
-        corrected: what came of them; None without any edits.
+        fates: the outcome of each of them.
+        run: that made a result which was loaded from its folder; None before it was saved.
     """
 
     scene: Scene
@@ -101,7 +103,8 @@ class Result:
     num_moved: int | None = None
     views_left_out: tuple[str, ...] = ()
     corrections: Corrections | None = None
-    corrected: Corrected | None = None
+    fates: tuple[Fate, ...] = ()
+    run: RunRecord | None = None
 
     @property
     def masks(self) -> Masks:
@@ -127,8 +130,3 @@ class Result:
     def traits(self) -> Traits | None:
         """See `Instances`."""
         return self.instances.traits
-
-    @property
-    def fates(self) -> tuple[Fate, ...]:
-        """The outcome of each of the corrections."""
-        return () if self.corrected is None else self.corrected.fates

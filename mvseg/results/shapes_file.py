@@ -1,13 +1,14 @@
 """Shapes as arrays: surfaces.npz and voxels.npz hold them exactly, for programs that read a result.
 
-Nothing is pickled. Arrays of several leaves are stacked in the order of their ids; what has another length for each leaf
-stands one after another, and an array `num_...` says how many are whose.
+Nothing is pickled. Arrays of several leaves are stacked in the order of their ids; what has another length for each
+leaf stands one after another, and an array `num_...` says how many are whose.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -58,16 +59,20 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
         reasons = _split(arrays["reasons"], arrays["num_reasons"])
         coefficients = arrays["coefficients"].reshape(-1, NUM_COEFFICIENTS, 3)
         covariance = arrays["covariance"].reshape(-1, *(3 * NUM_COEFFICIENTS,) * 2)
-        rows = zip(coefficients, covariance, views, residuals, ious, arrays["is_oriented"], reasons, strict=True)
+        rows = arrays["leaf"], arrays["is_oriented"], coefficients, covariance, views, residuals, ious, reasons
         return {
             int(leaf): LeafSurface(
-                *(torch.from_numpy(numbers.copy()) for numbers in row[:5]),
-                is_oriented=bool(row[5]),
-                quality=Quality(tuple(row[6].tolist())),
+                coefficients=torch.from_numpy(numbers.copy()),
+                covariance=torch.from_numpy(products.copy()),
+                views=torch.from_numpy(seen.copy()),
+                residual_px=torch.from_numpy(residual.copy()),
+                iou=torch.from_numpy(iou.copy()),
+                is_oriented=bool(is_oriented),
+                quality=Quality(tuple(doubts.tolist())),
             )
-            for leaf, row in zip(arrays["leaf"], rows, strict=True)
+            for leaf, is_oriented, numbers, products, seen, residual, iou, doubts in zip(*rows, strict=True)
         }
-    except (KeyError, TypeError, ValueError) as error:
+    except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no surfaces that mvseg wrote ({error})") from None
 
 
@@ -76,7 +81,7 @@ def write_voxels(path: Path, voxels: Mapping[int, VoxelGrid]) -> None:
     `origin` (N, 3), `voxel_size`, `threshold` (N,) float64; and `votes_K` (X, Y, Z) float32 of leaf K."""
     leaves = sorted(voxels)
     own = [voxels[leaf] for leaf in leaves]
-    votes = {f"votes_{leaf}": voxels[leaf].votes.cpu().numpy() for leaf in leaves}
+    votes: dict[str, Any] = {f"votes_{leaf}": voxels[leaf].votes.cpu().numpy() for leaf in leaves}
     np.savez_compressed(
         path,
         leaf=np.array(leaves, np.int64),
@@ -114,15 +119,15 @@ def _stack(tensors: Iterable[torch.Tensor], shape: Sequence[int]) -> NDArray[np.
     return np.array([each.cpu().numpy() for each in tensors], np.float64).reshape(-1, *shape)
 
 
-def _split(values: NDArray[np.generic], counts: NDArray[np.int64]) -> list[NDArray[np.generic]]:
+def _split(values: NDArray[Any], counts: NDArray[np.int64]) -> list[NDArray[Any]]:
     if counts.sum() != len(values):
         raise ValueError(f"{len(values)} numbers, expected {counts.sum()}")
     return np.split(values, counts.cumsum()[:-1]) if len(counts) else []
 
 
-def _read(path: Path) -> dict[str, NDArray[np.generic]]:
+def _read(path: Path) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return dict(file)
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as arrays:
+            return dict(arrays)
     except Exception as error:  # zipfile, zlib and NumPy raise many kinds at broken files
         raise InputError(f"{path}: is no NumPy archive that mvseg wrote ({' '.join(str(error).split())})") from None

@@ -104,8 +104,8 @@ class OpenResult:
                 state = stage(state)
             messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
         told = () if state.corrected is None else state.corrected.messages
-        outcomes = [describe_fate(fate) for fate in state.fates]
         shown = keep_numbers(state.result(), self._numbers)
+        outcomes = [describe_fate(fate) for fate in shown.fates]
         return shown, outcomes, [text for text in dict.fromkeys(messages) if text not in told]
 
     @cached_property

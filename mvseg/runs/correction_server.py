@@ -78,7 +78,7 @@ class Corrector:
         with self.news:
             self._take_changes()
             shown, pictures = replace(self.shown, corrections=self.corrections), self.pictures
-        return build_page(shown, pictures, run=dict(self.opened.run.said), is_served=True).encode()
+        return build_page(shown, pictures, run=self.opened.run.said.as_json(), is_served=True).encode()
 
     def save(self, text: bytes, base: str) -> dict[str, Any]:
         """Write the edits of a corrections.json to the result folder and have them computed; returns their number and

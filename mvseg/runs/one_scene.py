@@ -199,10 +199,8 @@ def describe_run(
         **made_by(),
         "torch": torch.__version__,
         "python": platform.python_version(),
-        "scene": result.scene.name,
         "inputs": {str(path.resolve()): hash_files(path) for path in sources if path is not None},
         "config": options,
-        "mask_kind": result.mask_kind or None,
         "warnings": list(messages),
     }
 

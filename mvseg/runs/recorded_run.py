@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import os
 import shlex
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from mvseg._version import __version__, code_hash
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE
+from mvseg.results.run_record import RunRecord, find_place, load_run
 from mvseg.system.file_hash import hash_files
 
 PLACES = ("scene", "out", "masks", "corrections")  # of run.json's config: what the run read and wrote
@@ -36,7 +35,7 @@ class RecordedRun:
     """
 
     folder: Path
-    said: Mapping[str, Any]
+    said: RunRecord
     config: RunConfig
     scene: Path
     masks: Path | None
@@ -52,10 +51,14 @@ def read_recorded(folder: Path) -> RecordedRun:
         InputError: this is no result, or one with options that this version does not have; its scene or its masks are
             gone.
     """
-    said = _read_run(folder)
-    found = {name: _find(folder, said, name) for name in PLACES if said["config"].get(name) is not None}
-    scene, masks, corrections = (found.get(name) for name in ("scene", "masks", "corrections"))
-    if scene is None or not scene.exists():
+    said = load_run(folder)
+    scene, masks, corrections = (
+        None if (stated := said.config.get(name)) is None else find_place(folder, said, Path(str(stated)))
+        for name in ("scene", "masks", "corrections")
+    )
+    if scene is None:
+        raise InputError(f"{folder / RUN_FILE}: does not say which scene this is, expected a result of one scene")
+    if not scene.exists():
         raise InputError(f"{scene}: the scene of this result is gone, expected it there")
     if masks is not None and not masks.exists():
         raise InputError(f"{masks}: the masks of this result are gone, expected them there")
@@ -66,7 +69,7 @@ def read_recorded(folder: Path) -> RecordedRun:
         scene=scene,
         masks=masks,
         corrections=corrections,
-        changes=tuple(_list_changes(said, found)),
+        changes=tuple(_list_changes(folder, said)),
     )
 
 
@@ -89,26 +92,14 @@ def _from(out: Path, path: str) -> str | None:
         return None
 
 
-def _find(folder: Path, said: Mapping[str, Any], name: str) -> Path:
-    """Where an input of the run is now; where it was, if it is nowhere."""
-    stated = Path(str(said["config"][name]))
-    beside = said["config"].get("from_here")
-    relative = beside.get(name) if isinstance(beside, dict) else None
-    moved = None if relative is None else (folder / str(relative)).resolve()
-    return moved if moved is not None and not stated.exists() and moved.exists() else stated
-
-
-def _list_changes(said: Mapping[str, Any], found: Mapping[str, Path]) -> list[str]:
-    made, changes = str(said.get("mvseg"))[:60], []
-    if said.get("code") != code_hash():
-        changes.append(f"mvseg {made} made this result, and this is {__version__}: what it computes may differ.")
-    inputs = said.get("inputs")
-    moved = {str(said["config"].get(name)): path for name, path in found.items()}
-    for stated, sha256 in (inputs if isinstance(inputs, dict) else {}).items():
-        path = moved.get(stated, Path(stated))
-        if not path.exists():  # a scene's file of cameras, that moved with its folder
-            parents = [(old, new) for old, new in moved.items() if Path(old) in Path(stated).parents]
-            path = parents[0][1] / Path(stated).relative_to(parents[0][0]) if parents else path
+def _list_changes(folder: Path, said: RunRecord) -> list[str]:
+    changes = []
+    if said.code != code_hash():
+        changes.append(
+            f"mvseg {said.mvseg[:60]} made this result, and this is {__version__}: what it computes may differ."
+        )
+    for stated, sha256 in said.inputs.items():
+        path = find_place(folder, said, Path(stated))
         if not path.exists():
             changes.append(f"{path}: is gone since this result was made.")
         elif hash_files(path) != sha256:
@@ -116,22 +107,9 @@ def _list_changes(said: Mapping[str, Any], found: Mapping[str, Path]) -> list[st
     return changes
 
 
-def _read_run(folder: Path) -> dict[str, Any]:
-    path = folder / RUN_FILE
-    try:
-        run = json.loads(path.read_text(encoding="utf-8"))
-    except OSError:
-        raise InputError(f"{folder}: holds no {RUN_FILE}, expected a result folder of mvseg infer") from None
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not a whole JSON file ({error})") from None
-    if not isinstance(run, dict) or not isinstance(run.get("config"), dict) or "scene" not in run["config"]:
-        raise InputError(f"{path}: does not say which scene this is, expected a result of one scene")
-    return run
-
-
-def _read_config(folder: Path, said: Mapping[str, Any]) -> RunConfig:
+def _read_config(folder: Path, said: RunRecord) -> RunConfig:
     """The options of the stages."""
-    options = {name: value for name, value in said["config"].items() if name not in (*PLACES, "from_here")}
+    options = {name: value for name, value in said.config.items() if name not in (*PLACES, "from_here")}
     known = asdict(RunConfig())
     unknown = [name for name in options if name not in known]
     for stage, inside in options.items():
@@ -143,6 +121,5 @@ def _read_config(folder: Path, said: Mapping[str, Any]) -> RunConfig:
         return TypeAdapter(RunConfig).validate_python({"reconstruct": None, **options})
     except (ValidationError, InputError) as error:
         problem = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
-        made = str(said.get("mvseg"))[:60]
-        message = f"mvseg {made} made this result, with options that this version does not have ({problem})"
+        message = f"mvseg {said.mvseg[:60]} made this result, with options that this version does not have ({problem})"
         raise InputError(f"{folder}: {message}; expected one made by this version") from None

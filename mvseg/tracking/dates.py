@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import datetime
 import math
 from collections import defaultdict
@@ -11,23 +10,19 @@ from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel
 
 from mvseg.errors import InputError
-from mvseg.formats.json_file import Vector3, read_json
-from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE
-from mvseg.results.read import find_result
-from mvseg.traits.filters import STEM
-from mvseg.traits.leaf import BASE_UNKNOWN, Measurement, cell_normals
+from mvseg.reconstruction.shapes import best_shape
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
+from mvseg.reconstruction.voxels import VoxelGrid
+from mvseg.results.read import find_result, load_result
+from mvseg.results.result import Result
+from mvseg.traits.leaf import Measurement, cell_normals
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
-
-if TYPE_CHECKING:
-    from mvseg.results.result import Result
 
 Floats = NDArray[np.float64]
 STATIONS = 9  # points of a midrib, base and tip included
@@ -107,16 +102,6 @@ class PlantOnDate:
         return [index for index, leaf in enumerate(self.leaves) if leaf.midrib is not None]
 
 
-class _World(BaseModel):
-    unit: str | None = None
-    up: Vector3 | None = None
-
-
-class _Run(BaseModel):
-    traits: _World | None = None
-    files: dict[str, str] = {}
-
-
 def read_date(folder: Path, time: str | float) -> PlantOnDate:
     """One date from a result folder of `mvseg infer` or `mvseg batch`; `time` as in `read_time`.
 
@@ -124,28 +109,10 @@ def read_date(folder: Path, time: str | float) -> PlantOnDate:
         InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
     """
     folder = find_result(folder)
-    if not (folder / "run.json").is_file():
-        raise InputError(f"{folder}: is no result, expected a folder that mvseg infer or mvseg batch wrote")
-    run = read_json(folder / "run.json", _Run)
-    world = run.traits
-    if world is None or not (folder / "traits.csv").is_file():
+    result = load_result(folder)
+    if result.traits is None:
         raise InputError(f"{folder}: has ids but no surfaces, run mvseg infer or mvseg batch with these masks first")
-    by_leaf, methods = _read_traits(folder / "traits.csv")
-    frame, leaves = None if world.up is None else level_frame(world.up), []
-    for number, method in sorted(methods.items()):
-        rejections = {each for each in method.values() if REJECTED in each}
-        if number and all(STEM in each for each in rejections):
-            name = f"leaves/leaf_{number:03d}.ply"
-            if name in run.files and not (folder / name).is_file():
-                raise InputError(f"{folder / name}: is missing, expected the whole result that run.json lists")
-            vertices = _read_vertices(folder / name)
-            is_oriented = BASE_UNKNOWN.method not in method.get("azimuth", "")
-            leaf = _leaf_of(number, vertices, by_leaf[number], frame, is_oriented=is_oriented)
-            leaves.append(replace(leaf, is_doubted=bool(rejections)))
-    return PlantOnDate(
-        scene=folder.name, time=read_time(time), written=str(time).strip(), unit=world.unit or "",
-        knows_up=frame is not None, leaves=tuple(leaves), whole=by_leaf[0], folder=folder,
-    )  # fmt: skip
+    return replace(date_of(result, time), scene=folder.name, folder=folder)
 
 
 def date_of(result: Result, time: str | float) -> PlantOnDate:
@@ -154,8 +121,6 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
     Raises:
         InputError: it has no surfaces.
     """
-    from mvseg.reconstruction.shapes import best_shape
-
     traits = result.traits
     if traits is None:
         raise InputError(f"{result.scene.name}: has ids but no surfaces, expected a run with reconstruct and traits")
@@ -168,9 +133,7 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
     for leaf in traits.leaves:
         if leaf.rejection is None or leaf.rejection.kind == "stem":
             shape = best_shape(leaf.leaf, result.surfaces, result.voxels)
-            vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
-            is_oriented = bool(getattr(shape, "is_oriented", False))
-            seen = _leaf_of(leaf.leaf, vertices, numbers_of(leaf.numbers), frame, is_oriented=is_oriented)
+            seen = _see_leaf(leaf.leaf, shape, numbers_of(leaf.numbers), frame)
             leaves.append(replace(seen, is_doubted=leaf.rejection is not None))
     return PlantOnDate(
         scene=result.scene.name, time=read_time(time), written=str(time).strip(), unit=traits.unit,
@@ -275,44 +238,15 @@ def _in_unit(date: PlantOnDate, first: PlantOnDate) -> PlantOnDate:
     return replace(date, unit=first.unit, leaves=tuple(map(enlarge, date.leaves)), whole=convert(date.whole))
 
 
-def _read_traits(path: Path) -> tuple[dict[int, dict[str, Number]], dict[int, dict[str, str]]]:
-    """{leaf: {trait: number}} and {leaf: {trait: method, or why there is no number}}; leaf 0 is the plant."""
-    numbers: dict[int, dict[str, Number]] = defaultdict(dict)
-    methods: dict[int, dict[str, str]] = defaultdict(dict)
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            for row in csv.DictReader(file):
-                leaf = int(row["leaf"] or 0)
-                methods[leaf][row["trait"]] = row["method"]
-                if row["value"]:
-                    numbers[leaf][row["trait"]] = Number(float(row["value"]), float(row["sd"] or "nan"), row["unit"])
-    except (OSError, ValueError, KeyError, TypeError, csv.Error) as error:
-        raise InputError(f"{path}: is no table of traits that mvseg wrote ({error})") from None
-    return numbers, methods
-
-
-def _read_vertices(path: Path) -> Floats:
-    """(P, 3) vertices of a mesh; none where there is no file."""
-    import trimesh  # slow to load
-
-    if not path.is_file():
-        return np.zeros((0, 3))
-    try:
-        mesh: Any = trimesh.load(path, process=False, force="mesh")
-        return np.asarray(mesh.vertices, dtype=np.float64)
-    except Exception as error:  # trimesh raises anything at broken files
-        raise InputError(f"{path}: is no mesh that mvseg wrote ({error})") from None
-
-
-def _leaf_of(
-    number: int, vertices: Floats, numbers: Mapping[str, Number], frame: Floats | None, *, is_oriented: bool
+def _see_leaf(
+    number: int, shape: LeafSurface | VoxelGrid | None, numbers: Mapping[str, Number], frame: Floats | None
 ) -> SeenLeaf:
-    if len(vertices) < CLOUD or not np.isfinite(vertices).all():
+    vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
+    if len(vertices) < CLOUD:
         return SeenLeaf(number, None, None, None, False, numbers)
     points = vertices if frame is None else vertices @ frame.T
-    rows, columns = MESH_SHAPE
-    if len(points) == 2 + (rows - 2) * columns:
-        return see_surface(number, points, columns, numbers, is_oriented=is_oriented)
+    if isinstance(shape, LeafSurface):
+        return see_surface(number, points, MESH_SHAPE[1], numbers, is_oriented=shape.is_oriented)
     midrib, normal = _midrib_of_voxels(points)
     cloud = points[np.linspace(0, len(points) - 1, CLOUD).round().astype(int)]
     return SeenLeaf(number, midrib, normal, cloud, False, numbers)

@@ -15,13 +15,11 @@ from typing import Any
 import cv2
 import numpy as np
 from PIL import Image, ImageDraw, ImageOps
-from pydantic import BaseModel
 
-from mvseg.errors import InputError
 from mvseg.formats.image_file import encode_jpeg, write_png
-from mvseg.formats.json_file import read_json
-from mvseg.formats.label_png import read_labels
 from mvseg.results.overlay import instance_color
+from mvseg.results.photo_masks import labels_in_photo
+from mvseg.results.read import load_result
 from mvseg.results.report.page import dump_inside_script
 from mvseg.tracking.dates import ROWS, PlantOnDate
 from mvseg.tracking.growth import SIZES, Growth
@@ -32,19 +30,6 @@ CROP, QUALITY = 72, 70  # pixels and JPEG quality of a leaf's picture
 CURVE_STEPS = 40
 CHART = (1500, 1000)  # pixels of growth.png
 ASSETS = files("mvseg.tracking") / "assets"
-
-
-class _Image(BaseModel):
-    file_name: str
-    name: str
-
-
-class _Images(BaseModel):
-    images: list[_Image]
-
-
-class _Inputs(BaseModel):
-    inputs: dict[str, str] = {}
 
 
 def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
@@ -189,30 +174,23 @@ def _crops(date: PlantOnDate, track_of: Mapping[int, int]) -> dict[int, str]:
     """{leaf: JPEG in base64} of where each leaf is largest: of the photo if it is still there, else of its mask."""
     if date.folder is None:
         return {}
-    try:
-        images = read_json(date.folder / "instances.json", _Images).images
-        labels = [read_labels(date.folder / "labels" / f"{image.name}.png") for image in images]
-    except InputError:
-        return {}
+    result = load_result(date.folder)
+    labels = [labels_in_photo(result, view) for view in range(len(result.scene.views))]
     count = max(track_of, default=0) + 1
     sizes = np.array([np.bincount(np.minimum(view, count).ravel(), minlength=count + 1) for view in labels])
     crops: dict[int, str] = {}
-    for view, image in enumerate(images):
+    for view, about in enumerate(result.scene.views):
         shown = [leaf for leaf in track_of if sizes[:, leaf].argmax() == view and sizes[view, leaf]]
-        photo = _photo(date.folder, image.file_name, labels[view].shape) if shown else None
+        photo = _photo(about.path, labels[view].shape) if shown else None
         for leaf in shown:
             crops[leaf] = _crop(photo, labels[view] == leaf, instance_color(track_of[leaf]))
     return crops
 
 
-def _photo(folder: Path, file_name: str, shape: tuple[int, ...]) -> np.ndarray | None:
-    """The photo of a view, if it still is where the run found it and has its size."""
-    for source in read_json(folder / "run.json", _Inputs).inputs:
-        for path in (Path(source).parent / "images" / file_name, Path(source).parent / file_name):
-            photo = cv2.imread(str(path)) if path.is_file() else None
-            if photo is not None and photo.shape[:2] == shape[:2]:
-                return np.asarray(photo[..., ::-1])
-    return None
+def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
+    """A photo, if it still is where the run found it and has its size."""
+    photo = cv2.imread(str(path)) if path.is_file() else None
+    return None if photo is None or photo.shape[:2] != shape else np.asarray(photo[..., ::-1])
 
 
 def _crop(photo: np.ndarray | None, mask: np.ndarray, color: tuple[int, int, int]) -> str:

@@ -8,43 +8,16 @@ views, one that matches nothing, one that matches badly.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
-from pydantic import BaseModel
+import torch
+from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.formats.coco import CocoAnnotation, CocoFile
-from mvseg.formats.json_file import Items, read_json
-from mvseg.formats.scene_folder import load_scene
-from mvseg.masks import SURE
+from mvseg.formats.coco import CocoAnnotation, encode_mask
+from mvseg.masks import SURE, Masks, Origin
+from mvseg.results.photo_masks import mask_in_photo
+from mvseg.results.read import load_result
 from mvseg.training.data import Sample, SampleList
-
-INSTANCES, RUN = "instances.json", "run.json"
-
-
-class _Mask(CocoAnnotation):
-    instance_id: int
-    match_score: float
-    from_other_views: bool = False
-    from_few_views: bool = False
-    corrected: str | None = None
-
-    @property
-    def is_label(self) -> bool:
-        is_sure = self.instance_id > 0 and self.match_score >= SURE
-        return self.corrected is not None or (is_sure and not self.from_other_views and not self.from_few_views)
-
-
-class _Masks(CocoFile):
-    annotations: Items[_Mask]  # type: ignore[assignment]
-
-
-class _Config(BaseModel):
-    scene: Path
-
-
-class _Run(BaseModel):
-    config: _Config
 
 
 def list_results(folder: Path) -> SampleList:
@@ -54,38 +27,43 @@ def list_results(folder: Path) -> SampleList:
         One sample for each photo, named "<result>/<photo>". Photos are those of the scene that run.json names.
 
     Raises:
-        InputError: no result, one of a version that did not write what is needed, one without photos or without a mask
-            to learn from, or whose photos are gone.
+        InputError: no result, or a broken one, see `load_result`; one without a mask to learn from, or whose photos are
+            gone.
     """
-    is_result = (folder / INSTANCES).is_file()
-    found = [folder] if is_result else sorted(path.parent for path in folder.glob(f"*/{INSTANCES}"))
+    is_result = (folder / "instances.json").is_file()
+    found = [folder] if is_result else sorted(path.parent for path in folder.glob("*/instances.json"))
     if not found:
-        raise InputError(f"{folder}: holds no result (no {INSTANCES}), expected a folder that `mvseg infer` wrote")
+        raise InputError(f"{folder}: holds no result (no instances.json), expected a folder that `mvseg infer` wrote")
     return SampleList(tuple(sample for result in found for sample in _list_photos(result)), ("leaf",))
 
 
-def _list_photos(result: Path) -> list[Sample]:
-    try:
-        content, scene = read_json(result / INSTANCES, _Masks), read_json(result / RUN, _Run).config.scene
-    except (OSError, InputError) as error:
-        message = f"is no result of this version of mvseg ({str(error).splitlines()[0]}); run `mvseg infer` again"
-        raise InputError(f"{result}: {message}") from None
-    if not any(mask.is_label for mask in content.annotations):
-        raise InputError(f"{result}: holds no mask that is sure enough to learn from, expected a result with leaves")
-    if not scene.is_dir():
-        raise InputError(f"{result}: its scene {scene} is gone, expected the photos where they were")
-    photo_of: dict[str, Any] = {view.name + view.path.suffix: view.path for view in load_scene(scene).views}
-    samples = []
-    for image in sorted(content.images, key=lambda image: image.file_name):
-        photo = photo_of.get(image.file_name)
-        if photo is None or not photo.is_file():
-            message = f"its photo {image.file_name} is not in {scene}, expected the photos of the result"
-            raise InputError(f"{result}: {message}")
+def _list_photos(folder: Path) -> list[Sample]:
+    result = load_result(folder)
+    is_label = are_labels(result.masks)
+    if not is_label.any():
+        raise InputError(f"{folder}: holds no mask that is sure enough to learn from, expected a result with leaves")
+    samples, sizes = [], result.scene.cameras.sizes.tolist()
+    for view, (width, height) in enumerate(sizes):
+        photo = result.scene.views[view].path
+        if not photo.is_file():
+            raise InputError(f"{folder}: its photo {photo} is gone, expected the photos of the result")
+        rows = (result.masks.view_index == view).nonzero()[:, 0].tolist()
         masks = tuple(
-            mask.model_copy(update={"category_id": 1, "iscrowd": int(not mask.is_label)})
-            for mask in content.annotations
-            if mask.image_id == image.id
+            CocoAnnotation(
+                id=row + 1,
+                image_id=view + 1,
+                category_id=1,
+                segmentation=encode_mask(mask_in_photo(result, row)),
+                iscrowd=int(not is_label[row]),
+            )
+            for row in rows
         )
-        name, size = f"{result.name}/{image.file_name}", (image.width, image.height)
-        samples.append(Sample(name=name, photo=photo, annotations=masks, size=size, class_of={1: 1}))
-    return samples
+        name = f"{folder.name}/{result.scene.views[view].name}{photo.suffix}"
+        samples.append(Sample(name=name, photo=photo, annotations=masks, size=(width, height), class_of={1: 1}))
+    return sorted(samples, key=lambda sample: sample.name)
+
+
+def are_labels(masks: Masks) -> Tensor:
+    """(D,) bool: the masks to learn from."""
+    is_seen = ~torch.isin(masks.origin, torch.tensor([Origin.OTHER_VIEWS, Origin.FEW_VIEWS]))
+    return masks.is_corrected | ((masks.instance_ids > 0) & (masks.match_scores >= SURE) & is_seen)

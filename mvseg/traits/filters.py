@@ -29,7 +29,15 @@ FEWEST = 3  # instances, for floor and distance to be told
 NUM_POINTS = 400  # of a shape, for distances
 
 
-STEM = "looks like a stem"  # begins the reason of a rejection
+# What the reasons of a rejection begin with, or, of those that begin with a number, hold.
+WORDS: dict[Kind, str] = {
+    "few_sure_views": "sure views, asked for are",
+    "low_quality": "median IoU",
+    "hardly_visible": "its masks cover a share",
+    "stem": "looks like a stem",
+    "floor": "looks like the floor",
+    "beside_the_plant": "lies beside the plant",
+}
 
 
 @dataclass(frozen=True)
@@ -38,6 +46,18 @@ class Rejection:
 
     kind: Kind
     reason: str
+
+    @staticmethod
+    def of(reason: str) -> Rejection:
+        """The rejection of this reason, as a table has it.
+
+        Raises:
+            ValueError: no rejection has it.
+        """
+        kinds: list[Kind] = [kind for kind, words in WORDS.items() if words in reason]
+        if len(kinds) != 1:
+            raise ValueError(f"nothing is rejected with the reason '{reason}'")
+        return Rejection(kinds[0], reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,11 +117,11 @@ def find_rejected(
         {instance id: why}: the gravest of several reasons, see `Kind`.
     """
     ious = {instance: median_iou(shape) for instance, shape in shapes.items() if isinstance(shape, LeafSurface)}
-    share = "its masks cover a share of {:.2f} of its surface, asked for is {:g}"
+    share = WORDS["hardly_visible"] + " of {:.2f} of its surface, asked for is {:g}"
     limits: tuple[tuple[Kind, Mapping[int, float], float, str], ...] = (
         ("hardly_visible", visible_shares, config.min_visible_share, share),
-        ("low_quality", ious, config.min_quality, "median IoU {:.2f} with its masks, asked for is {:g}"),
-        ("few_sure_views", sure_views, config.min_sure_views, "{} sure views, asked for are {}"),
+        ("low_quality", ious, config.min_quality, WORDS["low_quality"] + " {:.2f} with its masks, asked for is {:g}"),
+        ("few_sure_views", sure_views, config.min_sure_views, "{} " + WORDS["few_sure_views"] + " {}"),
     )
     found: dict[int, Rejection] = {}
     for kind, values, least, reason in limits:
@@ -131,7 +151,7 @@ def find_stems(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
         elongation = body.deviations[0] / max(body.deviations[1], 1e-12)
         steepness = np.degrees(np.arcsin(min(1.0, abs(float(body.axis @ up)))))
         if elongation > LONG and steepness > STEEP_DEG and body.iou < TUBE_IOU:
-            reason = f"{STEM}: {elongation:.0f} times longer than wide, {steepness:.0f} degrees steep"
+            reason = f"{WORDS['stem']}: {elongation:.0f} times longer than wide, {steepness:.0f} degrees steep"
             found[instance] = Rejection("stem", reason)
     return found
 
@@ -148,7 +168,7 @@ def find_floor(bodies: Mapping[int, _Body], up: Floats) -> dict[int, Rejection]:
     ratio = bodies[lowest].area / max(max(body.area for body in others), 1e-300)
     if ratio <= FLOOR_AREA:
         return {}
-    reason = f"looks like the floor: below everything else, and {ratio:.1f} times the largest leaf"
+    reason = f"{WORDS['floor']}: below everything else, and {ratio:.1f} times the largest leaf"
     return {lowest: Rejection("floor", reason)}
 
 
@@ -167,6 +187,6 @@ def find_distant(bodies: Mapping[int, _Body]) -> dict[int, Rejection]:
     away, found = gaps[:, plant].min(1) / length, {}
     for instance, steps, is_plant in zip(bodies, away, plant, strict=True):
         if not is_plant:
-            reason = f"lies beside the plant: {steps:.1f} lengths of a large leaf away from it"
+            reason = f"{WORDS['beside_the_plant']}: {steps:.1f} lengths of a large leaf away from it"
             found[instance] = Rejection("beside_the_plant", reason)
     return found

@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
-from mvseg.traits.leaf import Measurement
-from mvseg.traits.measure import Traits
+from mvseg.errors import InputError
+from mvseg.traits.config import ColorCorrection
+from mvseg.traits.filters import Rejection
+from mvseg.traits.leaf import Measurement, missing
+from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology")
@@ -23,6 +26,7 @@ FORMULA_STARTS = ("=", "+", "-", "@")
 NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
 WIDE_TRAITS = [trait for trait in LEAF_TRAITS if trait.name != "quality"]
+GOOD, REJECTED = "good", "rejected: "
 
 
 def write_long(path: Path, traits: Traits) -> None:
@@ -50,7 +54,7 @@ def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = 
         for trait in WIDE_TRAITS:
             number = leaf.numbers[trait.name]
             numbers += [number.value, number.sd] if trait.has_sd else [number.value]
-        texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or "good"
+        texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or GOOD
         rows.append(
             as_cells(leaf.leaf, *numbers, leaf.numbers["quality"].value, *texts, probabilities.get(leaf.leaf))
         )
@@ -61,6 +65,52 @@ def wide_columns() -> list[str]:
     """The columns of `write_wide`."""
     pairs = [[trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name] for trait in WIDE_TRAITS]
     return ["leaf", *chain.from_iterable(pairs), "iou", "unit", "method", "quality", "probability"]
+
+
+def read_traits(
+    long: Path,
+    wide: Path,
+    *,
+    plant: str,
+    unit: str,
+    up: tuple[float, float, float] | None,
+    corrections: Sequence[ColorCorrection] = (),
+) -> Traits:
+    """The traits that `write_long` and `write_wide` wrote, with six digits; what the tables do not say is given.
+
+    Raises:
+        InputError: these are no such tables.
+    """
+    numbers: dict[int, dict[str, Measurement]] = {0: {}}
+    try:
+        for row in read_csv(long, COLUMNS):
+            value, sd = float(row["value"] or "nan"), float(row["sd"] or "nan")
+            numbers.setdefault(int(row["leaf"] or 0), {})[row["trait"]] = Measurement(value, sd, row["method"])
+        leaves = [
+            _read_leaf(int(row["leaf"]), row, numbers[int(row["leaf"])])
+            for row in read_csv(wide, ("leaf", "method", "quality"))
+        ]
+    except (KeyError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f"{long}: is no table of traits that mvseg wrote ({error})") from None
+    return Traits(
+        plant=plant, unit=unit, leaves=tuple(leaves), whole=numbers[0], up=up, corrections=tuple(corrections)
+    )
+
+
+def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement]) -> LeafTraits:
+    reasons = () if row["quality"] == GOOD else tuple(row["quality"].split("; "))
+    rejection = None
+    if reasons and reasons[0].startswith(REJECTED):
+        rejection = Rejection.of(reasons[0].removeprefix(REJECTED))
+    return LeafTraits(
+        leaf=leaf,
+        numbers={trait.name: numbers.get(trait.name, missing("has no voxels")) for trait in LEAF_TRAITS},
+        method=row["method"],
+        reasons=reasons,
+        rejection=rejection,
+    )
 
 
 def as_cells(*values: str | float | None) -> list[str | int]:
@@ -89,3 +139,23 @@ def write_csv(path: Path, columns: Sequence[str], rows: Sequence[Sequence[str | 
     """Columns, then rows, as UTF-8."""
     with path.open("w", newline="", encoding="utf-8") as file:
         csv.writer(file, lineterminator="\n").writerows([columns, *rows])
+
+
+def read_csv(path: Path, columns: Collection[str] = ()) -> list[dict[str, str]]:
+    """The rows of a table that `write_csv` wrote, with these columns and perhaps others, as text.
+
+    Raises:
+        InputError: it cannot be read, or has no such column.
+    """
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file, restkey="", restval="")
+            rows, found = list(reader), reader.fieldnames or ()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except (ValueError, csv.Error) as error:
+        raise InputError(f"{path}: is no CSV table ({error})") from None
+    missing_ones = [column for column in columns if column not in found]
+    if missing_ones:
+        raise InputError(f"{path}: has no column '{missing_ones[0]}', expected a table that mvseg wrote")
+    return rows

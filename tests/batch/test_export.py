@@ -162,7 +162,7 @@ def test_wrong_tables_are_named(
 
 def test_what_is_no_batch_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["export", str(tmp_path), "--brapi"]) == 2
-    assert "is not an output of mvseg batch (tables/traits.csv: No such file" in complaint(capsys)
+    assert "is not an output of mvseg batch (tables/traits.csv is missing)" in complaint(capsys)
 
 
 def test_files_of_the_user_stay(tmp_path: Path) -> None:

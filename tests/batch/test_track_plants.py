@@ -145,9 +145,10 @@ def test_bad_input_gets_one_sentence(
     monkeypatch.chdir(tmp_path)
     for name in ("a", "b"):
         write_result(tmp_path / name, BLADES)
-    (tmp_path / "ids").mkdir()
-    for name, content in (("run.json", "{}"), ("instances.json", "{}")):
-        (tmp_path / "ids" / name).write_text(content)
+    write_result(tmp_path / "ids", BLADES)
+    for name in ("traits.csv", "surfaces.npz"):
+        (tmp_path / "ids" / name).unlink()
+    (tmp_path / "ids" / "run.json").write_text('{"format": 2}')
     assert main(["track", *arguments, "--out", "out", "--quiet"]) == 2
     error = capsys.readouterr().err.strip()
     assert re.search(said, error)

@@ -19,6 +19,7 @@ import torch
 from PIL import Image
 from safetensors.torch import save
 
+from known_leaves import bent_blade
 from mvseg.cli.command import _parse
 from mvseg.cli.options import build_options
 from mvseg.detection.config import DetectConfig
@@ -31,8 +32,10 @@ from mvseg.formats.photos import check_photos, read_photo
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.earlier import check_out
-from mvseg.results.read import read_instances
+from mvseg.results.read import load_result, read_instances
+from mvseg.results.shapes_file import write_surfaces, write_voxels
 from mvseg.training.config import TrainConfig
 from mvseg.training.data import list_samples, read_sample
 
@@ -216,12 +219,27 @@ LABELME: dict[str, Any] = {
 SAM = [{"segmentation": encode_mask(MASK), "area": 36, "bbox": [3, 2, 6, 6]}, {"segmentation": RUNS, "area": 6}]
 YOLO = b"0 0.1 0.1 0.6 0.1 0.6 0.8\n1 0.5 0.5 0.2 0.2\n1 0.2 0.2 0.9 0.2 0.9 0.9 0.2 0.9 0.87\n"
 YOLO_NAMES = b"path: .\nnames:\n  0: leaf\n  1: stem\n"
+CAMERA = {"K": K, "R": np.eye(3).tolist(), "t": [0, 0, 50]}
+LENS = {"model": "OPENCV", "params": [20, 20, 8, 6, 0.1, 0, 0, 0]}
 RESULT = {
-    "images": [image | {"name": name} for image, name in zip(IMAGES, NAMES, strict=True)],
-    "annotations": [
-        {"image_id": view, "instance_id": 1, "segmentation": encode_mask(MASK)} for view in range(VIEWS)
+    "images": [
+        image | {"name": name, "camera": CAMERA | ({"lens": LENS} if name == NAMES[0] else {})}
+        for image, name in zip(IMAGES, NAMES, strict=True)
     ],
-}
+    "annotations": [
+        {"image_id": view, "instance_id": 1, "segmentation": encode_mask(MASK), "match_score": 0.9, "source_label": 3,
+         "other_instance_id": 2, "other_part": encode_mask(MASK)}
+        for view in range(VIEWS)
+    ],
+}  # fmt: skip
+RESULT_RUN = {
+    "format": 2, "scene": "plant", "photos": "/plants/images", "matched_by": "nview", "residual_px": 1,
+    "matching": {"has_probabilities": True, "explained": 0.9, "view_explained": [0.9, None]},
+    "poses": {"refined": True, "residual_px": [1.0, None]}, "traits": {"unit": "mm", "up": [0, 0, 1]},
+    "edits": [{"op": "reject", "view": "000", "at": [1, 2]}],
+    "corrections": [{"edit": 1, "op": "reject", "fate": "applied", "problem": ""}],
+    "counts": {"moved": 1}, "seconds": {"match": 0.5}, "config": {"scene": "/plants", "from_here": {"scene": ".."}},
+}  # fmt: skip
 RUN = {"files": {"labels/000.png": "0" * 64, "contact.png": "1" * 64}, "mvseg": "0.1.0"}
 METADATA = {"arch": "resnet18_fpn", "categories": '["leaf"]', "image_size": "320"}
 STATE = {"roi_heads.box_predictor.cls_score.bias": torch.zeros(2), "weight": torch.arange(6.0)}
@@ -334,8 +352,23 @@ def read_training_options(folder: Path) -> None:
 
 
 def read_result(folder: Path) -> None:
+    result = load_result(folder)
+    for surface in (result.surfaces or {}).values():
+        surface.mesh()
     regions, truth = read_instances(folder, folder / "truth")
     assert regions.num_views == len(truth)
+
+
+def result_files(folder: Path) -> dict[str, Any]:
+    """Of a whole result with shapes and traits."""
+    write_surfaces(folder / "surfaces.npz", {1: bent_blade(), 2: bent_blade()})
+    votes = torch.rand(3, 4, 5, generator=torch.Generator().manual_seed(0))
+    grid = VoxelGrid(origin=torch.zeros(3).double(), voxel_size=0.5, votes=votes, num_views=2, threshold=0.5)
+    write_voxels(folder / "voxels.npz", {2: grid})
+    tables = Path(__file__).parents[1] / "results" / "format_1"
+    files: dict[str, Any] = {name: (folder / name).read_bytes() for name in ("surfaces.npz", "voxels.npz")}
+    files |= {name: (tables / name).read_bytes() for name in ("traits.csv", "traits_wide.csv")}
+    return files | {"instances.json": RESULT, "run.json": RESULT_RUN}
 
 
 def readers(folder: Path) -> dict[str, Reader]:
@@ -385,6 +418,6 @@ def readers(folder: Path) -> dict[str, Reader]:
         "training config": Reader({"train.yaml": TRAIN_CONFIG}, read_training_options),
         "safetensors": Reader({"w.safetensors": save(STATE, METADATA)}, lambda f: read_weights(f / "w.safetensors")),
         "checkpoint": Reader({"w.pt": checkpoint()}, lambda f: read_weights(f / "w.pt")),
-        "result": Reader({"instances.json": RESULT}, read_result, labels),
+        "result": Reader(result_files(folder), read_result, labels),
         "run": Reader({"run.json": RUN}, check_out),
     }

@@ -64,7 +64,7 @@ IDS_FILES = {
     "run.json",
 }
 SHAPE_FILES = {
-    *(f"leaves/leaf_{leaf:03d}.ply" for leaf in (1, 2, 3)), "scene.glb", "traits.csv", "traits_wide.csv"
+    *(f"leaves/leaf_{leaf:03d}.ply" for leaf in (1, 2, 3)), "scene.glb", "traits.csv", "traits_wide.csv", "voxels.npz"
 }  # fmt: skip
 
 
@@ -382,11 +382,11 @@ class TestBrokenPhotos:
 
 WRITERS = [
     "write_label_png", "draw_overlay", "draw_tile", "draw_picture", "write_png", "draw_contact_sheet", "write_coco",
-    "write_ply", "write_glb", "write_long", "write_wide", "write_report",
+    "write_voxels", "write_ply", "write_glb", "write_long", "write_wide", "write_report",
 ]  # fmt: skip
 
 
-OF_A_PLANT = ("write_ply", "write_glb", "write_long", "write_wide")
+OF_A_PLANT = ("write_voxels", "write_ply", "write_glb", "write_long", "write_wide")
 SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_tile", "draw_picture", "write_png", "write_ply")
 
 
@@ -536,8 +536,7 @@ class TestPlaces:
 class TestReadInstances:
     @pytest.fixture
     def broken(self, saved: Path, tmp_path: Path) -> Path:
-        (tmp_path / "instances.json").write_bytes((saved / "instances.json").read_bytes())
-        return tmp_path
+        return shutil.copytree(saved, tmp_path / "broken")
 
     def test_no_result(self, tmp_path: Path, plant: Path) -> None:
         with pytest.raises(InputError, match=r"instances\.json: is missing, expected a result folder"):

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
+from known_leaves import make_surface
+from mvseg import load_result
 from mvseg.errors import InputError
 from mvseg.tracking.dates import STATIONS, Number, date_of, name_apart, order_dates, read_date, read_time
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
-from tests.plants_over_days import grow_blades, see, write_result
+from tests.plants_over_days import fit_blade, grow_blades, see, write_result
 
 
 def test_times_are_days() -> None:
@@ -36,13 +38,11 @@ def test_times_with_a_zone_are_in_the_order_in_which_they_were() -> None:
         order_dates([*dates, bare])
 
 
-def test_a_result_that_lost_a_leaf_is_refused(tmp_path: Path) -> None:
+def test_a_result_that_lost_its_surfaces_is_refused(tmp_path: Path) -> None:
     write_result(tmp_path / "day", grow_blades(3, 1))
-    run = tmp_path / "day" / "run.json"
-    run.write_text(run.read_text().replace('"files": {}', '"files": {"leaves/leaf_003.ply": "hash"}'))
     assert len(read_date(tmp_path / "day", 0).shaped) == 3
-    (tmp_path / "day" / "leaves" / "leaf_003.ply").unlink()
-    with pytest.raises(InputError, match=r"leaf_003.ply: is missing, expected the whole result"):
+    (tmp_path / "day" / "surfaces.npz").unlink()
+    with pytest.raises(InputError, match=r"surfaces.npz: is missing, expected the whole result"):
         read_date(tmp_path / "day", 0)
 
 
@@ -97,39 +97,42 @@ def test_results_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(midrib[[0, -1]], blades[1][[0, -1], 1], atol=1.5)
 
 
-def test_leaves_without_a_shape_and_rejected_ones(tmp_path: Path) -> None:
+def test_a_date_read_back_is_that_of_the_result_in_memory(tmp_path: Path) -> None:
     write_result(tmp_path / "day", grow_blades(3, 1))
-    (tmp_path / "day" / "leaves" / "leaf_002.ply").unlink()
-    table = (
-        (tmp_path / "day" / "traits.csv")
-        .read_text()
-        .replace("p,3,length", "p,3,width,,,mm,rejected: flat,\np,3,length")
-    )
-    (tmp_path / "day" / "traits.csv").write_text(table)
+    read, held = read_date(tmp_path / "day", 3), date_of(load_result(tmp_path / "day"), 3)
+    assert (read.scene, read.folder, held.scene, held.folder) == ("day", tmp_path / "day", "p", None)
+    for one, other in zip(read.leaves, held.leaves, strict=True):
+        assert one.numbers == other.numbers
+        np.testing.assert_array_equal(one.points, other.points)
+
+
+def test_leaves_without_a_shape_and_rejected_ones(tmp_path: Path) -> None:
+    write_result(tmp_path / "day", grow_blades(3, 1), shapeless=[2], rejected={3: "looks like the floor: flat"})
     date = read_date(tmp_path / "day", 0)
     assert [(leaf.leaf, leaf.midrib is None) for leaf in date.leaves] == [(1, False), (2, True)]
     assert date.shaped == [0]
-    (tmp_path / "day" / "traits.csv").write_text(table.replace("flat", "looks like a stem: 14 times longer than wide"))
-    doubted = {leaf.leaf: leaf.is_doubted for leaf in read_date(tmp_path / "day", 0).leaves}
+    write_result(tmp_path / "stem", grow_blades(3, 1), rejected={3: "looks like a stem: 14 times longer than wide"})
+    doubted = {leaf.leaf: leaf.is_doubted for leaf in read_date(tmp_path / "stem", 0).leaves}
     assert doubted == {1: False, 2: False, 3: True}
 
 
 def test_what_is_no_result_with_surfaces_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="is no result"):
+    with pytest.raises(InputError, match="is missing, expected a result folder"):
         read_date(tmp_path, 0)
     write_result(tmp_path / "day", grow_blades(3, 1))
+    run = tmp_path / "day" / "run.json"
+    said = json.loads(run.read_text())
     (tmp_path / "day" / "traits.csv").write_text("no,table\n1,2\n")
-    with pytest.raises(InputError, match="is no table of traits"):
+    with pytest.raises(InputError, match="expected a table that mvseg wrote"):
         read_date(tmp_path / "day", 0)
-    (tmp_path / "day" / "run.json").write_text(json.dumps({"scene": "p"}))
+    del said["traits"]
+    run.write_text(json.dumps(said))
     with pytest.raises(InputError, match="has ids but no surfaces, run mvseg infer"):
         read_date(tmp_path / "day", 0)
 
 
 def test_results_in_memory() -> None:
-    blade = grow_blades(1, 1)[1]
-    vertices = np.concatenate([blade[0, 1:2], np.repeat(blade[1:-1], 6, 0).reshape(-1, 3), blade[-1, 1:2]])
-    surface = SimpleNamespace(is_credible=True, is_oriented=True, mesh=lambda: SimpleNamespace(vertices=vertices))
+    surface = make_surface(fit_blade(grow_blades(1, 1)[1]))
     numbers = {"length": Measurement(80.0, 2.0, "surface"), "area": missing("no surface")}
     seen = LeafTraits(leaf=1, numbers=numbers, method="surface", reasons=(), rejection=None)
     none = replace(seen, leaf=2, numbers={})

@@ -2,103 +2,109 @@
 
 from __future__ import annotations
 
-import json
 import shutil
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
+import torch
+from PIL import Image
 
 from mvseg.demo import demo_scene
 from mvseg.errors import InputError
-from mvseg.formats.coco import encode_mask
+from mvseg.formats.label_png import read_labels
+from mvseg.formats.scene_folder import load_scene
+from mvseg.masks import Masks, Origin
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.regions import stack_regions
+from mvseg.results.folder import save_result
+from mvseg.results.result import Result
 from mvseg.training.data import read_sample
 from mvseg.training.from_results import list_results
+from scene_folders import edit_rig
 from tiny_training import make_config
 
 WIDTH, HEIGHT = 640, 480
-
-
-def square(left: int) -> Any:
-    mask = np.zeros((HEIGHT, WIDTH), np.uint8)
-    mask[10:30, left : left + 20] = 1
-    return encode_mask(mask)
+KINDS = (  # instance id, match score, origin
+    (1, 0.9, Origin.DETECTED),
+    (2, 0.2, Origin.DETECTED),
+    (-1, 0.9, Origin.DETECTED),
+    (3, 0.9, Origin.OTHER_VIEWS),
+    (3, 0.1, Origin.CORRECTED),
+)
 
 
 @pytest.fixture
-def result(tmp_path: Path) -> Path:
-    """One photo of the shipped plant with a mask of each kind, and one without masks."""
-    scene, folder = tmp_path / "scene", tmp_path / "out"
-    shutil.copytree(demo_scene(), scene)
-    folder.mkdir()
-    images = [
-        {"id": n + 1, "file_name": f"00{n}.jpg", "name": f"00{n}", "width": WIDTH, "height": HEIGHT} for n in range(2)
-    ]
-    kinds: list[dict[str, Any]] = [
-        {"instance_id": 1, "match_score": 0.9},
-        {"instance_id": 2, "match_score": 0.2},
-        {"instance_id": -1, "match_score": 0.9},
-        {"instance_id": 3, "match_score": 0.9, "from_other_views": True},
-        {"instance_id": 3, "match_score": 0.1, "corrected": "outline"},
-    ]
-    masks = [
-        {"id": n + 1, "image_id": 1, "category_id": 1, "segmentation": square(40 * n), **kind}
-        for n, kind in enumerate(kinds)
-    ]
-    (folder / "instances.json").write_text(json.dumps({"images": images, "annotations": masks}))
-    (folder / "run.json").write_text(json.dumps({"config": {"scene": str(scene)}}))
+def scene(tmp_path: Path) -> Path:
+    return shutil.copytree(demo_scene(), tmp_path / "scene")
+
+
+@pytest.fixture
+def result(scene: Path, tmp_path: Path) -> Path:
+    return write_squares(tmp_path / "out", scene, lefts=range(0, 200, 40))
+
+
+def write_squares(folder: Path, scene: Path, *, lefts: Sequence[int], kinds: Sequence[Any] = KINDS) -> Path:
+    """A result with a mask of each kind in the first photo of the shipped plant, and none in the others."""
+    boxes = [(left, 10, left + 20, 30) for left in lefts]
+    crops = [torch.ones(400, dtype=torch.bool)] * len(boxes)
+    regions = stack_regions([0] * len(boxes), boxes, crops, labels=[0] * len(boxes), num_views=9)
+    ids, scores, origins = (torch.tensor([kind[column] for kind in kinds]) for column in range(3))
+    masks = replace(Masks.of(regions, ids, scores), origin=origins)
+    matching = Matching(masks, MatchReport("nview", has_probabilities=True))
+    save_result(Result(scene=load_scene(scene), matching=matching), folder, report=False)
     return folder
-
-
-def change(result: Path, **changes: Any) -> None:
-    content = json.loads((result / "instances.json").read_text())
-    (result / "instances.json").write_text(json.dumps(content | changes))
 
 
 def test_sure_and_corrected_masks_are_labels_and_others_are_ignored(result: Path) -> None:
     samples = list_results(result)
-    assert [sample.name for sample in samples.samples] == ["out/000.jpg", "out/001.jpg"]
+    assert [sample.name for sample in samples.samples] == [f"out/00{view}.jpg" for view in range(9)]
     labelled = read_sample(samples.samples[0])
     assert labelled.classes.tolist() == [1, 1]
     is_label = (labelled.layers > 0).any(0)[20]
     assert [bool(is_label[40 * n + 5]) for n in range(5)] == [True, False, False, False, True]
     assert [bool(labelled.ignore[20, 40 * n + 5]) for n in range(5)] == [False, True, True, True, False]
     assert len(read_sample(samples.samples[1]).classes) == 0
-    assert len(list_results(result.parent)) == 2  # of a folder that holds results
+    assert len(list_results(result.parent)) == 9  # of a folder that holds results
 
 
-def test_a_doubtful_mask_hides_no_part_of_a_sure_one(result: Path) -> None:
-    masks = json.loads((result / "instances.json").read_text())["annotations"]
-    masks[1]["segmentation"] = square(10)  # the first one ends at 20
-    change(result, annotations=masks)
+def test_a_doubtful_mask_hides_no_part_of_a_sure_one(scene: Path, tmp_path: Path) -> None:
+    result = write_squares(tmp_path / "out", scene, lefts=(0, 10), kinds=KINDS[:2])  # the first one ends at 20
     labelled = read_sample(list_results(result).samples[0])
     assert bool((labelled.layers[:, 20, :20] == 1).any(0).all())
     assert labelled.ignore[20, :40].tolist() == [False] * 20 + [True] * 10 + [False] * 10
 
 
-def test_what_cannot_be_learned_from_is_named(result: Path, tmp_path: Path) -> None:
+def test_masks_of_photos_with_a_lens_are_those_of_the_photo(scene: Path, tmp_path: Path) -> None:
+    edit_rig(scene, 0, distortion=[-0.3, 0.1, 0.0, 0.0, 0.0])
+    sample = list_results(write_squares(tmp_path / "out", scene, lefts=(40,), kinds=KINDS[:1])).samples[0]
+    labelled = read_sample(sample)
+    saved = read_labels(tmp_path / "out" / "labels" / "000.png") == 1
+    assert bool(((labelled.layers > 0).any(0).numpy() == saved).all())
+    assert saved[10:30, 40:60].mean() < 0.9  # moved by the lens
+
+
+def test_what_cannot_be_learned_from_is_named(result: Path, scene: Path, tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
     with pytest.raises(InputError, match="holds no result"):
         list_results(tmp_path / "empty")
-    (tmp_path / "scene" / "images" / "001.jpg").unlink()
-    with pytest.raises(InputError, match=r"its photo 001\.jpg is not in"):
-        list_results(result)
-    shutil.rmtree(tmp_path / "scene")
-    with pytest.raises(InputError, match=r"its scene .* is gone"):
-        list_results(result)
-    change(result, annotations=[])
+    unsure = write_squares(tmp_path / "unsure", scene, lefts=(0,), kinds=KINDS[1:2])
     with pytest.raises(InputError, match="no mask that is sure enough"):
+        list_results(unsure)
+    (scene / "images" / "001.jpg").unlink()
+    with pytest.raises(InputError, match=r"its photo \S+001\.jpg is gone"):
         list_results(result)
-    change(result, annotations=[{"image_id": 1}])
-    with pytest.raises(InputError, match="no result of this version"):
+    (result / "instances.json").write_text("{")
+    with pytest.raises(InputError, match="not a whole JSON file"):
         list_results(result)
 
 
-def test_changed_photos_are_refused(result: Path) -> None:
-    images = json.loads((result / "instances.json").read_text())["images"]
-    change(result, images=[image | {"width": 320} for image in images])
-    with pytest.raises(InputError, match="its COCO entry says 320 x 480"):
+def test_changed_photos_are_refused(result: Path, scene: Path) -> None:
+    photo = scene / "images" / "000.jpg"
+    Image.open(photo).resize((320, 480)).save(photo)
+    with pytest.raises(InputError, match="its COCO entry says 640 x 480"):
         read_sample(list_results(result).samples[0])
 
 

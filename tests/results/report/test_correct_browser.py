@@ -7,7 +7,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -413,8 +412,8 @@ def test_hostile_names_stay_text(browser: sync_api.Browser, balls: Result, tmp_p
     result, path = rename_hostile(balls), tmp_path / "report.html"
     edits = [{"op": "reject", "view": f"0 {HOSTILE}", "at": [1, 1]}]
     corrections = parse_corrections({"format": "mvseg-corrections/1", "edits": edits})
-    corrected: Any = SimpleNamespace(fates=(Fate(1, "reject", f"bad {HOSTILE}"),))
-    write_report(path, replace(result, corrections=corrections, corrected=corrected), draw_pictures(result), run=RUN)
+    fates = (Fate(1, "reject", f"bad {HOSTILE}"),)
+    write_report(path, replace(result, corrections=corrections, fates=fates), draw_pictures(result), run=RUN)
     person = Person(browser, path)
     assert person.page.locator("#correct-list li button").first.inner_text() == f"no leaf, in 0 {HOSTILE}"
     assert person.page.locator("#correct-list .doubt").inner_text() == f"bad {HOSTILE}"

@@ -1,0 +1,108 @@
+"""What a result says of the run that made it: run.json."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from mvseg._version import __version__
+from mvseg.corrections.apply import Fate
+from mvseg.errors import InputError
+from mvseg.formats.json_file import Items, Vector3, check_content, load_json
+from mvseg.results.earlier import RUN_FILE
+from mvseg.traits.config import ColorCorrection
+
+FORMAT = 2  # of the folder; 1, of mvseg 0.2, says no "format" and holds neither cameras nor surfaces.npz
+
+
+class _Part(BaseModel):
+    model_config: ClassVar[ConfigDict] = ConfigDict(frozen=True, extra="allow")
+
+
+class MatchingRecord(_Part):
+    """What else `MatchReport` holds; `has_probabilities` is None where a result of format 1 does not say."""
+
+    has_probabilities: bool | None = None
+    explained: float | None = None
+    view_explained: tuple[float | None, ...] | None = None
+
+
+class PosesRecord(_Part):
+    """See `RefinedPoses`."""
+
+    refined: bool
+    residual_px: tuple[float | None, float | None]
+
+
+class TraitsRecord(_Part):
+    """The world that traits were measured in, and the corrections of colours."""
+
+    unit: str | None = None
+    up: Vector3 | None = None
+    colors: tuple[ColorCorrection, ...] = ()
+
+
+class RunRecord(_Part):
+    """What the run knew that made a result. Attributes are the fields of run.json, see docs/results.md; further fields
+    of the file are kept, too."""
+
+    format: int = Field(1, ge=1)
+    mvseg: str = ""
+    code: str = ""
+    scene: str = ""
+    inputs: dict[str, str] = {}
+    config: dict[str, Any] = {}
+    mask_kind: str | None = None
+    warnings: tuple[str, ...] = ()
+    unit: str | None = None
+    up: Vector3 | None = None
+    photos: Path | None = None
+    views: dict[str, tuple[str, ...]] = {}
+    matched_by: str = "none"
+    residual_px: int | None = None
+    matching: MatchingRecord = MatchingRecord()
+    poses: PosesRecord | None = None
+    traits: TraitsRecord | None = None
+    edits: Items[Any] = []
+    corrections: tuple[Fate, ...] = ()
+    counts: dict[str, int] = {}
+    seconds: dict[str, float] = {}
+    files: dict[str, str] = {}
+
+    def as_json(self) -> dict[str, Any]:
+        """What the file holds."""
+        return self.model_dump(mode="json", exclude_unset=True)
+
+
+def load_run(folder: Path) -> RunRecord:
+    """The run that made a result.
+
+    Raises:
+        InputError: this is no result, or one of a newer format; run.json is broken.
+    """
+    path = folder / RUN_FILE
+    if not path.is_file():
+        raise InputError(f"{folder}: holds no {RUN_FILE}, expected a result folder of mvseg infer")
+    content = load_json(path)
+    stated = content.get("format") if isinstance(content, dict) else None
+    if isinstance(stated, int) and stated > FORMAT:
+        message = f"is a result of format {stated}, and mvseg {__version__} reads those up to {FORMAT}"
+        raise InputError(f"{folder}: {message}; expected a newer mvseg")
+    return check_content(path, content, RunRecord)
+
+
+def find_place(folder: Path, run: RunRecord, stated: Path) -> Path:
+    """Where a file or folder is now that the run of a result names: where it was, or at the same place as seen from the
+    result, since they may have moved together; where it was, if it is nowhere."""
+    from_here = run.config.get("from_here")
+    if stated.exists() or not isinstance(from_here, dict):
+        return stated
+    for name, relative in from_here.items():
+        before = Path(str(run.config.get(name)))
+        if relative is not None and (before == stated or before in stated.parents):
+            moved = (folder / str(relative)).resolve() / stated.relative_to(before)
+            if moved.exists():
+                return moved
+    return stated

@@ -1,0 +1,402 @@
+"""Result folders read back: the way there and back, results of mvseg 0.2, and what is refused."""
+
+from __future__ import annotations
+
+import json
+import math
+import shutil
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from known_leaves import bent_blade, make_surface
+from mvseg import assert_same_result, load_result, load_scene
+from mvseg.config import RunConfig
+from mvseg.corrections.apply import Fate
+from mvseg.corrections.file import Corrections, Reject
+from mvseg.demo import demo_scene
+from mvseg.errors import InputError, InputWarning
+from mvseg.formats.coco import decode_crop, decode_rle, encode_mask
+from mvseg.formats.label_png import read_label_png
+from mvseg.formats.lens import distort, opencv_lens
+from mvseg.masks import MergedMask, Origin
+from mvseg.matching.result import MatchReport
+from mvseg.pipeline import run_scene
+from mvseg.poses.refine_poses import RefinedPoses
+from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.regions import mask_box
+from mvseg.results.folder import save_result
+from mvseg.results.result import Instances, Result
+from mvseg.traits.config import ColorCorrection, TraitsConfig
+from mvseg.traits.measure import measure_plant
+from scene_folders import HEIGHT, WIDTH, K, edit_rig, write_image, write_scene
+
+FORMAT_1 = Path(__file__).parent / "format_1"  # of the shipped plant with masks of two leaves, by mvseg 0.2
+LAWFUL = ("instances.json", "traits.csv", "surfaces.npz", "voxels.npz")  # the same bytes again
+
+
+@pytest.fixture(scope="module")
+def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three balls in four views, one of them through a lens."""
+    folder, distortion = write_scene(tmp_path_factory.mktemp("scenes") / "plant"), [-0.8, 0.3, 0.01, -0.01, 0.0]
+    edit_rig(folder, 2, distortion=distortion)
+    lens = opencv_lens(K, distortion, width=WIDTH, height=HEIGHT)
+    path = folder / "masks" / "002.png"
+    write_image(path, distort(read_label_png(path, WIDTH, HEIGHT), lens, K))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def balls(plant: Path) -> Result:
+    """As voxels."""
+    config = RunConfig(reconstruct=ReconstructConfig(shape="voxels", voxel_budget=8000))
+    return run_scene(plant, plant / "masks", config)
+
+
+@pytest.fixture(scope="module")
+def rich(balls: Result) -> Result:
+    """Something of everything that a result may hold: a surface, one with doubts, voxels, and a leaf without a shape;
+    masks of every origin, one of two leaves, one unmatched; corrections, colours, and refined poses."""
+    part = torch.zeros_like(balls.regions.crop(3))
+    part[: len(part) // 2] = True
+    masks = balls.masks.with_merged([MergedMask(region=3, own=int(balls.masks.instance_ids[3]), other=3, part=part)])
+    origin = torch.arange(len(masks)) % len(Origin)
+    ids = masks.instance_ids.clone()
+    ids[-1] = -1
+    scores = torch.where(origin > 0, torch.linspace(0.11111, 0.99999, len(masks)), torch.nan)
+    masks = replace(masks, origin=origin, instance_ids=ids, detection_scores=scores, classes=1 + (ids == 1).long())
+    report = MatchReport("nview", True, 2, 0.75, torch.tensor([0.5, math.nan, 0.25, 1.0]))
+    matching = replace(balls.matching, masks=masks, report=report)
+    doubtful = make_surface(bent_blade().coefficients.numpy() + 3, is_oriented=False, iou=0.8)
+    doubtful = replace(doubtful, quality=Quality(("seen from one side", "frayed")))
+    assert balls.voxels is not None
+    surfaces = {1: bent_blade(), 2: doubtful, 3: LeafSurface.none(torch.tensor([0]), "seen in one view only")}
+    scene = replace(balls.scene, up=(0.0, 0.6, 0.8))
+    colors = ColorCorrection(views="00[01]", matrix=(1.0, 0, 0, 0, 1, 0, 0, 0, 1), delta_e=2.5, photo="card.jpg")
+    colors_of = [colors, colors, None, None]
+    config = TraitsConfig(min_sure_views=0, min_visible_share=0, min_quality=0.9, leaves_only=False)
+    voxels = {1: balls.voxels[1]}
+    traits = measure_plant(
+        scene, matching, surfaces=surfaces, voxels=voxels, config=config, corrections=colors_of
+    )  # fmt: skip
+    assert traits.rejected == {"low_quality": 1}
+    return Result(
+        scene=scene,
+        matching=matching,
+        instances=Instances({1: 0.98765, 2: 0.5}, surfaces=surfaces, voxels=voxels, traits=traits),
+        poses=RefinedPoses(scene.cameras, is_refined=True, residual_px=(3.14159, math.nan)),
+        seconds={"match": 1.23456},
+        mask_kind="label images",
+        num_moved=2,
+        corrections=Corrections((Reject(view="000", at=(3.0, 4.0), by="me"),)),
+        fates=(Fate(1, "reject", "points at nothing", "there is no mask at (3, 4)"),),
+    )
+
+
+@pytest.fixture(scope="module")
+def ids_only(balls: Result) -> Result:
+    return replace(balls, instances=Instances())
+
+
+@pytest.mark.parametrize("name", ["balls", "rich", "ids_only"])
+def test_there_and_back(name: str, tmp_path: Path, request: pytest.FixtureRequest) -> None:
+    result = request.getfixturevalue(name)
+    save_result(result, tmp_path / "out", {"mvseg": "1.2.3", "warnings": ["odd"], "config": {"seed": 5}})
+    loaded = load_result(tmp_path / "out")
+    assert_same_result(result, loaded)
+    assert loaded.run is not None
+    assert (loaded.run.mvseg, loaded.run.warnings, loaded.run.config) == ("1.2.3", ("odd",), {"seed": 5})
+    for view, again in zip(result.scene.views, loaded.scene.views, strict=True):
+        assert view.path.resolve() == again.path
+        assert (view.lens is None) == (again.lens is None)
+    save_result(loaded, tmp_path / "again")
+    assert_same_result(loaded, load_result(tmp_path / "again"), relative=0, absolute=0)
+    for file in LAWFUL:
+        assert (tmp_path / "again" / file).is_file() == (tmp_path / "out" / file).is_file()
+        if (tmp_path / "out" / file).is_file():
+            assert (tmp_path / "again" / file).read_bytes() == (tmp_path / "out" / file).read_bytes(), file
+    before, after = (json.loads((tmp_path / place / "run.json").read_text()) for place in ("out", "again"))
+    assert {key for key in before | after if before.get(key) != after.get(key)} <= {"files"}
+
+
+def test_a_leaf_comes_back_exactly(rich: Result, tmp_path: Path) -> None:
+    save_result(rich, tmp_path, report=False)
+    loaded = load_result(tmp_path)
+    assert loaded.surfaces is not None
+    assert rich.surfaces is not None
+    for leaf, surface in rich.surfaces.items():
+        for name in ("coefficients", "covariance", "views", "residual_px", "iou"):
+            expected, found = getattr(surface, name), getattr(loaded.surfaces[leaf], name)
+            assert found.dtype == expected.dtype
+            assert torch.equal(found.nan_to_num(nan=-7), expected.nan_to_num(nan=-7))
+        assert loaded.surfaces[leaf].deviations == pytest.approx(surface.deviations, nan_ok=True, rel=1e-12)
+    assert loaded.voxels is not None
+    assert rich.voxels is not None
+    assert torch.equal(loaded.voxels[1].votes, rich.voxels[1].votes)
+
+
+@given(
+    st.integers(1, 9), st.integers(1, 9), st.lists(st.booleans(), min_size=81, max_size=81)
+)  # fmt: skip
+@settings(deadline=None)
+def test_crops_are_those_of_whole_masks(height: int, width: int, pixels: list[bool]) -> None:
+    """The slow twin decodes the whole image."""
+    mask = np.array(pixels[: height * width]).reshape(height, width)
+    counts = encode_mask(mask)["counts"]
+    box, crop = decode_crop(counts, width, height)
+    whole = decode_rle(counts, width, height)
+    assert box == (mask_box(torch.from_numpy(whole.copy())) if whole.any() else (0, 0, 1, 1))
+    np.testing.assert_array_equal(crop, whole[box[1] : box[3], box[0] : box[2]])
+
+
+def test_runs_of_no_pixels_change_nothing() -> None:
+    box, crop = decode_crop([3, 0, 1, 2, 0, 1, 5], 4, 3)
+    np.testing.assert_array_equal(crop, decode_rle([3, 0, 1, 2, 0, 1, 5], 4, 3)[box[1] : box[3], box[0] : box[2]])
+
+
+def test_a_thousand_masks_load_within_a_second(balls: Result, tmp_path: Path) -> None:
+    """Ten views of twelve megapixels with a hundred masks each; 0.53 s of CPU when this was written."""
+    save_result(replace(balls, instances=Instances()), tmp_path, report=False)
+    path = tmp_path / "instances.json"
+    content = json.loads(path.read_text())
+    straight, size = content["images"][0], {"width": 4000, "height": 3000}
+    frame = np.zeros((3000, 4000), bool)
+    frame[1000:1400, 2000:2300] = np.add.outer(np.arange(400), np.arange(300)) % 97 > 30  # in stripes: 2400 runs
+    mask = content["annotations"][0] | {"segmentation": encode_mask(frame)}
+    content["images"] = [straight | size | {"id": n, "name": f"{n}", "file_name": f"{n}.png"} for n in range(10)]
+    content["annotations"] = [mask | {"image_id": n % 10} for n in range(1000)]
+    path.write_text(json.dumps(content))
+    begun = time.process_time()
+    result = load_result(tmp_path)
+    assert time.process_time() - begun < 1.0
+    assert len(result.masks) == 1000
+    assert result.regions.areas.unique().tolist() == [int(frame.sum())]
+
+
+def test_photos_that_moved_with_the_result_are_found(plant: Path, tmp_path: Path) -> None:
+    from mvseg.runs.one_scene import run_one_scene
+
+    shutil.copytree(plant, tmp_path / "before" / "plant")
+    before = tmp_path / "before"
+    run_one_scene(
+        before / "plant", before / "plant" / "masks", before / "out", config=RunConfig(reconstruct=None), quiet=True
+    )
+    before.rename(tmp_path / "after")
+    views = load_result(tmp_path / "after" / "out").scene.views
+    assert [view.path.parent for view in views] == [tmp_path / "after" / "plant" / "images"] * 4
+    assert all(view.path.is_file() for view in views)
+
+
+class TestFormat1:
+    """The files as mvseg 0.2 wrote them, without those that nothing reads."""
+
+    @pytest.fixture
+    def old(self, tmp_path: Path) -> Path:
+        return shutil.copytree(FORMAT_1, tmp_path / "plant-result")
+
+    def test_beside_its_scene(self, old: Path) -> None:
+        (old.parent / "plant").mkdir()
+        shutil.copy(demo_scene() / "cameras.json", old.parent / "plant")
+        result, scene = load_result(old), load_scene(demo_scene())
+        assert torch.equal(result.scene.cameras.R, scene.cameras.R)
+        assert (result.scene.name, result.scene.unit, result.scene.up) == ("plant", "mm", (0, 0, 1))
+        assert len(result.masks) == 18
+        assert result.masks.origin.unique().tolist() == [Origin.GIVEN]
+        assert result.matching.support is not None
+        assert result.matching.support.tolist() == [9, 9]
+        assert result.run is not None
+        assert (result.run.format, result.run.mvseg) == (1, "0.2.0")
+        self.check_surfaces(result)
+
+    def test_where_its_scene_is_gone(self, old: Path) -> None:
+        with pytest.warns(InputWarning, match="holds no cameras, and its scene /plants/plant is gone"):
+            result = load_result(old)
+        assert [view.name for view in result.scene.views] == [f"{view:03d}" for view in range(9)]
+        self.check_surfaces(result)
+
+    def check_surfaces(self, result: Result) -> None:
+        """What was measured on the surfaces then is measured on those that were rebuilt."""
+        assert result.surfaces is not None
+        assert result.traits is not None
+        for leaf in result.traits.leaves:
+            surface = result.surfaces[leaf.leaf]
+            assert surface.is_credible
+            assert not surface.is_oriented
+            for name in ("area", "length", "width"):
+                assert getattr(surface, name) == pytest.approx(leaf.numbers[name].value, rel=1e-5)
+        assert result.traits.whole["number_of_leaves"].value == 2
+
+    def test_saved_again_it_is_of_todays_format(self, old: Path, tmp_path: Path) -> None:
+        with pytest.warns(InputWarning, match="holds no cameras"):
+            result = load_result(old)
+        save_result(result, tmp_path / "new", report=False)
+        again = load_result(tmp_path / "new")
+        assert_same_result(result, again)
+        assert (tmp_path / "new" / "traits.csv").read_bytes() == (old / "traits.csv").read_bytes()
+
+    def test_a_leaf_that_is_gone(self, old: Path) -> None:
+        (old / "leaves" / "leaf_002.ply").unlink()
+        with pytest.warns(InputWarning), pytest.raises(InputError, match=r"leaf_002\.ply: is missing, expected"):
+            load_result(old)
+        (old / "leaves" / "leaf_002.ply").write_text("ply")
+        with pytest.warns(InputWarning), pytest.raises(InputError, match=r"leaf_002\.ply: is no mesh"):
+            load_result(old)
+
+
+@pytest.fixture
+def saved(rich: Result, tmp_path: Path) -> Path:
+    save_result(rich, tmp_path / "out", report=False)
+    return tmp_path / "out"
+
+
+def change_run(folder: Path, **changes: Any) -> None:
+    path = folder / "run.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+def test_a_newer_format_is_refused(saved: Path) -> None:
+    change_run(saved, format=3)
+    message = r"out: is a result of format 3, and mvseg \S+ reads those up to 2; expected a newer mvseg$"
+    with pytest.raises(InputError, match=message):
+        load_result(saved)
+
+
+@pytest.mark.parametrize("name", ["surfaces.npz", "voxels.npz", "traits.csv"])
+def test_a_file_that_is_missing_or_cut_is_named(saved: Path, name: str) -> None:
+    data = (saved / name).read_bytes()
+    for content in (b"", data[: len(data) // 2], b"PK" + data[2:9] + data[:3]):
+        (saved / name).write_bytes(content)
+        with pytest.raises(InputError, match=rf"{name[:6]}\S+: "):
+            load_result(saved)
+    (saved / name).unlink()
+    with pytest.raises(InputError, match=f"{name}: is missing, expected the whole result that run.json lists"):
+        load_result(saved)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("surfaces.npz", {"num_views": np.array([9, 9, 9])}),
+        ("surfaces.npz", {"coefficients": np.zeros((3, 25, 3))}),
+        ("surfaces.npz", {"leaf": np.array([1, 2])}),
+        ("voxels.npz", {"origin": np.zeros((0, 3))}),
+        ("voxels.npz", {"leaf": np.array([4])}),
+    ],
+)
+def test_arrays_that_do_not_fit_are_refused(saved: Path, name: str, change: dict[str, Any]) -> None:
+    with np.load(saved / name) as file:
+        arrays = dict(file)
+    np.savez(saved / name, **(arrays | change))
+    with pytest.raises(InputError, match=f"{name}: holds no"):
+        load_result(saved)
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("traits", {"unit": 3}, r"run\.json: traits\.unit: "),
+        ("warnings", "odd", r"run\.json: warnings: "),
+        ("edits", [{"op": "sparkle"}], "edit 1: "),
+        ("format", 0, "format: Input should be greater than or equal to 1"),
+    ],
+)
+def test_what_run_json_says_is_checked(saved: Path, key: str, value: object, message: str) -> None:
+    change_run(saved, **{key: value})
+    with pytest.raises(InputError, match=message):
+        load_result(saved)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda image: image["camera"].update(R=[[1, 0, 0]] * 3), "view 2: R is not a rotation"),
+        (lambda image: image["camera"]["lens"].update(model="EYE"), "image 002: its lens is none of COLMAP's"),
+        (lambda image: image.update(file_name="../x.png"), r"image \.\./x\.png: "),
+        (lambda image: image.update(name="000"), "views 0 and 2 have the same name"),
+    ],
+)
+def test_broken_cameras_are_named(saved: Path, change: Callable[[Any], object], message: str) -> None:
+    content = json.loads((saved / "instances.json").read_text())
+    change(content["images"][2])
+    (saved / "instances.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match=rf"instances\.json: {message}"):
+        load_result(saved)
+
+
+# --- the same result
+
+
+def with_masks(result: Result, **columns: Any) -> Result:
+    return replace(result, matching=result.matching.with_masks(replace(result.masks, **columns)))
+
+
+def with_surface(result: Result, **changes: Any) -> Result:
+    surfaces = dict(result.surfaces or {})
+    surfaces[1] = replace(surfaces[1], **changes)
+    return replace(result, instances=replace(result.instances, surfaces=surfaces))
+
+
+def with_area(result: Result, factor: float) -> Result:
+    assert result.traits is not None
+    leaves = list(result.traits.leaves)
+    area = leaves[0].numbers["area"]
+    leaves[0] = replace(leaves[0], numbers={**leaves[0].numbers, "area": replace(area, value=area.value * factor)})
+    return replace(result, instances=replace(result.instances, traits=replace(result.traits, leaves=tuple(leaves))))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda r: replace(r, scene=replace(r.scene, unit="cm")), "unit: 'mm' and 'cm'"),
+        (lambda r: replace(r, scene=replace(r.scene, cameras=r.scene.cameras.scale(1.1))), r"cameras\.t\[\d, \d\]: "),
+        (lambda r: replace(r, matching=r.matching.with_masks(r.masks.select(torch.arange(11)))), "number of masks: 12"),
+        (lambda r: with_masks(r, regions=replace(r.regions, crops=~r.regions.crops)),
+         r"mask 0 \(view 0\): other pixels"),
+        (lambda r: with_masks(r, instance_ids=r.masks.instance_ids.flip(0)), r"mask 0 \(view 0\): instance id"),
+        (lambda r: with_masks(r, match_scores=r.masks.match_scores - 0.01), r"match_scores of mask\[0\]: "),
+        (lambda r: with_masks(r, second_parts=(None,) * 12), "masks of two instances"),
+        (lambda r: with_surface(r, coefficients=bent_blade().coefficients + 1), "surface of leaf 1: coefficients"),
+        (lambda r: with_surface(r, quality=Quality(("torn",))), "surface of leaf 1: quality"),
+        (lambda r: with_area(r, 1.001), "leaf 1: area: "),
+        (lambda r: replace(r, instances=replace(r.instances, voxels={})), "leaves with voxels"),
+        (lambda r: replace(r, instances=replace(r.instances, traits=None)), "has traits"),
+        (lambda r: replace(r, fates=()), "fates of corrections"),
+    ],
+)
+def test_the_first_difference_is_named(rich: Result, change: Callable[[Result], Result], message: str) -> None:
+    assert_same_result(rich, rich, relative=0, absolute=0)
+    with pytest.raises(AssertionError, match=f"^{message}"):
+        assert_same_result(rich, change(rich))
+
+
+def test_tolerances(rich: Result) -> None:
+    assert_same_result(rich, with_area(rich, 1.001), relative=0.002)
+    assert_same_result(rich, with_masks(rich, match_scores=rich.masks.match_scores - 0.01), absolute=0.011)
+
+
+def test_other_numbers_for_the_same_leaves(rich: Result, balls: Result) -> None:
+    of = {-1: -1, 1: 2, 2: 3, 3: 1}
+    ids, others = rich.masks.instance_ids, rich.masks.second_ids
+    ids, others = (torch.tensor([of[number] for number in column.tolist()]) for column in (ids, others))
+    masks = replace(rich.masks, instance_ids=ids, second_ids=others)
+    assert rich.traits is not None
+    leaves = tuple(replace(leaf, leaf=of[leaf.leaf]) for leaf in rich.traits.leaves)
+    instances = replace(rich.instances.renumber(of), traits=replace(rich.traits, leaves=leaves))
+    again = replace(rich, matching=rich.matching.with_masks(masks), instances=instances)
+    assert_same_result(rich, again, ids="renumbered")
+    with pytest.raises(AssertionError, match="instance id"):
+        assert_same_result(rich, again)
+    ids = balls.masks.instance_ids
+    joined = with_masks(balls, instance_ids=ids.where(ids != 3, 2))
+    for pair in ((balls, joined), (joined, balls)):
+        with pytest.raises(AssertionError, match="instance"):
+            assert_same_result(*pair, ids="renumbered")
