@@ -1,5 +1,5 @@
-"""Check the cameras, photos and masks of a scene, and the poses by the masks. Exit code 0: nothing would go wrong; 1:
-something would; 2: it cannot be read.
+"""Check the cameras, photos and masks of a scene, and the poses by the masks; or, with --target, areas by photos of the
+page of `mvseg target`. Exit code 0: nothing would go wrong; 1: something would; 2: it cannot be read.
 """
 
 from __future__ import annotations
@@ -30,13 +30,20 @@ NOTHING_TO_SEE = "there are neither photos nor masks"
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
     parser.add_argument("scene", type=Path, help="scene folder (photos, cameras of any kind in docs/formats.md)")
-    help_out = "folder for check.json and for cameras.png, a plan of the cameras (default: nothing is written)"
+    help_out = "folder for check.json (target.json), and for cameras.png, a plan (default: nothing is written)"
     parser.add_argument("--out", type=Path | None, help=help_out)
     add_shared(parser, "masks", "categories", "coco_crowd", "quiet")
+    help_target = "the photos show the page of mvseg target: how right are the areas of its shapes?"
+    parser.add_argument("--target", action="store_true", help=help_target)
+    parser.add_argument("--bar", type=float | None, help="length of the page's scale bar by a ruler, mm (default: 100)")
 
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
+    if args.target:
+        return _run_target(args)
+    if args.bar is not None:
+        raise InputError("--bar is of the page of mvseg target, expected --target with it")
     from mvseg.checks.check_scene import check_scene
     from mvseg.formats.scene_folder import load_masks, load_scene
     from mvseg.runs.one_scene import find_masks
@@ -66,6 +73,30 @@ def run(args: Namespace) -> int:
     if unread is not None:
         raise unread
     return WRONG if any(finding.level == "error" for finding in found) else 0
+
+
+def _run_target(args: Namespace) -> int:
+    from mvseg.formats.target import BAR
+    from mvseg.runs.check_target import check_target
+    from mvseg.system.atomic import write_text_whole
+
+    if args.masks is not None or args.categories is not None:
+        raise InputError("--masks and --categories have no effect with --target: its shapes are found by their colour")
+    check = check_target(args.scene, bar=BAR if args.bar is None else args.bar, progress=not args.quiet)
+    off = f"{check.residual:.2f} mm off; lengths {check.scale - 1:+.2%} by the tags"
+    print(f"{args.scene}: {check.num_tags} tags, {off}")
+    line = "{:12} {:>13} {:>13} {:>9} {:>7} {:>5} {:>10}"
+    print("\n" + line.format("shape", "true", "measured", "sd", "error", "95 %", "photos"))
+    for shape in check.shapes:
+        areas = [f"{area:.1f} mm^2" for area in (shape.true_area, shape.area)]
+        holds, photos = "yes" if shape.holds else "no", f"{shape.num_views} of {shape.num_masks}"
+        print(line.format(shape.name, *areas, f"{shape.sd:.1f}", f"{shape.error:+.1%}", holds, photos))
+    print(f"\n{check.verdict}")
+    if args.out is not None:
+        args.out.mkdir(parents=True, exist_ok=True)
+        write_text_whole(args.out / "target.json", json.dumps(check.describe(), indent=1) + "\n")
+        print(f"{args.out}: target.json", file=sys.stderr)
+    return 0 if check.is_right else WRONG
 
 
 @contextmanager

@@ -14,7 +14,7 @@ from typing import TextIO
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
 from mvseg._version import __version__
-from mvseg.cli import batch, check, correct, export, infer, match, models, pose, simulate, track, train
+from mvseg.cli import batch, check, correct, export, infer, match, models, pose, simulate, target, track, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -27,6 +27,7 @@ ABOUT = "The same instance, with the same id, in every calibrated view and in 3D
 VERBS: dict[str, tuple[ModuleType, str]] = {
     "pose": (pose, "a scene folder from photos alone"),
     "check": (check, "what would go wrong with a scene"),
+    "target": (target, "a page to print, that checks the whole chain"),
     "infer": (infer, "ids and 3D shapes of one scene"),
     "correct": (correct, "correct a result in the browser"),
     "batch": (batch, "many scenes, one table of traits"),

@@ -1,0 +1,24 @@
+"""Write a page to print, with shapes of known area: photographed and checked by `mvseg check --target`, it shows how
+good cameras, masks, surfaces and areas are.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from jsonargparse import ArgumentParser, Namespace
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """The options of the verb."""
+    parser.add_argument("page", type=Path, help="PDF file to write; A4, to be printed at 100 %%, in colour")
+
+
+def run(args: Namespace) -> int:
+    """Run the verb; returns the exit code."""
+    from mvseg.formats.target import tag_corners, tag_distance, write_target
+
+    write_target(args.page)
+    scale = f"--distance marker:0 marker:{len(tag_corners()) - 1} {tag_distance():.2f} --unit mm"
+    print(f"{args.page}: print it at 100 %, in colour. Of photos of it, mvseg pose needs {scale}")
+    return 0

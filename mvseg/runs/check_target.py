@@ -1,0 +1,222 @@
+"""How good a whole chain is, by the photographed page of `mvseg.formats.target`: its shapes are cut out by their colour
+and measured as leaves are, and compared with their true areas.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from mvseg.checks.target_masks import cut_shapes
+from mvseg.errors import InputError, faults_of
+from mvseg.formats.label_png import write_label_png
+from mvseg.formats.lens import distort
+from mvseg.formats.markers import find_markers, read_grey
+from mvseg.formats.photos import read_photo, require_photos
+from mvseg.formats.scene_folder import load_scene
+from mvseg.formats.target import BAR, FAMILY, Shape, list_shapes, tag_corners
+from mvseg.pipeline import run_scene
+from mvseg.poses.alignment import align
+from mvseg.reconstruction.triangulate import triangulate_points
+from mvseg.results.plant_files import METRES
+from mvseg.results.result import Result
+from mvseg.scene import Scene
+from mvseg.traits.leaf import missing
+
+Floats = NDArray[np.float64]
+
+NORMAL_95 = 1.96  # standard deviations
+# Of lengths; 2 % of areas. More is said to be a wrong scale: printers that fit a page shrink it by 3 %, and tags are
+# measured to 0.1 %, so a third more or less changes no verdict about these.
+MOST_OFF = 0.01
+MOST_OUTSIDE = 1  # of four: two outside of their 95 % intervals are chance in 1.4 % of sound chains
+
+
+@dataclass(frozen=True)
+class MeasuredShape:
+    """One shape of the page.
+
+    Attributes:
+        name: see `list_shapes`.
+        true_area: as printed, mm^2.
+        area, sd: as measured, mm^2; NaN if it was not.
+        num_views: how many of its masks were measured together.
+        num_masks: how many masks of it there are, one in each photo that shows it whole.
+        method: what it was measured on, or why it was not.
+    """
+
+    name: str
+    true_area: float
+    area: float
+    sd: float
+    num_views: int
+    num_masks: int
+    method: str
+
+    @property
+    def error(self) -> float:
+        """Share of the true area; NaN if it was not measured."""
+        return self.area / self.true_area - 1
+
+    @property
+    def holds(self) -> bool:
+        """Whether the true area is in the 95 % interval of the measured one."""
+        return abs(self.area - self.true_area) <= NORMAL_95 * self.sd
+
+
+@dataclass(frozen=True)
+class TargetCheck:
+    """What the photographed page says of a chain.
+
+    Attributes:
+        shapes: all that are on the page.
+        num_tags: tags of which a corner is seen in two photos or more.
+        scale: lengths of the scene over those of the print, by the tags.
+        residual: of the tags' corners from where they are on the print, root mean square, mm.
+    """
+
+    shapes: tuple[MeasuredShape, ...]
+    num_tags: int
+    scale: float
+    residual: float
+
+    @property
+    def is_right(self) -> bool:
+        """Scale right to 1 %, every shape measured, at most one outside of its interval."""
+        is_inside = [shape.holds for shape in self.shapes]
+        measured = bool(np.isfinite([shape.error for shape in self.shapes]).all())
+        return measured and abs(self.scale - 1) <= MOST_OFF and is_inside.count(False) <= MOST_OUTSIDE
+
+    @property
+    def verdict(self) -> str:
+        """One sentence."""
+        errors = np.array([shape.error for shape in self.shapes])
+        for shape in self.shapes:
+            if np.isnan(shape.error):
+                return f"the {shape.name} has no area: {shape.method}"
+        at_scale = f"{np.abs((1 + errors) / self.scale**2 - 1).max():.1%} at the scale of the tags"
+        if abs(self.scale - 1) > MOST_OFF:
+            return (
+                f"lengths are {abs(self.scale - 1):.1%} too {'short' if self.scale < 1 else 'long'}: the page was not "
+                f"printed at 100 % (measure the bar of {BAR:g} mm, and say --bar), or the scale of the cameras is "
+                f"wrong; areas are right to {at_scale}"
+            )
+        num_inside = sum(shape.holds for shape in self.shapes)
+        said = f"{num_inside} of {len(errors)} within their intervals"
+        said = f"areas are right to {np.abs(errors).max():.1%} ({at_scale}), {said}"
+        return said if self.is_right else f"{said}: they are less certain than their standard deviations say"
+
+    def describe(self) -> dict[str, Any]:
+        """What target.json says: areas in mm^2, errors as shares; null where there is none."""
+        shapes = [asdict(shape) | {"error": shape.error, "holds": shape.holds} for shape in self.shapes]
+        known = [{key: None if value != value else value for key, value in shape.items()} for shape in shapes]
+        return asdict(self) | {"shapes": known, "is_right": self.is_right, "verdict": self.verdict}
+
+
+def check_target(folder: Path, *, bar: float = BAR, progress: bool = False) -> TargetCheck:
+    """Measure the shapes of the photographed page with the stages of `mvseg infer`.
+
+    Where shapes are on the photos, and which mask shows which, follows from the tags; masks and areas do not.
+
+    Args:
+        folder: scene with photos of the page; its cameras state the unit of their lengths.
+        bar: length of the printed scale bar, by a ruler, mm: what tags and areas are multiplied with.
+        progress: show progress bars.
+
+    Raises:
+        InputError: bad scene; the unit is not known; no tag is seen in two photos; a photo shows no whole shape.
+    """
+    if not 0 < bar < np.inf:
+        raise InputError(f"bar is {bar:g}, expected its length in mm, about {BAR:g}")
+    scene = load_scene(folder)
+    require_photos(scene, folder)
+    if scene.unit.lower() not in METRES:
+        said = f"their unit is {scene.unit}" if scene.unit else "they say no unit"
+        raise InputError(f"{scene.source}: {said}, expected mm, cm or m, as mvseg pose --unit mm states it")
+    mm = 1000 * METRES[scene.unit.lower()]
+    corners = _find_corners(scene, progress=progress)
+    with faults_of(f"{folder}: {len(corners)} corners of the page's tags"):
+        places = tag_corners()
+        page = np.array([[*places[number][corner], 0] for number, corner in corners])
+        alignment = align(page, np.array(list(corners.values())))
+    shapes = dict(enumerate(list_shapes(), start=1))
+    with tempfile.TemporaryDirectory() as masks:
+        for view in tqdm(range(len(scene.views)), desc="masks", unit="photo", disable=not progress):
+            labels = _cut_view(scene, view, shapes=shapes, world_from_page=alignment.similarity)
+            write_label_png(Path(masks) / f"{scene.views[view].name}.png", labels)
+        result = run_scene(folder, masks, progress=progress)
+    printed = bar / BAR
+    return TargetCheck(
+        shapes=tuple(_measured(result, shape, label, mm=mm, printed=printed) for label, shape in shapes.items()),
+        num_tags=len({number for number, _ in corners}),
+        scale=float(alignment.similarity.scale) * mm / printed,
+        residual=alignment.rms * mm,
+    )
+
+
+def _find_corners(scene: Scene, *, progress: bool) -> Mapping[tuple[int, int], Floats]:
+    """{(tag, corner): (3,) where it is} of the page's tags, in the world."""
+    seen: dict[tuple[int, int], list[tuple[int, Floats]]] = {}
+    on_page = tag_corners()
+    for view in tqdm(range(len(scene.views)), desc="tags", unit="photo", disable=not progress):
+        for number, quad in find_markers(read_grey(scene, view), FAMILY).items():
+            for corner in range(4 if number in on_page else 0):
+                seen.setdefault((number, corner), []).append((view, quad[corner]))
+    corners = triangulate_points(scene.cameras, seen)
+    if not corners:
+        found = "no tag of the page is found in the photos"
+        if seen:
+            found = f"{len({number for number, _ in seen})} tags are found, but the cameras agree on none of them"
+        raise InputError(f"{scene.source}: {found}, expected photos of the page that mvseg target writes")
+    return corners
+
+
+def _cut_view(
+    scene: Scene, view: int, *, shapes: Mapping[int, Shape], world_from_page: pycolmap.Sim3d
+) -> NDArray[np.uint16]:
+    """(H, W) masks of the shapes that are whole in a photo, as the photo has them: with its lens distortion.
+
+    Raises:
+        InputError: none is there.
+    """
+    camera, size, places = scene.cameras[[view]], scene.cameras.sizes[view].numpy(), {}
+    for label, shape in shapes.items():
+        points = world_from_page * np.pad(np.concatenate([shape.cell, shape.outline]), ((0, 0), (0, 1)))
+        px, depth = (each[0].numpy() for each in camera.project(torch.from_numpy(points)))
+        if (depth > 0).all() and (px[4:] > 0).all() and (px[4:] < size).all():
+            places[label] = px[:4], px[4:]
+    labels = cut_shapes(read_photo(scene, view), places)
+    if not labels.any():
+        problem = "none of the page's shapes is found"
+        expected = "expected one whole, printed in colour; leave the photo out"
+        raise InputError(f"{scene.views[view].path}: view {view}: {problem}, {expected}")
+    return np.asarray(distort(labels, scene.views[view].lens, scene.cameras.K[view].numpy()), np.uint16)
+
+
+def _measured(result: Result, shape: Shape, label: int, *, mm: float, printed: float) -> MeasuredShape:
+    """A shape by the instance that most of its masks were matched to."""
+    is_shape = result.regions.labels == label
+    ids = Counter(result.masks.instance_ids[is_shape & (result.masks.instance_ids > 0)].tolist())
+    instance, num_views = ids.most_common(1)[0] if ids else (0, 0)
+    area = missing("no photos of it fit together" if is_shape.any() else "no photo shows it whole")
+    if instance and result.traits is not None:
+        area = result.traits.leaves[instance - 1].numbers["area"]
+    return MeasuredShape(
+        name=shape.name,
+        true_area=shape.area * printed**2,
+        area=area.value * mm**2,
+        sd=area.sd * mm**2,
+        num_views=num_views,
+        num_masks=int(is_shape.sum()),
+        method=area.method,
+    )

@@ -1,0 +1,220 @@
+"""`mvseg target` and `mvseg check --target`: the page, and photos of it by known cameras."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from benchmarks.target import MIDDLE, aim_cameras, write_photos
+from mvseg.checks.target_masks import cut_shapes
+from mvseg.cli import main
+from mvseg.demo import demo_scene
+from mvseg.formats.markers import find_markers, read_grey
+from mvseg.formats.scene_folder import load_scene
+from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, leaf_outline, list_shapes, tag_corners, tag_distance
+from mvseg.pipeline import run_scene
+from mvseg.results.result import Result
+from mvseg.runs import check_target
+from mvseg.scene import Cameras
+
+SIZE, FOCAL = (960, 720), 750.0
+
+
+def small_cameras(num_views: int = 6) -> Cameras:
+    return aim_cameras(num_views, size=SIZE, focal=FOCAL, seed=4)
+
+
+@pytest.fixture(scope="module")
+def photos(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Photos of the page, printed at 97 %, with the true cameras and a lens."""
+    folder = tmp_path_factory.mktemp("target") / "page"
+    write_photos(folder, small_cameras(), px_per_mm=4, seed=4, printed=0.97, lens=(0.03, -0.01))
+    return folder
+
+
+def complaint(capsys: pytest.CaptureFixture[str]) -> str:
+    (line,) = capsys.readouterr().err.splitlines()
+    return line.removeprefix("mvseg: error: ")
+
+
+# --- the page
+
+
+def test_areas_are_those_of_the_formulas() -> None:
+    disc, broad, *_ = list_shapes()
+    assert disc.area == pytest.approx(np.pi * 35**2, rel=2e-5)
+    u = np.linspace(0, 1, 100_001)
+    half = u**0.6 * (1 - u) ** 0.9
+    assert broad.area == pytest.approx(72 * 54 * (half / half.max()).mean(), rel=1e-4)
+
+
+def test_a_bent_leaf_has_the_area_of_the_straight_one() -> None:
+    """Pappus: what a half gains on the outer side of the arc, the other loses on the inner one."""
+    areas = []
+    for bend in (0.0, 0.9):
+        x, y = leaf_outline(78, 30, ends=(0.7, 0.9), bend=bend).T
+        areas.append(abs(x @ np.roll(y, 1) - y @ np.roll(x, 1)) / 2)
+    assert areas[0] == pytest.approx(areas[1], rel=1e-4)
+
+
+def test_the_first_and_the_last_tag_are_as_far_apart_as_said() -> None:
+    first, *_, last = (corners.mean(0) for corners in tag_corners().values())
+    assert tag_distance() == pytest.approx(np.hypot(*(last - first)))
+
+
+def test_nothing_on_the_page_touches_anything_else() -> None:
+    boxes = [(shape.cell[0], shape.cell[2]) for shape in list_shapes()]
+    boxes += [(corners[0] - TAG / 8, corners[2] + TAG / 8) for corners in tag_corners().values()]  # with a white module
+    for index, (low, high) in enumerate(boxes):
+        assert (low >= 5).all()  # mm, what printers leave white
+        assert (high <= (WIDTH - 5, HEIGHT - 5)).all()
+        for other_low, other_high in boxes[:index]:
+            assert ((low >= other_high) | (high <= other_low)).any()
+
+
+def test_the_file_holds_the_shapes_in_millimetres(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "new" / "page.pdf"
+    assert main(["target", str(path)]) == 0
+    assert "mvseg pose needs --distance marker:0 marker:11 277.48 --unit mm" in capsys.readouterr().out
+    pdf = path.read_text(encoding="ascii")
+    k = 72 / 25.4  # points per millimetre
+    media = re.findall(r"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf)
+    np.testing.assert_allclose(np.array(media, float), [[210 * k, 297 * k]])
+    matrix = re.search(r"stream\n([-\d.]+) 0 0 ([-\d.]+) 0 ([-\d.]+) cm", pdf)
+    assert matrix is not None
+    np.testing.assert_allclose(np.array(matrix.groups(), float), [k, -k, 297 * k], rtol=1e-7)
+    fills = re.findall(r"0.8353 0.0000 0.4706 rg\n([^f]*)h\nf\n", pdf)
+    for shape, fill in zip(list_shapes(), fills, strict=True):
+        outline = np.array(re.findall(r"([\d.]+) ([\d.]+) [ml]", fill), float)
+        np.testing.assert_array_equal(outline, shape.outline)
+    # every object is where the table of the PDF says
+    start = int(pdf.split("startxref\n")[1].split()[0])
+    assert pdf[start:].startswith("xref\n0 5\n")
+    for number, offset in enumerate(re.findall(r"(\d{10}) 00000 n", pdf), start=1):
+        assert pdf[int(offset) :].startswith(f"{number} 0 obj\n")
+
+
+def test_another_suffix_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["target", str(tmp_path / "page.png")]) == 2
+    assert complaint(capsys) == f"{tmp_path / 'page.png'}: expected a name that ends with .pdf"
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- masks by colour
+
+
+@pytest.mark.parametrize("light", [(1.0, 0.9, 0.7), (0.5, 0.6, 0.7)])
+@pytest.mark.parametrize(("shade", "most_wrong"), [(1.0, 0), (0.4, 100)])
+def test_masks_end_where_half_of_the_light_is_ink(
+    light: tuple[float, float, float], shade: float, most_wrong: int
+) -> None:
+    """A disc whose edge mixes light over two pixels, in lamplight and in blue shade, and partly in a hard shadow."""
+    rows, columns = np.mgrid[:200, :200] + 0.5
+    share = np.clip((60 - np.hypot(rows - 100, columns - 97)) / 2 + 0.5, 0, 1)[..., None]
+    strength = np.where(rows > 120, shade, 1.0)[..., None]
+    mixed = (share * (0.65, 0.04, 0.2) + (1 - share) * 0.95) * strength * light
+    photo = np.round(255 * mixed ** (1 / 2.2)).astype(np.uint8)
+    turn = np.linspace(0, 2 * np.pi, 100)
+    outline = np.stack([97 + 55 * np.cos(turn), 104 + 55 * np.sin(turn)], 1)  # a bit beside and smaller: no matter
+    cell = np.array([[10.0, 10], [190, 10], [190, 190], [10, 190]])
+    labels = cut_shapes(photo, {7: (cell, outline)})
+    assert np.unique(labels).tolist() == [0, 7]
+    assert ((labels == 7) != (share[..., 0] > 0.5)).sum() <= most_wrong  # of 11,304 pixels
+    assert not cut_shapes(photo, {7: (cell, outline + 100)}).any()  # another thing than the shape
+
+
+# --- the chain
+
+
+def test_a_page_printed_at_97_percent_is_noticed(
+    photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Law: measured with the bar as printed, the areas are right."""
+    results: list[Result] = []
+
+    def run_once(*args: Any, **options: Any) -> Result:
+        results.append(results[0] if results else run_scene(*args, **options))
+        return results[0]
+
+    monkeypatch.setattr(check_target, "run_scene", run_once)
+    out = tmp_path / "out"
+    assert main(["check", str(photos), "--target", "--quiet", "--out", str(out)]) == 1
+    assert "lengths are 3.0% too short: the page was not printed at 100 %" in capsys.readouterr().out
+    wrong = json.loads((out / "target.json").read_text())
+    assert wrong["scale"] == pytest.approx(0.97, abs=0.002)
+    assert wrong["is_right"] is False
+
+    assert main(["check", str(photos), "--target", "--bar", "97", "--quiet", "--out", str(out)]) == 0
+    said, right = capsys.readouterr().out, json.loads((out / "target.json").read_text())
+    assert "4 of 4 within their intervals" in said or "3 of 4 within their intervals" in said
+    assert right["num_tags"] == 12
+    assert right["residual"] < 0.5  # mm
+    assert right["scale"] == pytest.approx(1, abs=0.002)
+    assert [shape["name"] for shape in right["shapes"]] == [shape.name for shape in list_shapes()]
+    for shape, before in zip(right["shapes"], wrong["shapes"], strict=True):
+        assert abs(shape["error"]) < 0.015
+        assert 0 < shape["sd"] < 0.05 * shape["true_area"]
+        assert shape["area"] == before["area"]
+        assert shape["true_area"] == pytest.approx(0.97**2 * before["true_area"])
+        assert shape["num_views"] == shape["num_masks"] >= 4
+
+
+def test_a_photo_without_shapes_is_named(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Printed without colour: its tags are found, its shapes are not."""
+    folder = Path(shutil.copytree(photos, tmp_path / "page"))
+    path = folder / "images" / "01.jpg"
+    grey = cv2.cvtColor(cv2.imread(str(path)), cv2.COLOR_BGR2GRAY)
+    cv2.imwrite(str(path), grey)
+    assert main(["check", str(folder), "--target", "--quiet"]) == 2
+    expected = "none of the page's shapes is found, expected one whole, printed in colour; leave the photo out"
+    assert complaint(capsys) == f"{path}: view 1: {expected}"
+
+
+def test_photos_of_something_else(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(demo_scene()), "--target", "--quiet"]) == 2
+    said = "no tag of the page is found in the photos, expected photos of the page that mvseg target writes"
+    assert complaint(capsys) == f"{demo_scene() / 'cameras.json'}: {said}"
+
+
+def test_cameras_without_a_unit(photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = json.loads((photos / "cameras.json").read_text())
+    (tmp_path / "cameras.json").write_text(json.dumps(rig | {"unit": ""}))
+    (tmp_path / "images").symlink_to(photos / "images")
+    assert main(["check", str(tmp_path), "--target", "--quiet"]) == 2
+    said = "they say no unit, expected mm, cm or m, as mvseg pose --unit mm states it"
+    assert complaint(capsys) == f"{tmp_path / 'cameras.json'}: {said}"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--bar", "97"], "--bar is of the page of mvseg target, expected --target with it"),
+        (["--target", "--bar", "-1"], "--bar is -1, expected its length in mm, about 100"),
+        (["--target", "--masks", "masks"], "--masks and --categories have no effect with --target: its shapes are"),
+    ],
+)
+def test_options_that_do_not_fit(words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["check", str(demo_scene()), *words, "--quiet"]) == 2
+    assert complaint(capsys).startswith(message)
+
+
+def test_tags_are_where_the_page_says(photos: Path) -> None:
+    """Corners in the order of `find_markers`, no half pixel off."""
+    scene = load_scene(photos)
+    found = find_markers(read_grey(scene, 0), FAMILY)
+    assert found.keys() <= tag_corners().keys()
+    misses = []
+    for number, quad in found.items():
+        world = MIDDLE + 0.97 * (tag_corners()[number] - MIDDLE)
+        px, _ = scene.cameras[[0]].project(torch.from_numpy(np.pad(world, ((0, 0), (0, 1)))))
+        misses.append(quad - px[0].numpy())
+    assert np.abs(np.mean(misses, axis=(0, 1))).max() < 0.1
+    assert np.abs(misses).max() < 1.5
