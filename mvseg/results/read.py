@@ -120,8 +120,9 @@ def load_result(folder: Path | str) -> Result:
     of the instances, and the candidates `left` out. `Scene.views` name the photos where they are now, if they moved
     together with the result.
 
-    A result of mvseg 0.2 is read, too. It holds no cameras, so the scene folder is opened; its surfaces are rebuilt
-    from the meshes in leaves/, without covariance; leaves that have voxels only come without them.
+    A result of an earlier version, which says no format, is read, too. It holds no cameras, so the scene folder is
+    opened; its surfaces are rebuilt from the meshes in leaves/, without covariance; leaves that have voxels only come
+    without them.
 
     Args:
         folder: of one scene, as `mvseg infer`, `mvseg match` and `mvseg batch` write it.

@@ -14,7 +14,7 @@ from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE
 from mvseg.traits.config import ColorCorrection
 
-FORMAT = 2  # of the folder; 1, of mvseg 0.2, says no "format" and holds neither cameras nor surfaces.npz
+FORMAT = 2  # of the folder; 1, of earlier versions, says no "format" and holds neither cameras nor surfaces.npz
 
 
 class _Part(BaseModel):

@@ -1,4 +1,4 @@
-"""Result folders read back: the way there and back, results of mvseg 0.2, and what is refused."""
+"""Result folders read back: the way there and back, results of earlier versions, and what is refused."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from mvseg.traits.config import ColorCorrection, TraitsConfig
 from mvseg.traits.measure import measure_plant
 from scene_folders import HEIGHT, WIDTH, K, edit_rig, write_image, write_scene
 
-FORMAT_1 = Path(__file__).parent / "format_1"  # of the shipped plant with masks of two leaves, by mvseg 0.2
+FORMAT_1 = Path(__file__).parent / "format_1"  # of the shipped plant with masks of two leaves, by an earlier version
 LAWFUL = ("instances.json", "traits.csv", "surfaces.npz", "voxels.npz")  # the same bytes again
 
 
@@ -197,7 +197,7 @@ def test_photos_that_moved_with_the_result_are_found(plant: Path, tmp_path: Path
 
 
 class TestFormat1:
-    """The files as mvseg 0.2 wrote them, without those that nothing reads."""
+    """The files as an earlier version wrote them, without those that nothing reads."""
 
     @pytest.fixture
     def old(self, tmp_path: Path) -> Path:
