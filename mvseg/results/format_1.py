@@ -1,4 +1,4 @@
-"""Results of format 1, from before they had a number: what they lack is rebuilt from the scene folder and the meshes."""
+"""Results of format 1, which had no number yet: what they lack is rebuilt from the scene folder and the meshes."""
 
 from __future__ import annotations
 

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from mvseg.formats.lens import distort
 from mvseg.crop import Crop
+from mvseg.formats.lens import distort
 from mvseg.masks import Masks, replace_crops
 from mvseg.regions import Regions
 from mvseg.results.result import Result
