@@ -56,7 +56,8 @@ WITHOUT_TENSORS = {
 }  # fmt: skip
 # They read files, or take arrays of any kind: what they make is on the CPU.
 MAKERS = {
-    "load_masks", "load_scene", "load_photos", "load_detector", "run_scene", "regions_from_masks", "Scene",
+    "assert_same_result", "load_masks", "load_result", "load_scene", "load_photos", "load_detector", "run_scene",
+    "regions_from_masks", "Scene",
     "regions_from_label_maps", "with_instance_ids",
 }  # fmt: skip
 

@@ -72,7 +72,6 @@ def run(*edits: Edit, learn_plant: bool = True) -> State:
         scene=SCENE,
         photos=Photos(SCENE),
         found=found,  # type: ignore[arg-type]
-        match=found.match,
         fit=fit,
         corrections=Corrections(edits) if edits else None,
     )
@@ -93,7 +92,7 @@ def test_an_edit_is_about_the_mask_that_is_seen_whatever_it_scores() -> None:
     before = run()
     assert set(np.unique(as_painted(before))) == {0, 1, 2, WEAK}
     state = run(Reject(view="v0", at=at(WEAK, 0), everywhere=True))
-    assert [each.fate for each in state.fates] == [APPLIED]
+    assert [each.fate for each in state.result().fates] == [APPLIED]
     assert set(np.unique(as_painted(state))) == {0, 1, 2}
     for one, other in zip(as_painted(before), as_painted(state), strict=True):
         assert np.array_equal(np.where(one == WEAK, 0, one), other)
