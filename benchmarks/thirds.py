@@ -1,9 +1,9 @@
-"""What does a third more or less of each number change? `python benchmarks/thirds.py --cache DIR [--of surfaces]`
+"""What does a third more or less of each number of matching change? `python benchmarks/thirds.py --cache DIR`
 
-Numbers are those at the head of the modules of matching (and the fields of `NViewConfig`), or of surfaces; one at a
-time is divided and multiplied by 1.33, whole numbers change by 1 at least. The scenes are development plants with
-degraded masks. Of matching, a line says of each scene how many ids of "nview" and of "one-per-view" change, by how much
-their pair F1, and how far match scores move; of surfaces, fitted to the true ids, by how much areas of leaves change.
+Numbers are those at the head of the modules of matching, and the fields of `NViewConfig`; one at a time is divided and
+multiplied by 1.33, whole numbers change by 1 at least. The scenes are development plants with degraded masks. A line
+says of each scene how many ids of "nview" and of "one-per-view" change, by how much their pair F1, and how far match
+scores move.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ import importlib
 import pkgutil
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
@@ -27,7 +27,6 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import mvseg.matching
-import mvseg.reconstruction.surface
 from benchmarks.label_maps import LabelledScene, load_maps
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -36,11 +35,10 @@ from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.view_graph import ViewGraph
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.simulation.dataset import PRESETS, list_scenes
 
 FACTOR = 1.33
-SCENES = {"matching": ((3, 16), (5, 32), (10, 8), (20, 8)), "surfaces": ((3, 4), (5, 4), (10, 4), (20, 4))}
+SCENES = ((3, 16), (5, 32), (10, 8), (20, 8))  # views and leaves
 
 
 def scaled(value: Any, factor: float) -> Any:
@@ -106,25 +104,9 @@ def compare_matchings(before: list[tuple[np.ndarray, ...]], after: list[tuple[np
     return " | ".join(parts)
 
 
-def fit_all(scenes: list[LabelledScene]) -> np.ndarray:
-    """The areas of all leaves."""
-    areas = []
-    for scene in scenes:
-        regions, truth = scene.masks("degraded")
-        surfaces = fit_surfaces(regions, torch.where(truth > 0, truth, -1), scene.cameras)
-        areas += [float(surface.area) for surface in surfaces.values()]
-    return np.array(areas)
-
-
-def compare_areas(before: np.ndarray, after: np.ndarray) -> str:
-    change = np.abs(np.log(after / before))
-    return f"median {100 * np.nanmedian(change):.2f} %, most {100 * np.nanmax(change):.1f} %"
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, required=True, help="folder for rendered label maps")
-    parser.add_argument("--of", choices=tuple(SCENES), default="matching")
     parser.add_argument("--numbers", nargs="+", help="only these")
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -132,27 +114,24 @@ def main() -> None:
     specs = [spec for spec in list_scenes(PRESETS["paper-eval"], 0) if spec.split == "dev"]
     scenes = [
         load_maps(next(spec for spec in specs if (spec.num_views, spec.num_leaves) == cell), args.cache)
-        for cell in SCENES[args.of]
+        for cell in SCENES
     ]
-    is_matching = args.of == "matching"
-    work: Callable[..., Any] = match_all if is_matching else fit_all
-    compare: Callable[..., str] = compare_matchings if is_matching else compare_areas
-    before = work(scenes)
-    for module, name in list_numbers(mvseg.matching if is_matching else mvseg.reconstruction.surface):
+    before = match_all(scenes)
+    for module, name in list_numbers(mvseg.matching):
         for factor in (1 / FACTOR, FACTOR) if args.numbers is None or name in args.numbers else ():
             try:
                 with changed(module, name, scaled(getattr(module, name), factor)):
-                    said = compare(before, work(scenes))
+                    said = compare_matchings(before, match_all(scenes))
             except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
                 said = f"cannot be: {error}"
             print(f"{module.__name__.rpartition('.')[2]} {name} x {factor:.2f}: {said}", flush=True)
     config = NViewConfig()
-    for part in fields(config) if is_matching else ():
+    for part in fields(config):
         group = getattr(config, part.name)
         for field in fields(group):
             for factor in (1 / FACTOR, FACTOR) if args.numbers is None or field.name in args.numbers else ():
                 other = replace(group, **{field.name: factor * getattr(group, field.name)})
-                said = compare(before, match_all(scenes, replace(config, **{part.name: other})))
+                said = compare_matchings(before, match_all(scenes, replace(config, **{part.name: other})))
                 print(f"{part.name}.{field.name} x {factor:.2f}: {said}", flush=True)
 
 

@@ -71,10 +71,6 @@ class Crop:
         """What both masks cover, in the box of this one."""
         return Crop(self.box, self.pixels & other.within(self.box).pixels)
 
-    def share(self, other: Crop) -> float:
-        """The share of the mask that another one covers; 0 without a pixel."""
-        return self.intersect(other).area / max(self.area, 1)
-
     def iou(self, other: Crop) -> float:
         """Intersection over union; 0 without a pixel in either."""
         both = self.intersect(other).area

@@ -100,6 +100,13 @@ class Regions:
         x1, y1, x2, y2 = self.boxes[index].tolist()
         return Crop((x1, y1, x2, y2), self.crop(index))
 
+    def at(self, view: int, x: int, y: int) -> list[int]:
+        """The regions of a view that show the pixel in column x, row y, ascending; none outside of the image."""
+        x1, y1, x2, y2 = self.boxes.T
+        here = (self.view_index == view) & (x1 <= x) & (x < x2) & (y1 <= y) & (y < y2)
+        near = here.nonzero()[:, 0].tolist()
+        return [index for index in near if self.crop(index)[y - int(y1[index]), x - int(x1[index])]]
+
     def union(self, indices: Iterable[int]) -> Crop:
         """What one or more regions of one view cover."""
         first, *others = map(self.placed, indices)

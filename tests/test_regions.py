@@ -74,6 +74,21 @@ def test_a_union_is_that_of_whole_frames() -> None:
     assert (x1, y1, x2, y2) == mask_box(whole)
 
 
+def test_a_pixel_is_shown_by_the_masks_that_hold_it_in_whole_frames() -> None:
+    maps = random_maps()
+    regions = regions_from_label_maps(maps)
+    for view, labels in enumerate(maps):
+        height, width = labels.shape
+        for y, x in np.ndindex(height + 1, width + 1):
+            frames = [regions.mask(row, width, height) for row in range(len(regions))]
+            is_in = regions.view_index == view
+            expected = [
+                row for row in range(len(regions)) if is_in[row] and y < height and x < width and frames[row][y, x]
+            ]
+            assert regions.at(view, x, y) == expected
+    assert regions.at(0, -1, 0) == regions.at(0, 0, -1) == []
+
+
 def test_thinned_pixels_stand_for_the_whole_mask() -> None:
     maps = [np.zeros((300, 400), np.uint16)]
     maps[0][10:250, 20:380] = 1

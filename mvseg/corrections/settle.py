@@ -6,7 +6,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 from mvseg.corrections.apply import APPLIED, Corrected
-from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import LeftOut
@@ -33,7 +32,7 @@ def settle(
     gone: set[int] = set()
     answers: set[int] = set()
     for number, view, column, row, is_about_all in corrected.refused:
-        shown = [each for each in left if _is_shown(each.masks, view, column, row)]
+        shown = [each for each in left if each.masks.regions.at(view, column, row)]
         gone |= {id(each) for each in shown if is_about_all}
         width, height = cameras.sizes[view].tolist()
         is_in_photo = 0 <= column < width and 0 <= row < height
@@ -44,12 +43,3 @@ def settle(
     )
     return tuple(each for each in left if id(each) not in gone), replace(corrected, fates=fates)
 
-
-def _is_shown(masks: Masks, view: int, column: int, row: int) -> bool:
-    """Whether one of the masks of a view has a pixel."""
-    x1, y1, x2, y2 = masks.regions.boxes.T
-    here = (masks.view_index == view) & (x1 <= column) & (column < x2) & (y1 <= row) & (row < y2)
-    return any(
-        bool(masks.regions.crop(index)[row - int(y1[index]), column - int(x1[index])])
-        for index in here.nonzero()[:, 0].tolist()
-    )

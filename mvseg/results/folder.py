@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -208,10 +208,7 @@ def _undistorted(result: Result, region: int, view: int) -> dict[str, Any]:
 def _in_frame(result: Result, region: int, part: Tensor) -> NDArray[np.bool_]:
     """(H, W) mask in the undistorted image, of pixels in the box of a region."""
     width, height = result.scene.cameras.sizes[int(result.masks.view_index[region])].tolist()
-    x1, y1, x2, y2 = result.regions.boxes[region].tolist()
-    frame = np.zeros((height, width), bool)
-    frame[y1:y2, x1:x2] = part.numpy()
-    return frame
+    return replace(result.regions.placed(region), pixels=part).paste((width, height)).numpy()
 
 
 def _chance_of(result: Result, instance: int) -> float | None:

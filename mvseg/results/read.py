@@ -19,6 +19,7 @@ from torch import Tensor
 
 from mvseg.corrections.file import FORMAT as EDITS_FORMAT
 from mvseg.corrections.file import parse_corrections
+from mvseg.crop import Crop
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import Rle, decode_crop, decode_rle
 from mvseg.formats.image_file import file_name_problem
@@ -237,7 +238,7 @@ def _table_of(content: _Instances, scene: Scene) -> Masks:
             crops.append(torch.from_numpy(crop.copy()).flatten())
             if each.other_part is not None:
                 frame = decode_rle(each.other_part.counts, *scene.cameras.sizes[views[-1]].tolist())
-                part = torch.from_numpy(frame[box[1] : box[3], box[0] : box[2]].copy())
+                part = torch.from_numpy(Crop(box, torch.from_numpy(crop)).cut(frame).copy())
                 merged.append(MergedMask(region=row, own=each.instance_id, other=each.other_instance_id, part=part))
     rows = content.annotations
     labels = [row if each.source_label is None else each.source_label for row, each in enumerate(rows, start=1)]

@@ -123,10 +123,5 @@ def _agreeing(one: Masks, two: Masks, cameras: Cameras) -> tuple[Ints, Ints]:
 def _mask_at(masks: Masks, is_chosen: Bools, place: Sequence[int]) -> int | None:
     """The row of the mask that a pixel (view, x, y) lies in: of several, a chosen one, and the smallest."""
     view, column, line = place
-    x1, y1, x2, y2 = masks.regions.boxes.T
-    here = (masks.view_index == view) & (x1 <= column) & (column < x2) & (y1 <= line) & (line < y2)
-    rows = [
-        row for row in here.nonzero()[:, 0].tolist()
-        if masks.regions.crop(row)[line - int(y1[row]), column - int(x1[row])]
-    ]  # fmt: skip
+    rows = masks.regions.at(view, column, line)
     return min(rows, key=lambda row: (not is_chosen[row], int(masks.regions.areas[row])), default=None)
