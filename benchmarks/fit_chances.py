@@ -5,8 +5,8 @@ of few leaves and of 12 to 30. Of two dates at most three apart, a pose is right
 it pairs are the same. Prints, each of greatest likelihood,
 
 - `TEMPER` of `mvseg/tracking/align.py`, by the poses of two dates alone: that a right one is taken among all;
-- `GUESS` of the same file, by the poses of all dates placed together; beside them two dates of different plants of a
-  kind, where no pose is right, weighted by a third: they are rarer, but must be noticed;
+- `GUESS` of the same file, by the poses of all dates placed together; beside them 60 pairs of dates of different plants
+  of each kind, where no pose is right: they are rare, but must be noticed;
 - `CALIBRATION` of `mvseg/tracking/associate.py`, by links, with the chances of poses as they are in the code.
 """
 
@@ -33,7 +33,7 @@ from mvseg.tracking.costs import Leaves, Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.place_dates import place_dates
 
-NUM_OTHER, OTHER_WEIGHT, RIDGE, EPS = 60, 1 / 3, 0.01, 1e-6
+NUM_OTHER, RIDGE, EPS = 60, 0.01, 1e-6
 Dated = tuple[PlantOnDate, list[int]]
 Looked = dict[tuple[int, int], Poses]
 Placed = tuple[float, int, bool]  # gain of links, number of leaves, whether the pose is right
@@ -99,12 +99,11 @@ def fit_guess(plants: list[tuple[Seen, Looked]], others: list[tuple[Seen, Looked
     known: list[Placed] = [each for plant in plants for each in judge_placed(*plant, is_other=False)]
     strange = [each for plant in others for each in judge_placed(*plant, is_other=True)]
     gain, leaves, right = np.array(known + strange).T
-    weight = np.repeat([1.0, OTHER_WEIGHT], [len(known), len(strange)])
     sign = np.where(right > 0, 1, -1)
 
     def loss(b: np.ndarray) -> float:
         odds = b[0] + (b[1] * gain / leaves - b[2]) * np.sqrt(leaves)
-        return float((weight * np.logaddexp(0, -sign * odds)).sum() + RIDGE * float(b[1:] @ b[1:]))
+        return float(np.logaddexp(0, -sign * odds).sum() + RIDGE * float(b[1:] @ b[1:]))
 
     return [float(each) for each in minimize(loss, np.zeros(3)).x]
 
