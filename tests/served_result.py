@@ -13,8 +13,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from mvseg.corrections.file import name_edits
-from mvseg.runs.correct_result import OpenResult
-from mvseg.runs.correction_server import CorrectionServer, Corrector
+from mvseg.server.correction_server import CorrectionServer, Corrector
+from mvseg.server.open_result import OpenResult
 
 WAIT = 60.0  # seconds, on a busy machine
 

@@ -31,10 +31,10 @@ from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import run_scene
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.result import Instances, Result
-from mvseg.runs.correct_result import OpenResult, Superseded, keep_numbers, open_alone
-from mvseg.runs.correction_server import CHANGED, CorrectionServer, Corrector
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.scene import Scene, View
+from mvseg.server.correction_server import CHANGED, CorrectionServer, Corrector
+from mvseg.server.open_result import OpenResult, Superseded, keep_numbers, open_alone
 from mvseg.verification.known_surfaces import name_masks
 from room_scene import room_cameras
 from scene_folders import write_scene
@@ -247,7 +247,7 @@ def test_an_edit_that_cannot_be_saved_says_so(
     def refuse(*_: object) -> None:
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("mvseg.runs.correction_server.write_corrections", refuse)
+    monkeypatch.setattr("mvseg.server.correction_server.write_corrections", refuse)
     status, answer = save(served, [])
     assert status == 500
     assert answer["problem"] == f"{folder}: the edit could not be saved (Permission denied)"

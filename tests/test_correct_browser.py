@@ -10,8 +10,8 @@ from typing import Any
 import pytest
 
 from mvseg.config import RunConfig
-from mvseg.runs.correction_server import CorrectionServer
 from mvseg.runs.one_scene import run_one_scene
+from mvseg.server.correction_server import CorrectionServer
 from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from scene_folders import write_scene
 from served_result import serve, text_of

@@ -15,7 +15,7 @@ import mvseg.pipeline
 from mvseg import Corrections, InputError, InputWarning, ReconstructConfig, RunConfig, run_scene
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, parse_corrections
-from mvseg.runs.correct_result import CORRECTIONS_FILE, OpenResult
+from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
 from scene_folders import write_scene
 
 IDS_ONLY = RunConfig(reconstruct=None)

@@ -45,7 +45,7 @@ FLOORS = (
     ("results",),
     ("pipeline", "tracking", "training"),
     ("runs",),
-    ("batch",),
+    ("batch", "server"),
     ("__init__",),
     ("cli",),
 )

@@ -25,9 +25,9 @@ def run(args: Namespace) -> int:
     import webbrowser
 
     from mvseg.results.read import find_result
-    from mvseg.runs.correct_result import CORRECTIONS_FILE, OpenResult, check_writable, open_alone
-    from mvseg.runs.correction_server import CorrectionServer, Corrector
     from mvseg.runs.recorded_run import repeat_command
+    from mvseg.server.correction_server import CorrectionServer, Corrector
+    from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult, check_writable, open_alone
     from mvseg.system.worker_pool import default_workers, start_workers
 
     folder = find_result(args.result)

@@ -28,7 +28,7 @@ MIRROR = np.array([1.0, 1.0, -1.0])
 
 
 @dataclass(frozen=True, eq=False)
-class Alignment:
+class SimilarityFit:
     """A similarity that most of the points agree on.
 
     Attributes:
@@ -104,7 +104,7 @@ def _refuse_mirror(source: Floats, target: Floats, residuals: list[float]) -> No
         raise InputError("the known points are mirrored, expected right-handed axes: reverse one axis")
 
 
-def align(source: Floats, target: Floats) -> Alignment:
+def align(source: Floats, target: Floats) -> SimilarityFit:
     """A similarity that ignores the targets that contradict most others (least median of squares, then least squares).
 
     Of P targets, (P - 4) / 2 rounded up may be wrong: none of three or four, one of five, 28 of 60. Deterministic.
@@ -130,7 +130,7 @@ def align(source: Floats, target: Floats) -> Alignment:
             if is_one_line(source[is_inlier]) or is_one_line(target[is_inlier]):
                 is_inlier[:] = True
             best = fit_similarity(source[is_inlier], target[is_inlier])
-    return Alignment(similarity=best, residuals=_residuals(best, source, target), is_inlier=is_inlier)
+    return SimilarityFit(similarity=best, residuals=_residuals(best, source, target), is_inlier=is_inlier)
 
 
 def _residuals(similarity: pycolmap.Sim3d, source: Floats, target: Floats) -> Floats:

@@ -87,7 +87,7 @@ def pose_photos(
     for message in messages:
         print(f"mvseg: warning: {message}", file=sys.stderr)
     if not quiet:
-        print(describe_result(out, structure, placement=placement, scene=scene))
+        print(summarize_poses(out, structure, placement=placement, scene=scene))
     return scene
 
 
@@ -144,7 +144,7 @@ def describe_poses(structure: Structure, placement: Placement, files: Sequence[P
     }
 
 
-def describe_result(out: Path, structure: Structure, *, placement: Placement, scene: Scene) -> str:
+def summarize_poses(out: Path, structure: Structure, *, placement: Placement, scene: Scene) -> str:
     """The lines that a run ends with."""
     found, lost = len(structure.registered), len(structure.left_out)
     points = structure.model.num_points3D()

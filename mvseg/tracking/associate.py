@@ -26,7 +26,7 @@ ROUNDS = 10  # of joining anew, at most; two or three are enough
 
 
 @dataclass(frozen=True)
-class Link:
+class Association:
     """Two sights of one leaf that follow each other, and the probability that they are of one: 1 if a person says so.
 
     `link_leaves` gives it for dates that are surely aligned, `sum_over_poses` for any.
@@ -44,7 +44,7 @@ def link_leaves(
     *,
     same: Collection[tuple[Sight, Sight]] = (),
     different: Collection[tuple[Sight, Sight]] = (),
-) -> list[Link]:
+) -> list[Association]:
     """The links of the cheapest tracks, by their earlier sight.
 
     Args:
@@ -76,11 +76,11 @@ def link_leaves(
                 before, chance = known[-1], chances[tracks[after]]
                 is_asked = gains[known, after].max() >= ASKED
                 both = [(int(date_of[n]), int(n - starts[date_of[n]])) for n in (before, after)]
-                links.append(Link(both[0], both[1], 1.0 if is_asked else chance, is_asked=bool(is_asked)))
+                links.append(Association(both[0], both[1], 1.0 if is_asked else chance, is_asked=bool(is_asked)))
     return links
 
 
-def sum_over_poses(links: Sequence[Link], compared: Comparison) -> list[Link]:
+def sum_over_poses(links: Sequence[Association], compared: Comparison) -> list[Association]:
     """The links with probabilities summed over poses: that each is right under the one that was taken, and under the
     others. What a person says is so under all of them."""
     found = []

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mvseg.errors import InputError
-from mvseg.tracking.associate import Link, Sight, link_leaves, sum_over_poses
+from mvseg.tracking.associate import Association, Sight, link_leaves, sum_over_poses
 from mvseg.tracking.compare import Comparison, compare_dates
 from mvseg.tracking.config import Pots
 from mvseg.tracking.costs import leaves_of
@@ -133,7 +133,9 @@ def track_leaves(
     )  # fmt: skip
 
 
-def _link_dates(dates: Sequence[PlantOnDate], links: Sequence[LeafLink], pots: Pots) -> tuple[Comparison, list[Link]]:
+def _link_dates(
+    dates: Sequence[PlantOnDate], links: Sequence[LeafLink], pots: Pots
+) -> tuple[Comparison, list[Association]]:
     leaves = [leaves_of(date) for date in dates]
     knows_up = all(date.knows_up for date in dates)
     compared = compare_dates(leaves, [date.time for date in dates], knows_up=knows_up, pots=pots)
@@ -143,7 +145,7 @@ def _link_dates(dates: Sequence[PlantOnDate], links: Sequence[LeafLink], pots: P
     return compared, sum_over_poses(linked, compared)
 
 
-def _without_stems(dates: tuple[PlantOnDate, ...], links: Sequence[Link]) -> tuple[PlantOnDate, ...]:
+def _without_stems(dates: tuple[PlantOnDate, ...], links: Sequence[Association]) -> tuple[PlantOnDate, ...]:
     """The dates without what looks like a stem wherever it is seen."""
     sights = [(n, row) for n, date in enumerate(dates) for row in range(len(date.shaped))]
     track = {sight: sight for sight in sights}
@@ -188,7 +190,7 @@ def _sights_of(
     return same, different
 
 
-def _rows(dates: Sequence[PlantOnDate], links: Sequence[Link], roots: np.ndarray) -> tuple[TrackRow, ...]:
+def _rows(dates: Sequence[PlantOnDate], links: Sequence[Association], roots: np.ndarray) -> tuple[TrackRow, ...]:
     """All tracks, by date; leaves without a shape are tracks of one date."""
     place_of = {(n, row): (n, place) for n, date in enumerate(dates) for row, place in enumerate(date.shaped)}
     after = {place_of[link.before]: (place_of[link.after], link.probability) for link in links}

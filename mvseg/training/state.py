@@ -209,12 +209,12 @@ def apply_gradients(config: TrainConfig, state: TrainingState, rate: float) -> b
     state.optimizer.step()
     if state.averaged is not None:  # torch's AveragedModel would copy the first weights, and rename them
         decay = min(config.ema_decay, (1 + state.step) / (10 + state.step))
-        follow(state.averaged, state.model, decay=decay)
+        update_average(state.averaged, state.model, decay=decay)
     state.step += 1
     return True
 
 
-def follow(averaged: nn.Module, model: nn.Module, *, decay: float) -> None:
+def update_average(averaged: nn.Module, model: nn.Module, *, decay: float) -> None:
     """Move an average a share of 1 - `decay` towards the model: its parameters, and its buffers with them.
 
     The running statistics of a live BatchNorm belong to the weights that they were measured with. Those of the model

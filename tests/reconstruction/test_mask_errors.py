@@ -49,7 +49,7 @@ def test_density_is_symmetric_and_sums_to_one() -> None:
     assert errors is not None
     assert errors.density == pytest.approx(errors.density[::-1])
     assert errors.density.sum() * 0.05 == pytest.approx(1, abs=1e-3)
-    assert errors.spread == pytest.approx(2, abs=0.3)
+    assert errors.sd_px == pytest.approx(2, abs=0.3)
 
 
 def test_clean_masks_and_few_masks_teach_nothing() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.tracking.align import Alignment, make_poses
-from mvseg.tracking.associate import Link, join_sights, link_leaves
+from mvseg.tracking.associate import Association, join_sights, link_leaves
 from mvseg.tracking.compare import UNLINKED
 from mvseg.tracking.place_dates import chain_dates
 
@@ -62,7 +62,7 @@ def test_leaves_that_are_alike_are_one_track() -> None:
     assert ((tracks[:, None] == tracks) == (leaf[:, None] == leaf)).all()
 
 
-def pairs_of(links: list[Link]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
+def pairs_of(links: list[Association]) -> list[tuple[tuple[int, int], tuple[int, int]]]:
     return [(link.before, link.after) for link in links]
 
 

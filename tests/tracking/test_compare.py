@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mvseg.tracking.associate import Link, link_leaves, sum_over_poses
+from mvseg.tracking.associate import Association, link_leaves, sum_over_poses
 from mvseg.tracking.compare import Comparison, compare_dates
 from mvseg.tracking.costs import leaves_of
 from tests.plants_over_days import Blades, grow_blades, see
@@ -25,7 +25,7 @@ def opposite_leaves(count: int) -> Blades:
     return blades | behind
 
 
-def link_two(blades: Blades) -> tuple[list[Link], Comparison]:
+def link_two(blades: Blades) -> tuple[list[Association], Comparison]:
     leaves = [leaves_of(see(blades, day, turn=40 * day)[0]) for day in (0, 1)]
     compared = compare_dates(leaves, [0.0, 1.0], knows_up=True, pots="turned")
     return link_leaves([len(each) for each in leaves], compared.costs), compared
@@ -47,7 +47,7 @@ def test_one_leaf_that_breaks_the_symmetry_makes_them_sure() -> None:
 def test_the_sum_is_that_of_a_loop() -> None:
     rng, links = (
         np.random.default_rng(0),
-        [Link((0, 1), (1, 0), 0.8), Link((0, 0), (2, 1), 0.6), Link((0, 2), (2, 0), 1.0)],
+        [Association((0, 1), (1, 0), 0.8), Association((0, 0), (2, 1), 0.6), Association((0, 2), (2, 0), 1.0)],
     )
     trust, others = rng.uniform(size=(3, 3)), {(0, 1): rng.uniform(size=(3, 2)), (0, 2): rng.uniform(size=(3, 2))}
     compared = replace(link_two(grow_blades(3, 1))[1], trust=trust, otherwise=others)
@@ -65,6 +65,6 @@ def test_the_sum_is_that_of_a_loop() -> None:
 
 
 def test_what_a_person_says_holds_under_every_pose() -> None:
-    said = Link((0, 0), (1, 0), 1.0, is_asked=True)
+    said = Association((0, 0), (1, 0), 1.0, is_asked=True)
     compared = replace(link_two(grow_blades(3, 1))[1], trust=np.zeros((2, 2)))
     assert sum_over_poses([said], compared) == [said]

@@ -26,20 +26,20 @@ FLOOR = 1e-3  # least density, per pixel: any mask may be wrong in another way
 
 @dataclass(frozen=True, eq=False)
 class MaskErrors:
-    """The spread of the offsets of a segmenter's masks: a symmetric density.
+    """How far the masks of a segmenter lie off the true outlines: a symmetric density.
 
     Attributes:
-        spread: standard deviation, pixels.
+        sd_px: their standard deviation.
         density: (2 G + 1,) per pixel, at -G ... G steps of STEP_PX.
     """
 
-    spread: float
+    sd_px: float
     density: Floats
 
     @property
     def share(self) -> float:
         """How much of a measured offset is to be believed: all of it where masks differ by more than is measured."""
-        return self.spread**2 / (self.spread**2 + MEASURED_PX**2)
+        return self.sd_px**2 / (self.sd_px**2 + MEASURED_PX**2)
 
     def centre(self, offsets: Floats) -> tuple[float, float]:
         """Where offset 0 lies among the offsets (S,) of one leaf, in pixels, and its standard deviation.
@@ -70,7 +70,7 @@ def learn_mask_errors(offsets: Sequence[Floats]) -> MaskErrors | None:
         return None
     centres = [winsorised_mean(each) for each in offsets]
     errors = _spread(offsets, centres)
-    if errors.spread < LEAST_SPREAD_PX:
+    if errors.sd_px < LEAST_SPREAD_PX:
         return None
     for _ in range(ROUNDS):
         centres = [errors.centre(each)[0] for each in offsets]
@@ -97,4 +97,4 @@ def _spread(offsets: Sequence[Floats], centres: Sequence[float]) -> MaskErrors:
     counts = np.bincount(np.round(sample / STEP_PX).astype(int), minlength=half + 1) / (2 * len(sample) * STEP_PX)
     both = np.concatenate([counts[:0:-1], counts])
     both[half] *= 2
-    return MaskErrors(spread=spread, density=gaussian_filter1d(both, bandwidth / STEP_PX, mode="constant"))
+    return MaskErrors(sd_px=spread, density=gaussian_filter1d(both, bandwidth / STEP_PX, mode="constant"))

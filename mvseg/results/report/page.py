@@ -51,7 +51,7 @@ def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str,
         is_served: `mvseg correct` serves it: it sends each edit there, and shows the consequences. Otherwise it
             connects to nothing.
     """
-    data = describe_result(result, pictures, run=run)
+    data = describe_page(result, pictures, run=run)
     data["correct"]["isServed"] = is_served
     return Template(_read("page.html")).substitute(
         title=html.escape(f"{result.scene.name} - mvseg"),
@@ -63,7 +63,7 @@ def build_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str,
     )
 
 
-def describe_result(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
+def describe_page(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
     """All that the page shows, as its script reads it."""
     scene = result.scene
     shown = zip(scene.views, pictures, describe_masks(result, pictures), strict=True)

@@ -25,7 +25,7 @@ LEAST_HEIGHT, LARGEST_HEIGHT = 36, 110  # units, of a number in the picture
 
 
 @dataclass(frozen=True)
-class Outline:
+class MaskContour:
     """One mask, in units of the picture, of which it is 2000 wide.
 
     Attributes:
@@ -67,7 +67,7 @@ class Picture:
     thumbnail: bytes
     box: tuple[float, float, float, float]
     proportion: float
-    outlines: list[Outline]
+    outlines: list[MaskContour]
 
     def as_json(self) -> dict[str, Any]:
         """What the page reads, except for the masks; JPEGs in base64."""
@@ -111,7 +111,7 @@ def _shrink(image: np.ndarray, width: int) -> bytes:
     return encode_jpeg(cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA), quality=QUALITY)
 
 
-def outline_masks(masks: Masks, *, view: int, box: Box) -> list[Outline]:
+def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
     """The masks of one view, large ones first, so that small ones lie on top; those outside of the part of the photo
     that the picture shows (`box`, xyxy, pixels) are left out."""
     regions, others = masks.regions, masks.second_ids.tolist()
@@ -130,7 +130,7 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[Outline]:
         thickness = 2 * radius * UNITS / (box[2] - box[0])
         score = float(masks.match_scores[region])
         found.append(
-            Outline(
+            MaskContour(
                 region=region,
                 leaf=int(masks.instance_ids[region]),
                 path=path,

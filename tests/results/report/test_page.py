@@ -10,7 +10,7 @@ from pathlib import Path
 
 import torch
 
-from mvseg.results.report.page import ASSETS, SCRIPTS, describe_result, dump_inside_script
+from mvseg.results.report.page import ASSETS, SCRIPTS, describe_page, dump_inside_script
 from mvseg.results.result import Result
 from report_pages import HOSTILE, RUN, draw_pictures, rename_hostile, write_page
 
@@ -81,7 +81,7 @@ def test_the_same_result_gives_the_same_page(balls: Result, tmp_path: Path) -> N
 def test_scores_and_ids_are_those_of_the_result(balls: Result) -> None:
     scores = torch.linspace(0.3, 0.9, len(balls.regions))
     found = replace(balls, matching=balls.matching.with_masks(replace(balls.masks, detection_scores=scores)))
-    data = describe_result(found, draw_pictures(balls), run=RUN)
+    data = describe_page(found, draw_pictures(balls), run=RUN)
     masks = {mask["region"]: (view, mask) for view, entry in enumerate(data["views"]) for mask in entry["masks"]}
     assert sorted(masks) == list(range(len(balls.regions)))
     for region, (view, mask) in masks.items():

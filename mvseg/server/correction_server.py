@@ -32,7 +32,7 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.results.report.page import build_page, describe_update
 from mvseg.results.report.pictures import draw_picture
-from mvseg.runs.correct_result import CORRECTIONS_FILE, OpenResult, Superseded
+from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult, Superseded
 
 HOST = "127.0.0.1"
 WAIT_SECONDS = 20.0  # that a page's question for news stays open
@@ -292,10 +292,12 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_POST(self) -> None:
         corrector = self.server.corrector
-        self._answer({
-            "outline": lambda: self._json(corrector.outline(self._body())),
-            "whole": lambda: self._json(corrector.whole()),
-        })
+        self._answer(
+            {
+                "outline": lambda: self._json(corrector.outline(self._body())),
+                "whole": lambda: self._json(corrector.whole()),
+            }
+        )
 
     def _answer(self, places: Mapping[str, Callable[[], None]]) -> None:
         try:
