@@ -59,7 +59,7 @@ if TYPE_CHECKING:
     from mvseg.results.same_result import assert_same_result as assert_same_result
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
-    from mvseg.system.worker_pool import start_workers as start_workers
+    from mvseg.system.running import running as running
     from mvseg.tracking.track import LeafLink as LeafLink
     from mvseg.tracking.track import Tracks as Tracks
     from mvseg.tracking.track import track_leaves as track_leaves
@@ -107,7 +107,7 @@ _HOME = {
     "results.same_result": ("assert_same_result",),
     "pipeline": ("run_scene",),
     "tracking.track": ("LeafLink", "Tracks", "track_leaves"),
-    "system.worker_pool": ("start_workers",),
+    "system.running": ("running",),
 }
 __all__ = [name for names in _HOME.values() for name in names]
 

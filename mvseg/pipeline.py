@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -89,8 +88,6 @@ class State(Result):
     shown: Masks | None = None
     corrected: Corrected | None = None
     cache: Path | None = None
-    workers: ProcessPoolExecutor | None = None
-    progress: bool = False
     colors: NDArray[np.bool_] | None = None
     fit: Fit | None = None
 
@@ -122,8 +119,6 @@ def run_scene(
     corrections: Corrections | Path | str | None = None,
     force_corrections: bool = False,
     cache: Path | str | None = None,
-    workers: ProcessPoolExecutor | None = None,
-    progress: bool = False,
 ) -> Result:
     """From a scene folder, with or without masks, to ids in every view and, if asked for, shapes in 3D and traits.
 
@@ -136,8 +131,6 @@ def run_scene(
         cache: folder for the detections in this scene's photos, made when it is needed: a run that was cut off goes on
             from them, and one with other options of later stages uses them again. What it holds of other photos or
             options is deleted; `delete_cached` deletes the rest.
-        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
-        progress: show progress bars.
 
     Returns:
         The result; nothing is written but what `cache` says.
@@ -150,7 +143,7 @@ def run_scene(
     if isinstance(corrections, Path | str):
         corrections = load_corrections(corrections)
     has_edits = corrections is not None and len(corrections.edits) > 0
-    state = load(folder, masks, config, corrections=corrections, cache=cache, workers=workers, progress=progress)
+    state = load(folder, masks, config, corrections=corrections, cache=cache)
     if corrections is not None and not force_corrections:
         check_made_for(corrections, state.scene)
     seconds = {"load": time.perf_counter() - begun}
@@ -236,7 +229,7 @@ def detect(state: State) -> State:
     from mvseg.detection.detect_scene import detect_scene
 
     config = state.config
-    found = detect_scene(state.photos, config.detect, match=config.match, cache=state.cache, progress=state.progress)
+    found = detect_scene(state.photos, config.detect, match=config.match, cache=state.cache)
     return replace(state, found=found)
 
 
@@ -290,7 +283,7 @@ def _match_with(state: State, cameras: Cameras) -> Matching:
     if state.corrected is None and state.found is not None:
         return state.found.match(cameras)
     given = (state.masks, NO_LINKS) if state.corrected is None else (state.corrected.masks, state.corrected.links)
-    return match_masks(given[0], cameras, state.config.match, links=given[1], progress=state.progress)
+    return match_masks(given[0], cameras, state.config.match, links=given[1])
 
 
 def correct_instances(state: State) -> State:
@@ -379,8 +372,7 @@ def fit_of(state: State) -> Fit:
     from mvseg.verification.rough_surfaces import fit_roughly
 
     def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> Mapping[int, LeafSurface]:
-        cameras, workers = state.scene.cameras, state.workers
-        return fit_roughly(masks, cameras, known=known, workers=workers, progress=state.progress)
+        return fit_roughly(masks, state.scene.cameras, known=known)
 
     return fit
 
@@ -421,7 +413,7 @@ def check_cameras(state: State) -> State:
     """Warns where masks or photos contradict the cameras, see `warn_of_contradictions`; photos are not asked where ids
     alone are wanted."""
     has_photos = state.config.reconstruct is not None and state.photos.exist
-    warn_of_contradictions(state.scene, state.regions, photos=has_photos, progress=state.progress)
+    warn_of_contradictions(state.scene, state.regions, photos=has_photos)
     return state
 
 
@@ -447,7 +439,6 @@ def follow(state: State) -> State:
         cameras=state.scene.cameras,
         photos=state.photos if state.photos.exist else None,
         colors=state.colors,
-        workers=state.workers,
     )
     return replace(state, instances=Instances(starts=starts)).with_masks(masks)
 
@@ -465,8 +456,6 @@ def reconstruct(state: State, *, with_voxels: bool = True) -> State:
         starts=state.instances.starts,
         known=state.surfaces or {},
         with_voxels=with_voxels,
-        workers=state.workers,
-        progress=state.progress,
     )
     return replace(state, instances=replace(state.instances, surfaces=surfaces, voxels=voxels))
 

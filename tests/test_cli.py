@@ -273,7 +273,8 @@ def test_the_page_may_be_left_out(verb: str, plant: Path, tmp_path: Path) -> Non
 def test_up_that_is_no_direction(
     words: list[str], plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["infer", str(plant), "--masks", "masks", "--up", *words, "--out", str(tmp_path / "out")]) == 2
+    out = ["--out", str(tmp_path / "out"), "--quiet"]
+    assert main(["infer", str(plant), "--masks", "masks", "--up", *words, *out]) == 2
     assert complaint(capsys).startswith("--up is ")
     assert not (tmp_path / "out").exists()
 

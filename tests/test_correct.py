@@ -46,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A result of three balls in four views, ids only."""
     place = tmp_path_factory.mktemp("correct")
     scene = write_scene(place / "balls")
-    run_one_scene(scene, scene / "masks", place / "result", config=RunConfig(reconstruct=None), quiet=True)
+    run_one_scene(scene, scene / "masks", place / "result", config=RunConfig(reconstruct=None))
     return place / "result"
 
 
@@ -328,7 +328,7 @@ def test_saved_corrections_that_are_broken_are_not_written_over(folder: Path) ->
 
 def test_photos_that_are_gone(tmp_path: Path) -> None:
     scene = write_scene(tmp_path / "balls")
-    run_one_scene(scene, scene / "masks", tmp_path / "out", config=RunConfig(reconstruct=None), quiet=True)
+    run_one_scene(scene, scene / "masks", tmp_path / "out", config=RunConfig(reconstruct=None))
     for photo in (scene / "images").iterdir():
         photo.unlink()
     with pytest.raises(InputError, match="the photos of this result are gone"):
@@ -377,7 +377,7 @@ def test_ctrl_c_ends_it_with_one_sentence_at_any_moment(folder: Path) -> None:
 def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> None:
     scene, out = write_scene(tmp_path / "my balls"), tmp_path / "my result"
     config = RunConfig(reconstruct=None, scale=0.1, unit="cm", split_merged=True)
-    run_one_scene(scene, scene / "masks", out, config=config, quiet=True)
+    run_one_scene(scene, scene / "masks", out, config=config)
     before = json.loads((out / "run.json").read_text())["config"]
     with serve(out) as server:
         view, at = middle(server.corrector.opened, 0)
@@ -394,7 +394,7 @@ def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> Non
 def test_inputs_that_changed_or_moved_since(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, elsewhere = write_scene(tmp_path / "here" / "balls"), tmp_path / "there"
     monkeypatch.chdir(tmp_path / "here")
-    run_one_scene(Path("balls"), Path("masks"), Path("out"), config=RunConfig(reconstruct=None), quiet=True)
+    run_one_scene(Path("balls"), Path("masks"), Path("out"), config=RunConfig(reconstruct=None))
     monkeypatch.chdir(tmp_path)
     run = OpenResult(tmp_path / "here" / "out").run
     assert (run.scene, run.masks, run.changes) == (scene, scene / "masks", ())

@@ -31,7 +31,7 @@ def browser() -> Iterator[sync_api.Browser]:
 def folder(tmp_path: Path) -> Path:
     """A result of three balls in four views, ids only."""
     scene = write_scene(tmp_path / "balls")
-    run_one_scene(scene, scene / "masks", tmp_path / "result", config=RunConfig(reconstruct=None), quiet=True)
+    run_one_scene(scene, scene / "masks", tmp_path / "result", config=RunConfig(reconstruct=None))
     return tmp_path / "result"
 
 

@@ -45,6 +45,7 @@ from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
 from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Scene, View
+from mvseg.system.running import running
 from mvseg.verification.choose import Leaves
 from scene_folders import write_scene
 
@@ -112,7 +113,8 @@ def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
 
 
 def test_progress_bars_go_to_stderr_when_asked_for(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run_scene(plant, plant / "masks", COARSE, progress=True)
+    with running(progress=True):
+        run_scene(plant, plant / "masks", COARSE)
     captured = capsys.readouterr()
     assert captured.out == ""
     assert "back-projection: 100%" in captured.err

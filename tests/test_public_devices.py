@@ -52,7 +52,7 @@ ELSEWHERE = {
 WITHOUT_TENSORS = {
     "__version__", "InputError", "InputWarning", "MatchConfig", "DetectConfig", "TraitsConfig", "ReconstructConfig",
     "RunConfig", "Check", "Finding", "Corrections", "load_corrections", "LeafLink", "Tracks", "track_leaves",
-    "start_workers", "demo_scene", "Traits", "MatchReport", "Matching", "Origin", "MergedMask", "Affinity",
+    "running", "demo_scene", "Traits", "MatchReport", "Matching", "Origin", "MergedMask", "Affinity",
 }  # fmt: skip
 # They read files, or take arrays of any kind: what they make is on the CPU.
 MAKERS = {

@@ -36,7 +36,7 @@ from mvseg.reconstruction.shapes import reconstruct_shapes
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
 from mvseg.scene import Cameras
-from mvseg.system.worker_pool import start_workers
+from mvseg.system.running import running
 
 Value = TypeVar("Value")
 PROPOSALS = 100  # of each view, for the loop
@@ -72,11 +72,8 @@ def draw_pictures(masks: Masks, cameras: Cameras) -> None:
 
 def fit_shapes(regions: Regions, instance_ids: Tensor, cameras: Cameras, *, num_workers: int) -> None:
     config = ReconstructConfig()
-    if num_workers == 1:
+    with running(num_workers=num_workers):
         reconstruct_shapes(regions, instance_ids, cameras, config=config)
-        return
-    with start_workers(num_workers) as workers:
-        reconstruct_shapes(regions, instance_ids, cameras, config=config, workers=workers)
 
 
 def propose(maps: np.ndarray, count: int, seed: int) -> list[dict[str, Tensor]]:

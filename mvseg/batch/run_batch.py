@@ -22,6 +22,7 @@ from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.results.earlier import check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
+from mvseg.system.running import progress_bar
 
 SHOWN = 4  # names of running scenes beside the progress bar
 
@@ -46,7 +47,6 @@ def run_batch(
     resume: bool = False,
     num_workers: int = 1,
     scheduler: str | None = None,
-    quiet: bool = False,
 ) -> BatchCounts:
     """From scene folders to result folders `out/NAME` and the tables in `out/tables`. Failures are reported on stderr.
 
@@ -58,7 +58,6 @@ def run_batch(
         resume: continue the batch that `out` holds: scenes that are done with the same inputs and options are kept.
         num_workers: processes, >= 1, where no scheduler is given.
         scheduler: of a Dask cluster, see `connect`.
-        quiet: no progress bar.
 
     Raises:
         InputError: bad input, before any scene is started: the table, `out`, the scheduler.
@@ -77,7 +76,7 @@ def run_batch(
             if any(is_partial(path) for path in place.iterdir()):  # a run was killed
                 for scene in scenes:
                     sweep_abandoned(place / scene.name)
-            finished = _work_on_all(scenes, engine, place, quiet=quiet)
+            finished = _work_on_all(scenes, engine, place)
             rows = [(scene, finished[index].status) for index, scene in enumerate(scenes)]
             run = {**made_by(), "source": str(source), "masks": masks and str(masks)}
             write_tables(place / TABLES, place, rows, run={**run, "config": asdict(config)})
@@ -120,7 +119,7 @@ def _claim(out: Path, *, resume: bool) -> None:
     (out / STATE).mkdir(parents=True, exist_ok=True)
 
 
-def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path, *, quiet: bool) -> dict[int, Finished]:
+def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dict[int, Finished]:
     """Run all scenes in parallel, then those whose worker died once more, one at a time, when memory is free again."""
     finished: dict[int, Finished] = {}
     again: list[int] = []
@@ -139,7 +138,7 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path, *, qui
         for index in again:
             yield True, {index: scenes[index]}
 
-    with tqdm(total=len(scenes), desc="batch", unit="scene", disable=quiet) as bar:
+    with progress_bar(total=len(scenes), name="batch", unit="scene") as bar:
         for is_last, items in rounds():
             try:
                 with closing(engine(items, start)) as answers:

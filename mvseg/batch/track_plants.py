@@ -11,8 +11,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from mvseg._version import made_by
 from mvseg.batch.tables import read_table
 from mvseg.batch.workers import Engine, Lost, open_workers
@@ -21,6 +19,7 @@ from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.system.atomic import folder_whole
 from mvseg.system.file_hash import hash_files
+from mvseg.system.running import progress_bar
 from mvseg.tracking.config import Pots
 from mvseg.tracking.corrections import find_links, read_track_links
 from mvseg.tracking.dates import name_apart, read_date
@@ -79,7 +78,6 @@ def track_plants(
     num_workers: int = 1,
     scheduler: str | None = None,
     report: bool = True,
-    quiet: bool = False,
 ) -> list[TrackedPlant]:
     """Track plants and write the folder `out`, whole or not at all; an earlier one is replaced.
 
@@ -94,7 +92,6 @@ def track_plants(
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
         scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.
         report: write pages and pictures, too.
-        quiet: no progress bar.
 
     Raises:
         InputError: `out` cannot be written, the corrections are broken, or every plant failed.
@@ -110,7 +107,7 @@ def track_plants(
             work = partial(_track_plant, edits, pots=pots, report=report)
             items = dict(enumerate(zip(plants, places, strict=True)))
             with _open(work, min(num_workers, len(items)), scheduler) as engine, closing(engine(items, int)) as answers:
-                bar = tqdm(answers, total=len(plants), desc="track", unit="plant", disable=quiet)
+                bar = progress_bar(answers, total=len(plants), name="track", unit="plant")
                 done = {index: _or_failed(answer, plants[index]) for index, answer in bar}
             tracked = [done[index] for index in items]
             if all(plant.sentence for plant in tracked):

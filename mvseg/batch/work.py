@@ -79,8 +79,8 @@ def _finish(
 ) -> Status:
     sweep_abandoned(out)
     check_out(out)
-    result, messages = solve_scene(scene.folder, masks, config, corrections=corrections, cache=cache, progress=False)
-    save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages, progress=False)
+    result, messages = solve_scene(scene.folder, masks, config, corrections=corrections, cache=cache)
+    save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages)
     return Status(
         state="done",
         scene=str(scene.folder),

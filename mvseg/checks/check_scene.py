@@ -46,9 +46,7 @@ class Check:
         return any(finding.level == "error" for finding in self.findings)
 
 
-def check_scene(
-    scene: Scene, regions: Regions | None = None, *, features: bool = True, progress: bool = False
-) -> Check:
+def check_scene(scene: Scene, regions: Regions | None = None, *, features: bool = True) -> Check:
     """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks and the photos.
 
     No ids are given. Photos are decoded, one at a time. Everything runs on the CPU, wherever the inputs are.
@@ -57,7 +55,6 @@ def check_scene(
         scene: of V views; photos may be absent.
         regions: its masks.
         features: compare features of neighbouring photos with the cameras.
-        progress: show progress bars.
 
     Raises:
         InputError: regions and scene of different numbers of views.
@@ -66,18 +63,18 @@ def check_scene(
     regions = None if regions is None else regions.to("cpu")
     names = tuple(view.name for view in scene.views)
     coverage = find_coverage(scene.cameras)
-    photos = read_photo_facts(scene, progress=progress)
+    photos = read_photo_facts(scene)
     findings = camera_findings(scene, coverage) + photo_findings(photos, scene, has_masks=regions is not None)
     agreement = None
     if regions is not None:
         check_views(regions, scene.cameras)
         findings += mask_findings(regions, scene.cameras, names)
         if not bool(is_coincident(scene.cameras).all()):
-            agreement = pairwise_agreement(regions, scene.cameras, progress=progress)
+            agreement = pairwise_agreement(regions, scene.cameras)
             findings += pose_findings(agreement, names) + group_findings(agreement, names)
     if features:
         is_said = any(each.where == "poses" and each.level == "error" for each in findings)
-        findings += _compare_photos(scene, only_focal=is_said, progress=progress)
+        findings += _compare_photos(scene, only_focal=is_said)
     return Check(
         scene=scene,
         regions=regions,
@@ -88,7 +85,7 @@ def check_scene(
     )
 
 
-def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = True, progress: bool = False) -> None:
+def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = True) -> None:
     """Warn (InputWarning) of views that agree in groups only, and of focal lengths that the photos contradict.
 
     Groups of views are found by masks, or else by photos. The matching warns of single views that disagree.
@@ -97,17 +94,16 @@ def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = Tru
         scene: of V >= 2 views.
         regions: its masks.
         photos: compare features of the photos, if there are any, too; takes about 0.1 s per photo.
-        progress: show progress bars.
     """
     scene = replace(scene, cameras=scene.cameras.to("cpu"))
     agreement = pairwise_agreement(regions, scene.cameras)
     findings = group_findings(agreement, tuple(view.name for view in scene.views))
     if photos:
-        findings += _compare_photos(scene, only_focal=bool(findings), progress=progress)
+        findings += _compare_photos(scene, only_focal=bool(findings))
     for finding in findings:
         warn(finding.what)
 
 
-def _compare_photos(scene: Scene, *, only_focal: bool, progress: bool) -> list[Finding]:
-    matches = match_photos(partial(read_photo, scene), scene.cameras, progress=progress)
+def _compare_photos(scene: Scene, *, only_focal: bool) -> list[Finding]:
+    matches = match_photos(partial(read_photo, scene), scene.cameras)
     return distance_findings(matches, scene.cameras, tuple(view.name for view in scene.views), only_focal=only_focal)

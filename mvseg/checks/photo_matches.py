@@ -11,12 +11,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mvseg.checks.cameras import find_coverage
 from mvseg.errors import InputError
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras
+from mvseg.system.running import progress_bar
 
 Floats = NDArray[np.float64]
 
@@ -55,20 +55,17 @@ class PhotoMatches:
         return bool(self.is_rigid.sum() >= max(FEWEST, LEAST_SHARE * len(self.is_rigid)))
 
 
-def match_photos(
-    read: Callable[[int], NDArray[np.uint8]], cameras: Cameras, *, progress: bool = False
-) -> list[PhotoMatches]:
+def match_photos(read: Callable[[int], NDArray[np.uint8]], cameras: Cameras) -> list[PhotoMatches]:
     """The features that neighbouring photos share.
 
     Args:
         read: the photo of a view, (H, W, 3) RGB without distortion; one for which it raises InputError is skipped.
         cameras: V cameras on the CPU, which say what neighbours are.
-        progress: show a progress bar over the photos.
     """
     pairs = neighbours(cameras)
     wanted = sorted({view for pair in pairs for view in pair})
     features = {}
-    for view in tqdm(wanted, desc="features", unit="photo", disable=not progress):
+    for view in progress_bar(wanted, name="features", unit="photo"):
         try:
             features[view] = find_features(read(view))
         except InputError:

@@ -7,13 +7,13 @@ from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
-from tqdm import tqdm
 
 from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.errors import InputError
 from mvseg.formats.image_file import is_grey, is_turned, read_image_size, read_rgb
 from mvseg.formats.photos import describe_folder, photo_bits
 from mvseg.scene import Scene
+from mvseg.system.running import progress_bar
 
 # Standard deviation of a photo of nothing: grey levels, or a share of its level where it is dark (photos of something
 # have a fifth), but no less than rounding makes.
@@ -53,9 +53,9 @@ class PhotoFacts:
         return self.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * self.level))
 
 
-def read_photo_facts(scene: Scene, *, progress: bool = False) -> list[PhotoFacts]:
+def read_photo_facts(scene: Scene) -> list[PhotoFacts]:
     """One entry per view; each photo is decoded once."""
-    views = tqdm(range(len(scene.views)), desc="photos", unit="photo", disable=not progress)
+    views = progress_bar(range(len(scene.views)), name="photos", unit="photo")
     return [_read_facts(scene, view) for view in views]
 
 

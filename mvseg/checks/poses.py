@@ -16,13 +16,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg.checks.finding import Finding, Level, Rule, list_findings
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
 from mvseg.matching.tangency import WIDEST, hull_corners, touches_border
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.system.running import progress_bar
 
 Floats = NDArray[np.float64]
 
@@ -81,7 +81,7 @@ class _Spans:
     pitch: Tensor
 
 
-def pairwise_agreement(regions: Regions, cameras: Cameras, *, progress: bool = False) -> PoseAgreement:
+def pairwise_agreement(regions: Regions, cameras: Cameras) -> PoseAgreement:
     """How the masks of each pair of views agree with the poses.
 
     Masks that touch the border are left out: where they would end is not known. With more than 20 other views, each is
@@ -90,7 +90,6 @@ def pairwise_agreement(regions: Regions, cameras: Cameras, *, progress: bool = F
     Args:
         regions: D regions in V views.
         cameras: V >= 2 cameras.
-        progress: show a progress bar over the pairs of views.
     """
     num_views = len(cameras)
     regions, cameras = regions.to("cpu"), cameras.to("cpu")
@@ -102,7 +101,7 @@ def pairwise_agreement(regions: Regions, cameras: Cameras, *, progress: bool = F
     unit_px = cameras.unit_px
     skip = is_coincident(cameras).tolist()
     pairs = [(i, j) for i, j in _chosen_pairs(num_views) if len(hulls[i]) and len(hulls[j]) and not skip[i][j]]
-    for i, j in tqdm(pairs, desc="poses", unit="pair", disable=not progress):
+    for i, j in progress_bar(pairs, name="poses", unit="pair"):
         pencil = epipolar_pencil(cameras, i, j)
         first, second = _spans(pencil, 0, hulls[i]), _spans(pencil, 1, hulls[j])
         if len(first.ends) and len(second.ends):

@@ -38,7 +38,6 @@ def run(args: Namespace) -> int:
         resume=args.resume,
         num_workers=read_workers(args),
         scheduler=args.scheduler,
-        quiet=args.quiet,
     )
     total, tables = counts.done + counts.failed, out / "tables"
     if counts.warned:

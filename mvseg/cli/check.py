@@ -60,7 +60,7 @@ def run(args: Namespace) -> int:
                 regions = load_masks(scene, masks, crowd=args.coco_crowd, categories=wanted)
         except InputError as error:  # the findings about cameras and photos may explain it
             unread = error
-    check = check_scene(scene, regions, progress=not args.quiet)
+    check = check_scene(scene, regions)
     # without readable masks, missing photos are no fault of their own
     found += [each for each in check.findings if unread is None or not each.what.startswith(NOTHING_TO_SEE)]
     _print_table(check)
@@ -82,7 +82,7 @@ def _run_target(args: Namespace) -> int:
 
     if args.masks is not None or args.categories is not None:
         raise InputError("--masks and --categories have no effect with --target: its shapes are found by their colour")
-    check = check_target(args.scene, bar=BAR if args.bar is None else args.bar, progress=not args.quiet)
+    check = check_target(args.scene, bar=BAR if args.bar is None else args.bar)
     off = f"{check.residual:.2f} mm off; lengths {check.scale - 1:+.2%} by the tags"
     print(f"{args.scene}: {check.num_tags} tags, {off}")
     line = "{:12} {:>13} {:>13} {:>9} {:>7} {:>5} {:>10}"

@@ -19,6 +19,7 @@ from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
 from mvseg.errors import InputError, InputWarning
+from mvseg.system.running import running
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
 TERMINATED = 143
@@ -74,8 +75,9 @@ def main(argv: Sequence[str] | None = None) -> int:
             warnings.simplefilter("always", InputWarning)
             warnings.showwarning = _show_warning
             args = _parse(join_up(sys.argv[1:] if argv is None else argv))
-            with stopped_by_sigterm():
-                return VERBS[args.verb][0].run(args[args.verb])
+            options = args[args.verb]
+            with stopped_by_sigterm(), running(progress=not options.get("quiet", True)):
+                return VERBS[args.verb][0].run(options)
     except (InputError, argparse.ArgumentError) as error:
         return complain(error, sys.argv[1:] if argv is None else argv)
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 from contextlib import ExitStack, suppress
+from contextvars import copy_context
 from pathlib import Path
 
 from jsonargparse import ArgumentParser, Namespace
@@ -28,7 +29,8 @@ def run(args: Namespace) -> int:
     from mvseg.runs.recorded_run import repeat_command
     from mvseg.server.correction_server import CorrectionServer, Corrector
     from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult, check_writable, open_alone
-    from mvseg.system.worker_pool import default_workers, start_workers
+    from mvseg.system.running import running
+    from mvseg.system.worker_pool import default_workers
 
     folder = find_result(args.result)
     if not folder.is_dir():
@@ -36,13 +38,13 @@ def run(args: Namespace) -> int:
     check_writable(folder)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     with open_alone(folder), ExitStack() as stack:
-        workers = stack.enter_context(start_workers(num_workers))
-        opened = OpenResult(folder, workers=workers)
+        stack.enter_context(running(num_workers=num_workers))
+        opened = OpenResult(folder)
         if opened.notice:
             print(f"mvseg: {opened.notice}", file=sys.stderr)
         corrector = Corrector(opened)
         server = stack.enter_context(CorrectionServer(corrector))
-        computing = threading.Thread(target=corrector.compute)
+        computing = threading.Thread(target=copy_context().run, args=(corrector.compute,))
         try:
             computing.start()
             print(f"{server.address}\nEvery edit is saved to {folder}/{CORRECTIONS_FILE}. Ctrl-C ends.", flush=True)

@@ -46,7 +46,6 @@ def run(args: Namespace) -> int:
         force_corrections=args.force_corrections,
         num_workers=num_workers,
         overwrite=args.overwrite,
-        quiet=args.quiet,
     )
     return 0
 
@@ -67,5 +66,4 @@ def _run_again(args: Namespace, num_workers: int) -> None:
         force_corrections=args.force_corrections,
         num_workers=num_workers,
         overwrite=args.overwrite,
-        quiet=args.quiet,
     )

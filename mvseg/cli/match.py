@@ -44,7 +44,6 @@ def run(args: Namespace) -> int:
                 corrections=args.corrections,
                 force_corrections=args.force_corrections,
                 overwrite=args.overwrite,
-                quiet=args.quiet,
             )
         except InputError as error:  # the other scenes still get their results
             code = complain(error)

@@ -59,7 +59,7 @@ def run(args: Namespace) -> int:
         return 0
     from mvseg.runs.pose_photos import pose_photos  # keeps --help and wrong options quick
 
-    pose_photos(args.photos, args.out, config=config, known=known, up=read_up(args.up), quiet=args.quiet)
+    pose_photos(args.photos, args.out, config=config, known=known, up=read_up(args.up))
     return 0
 
 
@@ -81,12 +81,11 @@ def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
             args.out,
             turntable=Path(args.turntable),
             angles=args.angles,
-            quiet=args.quiet,
         )
     elif known.board is None:
         raise InputError("--turntable board needs the board: --board.columns, .rows, .square and .marker")
     else:
-        pose_board_photos(args.photos, args.out, board=known.board, unit=known.unit, quiet=args.quiet)
+        pose_board_photos(args.photos, args.out, board=known.board, unit=known.unit)
 
 
 def _read_distance(words: list[str] | None) -> tuple[str, str, float] | None:

@@ -55,7 +55,6 @@ def run(args: Namespace) -> int:
         num_workers=num_workers,
         scheduler=args.scheduler,
         report=args.report,
-        quiet=args.quiet,
     )
     for plant in tracked:
         for sentence in plant.warnings:

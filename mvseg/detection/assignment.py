@@ -24,7 +24,7 @@ class EpipolarAssignment(nn.Module):
 
     @torch.no_grad()
     def forward(
-        self, proposals: Regions, regions: Regions, instance_ids: Tensor, *, cameras: Cameras, progress: bool = False
+        self, proposals: Regions, regions: Regions, instance_ids: Tensor, *, cameras: Cameras
     ) -> tuple[Tensor, Tensor]:
         """Assign the proposals of all views.
 
@@ -33,14 +33,13 @@ class EpipolarAssignment(nn.Module):
             regions: D regions of the previous iteration.
             instance_ids: (D,) int64, their ids in [1, K]; -1 = matched to nothing.
             cameras: V cameras.
-            progress: show a progress bar over the pairs of views.
 
         Returns:
             (R,) int64 id of the instance with the largest similarity, -1 where every similarity is 0, and (R,) float32,
             that similarity.
         """
         similarity = ruzicka_similarity(
-            proposals, regions, instance_ids, cameras=cameras, max_pixels=MAX_PIXELS, progress=progress
+            proposals, regions, instance_ids, cameras=cameras, max_pixels=MAX_PIXELS
         )
         if not similarity.shape[1]:
             zeros = torch.zeros(len(proposals), device=proposals.device)
@@ -56,7 +55,6 @@ def ruzicka_similarity(
     *,
     cameras: Cameras,
     max_pixels: int | None = None,
-    progress: bool = False,
 ) -> Tensor:
     """Ruzicka similarity of every proposal's mask with every instance's epipolar map in its view (Eqs. 4, 5).
 
@@ -69,7 +67,6 @@ def ruzicka_similarity(
         instance_ids: (D,) int64 in [1, K] or -1.
         cameras: V cameras.
         max_pixels: thins the masks of the proposals; None takes all pixels.
-        progress: show a progress bar over the pairs of views.
 
     Returns:
         (R, K) float32 in [0, 1], the first column for id 1; 0 where an instance has no region in another view: those of
@@ -93,7 +90,7 @@ def ruzicka_similarity(
     on_image = torch.zeros(len(cameras), num_clusters, device=regions.device)  # sum of bands over the image
     count = torch.zeros(len(cameras), num_clusters, device=regions.device)  # #_c of Eq. 4
     joint = [_concatenate(source, target) for source, target in zip(sources, targets, strict=True)]
-    for pair in binned_pairs(joint, cameras, progress=progress):
+    for pair in binned_pairs(joint, cameras):
         for source, target, side in ((pair.i, pair.j, 0), (pair.j, pair.i, 1)):
             clusters = cluster_of[source_members[source]]
             sent = pair.pixels[side][: len(clusters)]

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg._version import code_hash
 from mvseg.detection.cached_detections import CachedDetections, delete_cached, read_detections, write_detections
@@ -26,6 +25,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
 from mvseg.system.file_hash import hash_files
+from mvseg.system.running import progress_bar
 
 UNSURE = 0.5  # share of the masks that are surely matched: with fewer, leaves may be too large for the detector
 SURE_MATCH = 0.9  # match score
@@ -41,7 +41,6 @@ def detect_scene(
     *,
     match: MatchConfig = MatchConfig(),
     cache: Path | None = None,
-    progress: bool = False,
 ) -> Found:
     """Find instances in every photo, and again, larger, where the plant fills a small part of the photos.
 
@@ -56,7 +55,6 @@ def detect_scene(
         config: which detector, and what it finds; `config.verify` is a stage of its own.
         match: how detections are matched.
         cache: folder for the detections, see `cached_detections`; those of other photos or options are deleted there.
-        progress: show progress bars.
 
     Returns:
         What was found. With the cameras of the photos it is matched already where the plant fills the photos.
@@ -64,7 +62,7 @@ def detect_scene(
     Raises:
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
     """
-    look = partial(_look, photos, match=match, cache=cache, progress=progress)
+    look = partial(_look, photos, match=match, cache=cache)
     seen, cameras = look(config), photos.scene.cameras
     names, beside = seen.names, None
     if config.image_size is None and share_of_sure(seen.match(cameras).masks) < UNSURE:
@@ -72,20 +70,20 @@ def detect_scene(
         smaller = look(replace(config, image_size=max(MIN_IMAGE_SIZE, longest // 2)))
         names = names | smaller.names
         if config.verify and median_side(seen.match(cameras).masks) * longest >= LARGE * int(cameras.sizes.max()):
-            beside = Found(smaller.model, smaller.detections, None, config.min_score, smaller.match, progress=progress)
+            beside = Found(smaller.model, smaller.detections, None, config.min_score, smaller.match)
         else:
             seen = max(seen, smaller, key=lambda each: area_of_sure(each.match(cameras).masks))
     boxes = None
     if config.crop == "auto" and beside is None:
         boxes = boxes_for_second_pass(seen.match(cameras).masks, cameras, longest=seen.model.transform.max_size)
     if boxes is not None:
-        in_crops, more_names = _detect_photos(seen.model, photos, boxes, cached=seen.cached, progress=progress)
+        in_crops, more_names = _detect_photos(seen.model, photos, boxes, cached=seen.cached)
         names = names | more_names
     if cache is not None:
         delete_cached(cache, but=names)
     if boxes is None:
-        return Found(seen.model, seen.detections, None, config.min_score, seen.match, beside, progress=progress)
-    return Found(seen.model, in_crops, boxes, config.min_score, progress=progress)
+        return Found(seen.model, seen.detections, None, config.min_score, seen.match, beside)
+    return Found(seen.model, in_crops, boxes, config.min_score)
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +97,6 @@ class Found:
         min_score: of what is matched at first.
         match_sure: from cameras to what is matched at first, where somebody has matched it before.
         beside: what it finds at another size, where leaves are large.
-        progress: show progress bars.
     """
 
     model: MultiViewMaskRCNN
@@ -108,7 +105,6 @@ class Found:
     min_score: float
     match_sure: Callable[[Cameras], Matching] | None = None
     beside: Found | None = None
-    progress: bool = False
 
     def match(self, cameras: Cameras) -> Matching:
         """The sure proposals, matched with V cameras, in the frames of the photos; `labels` are rows of `proposals`."""
@@ -141,7 +137,7 @@ class Found:
 @lru_cache(maxsize=4)  # each edit of a person asks again
 def _match(found: Found, cameras: Cameras, min_score: float) -> Matching:
     posed = cameras if found.boxes is None else crop_cameras(cameras, found.boxes)
-    matching = found.model.match_detections(found.detections, posed, min_score=min_score, progress=found.progress)
+    matching = found.model.match_detections(found.detections, posed, min_score=min_score)
     return matching if found.boxes is None else matching.with_masks(place_crops(matching.masks, found.boxes))
 
 
@@ -156,16 +152,16 @@ class _Seen:
     match: Callable[[Cameras], Matching]
 
 
-def _look(photos: Photos, config: DetectConfig, *, match: MatchConfig, cache: Path | None, progress: bool) -> _Seen:
+def _look(photos: Photos, config: DetectConfig, *, match: MatchConfig, cache: Path | None) -> _Seen:
     """Find instances in whole photos."""
     least = min(LEAST_SCORE, config.min_score) if config.verify else config.min_score
     detector = load_detector(config.weights, image_size=config.image_size, min_score=least)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(fold_norms(detector), num_iterations=config.num_iterations, match=match).to(device)
     cached = None if cache is None else CachedDetections(cache, describe_detector(config, model, device))
-    found, names = _detect_photos(model, photos, cached=cached, progress=progress)
+    found, names = _detect_photos(model, photos, cached=cached)
     # whole photos are matched to find the plant, and not again by who asks for that
-    match_found = partial(model.match_detections, found, min_score=config.min_score, progress=progress)
+    match_found = partial(model.match_detections, found, min_score=config.min_score)
     return _Seen(model, cached, names, found, lru_cache(maxsize=1)(match_found))
 
 
@@ -197,12 +193,11 @@ def _detect_photos(
     boxes: Tensor | None = None,
     *,
     cached: CachedDetections | None,
-    progress: bool,
 ) -> tuple[list[dict[str, Tensor]], set[str]]:
     """What the detector finds in every photo, or in its box (V, 4) xyxy, and the names of the files that cache it."""
     found, names, scene = [], set(), photos.scene
     device = next(model.parameters()).device
-    for view in tqdm(range(len(scene.views)), desc="detection", unit="view", disable=not progress):
+    for view in progress_bar(range(len(scene.views)), name="detection", unit="view"):
         box = None if boxes is None else boxes[view].tolist()
         path = cached.path(scene, view, box) if cached is not None and photos.exist else None
         detections = None if path is None else read_detections(path)

@@ -26,7 +26,6 @@ def match_proposals(
     cluster_iou: float = 0.3,
     detections_per_view: int = 100,
     match: MatchConfig = MatchConfig(),
-    progress: bool = False,
 ) -> Matching:
     """Match first, alternate assignment and NMS, then discard unconfirmed boxes (steps 2 to 4 of `MultiViewMaskRCNN`).
 
@@ -37,7 +36,6 @@ def match_proposals(
         cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
         detections_per_view: at most this many are kept in a view, best scores first.
         match: how regions are matched.
-        progress: show progress bars.
 
     Returns:
         The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns of
@@ -51,19 +49,18 @@ def match_proposals(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         keep = _suppress(proposals, per_class, cluster_iou, detections_per_view=detections_per_view)
-        matching = match_masks(masks.select(keep), cameras, match, progress=progress)
+        matching = match_masks(masks.select(keep), cameras, match)
         rematch = partial(
             match_masks,
             cameras=cameras,
             config=match,
             num_instances=_count_instances(matching.masks) if match.resolved_method == "symnmf" else {},
             residual_px=matching.residual_px,  # of the poses, which stay the same
-            progress=progress,
         )
         for _ in range(num_iterations):
             matched = matching.masks
             ids, _ = assignment(
-                proposals.regions, matched.regions, matched.instance_ids, cameras=cameras, progress=progress
+                proposals.regions, matched.regions, matched.instance_ids, cameras=cameras
             )
             groups = torch.cat((per_class, ids[:, None]), 1)
             keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
@@ -91,9 +88,7 @@ def _count_instances(masks: Masks) -> dict[int, int]:
     return {label: len(ids[ids > 0].unique()) for label, ids in of_class.items()}
 
 
-def _suppress(
-    proposals: Proposals, groups: Tensor, iou_threshold: float, *, detections_per_view: int
-) -> Tensor:
+def _suppress(proposals: Proposals, groups: Tensor, iou_threshold: float, *, detections_per_view: int) -> Tensor:
     """NMS by group, then the limit of detections per view, as torchvision has it."""
     keep = cluster_aware_nms(proposals.boxes, proposals.scores, groups, iou_threshold)
     view = proposals.regions.view_index[keep]

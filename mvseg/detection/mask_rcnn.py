@@ -126,16 +126,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             matching = self._match(proposals, cameras.to(images[0].device))
             return self._collect(detections, sizes, masks=matching.masks)
 
-    def find_regions(
-        self, images: Iterable[Tensor], cameras: Cameras, *, progress: bool = False
-    ) -> Matching:
+    def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> Matching:
         """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time (with
         `verify`, the others as bytes), masks as crops.
 
         Args:
             images: V tensors (3, H, W) in [0, 1] on the detector's device, e.g. from a generator.
             cameras: their V undistorted cameras.
-            progress: show progress bars while the detections are matched.
 
         Returns:
             The D detections that are kept, matched, on the CPU, ordered by view and by falling score (with `verify`:
@@ -152,9 +149,9 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
         if not self.verify:
-            return self.match_detections(detections, cameras, progress=progress)
+            return self.match_detections(detections, cameras)
         posed = cameras.to("cpu")
-        match = partial(self.match_detections, detections, posed, progress=progress)
+        match = partial(self.match_detections, detections, posed)
         matching = match(min_score=max(SURE_SCORE, self.roi_heads.score_thresh))
         leaves = choose_leaves(
             matching.masks, list_proposals(detections, posed), cameras=posed, more=(match(min_score=MORE_SCORE).masks,)
@@ -178,18 +175,15 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         cameras: Cameras,
         *,
         min_score: float = 0.0,
-        progress: bool = False,
     ) -> Matching:
         """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals
         that score `min_score` or more. `labels` of its regions are rows of `list_proposals`."""
         with torch.autocast("cpu", enabled=False):
             proposals = gather_proposals(detections, cameras.sizes.tolist())
-            matching = self._match(proposals, cameras.to("cpu"), min_score=min_score, progress=progress)
+            matching = self._match(proposals, cameras.to("cpu"), min_score=min_score)
         return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
 
-    def _match(
-        self, proposals: Proposals, cameras: Cameras, *, min_score: float = 0.0, progress: bool = False
-    ) -> Matching:
+    def _match(self, proposals: Proposals, cameras: Cameras, *, min_score: float = 0.0) -> Matching:
         """The proposals that are kept, of those whose mask is not empty, matched; `labels` say which they are."""
         is_asked = (proposals.regions.areas > 0) & (proposals.scores >= min_score)
         return match_proposals(
@@ -199,7 +193,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             cluster_iou=self.cluster_iou,
             detections_per_view=self.roi_heads.detections_per_img,
             match=self.match,
-            progress=progress,
         )
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:

@@ -8,11 +8,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mvseg.formats.board import FAMILIES, BoardConfig, Family, marker_dictionary
 from mvseg.formats.photos import read_photo
 from mvseg.scene import Scene
+from mvseg.system.running import progress_bar
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -40,14 +40,14 @@ def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
     return {number: quad for number, quad in zip(numbers, corners, strict=True) if numbers.count(number) == 1}
 
 
-def find_scene_markers(scene: Scene, *, progress: bool = False) -> dict[Family, Seen]:
+def find_scene_markers(scene: Scene) -> dict[Family, Seen]:
     """Corners of the markers in all photos of a scene, by family.
 
     Raises:
         InputError: a photo is missing or broken.
     """
     found: dict[Family, Seen] = {family: {} for family in FAMILIES}
-    for view in tqdm(range(len(scene.views)), desc="markers", unit="photo", disable=not progress):
+    for view in progress_bar(range(len(scene.views)), name="markers", unit="photo"):
         photo = read_grey(scene, view)
         for family, seen in found.items():
             for marker, quad in find_markers(photo, family).items():

@@ -36,9 +36,7 @@ class Affinity:
         return dense
 
 
-def region_affinity(
-    regions: Regions, cameras: Cameras, *, num_points: int | None = None, seed: int = 0, progress: bool = False
-) -> Affinity:
+def region_affinity(regions: Regions, cameras: Cameras, *, num_points: int | None = None, seed: int = 0) -> Affinity:
     """Affinity of all pairs of regions in different views (Eq. 3), symmetrised.
 
     Args:
@@ -47,7 +45,6 @@ def region_affinity(
         num_points: random pixels per region that send out epipolar lines (the paper: 200). None, the default, uses all
             pixels: no slower, and without sampling noise.
         seed: for the random pixels.
-        progress: show a progress bar over the pairs of views.
 
     Returns:
         The graph, on the device of the regions. A region of weight 0 to all regions of the other views has no edge.
@@ -58,7 +55,7 @@ def region_affinity(
     weights = [torch.zeros(0, device=regions.device)]
     # thousands of small operations: on a CPU, what autograd notes of each is a fifth of the time
     with torch.inference_mode(regions.device.type == "cpu"):
-        for pair in binned_pairs(samples, cameras, senders=senders, progress=progress):
+        for pair in binned_pairs(samples, cameras, senders=senders):
             j_from_i, i_from_j = pairwise_affinity(pair.bins, pair.pixels, pair.lines)
             mean = (j_from_i + i_from_j.T) / 2
             first, second = mean.nonzero().unbind(1)

@@ -17,12 +17,12 @@ from math import ceil
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg.matching.pencil import Pencil, epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
 from mvseg.matching.samples import Samples, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.system.running import progress_bar
 
 LINE_PX = 2.0  # thickness of an epipolar line (Sec. 3.1)
 # Limits of the computation: a third more or less of any changes no id of "nview" on degraded masks of 8 to 16 leaves.
@@ -177,7 +177,6 @@ def binned_pairs(
     cameras: Cameras,
     *,
     senders: Sequence[Samples] | None = None,
-    progress: bool = False,
 ) -> Iterator[BinnedPair]:
     """All pairs of views i < j that both have pixels, with a baseline between them.
 
@@ -185,14 +184,13 @@ def binned_pairs(
         samples: pixels of the regions, one entry per view.
         cameras: V cameras.
         senders: the pixels that send out lines; None for all.
-        progress: show a progress bar over the pairs.
     """
     skip = is_coincident(cameras).tolist()
     occupied = [view for view, sample in enumerate(samples) if len(sample.xy)]
     pairs = [(i, j) for i in occupied for j in occupied if i < j and not skip[i][j]]
     pencils = epipolar_pencils(cameras, pairs)
     every_pair = zip(pairs, pencils, _pair_pitches(samples, pairs, pencils), strict=True)
-    for (i, j), pencil, pitches in tqdm(every_pair, "epipolar weights", len(pairs), unit="pair", disable=not progress):
+    for (i, j), pencil, pitches in progress_bar(every_pair, "epipolar weights", len(pairs), unit="pair"):
         spans = find_spans(pencil, 0, samples[i]), find_spans(pencil, 1, samples[j])
         ends = tuple(torch.stack((part.low.min(), part.high.max())) for part in spans)
         bins = choose_bins(pitches, (ends[0], ends[1]))

@@ -40,7 +40,6 @@ def match_regions(
     *,
     residual_px: int | None = None,
     links: Links | None = None,
-    progress: bool = False,
 ) -> Matching:
     """Give every region an instance id by epipolar region matching (Sec. 3.1).
 
@@ -55,7 +54,6 @@ def match_regions(
             found it (`Matching.residual_px`); None: it is estimated. Only "nview" makes use of it.
         links: regions that show one instance, or different ones; these ids hold, and links that the views agree with
             change nothing.
-        progress: show progress bars.
 
     Returns:
         The matching, on the device of the regions; empty without regions. Warns (InputWarning) about pairs of views
@@ -75,17 +73,17 @@ def match_regions(
     check_baselines(cameras)
     _check_sizes(regions, cameras)
     _warn_of_gaps(regions, cameras)
-    affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed, progress=progress)
+    affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed)
     graph = ViewGraph.of(affinity, regions, links)
     if config.resolved_method == "nview":
-        matching = match_nview(regions, cameras, graph, residual_px=residual_px, progress=progress)
+        matching = match_nview(regions, cameras, graph, residual_px=residual_px)
         if len(cameras) > 2 and len(regions):
             _warn_of_disagreement(matching)
         return matching
     if config.resolved_method == "one-per-view":
         clusters = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph)).drop_singletons()
     else:
-        clusters = first_without_links(graph, partial(_factorise, regions, config=config, progress=progress))
+        clusters = first_without_links(graph, partial(_factorise, regions, config=config))
     return matching_of_ids(clusters.instance_ids().to(regions.device), regions, affinity, method=config.resolved_method)
 
 
@@ -97,7 +95,6 @@ def match_masks(
     links: Links = NO_LINKS,
     num_instances: Mapping[int, int] = MappingProxyType({}),
     residual_px: int | None = None,
-    progress: bool = False,
 ) -> Matching:
     """Match the masks of a table, class by class; what else is known of them stays.
 
@@ -108,7 +105,6 @@ def match_masks(
         links: of their rows; those between masks of different classes have no effect.
         num_instances: {class: number of instances}, where an earlier matching has found it; "symnmf" only.
         residual_px: see `match_regions`.
-        progress: show progress bars.
 
     Returns:
         The matching; instances of different classes have different ids. Its method is that of the config where it is
@@ -123,7 +119,6 @@ def match_masks(
             replace(config, num_instances=num_instances.get(label) or config.num_instances),
             residual_px=residual_px,
             links=links.select(members),
-            progress=progress,
         )
         parts.append(part)
         rows.append(members)
@@ -135,12 +130,10 @@ def match_masks(
     return Matching(kept, report)
 
 
-def _factorise(
-    regions: Regions, graph: ViewGraph, _: Clusters | None, *, config: MatchConfig, progress: bool
-) -> Clusters:
+def _factorise(regions: Regions, graph: ViewGraph, _: Clusters | None, *, config: MatchConfig) -> Clusters:
     """SymNMF of the nodes of the graph; of nodes that links keep apart, see `ViewGraph.part`."""
     weights = torch.from_numpy(graph.contract()).float().to(regions.device)
-    clustering = cluster_weights(weights, regions.num_per_view, config, progress=progress)
+    clustering = cluster_weights(weights, regions.num_per_view, config)
     return graph.part(Clusters.of(clustering.instance_ids.cpu().numpy()[graph.node]))
 
 

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.partition import Clusters
+from mvseg.system.running import progress_bar
 
 KS_AT_ONCE = 8  # limit: factorised together
 DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
@@ -47,7 +47,6 @@ def cluster_affinity(
     search_range: tuple[int, int] | None = None,
     num_restarts: int = 2,
     seed: int = 0,
-    progress: bool = False,
 ) -> Clustering:
     """Cluster the graph with SymNMF; without `num_instances`, |k| is the one with the least Eq. 7 in a range.
 
@@ -59,7 +58,6 @@ def cluster_affinity(
             wins a tie.
         num_restarts: random starts per factorisation; the best objective wins.
         seed: for the starts.
-        progress: show a progress bar over k.
 
     Returns:
         The clustering. Regions without an edge are -1 (the paper does not say; an arg max over a row of zeros would put
@@ -71,10 +69,10 @@ def cluster_affinity(
     config = MatchConfig(
         method="symnmf", num_instances=num_instances, search_range=search_range, num_restarts=num_restarts, seed=seed
     )
-    return cluster_weights(affinity.to_dense(), num_per_view, config, progress=progress)
+    return cluster_weights(affinity.to_dense(), num_per_view, config)
 
 
-def cluster_weights(W: Tensor, num_per_view: Tensor, config: MatchConfig, *, progress: bool = False) -> Clustering:
+def cluster_weights(W: Tensor, num_per_view: Tensor, config: MatchConfig) -> Clustering:
     """`cluster_affinity` of the weights W (D, D), symmetric, >= 0."""
     largest_view = int(num_per_view.max()) if len(num_per_view) else 0
     low, high = config.search_range or (max(1, largest_view), max(1, 2 * largest_view))
@@ -86,7 +84,7 @@ def cluster_weights(W: Tensor, num_per_view: Tensor, config: MatchConfig, *, pro
         return Clustering(labels, 0, {})
     candidates: dict[int, Tensor] = {}
     criterion: dict[int, float] = {}
-    with tqdm(total=high - low + 1, desc="number of instances", unit="k", disable=not progress or low == high) as bar:
+    with progress_bar(total=high - low + 1, name="number of instances", unit="k") as bar:
         for ks in torch.arange(low, high + 1).split(KS_AT_ONCE):
             linked_W = W[is_linked][:, is_linked]
             factors = factorise(linked_W, ks.tolist(), num_restarts=config.num_restarts, seed=config.seed)

@@ -17,7 +17,6 @@ import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.formats.image_file import read_rgb
@@ -25,6 +24,7 @@ from mvseg.poses.cancellable import run_cancellable
 from mvseg.poses.config import PoseConfig
 from mvseg.poses.photo_files import PhotoFile, group_by_camera
 from mvseg.poses.sift import coarsest, count_alike, find_sift
+from mvseg.system.running import progress_bar
 
 PHOTOS_AT_ONCE = max(2, os.cpu_count() or 1)  # of one call, after which the progress bar advances
 PAIRS_AT_ONCE = 100  # of one call, which indexes each of its photos once: at 10 matching takes several times as long
@@ -68,9 +68,7 @@ def make_database(
                 raise InputError(f"{photo.name}: COLMAP cannot read this photo, expected JPEG or PNG")
 
 
-def find_features(
-    database: Path, folder: Path, names: Sequence[str], *, image_size: int, progress: bool = False
-) -> NDArray[np.int64]:
+def find_features(database: Path, folder: Path, names: Sequence[str], *, image_size: int) -> NDArray[np.int64]:
     """Find up to QUICK_MOST features in each photo of the database, at QUICK_SIZE or `image_size` pixels if that is
     less.
 
@@ -80,7 +78,7 @@ def find_features(
     coarse = []
     with pycolmap.Database.open(database) as opened:
         number_of = {image.name: image.image_id for image in opened.read_all_images()}
-        for name in tqdm(names, desc="features", unit="photo", disable=not progress):
+        for name in progress_bar(names, name="features", unit="photo"):
             grey = np.asarray(cv2.cvtColor(read_rgb(folder / name), cv2.COLOR_RGB2GRAY), np.uint8)
             sift = find_sift(grey, image_size=min(image_size, QUICK_SIZE), most=QUICK_MOST)
             number = number_of[name]
@@ -98,11 +96,10 @@ def extract_features(
     *,
     config: PoseConfig,
     lens: pycolmap.Camera | None = None,
-    progress: bool = False,
 ) -> None:
     """Find COLMAP's features of all photos of the database, which was made with the same arguments."""
     options = pycolmap.FeatureExtractionOptions(use_gpu=False, max_image_size=config.image_size)
-    with tqdm(total=len(numbered), desc="more features", unit="photo", disable=not progress) as bar:
+    with progress_bar(total=len(numbered), name="more features", unit="photo") as bar:
         for names in _names_by_camera(numbered, config):
             for start in range(0, len(names), PHOTOS_AT_ONCE):
                 some = names[start : start + PHOTOS_AT_ONCE]
@@ -131,9 +128,7 @@ def _names_by_camera(numbered: Mapping[str, PhotoFile], config: PoseConfig) -> l
     return [[name_of[photo] for photo in group] for group in groups]
 
 
-def match_features(
-    database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]], *, progress: bool = False
-) -> None:
+def match_features(database: Path, names: Sequence[str], pairs: Sequence[tuple[int, int]]) -> None:
     """Match the features of pairs (i, j) of photos in the database, which have these names, and keep what fits one
     relative pose."""
     matching = pycolmap.FeatureMatchingOptions(use_gpu=False)
@@ -141,7 +136,7 @@ def match_features(
     verification.ransac.random_seed = SEED
     listed = database.with_name("pairs.txt")
     pairing = pycolmap.ImportedPairingOptions(match_list_path=listed)
-    with tqdm(total=len(pairs), desc="matching", unit="pair", disable=not progress) as bar:
+    with progress_bar(total=len(pairs), name="matching", unit="pair") as bar:
         for start in range(0, len(pairs), PAIRS_AT_ONCE):
             some = pairs[start : start + PAIRS_AT_ONCE]
             listed.write_text("".join(f"{names[i]} {names[j]}\n" for i, j in some), newline="\n")

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.board import BoardConfig
@@ -20,6 +19,7 @@ from mvseg.poses.alignment import align, is_one_line, scale_by, spreads
 from mvseg.poses.config import Known
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Scene
+from mvseg.system.running import progress_bar
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class Placement:
         return f"scale from {self.source}{fit}{wrong}"
 
 
-def place(scene: Scene, known: Known, *, progress: bool = False) -> Placement:
+def place(scene: Scene, known: Known) -> Placement:
     """The similarity that transforms a scene into the known world.
 
     Warns (InputWarning) of markers of different sizes, positions that hardly fit, and positions on one line.
@@ -68,19 +68,19 @@ def place(scene: Scene, known: Known, *, progress: bool = False) -> Placement:
         InputError: the markers or photos named are not seen, the positions do not fit the photos or are mirrored.
     """
     if known.board is not None:
-        return _by_board(scene, known.board, known.unit, progress=progress)
+        return _by_board(scene, known.board, known.unit)
     if known.marker is not None:
-        return _by_markers(scene, known.marker, known.unit, progress=progress)
+        return _by_markers(scene, known.marker, known.unit)
     if known.distance is not None:
-        return _by_distance(scene, known.distance, known.unit, progress=progress)
+        return _by_distance(scene, known.distance, known.unit)
     if known.positions is not None:
         return _by_positions(scene, known.positions, known.unit)
     return Placement(similarity=scale_by(1.0), unit=known.unit)
 
 
-def _by_board(scene: Scene, board: BoardConfig, unit: str, *, progress: bool) -> Placement:
+def _by_board(scene: Scene, board: BoardConfig, unit: str) -> Placement:
     seen: dict[int, list[tuple[int, Floats]]] = {}
-    for view in tqdm(range(len(scene.views)), desc="board", unit="photo", disable=not progress):
+    for view in progress_bar(range(len(scene.views)), name="board", unit="photo"):
         for number, px in zip(*find_board(read_grey(scene, view), board), strict=True):
             seen.setdefault(int(number), []).append((view, px))
     points = triangulate_points(scene.cameras, seen)
@@ -98,9 +98,9 @@ def _by_board(scene: Scene, board: BoardConfig, unit: str, *, progress: bool) ->
     )
 
 
-def _by_markers(scene: Scene, side: float, unit: str, *, progress: bool) -> Placement:
+def _by_markers(scene: Scene, side: float, unit: str) -> Placement:
     """All corners of all markers are fitted at once: each marker is a square of its own pose, of one common scale."""
-    sides = marker_sides(_marker_corners(scene, progress=progress))
+    sides = marker_sides(_marker_corners(scene))
     if not len(sides):
         raise InputError("no whole marker is seen in two photos, expected ArUco or AprilTag markers of --marker's size")
     middle = float(np.median(sides))
@@ -126,15 +126,15 @@ def marker_sides(corners: dict[Corner, Floats]) -> Floats:
     return np.linalg.svd(from_center.swapaxes(1, 2) @ square, compute_uv=False).sum(1) / (square**2).sum()
 
 
-def _marker_corners(scene: Scene, *, progress: bool) -> dict[Corner, Floats]:
+def _marker_corners(scene: Scene) -> dict[Corner, Floats]:
     """The corners of the family of markers that has the most of them in space."""
-    found = find_scene_markers(scene, progress=progress)
+    found = find_scene_markers(scene)
     return max((triangulate_points(scene.cameras, seen) for seen in found.values()), key=len)
 
 
-def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str, *, progress: bool) -> Placement:
+def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str) -> Placement:
     names, length = distance[:2], distance[2]
-    corners = _marker_corners(scene, progress=progress) if any(name.startswith(MARKER) for name in names) else {}
+    corners = _marker_corners(scene) if any(name.startswith(MARKER) for name in names) else {}
     first, second = (_point(scene, name, corners) for name in names)
     apart = float(np.linalg.norm(first - second))
     if apart <= 1e-9 * float(spreads(scene.cameras.centers.cpu().numpy())[0]):

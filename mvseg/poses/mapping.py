@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pycolmap
-from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.formats.opencv_yaml import Calibration
@@ -20,6 +19,7 @@ from mvseg.poses.config import LEAST, LEAST_SHARE, PoseConfig
 from mvseg.poses.features import SEED, extract_features, find_features, make_database, match_features, number_photos
 from mvseg.poses.pairs import Pair, choose_pairs, pairs_with
 from mvseg.poses.photo_files import PhotoFile
+from mvseg.system.running import progress_bar
 
 FEW_FEATURES = 300  # of a photo, below which it has too little texture
 ENOUGH = 0.9  # of the photos: with fewer, all is done again with more features; at 1, one blurred photo costs minutes
@@ -61,7 +61,6 @@ def find_structure(
     config: PoseConfig,
     calibration: Calibration | None = None,
     work: Path | None = None,
-    progress: bool = False,
 ) -> Structure:
     """Estimate the cameras of photos, and 3D points, from the photos alone.
 
@@ -74,7 +73,6 @@ def find_structure(
         config: see `PoseConfig`.
         calibration: camera of all photos, which then stays as it is.
         work: folder on whose disk COLMAP keeps its database meanwhile (default: the system's for temporary files).
-        progress: show progress bars.
 
     Raises:
         InputError: too few photos register (the message says how many, and what to do), COLMAP cannot read a photo, or
@@ -84,7 +82,7 @@ def find_structure(
     if lens is not None:
         config = replace(config, shared_camera=True)
     with tempfile.TemporaryDirectory(dir=work, prefix="colmap-") as folder:
-        task = _Task(Path(folder), number_photos(images, photos, Path(folder) / PHOTOS), config, lens, progress)
+        task = _Task(Path(folder), number_photos(images, photos, Path(folder) / PHOTOS), config, lens)
         models, pairs, plain = _map_quickly(task)
         if not models or models[0].num_reg_images() < ENOUGH * len(photos):
             models = _sorted([*models, *_map_thoroughly(task, pairs)])
@@ -119,7 +117,6 @@ class _Task:
     photo_of: Mapping[str, PhotoFile]
     config: PoseConfig
     lens: pycolmap.Camera | None
-    progress: bool
 
 
 def _map_quickly(task: _Task) -> tuple[list[pycolmap.Reconstruction], list[Pair], tuple[str, ...]]:
@@ -129,16 +126,16 @@ def _map_quickly(task: _Task) -> tuple[list[pycolmap.Reconstruction], list[Pair]
     """
     database, names, images = task.work / "quick.db", list(task.photo_of), task.work / PHOTOS
     make_database(database, images, task.photo_of, config=task.config, lens=task.lens)
-    alike = find_features(database, images, names, image_size=task.config.image_size, progress=task.progress)
+    alike = find_features(database, images, names, image_size=task.config.image_size)
     plain = _photos_with_few_features(database, task.photo_of)
     pairs = choose_pairs([photo.name for photo in task.photo_of.values()], task.config.pairs, alike=alike)
-    match_features(database, names, pairs, progress=task.progress)
+    match_features(database, names, pairs)
     models = _map(task, database, few_matches=False)
     if not _is_whole(models, task):
         found = {image.name for image in models[0].images.values() if image.has_pose} if models else set()
         lost = [index for index, name in enumerate(names) if name not in found]
         more = [] if task.config.pairs else sorted({*pairs_with(lost, len(names))} - {*pairs})
-        match_features(database, names, more, progress=task.progress)
+        match_features(database, names, more)
         pairs = sorted([*pairs, *more])
         models = _sorted([*models, *_map(task, database, few_matches=True)])
     return models, pairs, plain
@@ -148,8 +145,8 @@ def _map_thoroughly(task: _Task, pairs: Sequence[Pair]) -> list[pycolmap.Reconst
     """Models from all features that COLMAP finds."""
     database, images = task.work / "thorough.db", task.work / PHOTOS
     make_database(database, images, task.photo_of, config=task.config, lens=task.lens)
-    extract_features(database, images, task.photo_of, config=task.config, lens=task.lens, progress=task.progress)
-    match_features(database, list(task.photo_of), pairs, progress=task.progress)
+    extract_features(database, images, task.photo_of, config=task.config, lens=task.lens)
+    match_features(database, list(task.photo_of), pairs)
     models = _map(task, database, few_matches=False)  # strict first: it is right where it succeeds
     return models if _is_whole(models, task) else [*models, *_map(task, database, few_matches=True)]
 
@@ -182,7 +179,7 @@ def _mapping_options(*, fix_lens: bool, few_matches: bool) -> pycolmap.Increment
 def _map(task: _Task, database: Path, *, few_matches: bool) -> list[pycolmap.Reconstruction]:
     """All models, each in a frame of its own, the largest first."""
     num_photos = len(task.photo_of)
-    with tqdm(total=num_photos, desc="mapping", unit="photo", disable=not task.progress) as bar:
+    with progress_bar(total=num_photos, name="mapping", unit="photo") as bar:
 
         def count(photos: int) -> None:  # attempts that fail count as well: at most to the end of the bar
             bar.update(min(photos, num_photos - bar.n))

@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image, ImageOps
-from tqdm import tqdm
 
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.find_views import natural_order
@@ -23,6 +22,7 @@ from mvseg.formats.image_file import (
     sensor_bits,
     write_png,
 )
+from mvseg.system.running import progress_bar
 
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, CAMERA_MODEL, EXIF_BLOCK = 0x920A, 0xA405, 0x0110, 0x8769  # EXIF tags
 QUALITY = 95  # of a JPEG that is written anew, upright
@@ -98,7 +98,7 @@ def _are_photos(files: Sequence[Path]) -> bool:
     return any(path.suffix.lower() in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES) for path in files)
 
 
-def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: bool = False) -> list[PhotoFile]:
+def copy_photos(folder: Path, names: Sequence[str], images: Path) -> list[PhotoFile]:
     """Copy photos, by their paths in `folder`, into a scene's new `images/`, as they are where that is possible.
 
     Photos that EXIF turns are written anew, upright; so are WebP files and those of 10, 12 or 14 bits in 16, which
@@ -110,7 +110,7 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path, *, progress: b
     """
     photos = []
     bits = max((sensor_bits(folder / name) for name in names), default=8)
-    for name in tqdm(names, desc="photos", unit="photo", disable=not progress):
+    for name in progress_bar(names, name="photos", unit="photo"):
         path = images / name
         path.parent.mkdir(parents=True, exist_ok=True)
         with faults_of(f"{folder / name}: the photo cannot be read, expected a whole image file"):

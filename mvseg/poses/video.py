@@ -15,9 +15,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mvseg.errors import InputError
+from mvseg.system.running import progress_bar
 
 Grey = NDArray[np.uint8]
 Floats = NDArray[np.float64]
@@ -55,19 +55,18 @@ def is_video(path: Path) -> bool:
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
-def write_frames(clip: Path, folder: Path, *, most: int, progress: bool = False) -> list[str]:
+def write_frames(clip: Path, folder: Path, *, most: int) -> list[str]:
     """Write the sharp frames of a video into a new folder as JPEG, upright; returns their names, in order of time.
 
     Args:
         clip: the video.
         folder: made here.
         most: number of frames, at most; a video with less motion gives fewer.
-        progress: show progress bars.
 
     Raises:
         InputError: the video cannot be opened or read, or shows too little motion.
     """
-    footage = watch(clip, progress=progress)
+    footage = watch(clip)
     chosen = set(choose_frames(footage, most=most))
     if len(chosen) < LEAST_FRAMES:
         moved = footage.motion[-1]
@@ -83,7 +82,7 @@ def write_frames(clip: Path, folder: Path, *, most: int, progress: bool = False)
     return names
 
 
-def watch(clip: Path, *, progress: bool = False) -> Footage:
+def watch(clip: Path) -> Footage:
     """Measure motion and sharpness over a video, PER_SECOND frames of each second.
 
     Raises:
@@ -92,7 +91,7 @@ def watch(clip: Path, *, progress: bool = False) -> Footage:
     numbers: list[int] = []
     motion: list[float] = []
     sharpness: list[float] = []
-    with _opened(clip) as video, tqdm(desc="video", unit="frame", disable=not progress) as bar:
+    with _opened(clip) as video, progress_bar(name="video", unit="frame") as bar:
         rate = video.get(cv2.CAP_PROP_FPS)
         every = max(1, round(rate / PER_SECOND)) if 0 < rate < 1000 else 1
         track, base = None, 0.0

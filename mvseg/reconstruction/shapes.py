@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from types import MappingProxyType
 
 import torch
@@ -29,8 +28,6 @@ def reconstruct_shapes(
     starts: Surfaces = MappingProxyType({}),
     known: Surfaces = MappingProxyType({}),
     with_voxels: bool = True,
-    workers: ProcessPoolExecutor | None = None,
-    progress: bool = False,
 ) -> tuple[Surfaces | None, Voxels]:
     """The shapes of all instances, as `config.shape` says.
 
@@ -42,8 +39,6 @@ def reconstruct_shapes(
         starts: instance id -> a surface that is nearly right, see `fit_surfaces`.
         known: instance id -> a surface that stays as it is, see `fit_surfaces`.
         with_voxels: False leaves voxels out, whatever the config says.
-        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
-        progress: show progress bars over the instances.
 
     Returns:
         {instance id: surface}, None with "voxels"; and {instance id: voxels}: of all instances with "voxels" or "both",
@@ -60,8 +55,6 @@ def reconstruct_shapes(
             cameras,
             starts=starts,
             known=known,
-            workers=workers,
-            progress=progress,
         )
         if not with_voxels:
             return surfaces, {}
@@ -70,7 +63,7 @@ def reconstruct_shapes(
             instance_ids = instance_ids.where(~torch.isin(instance_ids, torch.tensor(credible).to(instance_ids)), -1)
             if not bool((instance_ids > 0).any()):
                 return surfaces, {}
-    voxels = reconstruct_instances(regions, instance_ids, cameras, config=config, progress=progress)
+    voxels = reconstruct_instances(regions, instance_ids, cameras, config=config)
     return surfaces, {instance: grid.without_crumbs() for instance, grid in voxels.items()}
 
 

@@ -13,12 +13,12 @@ import trimesh
 from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.system.running import progress_bar
 
 SEARCH_CELLS = 24  # cells along the bounding box of an instance when the search for it ends
 MAX_CELLS = 100_000  # or how many cells there are by then
@@ -106,7 +106,6 @@ def reconstruct_instances(
     cameras: Cameras,
     *,
     config: ReconstructConfig = ReconstructConfig(),
-    progress: bool = False,
 ) -> dict[int, VoxelGrid]:
     """Back-project every instance that is seen in at least two views.
 
@@ -117,7 +116,6 @@ def reconstruct_instances(
         instance_ids: (D,) int64, from 1 on; -1 = matched to nothing.
         cameras: V cameras.
         config: thresholds and voxel size.
-        progress: show a progress bar over the instances.
 
     Returns:
         {instance id: grid}, votes on the device of the regions. Instances seen in one view only are left out: they have
@@ -134,7 +132,7 @@ def reconstruct_instances(
         sizes = enumerate(cameras.sizes.tolist())
         free = {view: regions.label_map(view, ones, size) == 0 for view, size in sizes}
     instances = instance_ids[instance_ids > 0].unique().tolist()
-    for instance in tqdm(instances, desc="back-projection", unit="instance", disable=not progress):
+    for instance in progress_bar(instances, name="back-projection", unit="instance"):
         members = regions.select(instance_ids == instance)
         grid = back_project(members, cameras, config=config, free=free)
         if grid is not None and grid.occupied.any():

@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg.corrections.file import dump_edits
 from mvseg.formats.coco import encode_mask, write_coco
@@ -33,15 +32,14 @@ from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.results.run_record import FORMAT
 from mvseg.scene import Scene, View
+from mvseg.system.running import progress_bar
 
 REPORT_FILE = "report.html"
 CAMERAS_FILE = "cameras.json"
 CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED: "confirm"}  # the edit that made a mask
 
 
-def save_result(
-    result: Result, out: Path, run: Mapping[str, Any] | None = None, *, progress: bool = False, report: bool = True
-) -> None:
+def save_result(result: Result, out: Path, run: Mapping[str, Any] | None = None, *, report: bool = True) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
     The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.
@@ -51,7 +49,6 @@ def save_result(
         out: the folder.
         run: what goes into run.json besides timings and counts: version, config, inputs, warnings; None: what a result
             that was loaded knows of its run.
-        progress: show a progress bar over the views.
         report: write report.html, too.
 
     Raises:
@@ -62,8 +59,8 @@ def save_result(
         run = {} if result.run is None else result.run.as_json()
     said = {**run, **describe_result(result)}
     with replace_result(out, said) as folder:
-        pictures = _write_images(result, folder, progress)
-        _write_instances(result, folder, progress)
+        pictures = _write_images(result, folder)
+        _write_instances(result, folder)
         if result.surfaces is not None or result.voxels is not None:
             from mvseg.results.plant_files import write_plant  # loads trimesh and scikit-image
 
@@ -124,13 +121,13 @@ def _photos_folder(view: View) -> Path:
     return parents[min(view.name.count("/"), len(parents) - 1)]
 
 
-def _write_images(result: Result, folder: Path, progress: bool) -> list[Picture]:
+def _write_images(result: Result, folder: Path) -> list[Picture]:
     """Write labels, overlays and the contact sheet; returns the report's pictures, so that photos are read only
     once."""
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
     tiles, pictures = [], []
     views = list(enumerate(scene.views))
-    for index, view in tqdm(views, desc="pictures", unit="view", disable=not progress):
+    for index, view in progress_bar(views, name="pictures", unit="view"):
         width, height = scene.cameras.sizes[index].tolist()
         write_label_png(folder / "labels" / f"{view.name}.png", labels_in_photo(result, index))
         photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
@@ -144,7 +141,7 @@ def _write_images(result: Result, folder: Path, progress: bool) -> list[Picture]
     return pictures
 
 
-def _write_instances(result: Result, folder: Path, progress: bool) -> None:
+def _write_instances(result: Result, folder: Path) -> None:
     """instances.json: every region, in the frame of the photo the user took."""
     scene, images = result.scene, []
     for index, view in enumerate(scene.views):
@@ -152,7 +149,7 @@ def _write_instances(result: Result, folder: Path, progress: bool) -> None:
         file_name = view.name + view.path.suffix  # with its subfolder, so that it can be found again
         image = {"id": index + 1, "file_name": file_name, "name": view.name, "width": width, "height": height}
         images.append(image | {"camera": _describe_camera(scene, index)})
-    shown = tqdm(range(len(result.regions)), desc="masks", unit="mask", disable=not progress)
+    shown = progress_bar(range(len(result.regions)), name="masks", unit="mask")
     write_coco(folder / "instances.json", images, [_annotate(result, region) for region in shown])
 
 

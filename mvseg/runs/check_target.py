@@ -15,7 +15,6 @@ import numpy as np
 import pycolmap
 import torch
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mvseg.checks.target_masks import cut_shapes
 from mvseg.errors import InputError, faults_of
@@ -31,6 +30,7 @@ from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.results.plant_files import METRES
 from mvseg.results.result import Result
 from mvseg.scene import Scene
+from mvseg.system.running import progress_bar
 from mvseg.traits.leaf import missing
 
 Floats = NDArray[np.float64]
@@ -123,7 +123,7 @@ class TargetCheck:
         return asdict(self) | {"shapes": known, "is_right": self.is_right, "verdict": self.verdict}
 
 
-def check_target(folder: Path, *, bar: float = BAR, progress: bool = False) -> TargetCheck:
+def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
     """Measure the shapes of the photographed page with the stages of `mvseg infer`.
 
     Where shapes are on the photos, and which mask shows which, follows from the tags; masks and areas do not.
@@ -131,7 +131,6 @@ def check_target(folder: Path, *, bar: float = BAR, progress: bool = False) -> T
     Args:
         folder: scene with photos of the page; its cameras state the unit of their lengths.
         bar: length of the printed scale bar, by a ruler, mm: what tags and areas are multiplied with.
-        progress: show progress bars.
 
     Raises:
         InputError: bad scene; the unit is not known; no tag is seen in two photos; a photo shows no whole shape.
@@ -144,17 +143,17 @@ def check_target(folder: Path, *, bar: float = BAR, progress: bool = False) -> T
         said = f"their unit is {scene.unit}" if scene.unit else "they say no unit"
         raise InputError(f"{scene.source}: {said}, expected mm, cm or m, as mvseg pose --unit mm states it")
     mm = 1000 * METRES[scene.unit.lower()]
-    corners = _find_corners(scene, progress=progress)
+    corners = _find_corners(scene)
     with faults_of(f"{folder}: {len(corners)} corners of the page's tags"):
         places = tag_corners()
         page = np.array([[*places[number][corner], 0] for number, corner in corners])
         alignment = align(page, np.array(list(corners.values())))
     shapes = dict(enumerate(list_shapes(), start=1))
     with tempfile.TemporaryDirectory() as masks:
-        for view in tqdm(range(len(scene.views)), desc="masks", unit="photo", disable=not progress):
+        for view in progress_bar(range(len(scene.views)), name="masks", unit="photo"):
             labels = _cut_view(scene, view, shapes=shapes, world_from_page=alignment.similarity)
             write_label_png(Path(masks) / f"{scene.views[view].name}.png", labels)
-        result = run_scene(folder, masks, progress=progress)
+        result = run_scene(folder, masks)
     printed = bar / BAR
     return TargetCheck(
         shapes=tuple(_measured(result, shape, label, mm=mm, printed=printed) for label, shape in shapes.items()),
@@ -164,11 +163,11 @@ def check_target(folder: Path, *, bar: float = BAR, progress: bool = False) -> T
     )
 
 
-def _find_corners(scene: Scene, *, progress: bool) -> Mapping[tuple[int, int], Floats]:
+def _find_corners(scene: Scene) -> Mapping[tuple[int, int], Floats]:
     """{(tag, corner): (3,) where it is} of the page's tags, in the world."""
     seen: dict[tuple[int, int], list[tuple[int, Floats]]] = {}
     on_page = tag_corners()
-    for view in tqdm(range(len(scene.views)), desc="tags", unit="photo", disable=not progress):
+    for view in progress_bar(range(len(scene.views)), name="tags", unit="photo"):
         for number, quad in find_markers(read_grey(scene, view), FAMILY).items():
             for corner in range(4 if number in on_page else 0):
                 seen.setdefault((number, corner), []).append((view, quad[corner]))

@@ -6,7 +6,6 @@ import platform
 import sys
 import warnings
 from collections.abc import Sequence
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -28,7 +27,7 @@ from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.file_hash import hash_files
-from mvseg.system.worker_pool import start_workers
+from mvseg.system.running import running
 
 
 def run_one_scene(
@@ -41,7 +40,6 @@ def run_one_scene(
     force_corrections: bool = False,
     num_workers: int = 1,
     overwrite: bool = False,
-    quiet: bool,
 ) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json.
 
@@ -62,7 +60,7 @@ def run_one_scene(
     with ExitStack() as stack:
         if masks is None and stack.enter_context(claim_cache(cache, scene, overwrite=overwrite)):
             print(f"mvseg: going on from the detections in {cache}, for equal photos and options", file=sys.stderr)
-        with start_workers(num_workers) as workers:
+        with running(num_workers=num_workers):
             result, messages = solve_scene(
                 scene,
                 masks,
@@ -70,15 +68,13 @@ def run_one_scene(
                 corrections=corrections,
                 force_corrections=force_corrections,
                 cache=cache,
-                workers=workers,
-                progress=not quiet,
             )
         if left_out := len(result.views_left_out):
             num_taken, more = len(result.scene.views), "" if config.views else "; --views all takes all"
             print(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", file=sys.stderr)
         for message in messages:
             print(f"mvseg: warning: {message}", file=sys.stderr)
-        save_scene(result, scene, out, masks=masks, config=config, messages=messages, progress=not quiet)
+        save_scene(result, scene, out, masks=masks, config=config, messages=messages)
         if masks is None:
             delete_cached(cache)
     num_masks, num_views = len(result.regions), len(result.scene.views)
@@ -94,7 +90,6 @@ def run_again(
     force_corrections: bool = False,
     num_workers: int = 1,
     overwrite: bool = False,
-    quiet: bool,
 ) -> None:
     """The run that made a result once more, with its options; stderr says what has changed since.
 
@@ -102,7 +97,7 @@ def run_again(
         folder: the result.
         out: where the new one goes; None: in its place.
         corrections: file of a person's edits; None: that of the run, if it had one.
-        force_corrections, num_workers, overwrite, quiet: as of `run_one_scene`.
+        force_corrections, num_workers, overwrite: as of `run_one_scene`.
 
     Raises:
         InputError: see `read_recorded` and `run_one_scene`.
@@ -119,7 +114,6 @@ def run_again(
         force_corrections=force_corrections,
         num_workers=num_workers,
         overwrite=overwrite,
-        quiet=quiet,
     )
 
 
@@ -131,8 +125,6 @@ def solve_scene(
     corrections: Path | None = None,
     force_corrections: bool = False,
     cache: Path,
-    workers: ProcessPoolExecutor | None = None,
-    progress: bool,
 ) -> tuple[Result, list[str]]:
     """The result of one scene and the InputWarnings on the way, each once; other warnings are passed on."""
     with warnings.catch_warnings(record=True) as caught:
@@ -146,8 +138,6 @@ def solve_scene(
             corrections=corrections,
             force_corrections=force_corrections,
             cache=cache,
-            workers=workers,
-            progress=progress,
         )
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
@@ -164,7 +154,6 @@ def save_scene(
     masks: Path | None,
     config: RunConfig,
     messages: Sequence[str],
-    progress: bool,
 ) -> None:
     """Write the result folder, run.json included; with the report, the findings of the checks of the scene and its
     masks."""
@@ -174,7 +163,7 @@ def save_scene(
     if config.report:
         check = check_scene(result.scene, result.regions, features=False)  # of which the run has warned
         run["checks"] = [asdict(finding) for finding in check.findings]
-    save_result(result, out, run, progress=progress, report=config.report)
+    save_result(result, out, run, report=config.report)
 
 
 def describe_run(

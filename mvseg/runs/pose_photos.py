@@ -27,6 +27,7 @@ from mvseg.poses.video import is_video, write_frames
 from mvseg.results.earlier import check_out, replace_result
 from mvseg.scene import Scene
 from mvseg.system.atomic import sweep_abandoned
+from mvseg.system.running import now_running
 from mvseg.traits.config import Up
 from mvseg.traits.up import place_scene
 
@@ -40,7 +41,6 @@ def pose_photos(
     config: PoseConfig = PoseConfig(),
     known: Known = Known(),
     up: Up | None = None,
-    quiet: bool = False,
 ) -> Scene:
     """Estimate the cameras of photos, and write a scene folder that `load_scene` reads: whole, or not at all.
 
@@ -53,7 +53,6 @@ def pose_photos(
         config: how cameras are estimated.
         known: where scale and axes come from.
         up: the direction of up in the known world, or how to find it.
-        quiet: no progress bars and no line at the end.
 
     Raises:
         InputError: a photo or the video is broken, the video shows too little motion, too few photos register, what is
@@ -69,14 +68,9 @@ def pose_photos(
     start, run = time.perf_counter(), dict[str, Any](made_by())
     with warnings.catch_warnings(record=True) as caught, replace_result(out, run, POSE_FILE) as folder:
         warnings.simplefilter("always", InputWarning)
-        if is_clip:
-            files = _copy_frames(photos, folder, config=config, progress=not quiet)
-        else:
-            files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
-        structure = find_structure(
-            folder / IMAGES, files, config=config, calibration=calibration, work=folder, progress=not quiet
-        )
-        placement = place(write_structure(structure, folder), known, progress=not quiet)
+        files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, folder / IMAGES)
+        structure = find_structure(folder / IMAGES, files, config=config, calibration=calibration, work=folder)
+        placement = place(write_structure(structure, folder), known)
         scene = move_structure(structure, placement.similarity, folder)
         scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
         write_cameras(scene, folder)
@@ -86,7 +80,7 @@ def pose_photos(
         run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}
     for message in messages:
         print(f"mvseg: warning: {message}", file=sys.stderr)
-    if not quiet:
+    if now_running().progress:
         print(summarize_poses(out, structure, placement=placement, scene=scene))
     return scene
 
@@ -114,10 +108,10 @@ def check_place(out: Path) -> None:
     check_out(out, POSE_FILE)
 
 
-def _copy_frames(clip: Path, folder: Path, *, config: PoseConfig, progress: bool) -> list[PhotoFile]:
+def _copy_frames(clip: Path, folder: Path, *, config: PoseConfig) -> list[PhotoFile]:
     """The frames of a video as photos of a scene folder."""
     with tempfile.TemporaryDirectory(dir=folder, prefix="frames-") as work:
-        names = write_frames(clip, Path(work) / "frames", most=config.frames, progress=progress)
+        names = write_frames(clip, Path(work) / "frames", most=config.frames)
         return copy_photos(Path(work) / "frames", names, folder / IMAGES)
 
 

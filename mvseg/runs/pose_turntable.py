@@ -10,7 +10,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from tqdm import tqdm
 
 from mvseg._version import made_by
 from mvseg.errors import InputError
@@ -26,6 +25,7 @@ from mvseg.poses.table_fit import TableCamera
 from mvseg.results.earlier import replace_result
 from mvseg.runs.pose_photos import POSE_FILE, check_folders
 from mvseg.scene import Scene
+from mvseg.system.running import now_running, progress_bar
 
 TURNTABLE_FILE = "turntable.json"
 ONLY_CAMERA = "camera"  # name of a camera without a folder for its photos
@@ -33,7 +33,7 @@ ONLY_CAMERA = "camera"  # name of a camera without a folder for its photos
 Angles = Path | float | None
 
 
-def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str = "", quiet: bool = False) -> Scene:
+def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str = "") -> Scene:
     """Calibrate a turntable from photos of a board on it, and write a scene folder with a `turntable.json`.
 
     Args:
@@ -42,7 +42,6 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
         out: the scene folder; an earlier one is replaced, files of the user in it stay.
         board: what is printed; its lengths are in `unit`.
         unit: name of the unit.
-        quiet: no progress bars and no line at the end.
 
     Raises:
         InputError: see `calibrate_turntable`; a photo is broken, or `out` holds something else.
@@ -50,10 +49,10 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
     source, names = check_folders(photos, out)
     run: dict[str, Any] = made_by() | {"board": asdict(board), "unit": unit}
     with replace_result(out, run, POSE_FILE) as folder:
-        files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
+        files = copy_photos(source, names, folder / IMAGES)
         by_camera: dict[str, list[PhotoFile]] = {}
         grey: dict[str, list[np.ndarray]] = {}
-        for file in tqdm(files, desc="board", unit="photo", disable=quiet):
+        for file in progress_bar(files, name="board", unit="photo"):
             camera = file.folder or ONLY_CAMERA
             by_camera.setdefault(camera, []).append(file)
             photo = cv2.cvtColor(read_rgb(folder / IMAGES / file.name), cv2.COLOR_RGB2GRAY)
@@ -71,16 +70,14 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
         scene = load_scene(folder)
         run |= {"residual_px": round(found.residual_px, 4), "corners": found.num_corners, "photos": len(files)}
         run["registered"] = [name.removeprefix(f"{IMAGES}/") for name, _, _ in views]
-    if not quiet:
+    if now_running().progress:
         share = f"{len(views)} of {len(files)} photos are at angles at which the board is seen"
         print(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
         print(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
     return scene
 
 
-def pose_turntable_photos(
-    photos: Path, out: Path, *, turntable: Path, angles: Angles = None, quiet: bool = False
-) -> Scene:
+def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: Angles = None) -> Scene:
     """The scene folder of photos from a turntable that was calibrated before.
 
     Args:
@@ -89,7 +86,6 @@ def pose_turntable_photos(
         turntable: a turntable file.
         angles: CSV file of `read_photo_angles`; or the degrees from one photo of a camera to its next one; None: those
             of the file, which then has as many views of each camera as there are photos.
-        quiet: no progress bars and no line at the end.
 
     Raises:
         InputError: photos of a camera that the file does not know, of another number or size than it says, or without
@@ -101,7 +97,7 @@ def pose_turntable_photos(
     angle_of = _angles_of(names, camera_of, known, angles=angles, turntable=turntable)
     run: dict[str, Any] = made_by() | {"photos": len(names), "turntable": str(turntable), "unit": unit}
     with replace_result(out, run, POSE_FILE) as folder:
-        files = copy_photos(source, names, folder / IMAGES, progress=not quiet)
+        files = copy_photos(source, names, folder / IMAGES)
         for file, camera in zip(files, camera_of, strict=True):
             size, expected = (file.width, file.height), (cameras[camera]["width"], cameras[camera]["height"])
             if size != expected:
@@ -112,7 +108,7 @@ def pose_turntable_photos(
             folder / TURNTABLE_FILE, cameras, list(zip(places, camera_of, angle_of, strict=True)), unit=unit
         )
         scene = load_scene(folder)
-    if not quiet:
+    if now_running().progress:
         has_step = isinstance(angles, float)
         described = f"steps of {angles:g} degrees" if has_step else f"the angles of {angles or turntable}"
         print(f"{out}: {len(files)} photos at {described}")

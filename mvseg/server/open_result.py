@@ -7,7 +7,6 @@ import os
 import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -50,7 +49,7 @@ class OpenResult:
         found: the masks, not matched yet, or how to find them.
     """
 
-    def __init__(self, folder: Path, *, workers: ProcessPoolExecutor | None = None) -> None:
+    def __init__(self, folder: Path) -> None:
         """Read the scene and its masks; where a detector made them, find them again.
 
         Raises:
@@ -63,7 +62,7 @@ class OpenResult:
         changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
         self.notice = " ".join(("What you see is computed anew.", *changes)) if changes else ""
         saved = self.saved_corrections()  # the views that they name are taken
-        state = replace(load(self.run.scene, masks, self.config, corrections=saved, workers=workers), corrections=None)
+        state = replace(load(self.run.scene, masks, self.config, corrections=saved), corrections=None)
         if not state.photos.exist:
             raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
         self.found = state if masks is not None else detect(state)

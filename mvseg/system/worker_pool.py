@@ -73,7 +73,7 @@ def default_workers() -> int:
     return min(4, cores)
 
 
-def spread(
+def map_in_order(
     work: Callable[[Item], Answer], items: Iterable[Item], workers: ProcessPoolExecutor | None
 ) -> Iterator[Answer]:
     """`map(work, items)`, in processes of the pool if there is one; their warnings are given here.
@@ -110,7 +110,7 @@ def spread(
 def run_all(work: Callable[[Item], Answer], items: Iterable[Item], num_workers: int) -> Iterator[Answer]:
     """The answers of `work` for each item in order, from this process or from spawned ones."""
     with start_workers(num_workers) as workers:
-        yield from spread(work, items, workers)
+        yield from map_in_order(work, items, workers)
 
 
 def _start_worker(parent: Connection) -> None:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from typing import Any
 
@@ -52,7 +51,6 @@ def follow_drawn(
     cameras: Cameras,
     photos: Photos | None,
     colors: Frame | None = None,
-    workers: ProcessPoolExecutor | None = None,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
     """Give the leaves that a person drew a mask in each other view that shows them openly.
 
@@ -65,7 +63,6 @@ def follow_drawn(
         cameras: V cameras.
         photos: view index -> (H, W, 3) uint8 RGB, undistorted. None: the outlines alone tell.
         colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
-        workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
 
     Returns:
         The D masks on the CPU in their order, and the new ones after them. And {instance id: surface} of the leaves
@@ -82,7 +79,7 @@ def follow_drawn(
         colored = [has_leaf_color(photos(view), colors) for view in range(len(cameras))]
     surfaces: dict[int, LeafSurface] = {}
     for leaf in (leaf for leaf in drawn if others[leaf]):
-        surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras, workers=workers)
+        surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras)
         if surface.is_credible:
             surfaces[leaf] = surface
             masks = _show(masks, leaf, surface, cameras=cameras, colored=colored)
@@ -94,9 +91,7 @@ def _views_without(masks: Masks, leaf: int) -> list[int]:
     return [view for view in range(masks.regions.num_views) if view not in shown] if len(shown) > 1 else []
 
 
-def _fit(
-    masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Cameras, workers: ProcessPoolExecutor | None
-) -> LeafSurface:
+def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Cameras) -> LeafSurface:
     """The surface of a leaf from its masks and, where they and the colours agree, from what may be its parts in the
     other views; all other masks may hide it."""
     regions = masks.regions
@@ -107,7 +102,7 @@ def _fit(
         ids = torch.cat((alone, torch.full((len(parts),), leaf)))
         more = _with_parts(regions, parts)
         starts = {} if start is None else {leaf: start}
-        return fit_surfaces(more, ids, cameras, starts=starts, workers=workers)[leaf]
+        return fit_surfaces(more, ids, cameras, starts=starts)[leaf]
 
     if colored is None:
         return fit({}, None)

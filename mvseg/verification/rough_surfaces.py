@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from types import MappingProxyType
 
 import torch
@@ -24,8 +23,6 @@ def fit_roughly(
     cameras: Cameras,
     *,
     known: Mapping[int, LeafSurface] = MappingProxyType({}),
-    workers: ProcessPoolExecutor | None = None,
-    progress: bool = False,
 ) -> dict[int, LeafSurface]:
     """{instance id: surface} to verify masks with; for `known` see `fit_surfaces`. It does not warn: what still holds
     after the correction is said then."""
@@ -38,8 +35,6 @@ def fit_roughly(
             known=known,
             most_views=ROUGH_VIEWS,
             is_rough=True,
-            workers=workers,
-            progress=progress,
         )
 
 

@@ -203,7 +203,7 @@ def test_a_worker_that_is_killed_for_good(plants: Path, tmp_path: Path) -> None:
     thread.start()
     try:
         (plants / "cactus").rename(tmp_path / "cactus")
-        counts = run_batch(plants, out, masks=Path("masks"), quiet=True)
+        counts = run_batch(plants, out, masks=Path("masks"))
     finally:
         stop.set()
         thread.join()

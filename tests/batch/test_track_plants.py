@@ -82,12 +82,12 @@ def test_all_plants_of_a_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str
 def test_tables_of_many_plants_are_those_of_each_one_below_the_other(tmp_path: Path) -> None:
     rows = [(f"{plant}{day}", plant, str(day)) for plant in "ab" for day in (0, 1)]
     batch = write_batch(tmp_path / "batch", rows)
-    track_plants(list_plants(batch)[0], tmp_path / "all", report=False, quiet=True)
+    track_plants(list_plants(batch)[0], tmp_path / "all", report=False)
     assert sorted(path.name for path in (tmp_path / "all").iterdir()) == [
         "curves.csv", "growth.csv", "plants.csv", "run.json", "tracks.csv",
     ]  # fmt: skip
     for plant in list_plants(batch)[0]:
-        track_plants([plant], tmp_path / plant.plant, report=False, quiet=True)
+        track_plants([plant], tmp_path / plant.plant, report=False)
     for name in ("tracks.csv", "growth.csv", "plants.csv"):
         assert read(tmp_path / "all" / name) == [*read(tmp_path / "a" / name), *read(tmp_path / "b" / name)]
 

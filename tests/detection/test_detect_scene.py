@@ -35,7 +35,7 @@ def test_both_sizes_count_where_masks_are_large(monkeypatch: pytest.MonkeyPatch)
     def look(_: Photos, config: DetectConfig, **__: object) -> SimpleNamespace:
         table = tables[config.image_size is not None]
         model = SimpleNamespace(transform=SimpleNamespace(max_size=int(scene.cameras.sizes.max())))
-        model.match_detections = lambda found, _, min_score, progress: SimpleNamespace(masks=found)
+        model.match_detections = lambda found, _, min_score: SimpleNamespace(masks=found)
         matching = SimpleNamespace(masks=table)
         return SimpleNamespace(model=model, cached=None, names=set(), detections=table, match=lambda _: matching)
 

@@ -21,7 +21,7 @@ NAMES = [f"{view}.png" for view in range(7)]
 @pytest.fixture(autouse=True)
 def known_markers(room, monkeypatch: pytest.MonkeyPatch) -> None:
     """To find them takes a second, of which one is enough."""
-    monkeypatch.setattr(known_world, "find_scene_markers", lambda scene, progress: room.markers)
+    monkeypatch.setattr(known_world, "find_scene_markers", lambda scene: room.markers)
 
 
 def write_positions(path: Path, centers: np.ndarray, names=NAMES) -> Path:

@@ -188,7 +188,7 @@ def test_photos_that_moved_with_the_result_are_found(plant: Path, tmp_path: Path
     shutil.copytree(plant, tmp_path / "before" / "plant")
     before = tmp_path / "before"
     run_one_scene(
-        before / "plant", before / "plant" / "masks", before / "out", config=RunConfig(reconstruct=None), quiet=True
+        before / "plant", before / "plant" / "masks", before / "out", config=RunConfig(reconstruct=None)
     )
     before.rename(tmp_path / "after")
     views = load_result(tmp_path / "after" / "out").scene.views

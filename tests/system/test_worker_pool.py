@@ -16,7 +16,8 @@ import torch
 from blade_scene import EllipticBlade, as_regions, blade_masks, ring_cameras
 from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.system.worker_pool import default_workers, run_all, spread, start_workers
+from mvseg.system.running import running
+from mvseg.system.worker_pool import default_workers, map_in_order, run_all, start_workers
 
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed")
 
@@ -39,26 +40,28 @@ def workers() -> Iterator[ProcessPoolExecutor | None]:
 
 
 def test_answers_come_in_order_from_other_processes(workers: ProcessPoolExecutor) -> None:
-    answers = list(spread(work, range(40, 80), workers))
+    answers = list(map_in_order(work, range(40, 80), workers))
     assert [square for square, _, _ in answers] == [number**2 for number in range(40, 80)]
     assert os.getpid() not in {process for _, process, _ in answers}
     assert {threads for _, _, threads in answers} == {"1"}
-    assert [square for square, _, _ in spread(work, range(3), None)] == [0, 1, 4]
+    assert [square for square, _, _ in map_in_order(work, range(3), None)] == [0, 1, 4]
 
 
 def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor) -> None:
     with pytest.warns(InputWarning, match=r"^7 is odd$"):
-        assert next(spread(work, [7], workers))[0] == 49
+        assert next(map_in_order(work, [7], workers))[0] == 49
     with pytest.raises(InputError, match=r"^13 brings bad luck$"):
-        list(spread(work, [1, 13, 2], workers))
-    assert next(spread(work, [3], workers))[0] == 9  # the workers are still there
+        list(map_in_order(work, [1, 13, 2], workers))
+    assert next(map_in_order(work, [3], workers))[0] == 9  # the workers are still there
 
 
-def test_surfaces_are_the_same_to_the_bit(workers: ProcessPoolExecutor, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_surfaces_are_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.FEW_MASKS", 0)
     cameras = ring_cameras(4)
     regions, ids = as_regions(blade_masks(EllipticBlade(), cameras))
-    here, there = (fit_surfaces(regions, ids, cameras, workers=each)[1] for each in (None, workers))
+    here = fit_surfaces(regions, ids, cameras)[1]
+    with running(num_workers=2):
+        there = fit_surfaces(regions, ids, cameras)[1]
     assert here.exists
     assert torch.equal(here.coefficients, there.coefficients)
     assert torch.equal(here.covariance, there.covariance)
@@ -74,7 +77,7 @@ def test_an_interruption_ends_them_at_once() -> None:
 
     def interrupt() -> None:
         with start_workers(2) as workers:
-            next(spread(nap, [0.0] * 20 + [3600.0] * 2, workers))
+            next(map_in_order(nap, [0.0] * 20 + [3600.0] * 2, workers))
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):

@@ -46,7 +46,6 @@ def match_nview(
     *,
     config: NViewConfig = NViewConfig(),
     residual_px: int | None = None,
-    progress: bool = False,
 ) -> Matching:
     """Match the regions of V >= 2 views by what all views show.
 
@@ -56,7 +55,6 @@ def match_nview(
         graph: the epipolar weights of the regions, and their links.
         config: costs, gains and thresholds.
         residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
-        progress: show progress bars.
 
     Returns:
         The matching, on the device of the regions. Its method is "one-per-view" where the hypotheses do not explain the
@@ -65,7 +63,7 @@ def match_nview(
     """
     order = regions.view_index.argsort(stable=True)
     ordered, graph = regions.select(order), graph.select(order.cpu().numpy())
-    found = find_clusters(ordered, cameras, graph, config=config, residual_px=residual_px, progress=progress)
+    found = find_clusters(ordered, cameras, graph, config=config, residual_px=residual_px)
     clusters, chance = part_pieces(found.scores, found.clusters)
     evidence = collect_evidence(found.scores, clusters, found.pairwise)
     report = MatchReport(
@@ -108,7 +106,6 @@ def find_clusters(
     *,
     config: NViewConfig = NViewConfig(),
     residual_px: int | None = None,
-    progress: bool = False,
 ) -> FoundClusters:
     """The clusters that explain all views best, or where hypotheses explain too little, those from the weights alone.
 
@@ -118,17 +115,16 @@ def find_clusters(
         graph: their epipolar weights, and their links.
         config: costs, gains and thresholds.
         residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
-        progress: show progress bars.
     """
     pairwise = one_per_view_clusters(graph.without_links)
     scores, residual_px = select_dilation(
-        regions, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px, progress=progress
+        regions, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px
     )
 
     def cluster(graph: ViewGraph, unlinked: Clusters | None) -> Clusters:
         weighed = pairwise if unlinked is None else one_per_view_clusters(graph)
         starts = [] if unlinked is None else [_free_linked(unlinked, graph)]
-        return search(replace(scores, graph=graph), weighed, more_starts=starts, progress=progress)
+        return search(replace(scores, graph=graph), weighed, more_starts=starts)
 
     clusters, method = first_without_links(graph, cluster) if len(cameras) > 2 else pairwise, "nview"
     if len(cameras) < 3 or scores.explained(clusters) < UNEXPLAINED:
@@ -149,7 +145,6 @@ def select_dilation(
     pairwise: Clusters,
     config: NViewConfig,
     residual_px: int | None = None,
-    progress: bool = False,
 ) -> tuple[ClusterScores, int]:
     """The scores of the plane sweep whose label maps are dilated by the reprojection error, and that error in pixels.
 
@@ -161,17 +156,17 @@ def select_dilation(
     def score(sweep: PlaneSweep) -> ClusterScores:
         return ClusterScores(sweep, graph, config)
 
-    first = score(sweep_planes(regions, cameras, dilation_px=residual_px or DILATIONS[0], progress=progress))
+    first = score(sweep_planes(regions, cameras, dilation_px=residual_px or DILATIONS[0]))
     explained = [first.explained(pairwise)]
     if residual_px is not None or explained[0] >= EXPLAINED:
         return first, residual_px or DILATIONS[0]
     rays = min(rays_per_region(len(cameras)), -(-PROBE_RAYS // max(len(regions), 1)))
-    for sweep in sweep_dilated(regions, cameras, dilations=DILATIONS[1:], rays=rays, progress=progress):
+    for sweep in sweep_dilated(regions, cameras, dilations=DILATIONS[1:], rays=rays):
         explained.append(score(sweep).explained(pairwise))
     best = int(np.argmax(np.array(explained) >= max(explained) - 0.05))
     if best == 0:
         return first, DILATIONS[0]
-    return score(sweep_planes(regions, cameras, dilation_px=DILATIONS[best], progress=progress)), DILATIONS[best]
+    return score(sweep_planes(regions, cameras, dilation_px=DILATIONS[best])), DILATIONS[best]
 
 
 def _final_numbers(ids: torch.Tensor) -> torch.Tensor:

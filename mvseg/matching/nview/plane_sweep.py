@@ -19,11 +19,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hypotheses, pack_views
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.system.running import progress_bar
 
 # Labels of a hypothesis: no region there; outside the image, behind the camera, or the own view.
 EMPTY, OUTSIDE = -1, -2
@@ -117,20 +117,19 @@ class PlaneSweep:
         return self._hypotheses_of_regions[view]
 
 
-def sweep_planes(regions: Regions, cameras: Cameras, *, dilation_px: int = 1, progress: bool = False) -> PlaneSweep:
+def sweep_planes(regions: Regions, cameras: Cameras, *, dilation_px: int = 1) -> PlaneSweep:
     """Sweep the rays of all regions through the label maps of all other views.
 
     Args:
         regions: D regions ordered by view (int64 `view_index` must not decrease).
         cameras: V cameras.
         dilation_px: regions grow this far into unlabelled pixels; about the expected reprojection error.
-        progress: show a progress bar over the views.
 
     Returns:
         The sweep. A hypothesis is kept when at least one view shows a region, at most half of the views that the point
         lies in show none (one always may), and no neighbour on the ray shows the same regions and more.
     """
-    return next(sweep_dilated(regions, cameras, dilations=(dilation_px,), progress=progress))
+    return next(sweep_dilated(regions, cameras, dilations=(dilation_px,)))
 
 
 def sweep_dilated(
@@ -139,7 +138,6 @@ def sweep_dilated(
     *,
     dilations: Sequence[int],
     rays: int | None = None,
-    progress: bool = False,
 ) -> Iterator[PlaneSweep]:
     """The sweep of each of several dilations, in ascending order; see `sweep_planes`. `rays` of each region are swept,
     at most; None: `rays_per_region`."""
@@ -153,7 +151,7 @@ def sweep_dilated(
             _dilate(labels, of_view, start_px=grown_px, stop_px=dilation_px)
         grown_px = dilation_px
         label_maps = _LabelMaps(cameras, maps, [_label_box(labels) for labels in maps])
-        yield _sweep_views(label_maps, regions, xy, region=region, title=f"rays, {dilation_px} px" if progress else "")
+        yield _sweep_views(label_maps, regions, xy, region=region, title=f"rays, {dilation_px} px")
 
 
 def rays_per_region(num_views: int) -> int:
@@ -163,11 +161,11 @@ def rays_per_region(num_views: int) -> int:
 
 @torch.inference_mode()
 def _sweep_views(label_maps: _LabelMaps, regions: Regions, xy: Tensor, *, region: Tensor, title: str) -> PlaneSweep:
-    """The sweep of the rays through pixels `xy` (Q, 2) of `region` (Q,); a title shows a progress bar."""
+    """The sweep of the rays through pixels `xy` (Q, 2) of `region` (Q,); `title` is that of the progress bar."""
     num_views = len(label_maps.maps)
     pixels, inverse = [np.zeros(0, np.int64)], [np.zeros(0, np.float32)]
     labels = [np.zeros((0, num_views), label_maps.maps[0].numpy().dtype)]
-    for view in tqdm(range(num_views), desc=title, unit="view", disable=not title):
+    for view in progress_bar(range(num_views), title, unit="view"):
         here = (regions.view_index[region] == view).nonzero()[:, 0]
         for chunk in torch.split(here, CHUNK) if len(here) else ():
             pixel, label, inverse_depth = _join_equal(*label_maps.hypotheses(view, xy[chunk]))

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from tqdm import tqdm
 
 from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
 from mvseg.matching.nview.config import NViewConfig
@@ -19,6 +18,7 @@ from mvseg.matching.nview.initialisation import initial_partitions
 from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_order
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import Movers
+from mvseg.system.running import progress_bar
 
 MAX_SWEEPS = 3  # limit: one more or less changes no id on degraded masks of 8 to 32 leaves
 # Pairwise clusters are kept if they are worth at least this share of the best value. At 1, they never are, and no id of
@@ -32,9 +32,7 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 
-def search(
-    scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[Clusters] = (), progress: bool = False
-) -> Clusters:
+def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[Clusters] = ()) -> Clusters:
     """The best partition that refinement finds from one start, or, with few views, two.
 
     What the graph of the scores says must stay together, or apart, does so all the way.
@@ -46,11 +44,10 @@ def search(
         scores: of D regions in three views or more.
         pairwise: clusters from the weights alone, those of one region included, as in all partitions here.
         more_starts: partitions to start from as well.
-        progress: show a progress bar over the views of each sweep.
     """
     refined = []
     for start in (*initial_partitions(scores.sweep, scores.graph), *more_starts):
-        refined.append(refine(scores, refine(scores, start, progress=progress), join_fragments=True, progress=progress))
+        refined.append(refine(scores, refine(scores, start), join_fragments=True))
     values = [scores.value(clusters) for clusters in (pairwise, *refined)]
     best = pairwise
     if max(values) - values[0] > (1 - AS_GOOD) * abs(max(values)):
@@ -59,21 +56,18 @@ def search(
     return join_few(scores, best)
 
 
-def refine(
-    scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = False, progress: bool = False
-) -> Clusters:
+def refine(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = False) -> Clusters:
     """Re-assign the regions of one view after another to the clusters of the others, until nothing changes.
 
     Args:
         scores: of D regions.
         clusters: to start from.
         join_fragments: left-over regions may join a cluster that has a region in their view already.
-        progress: show a progress bar over the views of each sweep.
     """
     order = view_order(scores.graph)
     for _ in range(MAX_SWEEPS):
         ids, coverages = clusters.ids.copy(), scores.coverages(clusters)
-        for view in tqdm(order.tolist(), desc="search", unit="view", leave=False, disable=not progress):
+        for view in progress_bar(order.tolist(), name="search", unit="view", leave=False):
             movers = scores.graph.movers(view)
             if not movers.num:
                 continue

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -12,7 +11,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
-from tqdm import tqdm
 
 from mvseg.errors import InputError
 from mvseg.reconstruction.spread_views import spread_directions, spread_views
@@ -35,7 +33,8 @@ from mvseg.reconstruction.surface.patch_image import cover_crops, crop_ious, hid
 from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.system.worker_pool import spread
+from mvseg.system.running import now_running, progress_bar
+from mvseg.system.worker_pool import map_in_order
 
 NUM_FIRST_STEPS = 3  # of a fit that a second one follows
 GOOD_IOU = 0.93  # of a patch, after which no less likely start is tried
@@ -68,8 +67,6 @@ def fit_surfaces(
     known: Mapping[int, LeafSurface] = MappingProxyType({}),
     most_views: int = MOST_VIEWS,
     is_rough: bool = False,
-    workers: ProcessPoolExecutor | None = None,
-    progress: bool = False,
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
 
@@ -85,8 +82,6 @@ def fit_surfaces(
             them: it hides what lies behind it, and its masks tell how all masks err.
         most_views: at least 2.
         is_rough: leave out the second fit, which knows what the leaves hide of each other, and how the masks err.
-        workers: processes that instances are spread over, see `start_workers`; None: this one does it all.
-        progress: show a progress bar over the instances.
 
     Returns:
         {instance id: surface} for every instance. Where no surface can be fitted (one view, masks that agree on no
@@ -97,7 +92,7 @@ def fit_surfaces(
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
-    workers = workers if len(regions) >= FEW_MASKS else None
+    workers = now_running().workers if len(regions) >= FEW_MASKS else None
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
     frames = _instance_frames(regions, instance_ids, cameras)
     stacks: dict[int, MaskStack] = {}
@@ -121,8 +116,8 @@ def fit_surfaces(
         start = starts.get(instance)
         rough = start.coefficients.numpy() if start is not None and start.exists else None
         unfitted[instance] = stacks[instance], rough
-    answers = spread(_fit_first, unfitted.values(), workers)
-    shown = tqdm(answers, "surfaces", len(unfitted), unit="instance", disable=not progress)
+    answers = map_in_order(_fit_first, unfitted.values(), workers)
+    shown = progress_bar(answers, "surfaces", len(unfitted), unit="instance")
     for instance, (masks, fit) in zip(unfitted, shown, strict=True):
         stacks[instance] = masks
         if fit is None:
@@ -136,7 +131,8 @@ def fit_surfaces(
         offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
         errors = learn_mask_errors([each for each in offsets if len(each) > 1])
         points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
-        refitted = spread(partial(_fit_again, points, errors), [(i, stacks[i], fits[i]) for i in unknown], workers)
+        asked = [(instance, stacks[instance], fits[instance]) for instance in unknown]
+        refitted = map_in_order(partial(_fit_again, points, errors), asked, workers)
         for instance, (masks, better) in zip(unknown, refitted, strict=True):
             stacks[instance], fits[instance] = masks, better
     surfaces |= {instance: _surface(stacks[instance], fits[instance]) for instance in unknown}

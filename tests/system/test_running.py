@@ -1,0 +1,52 @@
+"""How a run works is said once, outside, and holds for all that is called inside."""
+
+from __future__ import annotations
+
+import threading
+from contextvars import copy_context
+
+import pytest
+
+from mvseg.errors import InputError
+from mvseg.system.running import Running, now_running, progress_bar, running
+
+
+def test_it_holds_inside_only_and_nests() -> None:
+    assert now_running() == Running(progress=False, workers=None)
+    with running(progress=True):
+        with running(num_workers=2):
+            assert now_running().progress
+            assert now_running().workers is not None
+            with running(progress=False, num_workers=1):
+                assert now_running() == Running()
+        assert now_running() == Running(progress=True)
+    assert now_running() == Running()
+
+
+def test_it_ends_with_an_error() -> None:
+    with pytest.raises(InputError, match=r"^num_workers is 0"), running(progress=True, num_workers=0):
+        pass
+    with pytest.raises(KeyboardInterrupt), running(progress=True):
+        raise KeyboardInterrupt
+    assert now_running() == Running()
+
+
+def test_threads_know_of_it_if_they_run_in_its_context() -> None:
+    seen: list[bool] = []
+
+    def look() -> None:
+        seen.append(now_running().progress)
+
+    with running(progress=True):
+        for thread in (threading.Thread(target=look), threading.Thread(target=copy_context().run, args=(look,))):
+            thread.start()
+            thread.join()
+    assert seen[1]  # the first one differs between versions of Python
+
+
+def test_bars_are_silent_by_default(capsys: pytest.CaptureFixture[str]) -> None:
+    assert list(progress_bar(range(3), "counting")) == [0, 1, 2]
+    assert capsys.readouterr() == ("", "")
+    with running(progress=True):
+        assert list(progress_bar(range(3), "counting")) == [0, 1, 2]
+    assert "counting: 100%" in capsys.readouterr().err
