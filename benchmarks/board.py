@@ -45,9 +45,9 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
-from mvseg.pipeline import State, choose, detect, match, snap
 from mvseg.results.overlay import draw_contact_sheet, draw_tile
 from mvseg.scene import Scene
+from mvseg.stages import State, choose, detect, match, snap
 from mvseg.training.data import list_samples
 from mvseg.training.validation import detect_and_label
 

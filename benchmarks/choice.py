@@ -39,7 +39,6 @@ from mvseg.scene import Scene
 from mvseg.verification.choose import choose, gather_candidates
 from mvseg.verification.evidence import Drawn, draw_views, see
 from mvseg.verification.leaf_scores import FITTED, Candidates, LeafScores, matched_features, shows_features
-from mvseg.verification.rough_surfaces import fit_roughly
 from mvseg.verification.snap_edges import snap_masks
 
 RIDGE, ROUNDS, SHOWS = 0.1, 3, 0.5  # SHOWS: IoU from which a mask shows a leaf
@@ -75,7 +74,7 @@ def study(folder: Path, step: int = 1) -> Study | None:
     matched = [found.match(scene.cameras).masks, *found.match_more(scene.cameras)]
     candidates = gather_candidates(
         [(masks, masks.regions.labels) for masks in matched],
-        lambda masks, known: fit_roughly(masks, scene.cameras, known=known),
+        scene.cameras,
         table=table,
         is_held=torch.zeros(len(matched[0]), dtype=torch.bool),
     )

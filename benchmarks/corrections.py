@@ -53,19 +53,20 @@ from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import State, Unedited, choose_unedited, detect, fit_of, list_stages, load
+from mvseg.pipeline import list_stages
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene, View
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
+from mvseg.stages import State, load
 from mvseg.system.atomic import write_text_whole
-from mvseg.verification.choose import Fit
-from mvseg.verification.known_surfaces import fit_once
+from mvseg.system.running import running
 
 Record = dict[str, Any]
 
-NOT_AGAIN = ("detect", "say_what_is_missing", "check", "measure")  # done once, or not shown
+BEFORE_EDITS = ("detect", "match", "split", "choose")  # of detected masks: done once
+NOT_SHOWN = ("say_what_is_missing", "check", "measure")
 MOST, ROUNDS = 2.0, 8  # edits' worth per leaf, and in how many rounds, as a rule
 LEARN = "-learn"  # the same person, and `--detect.learn_plant true`
 ORDERS = ("repair", "ask", f"repair{LEARN}", f"ask{LEARN}")
@@ -90,19 +91,15 @@ class Case:
 
     Attributes:
         name: of its files.
-        found: what `load` or `detect` leaves.
+        found: what is known before edits.
         truth: V label maps.
         has_masks: they were given.
-        fit: of rough surfaces; those of the same masks are kept from round to round, as in `mvseg correct`.
-        unedited: what is known without a person.
     """
 
     name: str
     found: State
     truth: Sequence[Labels]
     has_masks: bool
-    fit: Fit | None = None
-    unedited: Unedited | None = None
 
     @property
     def num_leaves(self) -> int:
@@ -119,10 +116,10 @@ def list_cases(args: argparse.Namespace) -> Iterator[Case]:
 
 def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -> Case:
     """A scene whose leaves the detector finds."""
-    state = detect(load(folder, None, config, cache=cache))
-    fit = fit_once(fit_of(state))
-    truth, known = true_maps(folder, state.scene), choose_unedited(replace(state, fit=fit))
-    return Case(f"detected_{folder.name}", state, truth, has_masks=False, fit=fit, unedited=known)
+    state = load(folder, None, config, cache=cache)
+    for name, stage in list_stages(config, has_masks=False).items():
+        state = stage(state) if name in BEFORE_EDITS else state
+    return Case(f"detected_{folder.name}", state, true_maps(folder, state.scene), has_masks=False)
 
 
 def degraded_case(spec: SceneSpec, cache: Path) -> Case:
@@ -155,10 +152,11 @@ def render(spec: SceneSpec, cache: Path) -> Path:
 
 def compute(case: Case, corrections: Corrections) -> State:
     """What a run makes of the scene with these corrections, without traits."""
-    state = replace(case.found, corrections=corrections, fit=case.fit, unedited=case.unedited)
+    state = replace(case.found, corrections=corrections)
     stages = list_stages(state.config, has_masks=case.has_masks, has_edits=len(corrections.edits) > 0)
     for name, stage in stages.items():
-        state = state if name in NOT_AGAIN else stage(state)
+        is_done = name in BEFORE_EDITS and not case.has_masks
+        state = state if is_done or name in NOT_SHOWN else stage(state)
     return state
 
 
@@ -333,9 +331,10 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", InputWarning)
-    for case in list_cases(args):
-        for order in args.orders:
-            correct(case, order, args.out)
+    with running(keep=True):
+        for case in list_cases(args):
+            for order in args.orders:
+                correct(case, order, args.out)
     runs = [read_records(path) for path in sorted(args.out.glob("*.csv"))]
     print_table(runs)
     if args.plot is not None:

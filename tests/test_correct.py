@@ -29,13 +29,13 @@ from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline import run_scene
+from mvseg.reconstruction.surface.kept_surfaces import name_instance
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.scene import Scene, View
 from mvseg.server.correction_server import CHANGED, CorrectionServer, Corrector
 from mvseg.server.open_result import OpenResult, Superseded, keep_numbers, open_alone
-from mvseg.verification.known_surfaces import name_masks
 from room_scene import room_cameras
 from scene_folders import write_scene
 from served_result import WAIT, ask, save, save_text, serve, text_of, wait_until_computed
@@ -192,7 +192,11 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     run = run_scene(opened.run.scene, opened.run.masks, RunConfig(reconstruct=None), corrections=corrections)
     assert outcomes == [""]
     assert shown.masks.instance_ids.tolist() == run.masks.instance_ids.tolist()
-    assert name_masks(shown.masks, 1) == name_masks(run.masks, 1) != name_masks(run.masks, 2)
+    first, same, other = (
+        name_instance(masks.regions, masks.instance_ids == leaf)
+        for masks, leaf in ((shown.masks, 1), (run.masks, 1), (run.masks, 2))
+    )
+    assert first == same != other
     with pytest.raises(Superseded):
         opened.recompute(corrections, lambda: True)
     (folder / "corrections.json").unlink()

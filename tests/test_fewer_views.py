@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 import torch
 
-import mvseg.pipeline
+import mvseg.stages
 from mvseg import Corrections, InputError, InputWarning, ReconstructConfig, RunConfig, run_scene
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, parse_corrections
@@ -29,7 +29,7 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def taken(folder: Path, views: Any, **how: Any) -> list[str]:
     """Names of the views that a run from photos takes."""
-    state = mvseg.pipeline.load(folder, None, replace(IDS_ONLY, views=views), **how)
+    state = mvseg.stages.load(folder, None, replace(IDS_ONLY, views=views), **how)
     names = [view.name for view in state.scene.views]
     assert sorted([*names, *state.views_left_out]) == [f"{view:03d}" for view in range(9)]
     return names
@@ -74,7 +74,7 @@ def test_photos_alone_are_as_many_as_are_enough_and_given_masks_are_all(
     plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert len(taken(plant, None)) == 9
-    monkeypatch.setattr(mvseg.pipeline, "ENOUGH_VIEWS", 5)
+    monkeypatch.setattr(mvseg.stages, "ENOUGH_VIEWS", 5)
     assert taken(plant, None) == taken(plant, 5)
     assert len(taken(plant, "all")) == len(taken(plant, 9)) == len(taken(plant, 500)) == 9
     assert len(run_scene(plant, plant / "masks", IDS_ONLY).regions) == 27

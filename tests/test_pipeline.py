@@ -16,7 +16,7 @@ import pytest
 import torch
 
 import mvseg
-import mvseg.pipeline
+import mvseg.stages
 from found_masks import FoundMasks
 from mvseg import (
     InputError,
@@ -38,13 +38,13 @@ from mvseg.formats.photos import Photos, read_photo
 from mvseg.masks import Masks, MergedMask
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.pipeline import State
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
 from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Scene, View
+from mvseg.stages import State
 from mvseg.system.running import running
 from mvseg.verification.choose import Leaves
 from scene_folders import write_scene
@@ -98,11 +98,11 @@ def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.M
     assert result.scene.cameras is better
     assert result.poses is poses
     fisheye = pycolmap.Camera(model="OPENCV_FISHEYE", width=128, height=96, params=[150, 150, 64, 48, 0, 0, 0, 0])
-    state = mvseg.pipeline.load(plant, plant / "masks", IDS_ONLY)
+    state = mvseg.stages.load(plant, plant / "masks", IDS_ONLY)
     view, *others = state.scene.views
     odd = replace(state.scene, views=(replace(view, lens=fisheye), *others))
     with pytest.warns(InputWarning, match="view 000 has a lens that no rig file can hold"):
-        assert mvseg.pipeline.match_refined(replace(state, scene=odd)).scene.cameras is better
+        assert mvseg.stages.match_refined(replace(state, scene=odd)).scene.cameras is better
 
 
 def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
@@ -238,7 +238,7 @@ def test_surfaces_check_the_ids_and_those_that_changed_are_fitted_again(
         ids[0] = ids[0] % 3 + 1
         return replace(masks, instance_ids=ids)
 
-    monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
     config = RunConfig(reconstruct=ReconstructConfig(check_ids=is_wanted, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
@@ -279,9 +279,9 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
         matching = match_masks(*args, **kwargs)
         return matching.with_masks(show_two(matching.masks))
 
-    monkeypatch.setattr("mvseg.reconstruction.shapes.fit_surfaces", fit)
+    monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
-    monkeypatch.setattr("mvseg.pipeline.match_masks", match)
+    monkeypatch.setattr("mvseg.stages.match_masks", match)
     config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
     ids = result.matching.instance_ids.tolist()
@@ -310,7 +310,7 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
         asked.append(matched)
         return Leaves(matched, {}, {}, ())
 
-    monkeypatch.setattr(mvseg.pipeline, "detect", detect)
+    monkeypatch.setattr("mvseg.pipeline.detect", detect)
     monkeypatch.setattr("mvseg.verification.choose.choose_leaves", choose)
     config = replace(IDS_ONLY, split_merged=True, detect=DetectConfig(verify=verifies))
     result = run_scene(plant, None, config)

@@ -38,7 +38,7 @@ def run(args: Namespace) -> int:
     check_writable(folder)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     with open_alone(folder), ExitStack() as stack:
-        stack.enter_context(running(num_workers=num_workers))
+        stack.enter_context(running(num_workers=num_workers, keep=True))
         opened = OpenResult(folder)
         if opened.notice:
             print(f"mvseg: {opened.notice}", file=sys.stderr)

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.kept_surfaces import fit_kept
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid, reconstruct_instances
 from mvseg.regions import Regions
@@ -26,7 +26,6 @@ def reconstruct_shapes(
     *,
     config: ReconstructConfig,
     starts: Surfaces = MappingProxyType({}),
-    known: Surfaces = MappingProxyType({}),
     with_voxels: bool = True,
 ) -> tuple[Surfaces | None, Voxels]:
     """The shapes of all instances, as `config.shape` says.
@@ -37,7 +36,6 @@ def reconstruct_shapes(
         cameras: V cameras.
         config: what to make, and how.
         starts: instance id -> a surface that is nearly right, see `fit_surfaces`.
-        known: instance id -> a surface that stays as it is, see `fit_surfaces`.
         with_voxels: False leaves voxels out, whatever the config says.
 
     Returns:
@@ -49,13 +47,7 @@ def reconstruct_shapes(
     """
     surfaces = None
     if config.shape != "voxels":
-        surfaces = fit_surfaces(
-            regions,
-            instance_ids,
-            cameras,
-            starts=starts,
-            known=known,
-        )
+        surfaces = fit_kept(regions, instance_ids, cameras, starts=starts)
         if not with_voxels:
             return surfaces, {}
         if config.shape == "surface":

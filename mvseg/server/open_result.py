@@ -6,7 +6,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cached_property
@@ -20,19 +20,18 @@ from torch import Tensor
 
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, InputWarning
-from mvseg.pipeline import Stage, State, Unedited, choose_unedited, detect, fit_of, list_stages, load, reconstruct
-from mvseg.reconstruction.shapes import Surfaces
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.pipeline import Stage, list_stages
+from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
+from mvseg.stages import State, detect, load, reconstruct
 from mvseg.system.atomic import lock_folder
-from mvseg.verification.known_surfaces import fit_once, fit_unknown, name_each
 from mvseg.verification.leaf_color import colors_of_leaves
 
 CORRECTIONS_FILE = "corrections.json"
-# Stages whose outcome the page does not show, or that ran.
-NOT_AGAIN = ("detect", "say_what_is_missing", "check", "measure", "reconstruct")
+NOT_SHOWN = ("say_what_is_missing", "check", "measure")  # stages whose outcome the page does not show
+BEFORE_EDITS = ("detect", "match", "split", "choose")  # stages of detected masks that no edit changes
 
 
 class Superseded(Exception):
@@ -66,8 +65,6 @@ class OpenResult:
         if not state.photos.exist:
             raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
         self.found = state if masks is not None else detect(state)
-        self._fitted: dict[str, LeafSurface] = {}
-        self._fit_roughly = fit_once(fit_of(state))  # what leaves are chosen by
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self.has_masks = masks is not None
 
@@ -84,28 +81,23 @@ class OpenResult:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
         and the other warnings on the way. Leaves keep their numbers from one result to the next, see `keep_numbers`.
 
-        A surface is fitted anew only if its instance's masks differ from those in all results before. (A run from
-        the command line fits all of them: each surface also depends a little on the masks that may hide it.)
+        Where what was computed is kept (`running`), a surface is fitted anew only if its instance's masks differ from
+        those in all results before. (A run from the command line fits all of them: each surface also depends a little
+        on the masks that may hide it.)
 
         Raises:
             Superseded: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        state = replace(self.found, corrections=corrections, colors=self._colors, fit=self._fit_roughly)
-        if corrections.edits and not self.has_masks and self.config.detect.verify:
-            state = replace(state, unedited=self._unedited)
-        messages: list[str] = []
-        for stage in self._stages(has_edits=len(corrections.edits) > 0):
-            if is_old():
-                raise Superseded
-            with warnings.catch_warnings(record=True) as caught:
-                warnings.simplefilter("always", InputWarning)
-                state = stage(state)
-            messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
+        state, messages = self._before_edits
+        state = replace(state, corrections=corrections, colors=self._colors)
+        stages = list_stages(self.config, has_masks=self.has_masks, has_edits=len(corrections.edits) > 0)
+        left = {name: stage for name, stage in stages.items() if self.has_masks or name not in BEFORE_EDITS}
+        state, more = _run(state, left, is_old)
         told = () if state.corrected is None else state.corrected.messages
         shown = keep_numbers(state.result(), self._numbers)
         outcomes = [describe_fate(fate) for fate in shown.fates]
-        return shown, outcomes, [text for text in dict.fromkeys(messages) if text not in told]
+        return shown, outcomes, [text for text in dict.fromkeys(messages + more) if text not in told]
 
     @cached_property
     def _colors(self) -> NDArray[np.bool_]:
@@ -113,28 +105,26 @@ class OpenResult:
         return colors_of_leaves(self.matched().masks.to("cpu"), self.found.photos)
 
     @cached_property
-    def _unedited(self) -> Unedited:
-        """What is known without a person; it stays."""
-        return choose_unedited(replace(self.found, fit=self._fit_roughly))
+    def _before_edits(self) -> tuple[State, list[str]]:
+        """What is known without a person, and the warnings on the way; it stays."""
+        stages = list_stages(self.config, has_masks=self.has_masks)
+        names = () if self.has_masks else BEFORE_EDITS[1:]
+        return _run(self.found, {name: stages[name] for name in names if name in stages}, lambda: False)
 
-    def _stages(self, *, has_edits: bool) -> list[Stage]:
-        stages: list[Stage] = []
-        for name, stage in list_stages(self.config, has_masks=self.has_masks, has_edits=has_edits).items():
-            if name in ("check_ids", "reconstruct"):
-                stages.append(self._fit)
-            if name not in NOT_AGAIN:
-                stages.append(stage)
-        return stages
 
-    def _fit(self, state: State) -> State:
-        """A surface for every instance; those whose masks had one before keep it."""
-
-        def fit(known: dict[int, LeafSurface]) -> Surfaces | None:
-            instances = replace(state.instances, surfaces=known)
-            return reconstruct(replace(state, instances=instances), with_voxels=False).surfaces
-
-        surfaces = fit_unknown(state.masks, self._fitted, fit)
-        return replace(state, instances=replace(state.instances, surfaces=surfaces))
+def _run(state: State, stages: Mapping[str, Stage], is_old: Callable[[], bool]) -> tuple[State, list[str]]:
+    """Run stages, without traits and voxels; and the warnings on the way."""
+    messages: list[str] = []
+    for name, stage in stages.items():
+        if is_old():
+            raise Superseded
+        if name in NOT_SHOWN:
+            continue
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            state = reconstruct(state, with_voxels=False) if name == "reconstruct" else stage(state)
+        messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
+    return state, messages
 
 
 def keep_numbers(result: Result, known: dict[str, int]) -> Result:
@@ -142,7 +132,7 @@ def keep_numbers(result: Result, known: dict[str, int]) -> Result:
     their order. So ids may have gaps. `known`, {name of a mask: number of its leaf}, learns them."""
     masks = result.masks
     named = [(int(id), int(area), name) for id, area, name in
-             zip(masks.instance_ids, masks.regions.areas, name_each(masks), strict=True) if id > 0]  # fmt: skip
+             zip(masks.instance_ids, masks.regions.areas, name_each(masks.regions), strict=True) if id > 0]  # fmt: skip
     votes = Counter[tuple[int, int]]()
     for instance, area, name in named:
         if name in known:

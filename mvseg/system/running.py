@@ -1,4 +1,4 @@
-"""How a run works: whether it shows progress, and which processes help it. Neither changes a result.
+"""How a run works: whether it shows progress, which processes help it, and what it has computed already.
 
 Stages ask here, so that no signature hands it on (as with `decimal.localcontext`, it is a context variable).
 """
@@ -24,10 +24,12 @@ class Running:
     Attributes:
         progress: show progress bars, and lines that say what was done.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
+        kept: {name of what it was computed from: what was computed}; None: nothing is kept.
     """
 
     progress: bool = False
     workers: ProcessPoolExecutor | None = None
+    kept: dict[str, Any] | None = None
 
 
 SILENT = Running()
@@ -40,12 +42,13 @@ def now_running() -> Running:
 
 
 @contextmanager
-def running(*, progress: bool | None = None, num_workers: int | None = None) -> Iterator[None]:
+def running(*, progress: bool | None = None, num_workers: int | None = None, keep: bool = False) -> Iterator[None]:
     """Let all of mvseg that is called inside the block work so. A thread that is started there does not know of it.
 
     Args:
         progress: show progress bars; None: as outside.
         num_workers: processes that surfaces are fitted in, stopped at the end, see `start_workers`; None: as outside.
+        keep: what was computed inside, or outside where that is kept, too, is not computed again, see `fit_kept`.
 
     Raises:
         InputError: fewer than one process.
@@ -53,8 +56,9 @@ def running(*, progress: bool | None = None, num_workers: int | None = None) -> 
     outside = now_running()
     with ExitStack() as stack:
         workers = outside.workers if num_workers is None else stack.enter_context(start_workers(num_workers))
-        token = _NOW.set(Running(progress=outside.progress if progress is None else progress, workers=workers))
-        stack.callback(_NOW.reset, token)
+        is_shown = outside.progress if progress is None else progress
+        kept = {} if keep and outside.kept is None else outside.kept
+        stack.callback(_NOW.reset, _NOW.set(Running(progress=is_shown, workers=workers, kept=kept)))
         yield
 
 

@@ -113,20 +113,10 @@ def _with_ids(masks: Masks, ids: Ints) -> Masks:
 
 
 def unchanged_surfaces(before: Masks, after: Masks, surfaces: Surfaces) -> dict[int, LeafSurface]:
-    """The surfaces of the instances whose masks are the same before and after, by their ids; `after` are the same D
-    masks, or these and more in the place of some of them."""
-    same = len(before) == len(after)
-
-    def members(masks: Masks, instance: int) -> Masks:
-        return masks.select(masks.instance_ids == instance)
-
-    def is_same(instance: int) -> bool:
-        if same:
-            return bool(((before.instance_ids == instance) == (after.instance_ids == instance)).all())
-        one, other = members(before, instance).regions, members(after, instance).regions
-        return len(one) == len(other) and torch.equal(one.boxes, other.boxes) and torch.equal(one.crops, other.crops)
-
-    return {instance: surface for instance, surface in surfaces.items() if is_same(instance)}
+    """The surfaces of the instances that have the same of D masks before and after."""
+    changed = torch.cat([masks.instance_ids[before.instance_ids != after.instance_ids] for masks in (before, after)])
+    gone = set(changed.tolist())
+    return {instance: surface for instance, surface in surfaces.items() if instance not in gone}
 
 
 def move_pieces(regions: Regions, ids: Ints, shown: Shown) -> Ints:

@@ -10,7 +10,7 @@ leaves fall by themselves. The paper's idea of an excessive set from which the v
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -34,9 +34,6 @@ from mvseg.verification.leaf_scores import (
     show_chances,
 )
 from mvseg.verification.rough_surfaces import LEAST_PARALLAX, fit_roughly, median_parallax
-
-Surfaces = Mapping[int, LeafSurface]
-Fit = Callable[[Masks, Surfaces], Surfaces]
 
 ROUNDS = 2  # in the first nothing hides anything, in the second the leaves of the first do
 SAME = 0.8  # Jaccard index of the masks of two candidates, from which they are one: the second is not fitted
@@ -82,7 +79,6 @@ def choose_leaves(
     gone: Masks | None = None,
     min_probability: float | None = None,
     fitted: LeafScores = FITTED,
-    fit: Fit | None = None,
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
@@ -100,7 +96,6 @@ def choose_leaves(
         gone: masks that a person took away; None: none.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
         fitted: the numbers of the two scores.
-        fit: from masks and surfaces that are known to {instance id: surface}; None: `fit_roughly`.
 
     Returns:
         The leaves. Where the cameras see the plant from one side only, by less than `LEAST_PARALLAX`, surfaces are too
@@ -118,12 +113,11 @@ def choose_leaves(
     row_of[is_added] = len(proposals) + torch.arange(len(added))
     held = np.zeros(len(table), bool)
     held[row_of[is_held].numpy()] = True
-    fit = fit or (lambda masks, known: fit_roughly(masks, cameras, known=known))
     has_shapes, ids = _is_seen_around(matched, cameras), matched.instance_ids
     if linked is not None:
         matched = replace(matched, instance_ids=ids.where(torch.isin(ids, ids[is_held]), -1))
     found = [(matched, row_of), *((each.to("cpu"), each.regions.labels.cpu()) for each in more)]
-    candidates = gather_candidates(found, fit if has_shapes else None, table=table, is_held=is_held)
+    candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)
     drawn = draw_views(table.regions, candidates.surfaces, cameras)
     usable = np.concatenate((left, np.ones(len(added), bool)))
     chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability, fitted=fitted)
@@ -180,13 +174,13 @@ def _without(proposals: Masks, gone: Masks | None) -> Bools:
 
 
 def gather_candidates(
-    found: Sequence[tuple[Masks, Tensor]], fit: Fit | None, *, table: Masks, is_held: Tensor
+    found: Sequence[tuple[Masks, Tensor]], cameras: Cameras | None, *, table: Masks, is_held: Tensor
 ) -> Candidates:
     """The instances of each matching; those that an earlier one has, too, once.
 
     Args:
         found: masks of each matching and (D,) their rows in the table.
-        fit: see `choose_leaves`; None: no surfaces.
+        cameras: that surfaces are fitted with; None: no surfaces.
         table: R' masks.
         is_held: (D,) bool, of the masks of the first matching.
     """
@@ -197,10 +191,10 @@ def gather_candidates(
     for number, (masks, rows) in enumerate(found):
         ids = masks.instance_ids
         instances = ids[ids > 0].unique().tolist()
-        twin = {each: _twin(rows[ids == each], members, areas) for each in instances}
-        known = {each: surfaces[other] for each, other in twin.items() if other is not None}
-        fitted = {} if fit is None else fit(masks, {k: surface for k, surface in known.items() if surface is not None})
-        for each in (each for each in instances if twin[each] is None):
+        new = [each for each in instances if not _is_there(rows[ids == each], members, areas)]
+        is_new = torch.isin(ids, torch.tensor(new, dtype=torch.int64))
+        fitted = {} if cameras is None else fit_roughly(replace(masks, instance_ids=ids.where(is_new, -1)), cameras)
+        for each in new:
             own = ids == each
             members.append(rows[own])
             surface = fitted.get(each)
@@ -216,13 +210,13 @@ def gather_candidates(
     return Candidates(tuple(surfaces), torch.stack(columns, 1).numpy(), torch.stack(certain, 1).numpy())
 
 
-def _twin(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> int | None:
-    """The candidate whose masks are nearly these, by area; None if there is none."""
-    for number, others in enumerate(members):
+def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
+    """Whether the masks of one of the candidates are nearly these, by area."""
+    for others in members:
         common, either = areas[rows[torch.isin(rows, others)]].sum(), areas[torch.cat((rows, others)).unique()].sum()
         if common > SAME * either:
-            return number
-    return None
+            return True
+    return False
 
 
 # --- the choice

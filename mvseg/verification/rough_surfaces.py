@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
-from types import MappingProxyType
 
 import torch
 
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.kept_surfaces import fit_kept
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 
@@ -18,24 +16,12 @@ ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must s
 LEAST_PARALLAX = 30.0  # degrees between the views of an instance, from which its surface tells what they show
 
 
-def fit_roughly(
-    masks: Masks,
-    cameras: Cameras,
-    *,
-    known: Mapping[int, LeafSurface] = MappingProxyType({}),
-) -> dict[int, LeafSurface]:
-    """{instance id: surface} to verify masks with; for `known` see `fit_surfaces`. It does not warn: what still holds
-    after the correction is said then."""
+def fit_roughly(masks: Masks, cameras: Cameras) -> dict[int, LeafSurface]:
+    """{instance id: surface} to verify masks with. It does not warn: what still holds after the correction is said
+    then."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        return fit_surfaces(
-            masks.regions,
-            masks.instance_ids,
-            cameras,
-            known=known,
-            most_views=ROUGH_VIEWS,
-            is_rough=True,
-        )
+        return fit_kept(masks.regions, masks.instance_ids, cameras, most_views=ROUGH_VIEWS, is_rough=True)
 
 
 def median_parallax(masks: Masks, cameras: Cameras) -> float:

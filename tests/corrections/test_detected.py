@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,9 +17,10 @@ from mvseg.detection.config import DetectConfig
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import State, choose, choose_unedited, correct, correct_instances, match
+from mvseg.pipeline import list_stages
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras, Scene, View
+from mvseg.stages import State
 from mvseg.verification import choose as choosing
 from mvseg.verification.choose import Leaves, choose_leaves
 from mvseg.verification.leaf_scores import FITTED, LeafScores
@@ -35,6 +35,7 @@ PROPOSALS = Masks.of(
 )
 MATCHED = replace(PROPOSALS, instance_ids=IDS, match_scores=torch.full((len(IDS),), 0.9))
 VIEWS = tuple(View(f"v{view}", Path(f"v{view}.png")) for view in range(len(CAMERAS)))
+OTHERS = ("detect", "follow", "snap", "say_what_is_missing", "check", "reconstruct", "settle", "measure")
 SCENE = Scene(name="plant", views=VIEWS, cameras=CAMERAS, unit="mm", up=None)
 
 
@@ -52,7 +53,7 @@ class Found:
         return PROPOSALS
 
 
-def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> dict[int, LeafSurface]:
+def fit(masks: Masks, _: Cameras) -> dict[int, LeafSurface]:
     ids = masks.instance_ids
     instances = ids[ids > 0].unique().tolist()
     return {each: LEAVES[int(IDS[masks.regions.labels[ids == each]].mode().values)] for each in instances}
@@ -72,12 +73,16 @@ def run(*edits: Edit, learn_plant: bool = True) -> State:
         scene=SCENE,
         photos=Photos(SCENE),
         found=found,  # type: ignore[arg-type]
-        fit=fit,
         corrections=Corrections(edits) if edits else None,
     )
-    for stage in (correct, match, correct_instances, choose) if edits else (match, choose):
-        state = stage(state)
+    for name, stage in list_stages(state.config, has_masks=False, has_edits=len(edits) > 0).items():
+        state = state if name in OTHERS else stage(state)
     return state
+
+
+@pytest.fixture(autouse=True)
+def known_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(choosing, "fit_roughly", fit)
 
 
 def as_painted(state: State) -> list[np.ndarray]:
@@ -127,9 +132,7 @@ def test_the_plant_is_learnt_if_one_wants_it(learn_plant: bool, monkeypatch: pyt
 
 
 def test_what_is_known_without_a_person_is_found_once() -> None:
-    known = choose_unedited(replace(run(), matching=MatchedNothing))
+    known = run(Reject(view="v0", at=at(1, 0), everywhere=True)).unedited
+    assert known is not None
     assert len(known.leaves.probabilities) == 3
     assert [len(each) for each in known.matched] == [int((IDS != WEAK).sum()), len(IDS)]
-
-
-MatchedNothing = Matching(PROPOSALS, MatchReport("none"))

@@ -21,8 +21,8 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import State, choose, measure, reconstruct
 from mvseg.results.folder import save_result
+from mvseg.stages import State, choose, measure, reconstruct
 
 SIZE = 40
 

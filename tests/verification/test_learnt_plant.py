@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +14,7 @@ from scipy.special import expit, logit
 from blade_scene import as_regions
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.scene import Cameras
 from mvseg.verification.choose import Leaves, choose_leaves
 from mvseg.verification.leaf_scores import FITTED
 from mvseg.verification.learnt_plant import LEAF_SHIFT, Labels, label_leaves, learn_plant, learn_shift
@@ -29,12 +30,18 @@ MATCHED = replace(PROPOSALS, instance_ids=IDS, match_scores=torch.full((len(IDS)
 NO_LABELS = Labels(np.zeros(0), np.zeros(0, bool))
 
 
-def fit(masks: Masks, known: Mapping[int, LeafSurface]) -> dict[int, LeafSurface]:
+def fit(masks: Masks, _: Cameras) -> dict[int, LeafSurface]:
     ids = masks.instance_ids
     return {each: LEAVES[int(IDS[masks.regions.labels[ids == each]].mode().values)] for each in ids.unique().tolist()}
 
 
-ALONE = choose_leaves(MATCHED, PROPOSALS, cameras=CAMERAS, fit=fit)
+def choose(matched: Masks, proposals: Masks, **more: Any) -> Leaves:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("mvseg.verification.choose.fit_roughly", fit)
+        return choose_leaves(matched, proposals, cameras=CAMERAS, **more)
+
+
+ALONE = choose(MATCHED, PROPOSALS)
 
 
 def say(matched: Masks = MATCHED, held: object = (), rejected: object = (), alone: Leaves = ALONE) -> Labels:
@@ -148,7 +155,7 @@ def test_neither_the_order_of_masks_nor_that_of_edits_matters() -> None:
 
 def test_nothing_chosen_is_nothing_to_label() -> None:
     nothing = PROPOSALS.select(torch.zeros(0, dtype=torch.int64))
-    alone = choose_leaves(nothing, nothing, cameras=CAMERAS, fit=fit)
+    alone = choose(nothing, nothing)
     assert learn_plant(say(held=[0], alone=alone)) == FITTED
 
 
@@ -161,11 +168,11 @@ def test_a_doubtful_leaf_falls_when_others_like_it_were_none_and_what_a_person_c
     proposals, matched = (replace(each, detection_scores=scores) for each in (PROPOSALS, MATCHED))
     strict = learn_plant(Labels(np.full(40, 0.6), np.zeros(40, bool)))
     plain, learnt = (
-        choose_leaves(matched, proposals, cameras=CAMERAS, fit=fit, fitted=fitted) for fitted in (FITTED, strict)
+        choose(matched, proposals, fitted=fitted) for fitted in (FITTED, strict)
     )
     assert len(plain.probabilities) == 3
     assert len(learnt.probabilities) == 2
     confirmed = replace(matched, origin=torch.where(IDS == 3, int(Origin.CONFIRMED), matched.origin))
-    kept = choose_leaves(confirmed, proposals, cameras=CAMERAS, fit=fit, fitted=strict)
+    kept = choose(confirmed, proposals, fitted=strict)
     assert 1.0 in kept.probabilities.values()
     assert int((kept.masks.origin == Origin.CONFIRMED).sum()) == int((IDS == 3).sum())

@@ -17,7 +17,7 @@ from mvseg.corrections.file import Corrections
 from mvseg.errors import InputWarning
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
-from mvseg.pipeline import State, say_what_is_missing
+from mvseg.stages import State, say_what_is_missing
 from mvseg.verification.unexplained import describe_missing, share_unexplained
 from three_leaves import true_maps
 

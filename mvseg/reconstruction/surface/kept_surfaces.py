@@ -1,0 +1,59 @@
+"""Surfaces are kept by the content of their masks: a run fits an instance once, as long as its masks stay the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from typing import Any
+
+from torch import Tensor
+
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions
+from mvseg.scene import Cameras
+from mvseg.system.running import now_running
+
+
+def fit_kept(regions: Regions, instance_ids: Tensor, cameras: Cameras, **how: Any) -> dict[int, LeafSurface]:
+    """As `fit_surfaces`; where the run keeps what it computed, see `running`, only the instances that it has not fitted
+    yet to the same masks, with the same cameras and options. (A surface also depends a little on what may hide it: it
+    is that of the first time.)
+
+    Args:
+        regions: D regions.
+        instance_ids: (D,) int64, from 1 on; -1 = no instance.
+        cameras: V cameras.
+        how: options of `fit_surfaces`. `starts` say where a fit begins, not what it finds.
+
+    Returns:
+        {instance id: surface} for every instance.
+    """
+    kept = now_running().kept
+    if kept is None:
+        return fit_surfaces(regions, instance_ids, cameras, **how)
+    fitted_as = json.dumps([_digest(cameras.px_from_world), {k: how[k] for k in sorted(how) if k != "starts"}])
+    ids = instance_ids[instance_ids > 0].unique().tolist()
+    names = {each: f"{fitted_as} {name_instance(regions, instance_ids == each)}" for each in ids}
+    known = {each: kept[name] for each, name in names.items() if name in kept}
+    if ids and len(known) == len(ids):
+        return known
+    surfaces = fit_surfaces(regions, instance_ids, cameras, known=known, **how)
+    kept.update({names[each]: surface for each, surface in surfaces.items()})
+    return surfaces
+
+
+def name_instance(regions: Regions, is_member: Tensor) -> str:
+    """A name that two instances share only if they have the same masks in the same views; `is_member` (D,) bool."""
+    return json.dumps(sorted(name_each(regions.select(is_member))))
+
+
+def name_each(regions: Regions) -> list[str]:
+    """A name of each of D regions, that it shares with no other."""
+    regions = regions.to("cpu")
+    places = zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
+    return [json.dumps([view, *box, _digest(regions.crop(row))]) for row, (view, box) in enumerate(places)]
+
+
+def _digest(values: Tensor) -> str:
+    return hashlib.sha256(values.cpu().numpy().tobytes()).hexdigest()
