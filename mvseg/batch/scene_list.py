@@ -11,14 +11,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from mvseg.batch.status import EXPORT, STATE, TABLES
+from mvseg.batch.status import STATE, TABLES
 from mvseg.errors import InputError
 from mvseg.system.atomic import resolve_place
 
 OWN_COLUMNS = ("scene", "name", "masks", "corrections")
 # of summary.csv, behind those of the scene
 SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds", "peak_mb", "warning_text", "sentence")
-RESERVED = {STATE, TABLES, EXPORT}
+RESERVED = {STATE, TABLES}
 MAX_BYTES = 1 << 26
 FORBIDDEN = "/\\\0" + ('<>:"|?*' if sys.platform == "win32" else "")  # in the name of a folder
 

@@ -1,6 +1,6 @@
 """The folder of a batch, and the status of its scenes: a small JSON file each, written whole whenever it changes.
 
-OUT/NAME holds the result of a scene; three folders beside them belong to the batch.
+OUT/NAME holds the result of a scene; two folders beside them belong to the batch.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from mvseg.errors import InputError
 from mvseg.formats.json_file import read_json
 from mvseg.system.atomic import write_text_whole
 
-STATE, TABLES, EXPORT = "_batch", "tables", "export"
+STATE, TABLES = "_batch", "tables"
 STATUS_FILE = "status.json"
 
 

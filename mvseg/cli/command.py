@@ -14,7 +14,7 @@ from typing import TextIO
 from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
 
 from mvseg._version import __version__
-from mvseg.cli import batch, check, correct, export, infer, match, models, pose, simulate, target, track, train
+from mvseg.cli import batch, check, correct, infer, match, models, pose, simulate, target, track, train
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
@@ -32,7 +32,6 @@ VERBS: dict[str, tuple[ModuleType, str]] = {
     "infer": (infer, "ids and 3D shapes of one scene"),
     "correct": (correct, "correct a result in the browser"),
     "batch": (batch, "many scenes, one table of traits"),
-    "export": (export, "traits of a batch for MIAPPE and BrAPI"),
     "track": (track, "the same leaf over days"),
     "match": (match, "ids only, of any number of scenes"),
     "eval": (evaluate, "compare a result with true labels"),

@@ -1,19 +1,24 @@
-"""A batch for MIAPPE and BrAPI: against the published checklist and the published schema."""
+"""The recipe for MIAPPE and BrAPI: against the published checklist and the published schema."""
 
 from __future__ import annotations
 
 import csv
 import json
+import re
+import runpy
+import subprocess
+import sys
 from datetime import datetime
 from pathlib import Path
 
 import pytest
 
-from mvseg.cli import main
 from mvseg.traits.ontology import DEFINITIONS
 
+RECIPE = Path(__file__).parent.parent / "docs" / "recipes" / "miappe_brapi.py"
+convert = runpy.run_path(str(RECIPE))["main"]
 # section, field, cardinality: the rows of "MIAPPE_Checklist-Data-Model-v1.1.tsv" (github.com/MIAPPE/MIAPPE)
-CHECKLIST = [line.split("\t") for line in (Path(__file__).parent / "miappe-1.1.tsv").read_text().splitlines()]
+CHECKLIST = [line.split("\t") for line in RECIPE.with_name("miappe-1.1.tsv").read_text().splitlines()]
 LINKS = {"Study unique ID", "Biological material ID"}  # to another table, in any table
 FACTS = {
     "Investigation title": "Drought in basil",
@@ -45,14 +50,13 @@ BRAPI_TEXT = {
 }  # fmt: skip
 
 
-def write_batch(folder: Path, rows: list[dict[str, str]]) -> Path:
-    """The tables of a batch with the same numbers for each plant."""
+def write_traits(path: Path, rows: list[dict[str, str]]) -> Path:
+    """The tables/traits.csv of a batch with the same numbers for each plant."""
     columns = [*rows[0], "leaf", "trait", "value", "sd", "unit", "method", "ontology"]
-    (folder / "tables").mkdir(parents=True)
-    with (folder / "tables" / "traits.csv").open("w", newline="", encoding="utf-8") as file:
+    with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerows([columns, *([*row.values(), *numbers] for row in rows for numbers in NUMBERS)])
-    return folder
+    return path
 
 
 def plants(**changes: str) -> list[dict[str, str]]:
@@ -70,18 +74,18 @@ def read_table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def complaint(capsys: pytest.CaptureFixture[str]) -> str:
-    captured = capsys.readouterr()
-    assert captured.out == ""
-    return captured.err.removeprefix("mvseg: error: ").rstrip("\n")
+@pytest.fixture
+def traits(tmp_path: Path) -> Path:
+    return write_traits(tmp_path / "traits.csv", plants())
 
 
-def test_the_tables_are_what_the_checklist_asks_for(tmp_path: Path) -> None:
-    batch = write_batch(tmp_path / "batch", plants())
-    assert main(["export", str(batch), "--miappe", "--factors", "treatment"]) == 0
-    out = batch / "export"
+def test_the_tables_are_what_the_checklist_asks_for(traits: Path) -> None:
+    """As on the page, in a process of its own."""
+    out = traits.with_name("out")
+    words = [sys.executable, "-W", "error", str(RECIPE), "miappe", str(traits), str(out), "--factors", "treatment"]
+    subprocess.run(words, cwd=RECIPE.parents[2], check=True)
     sections = {section for section, *_ in CHECKLIST}
-    assert {path.stem for path in out.glob("*.csv")} == {*sections, "observations"}
+    assert {path.stem for path in out.iterdir()} == {*sections, "observations"}
     for section in sections:
         rows = read_table(out / f"{section}.csv")
         known = {field: cardinality for name, field, cardinality in CHECKLIST if name == section}
@@ -98,26 +102,26 @@ def test_the_tables_are_what_the_checklist_asks_for(tmp_path: Path) -> None:
     assert len(read_table(out / "biological_material.csv")) == 1
 
 
-def test_every_number_has_its_unit_and_variable(tmp_path: Path) -> None:
-    batch = write_batch(tmp_path / "batch", plants())
-    assert main(["export", str(batch), "--miappe", "--out", str(tmp_path / "out")]) == 0
-    numbers = read_table(tmp_path / "out" / "observations.csv")
+def test_every_number_has_its_unit_and_variable(traits: Path) -> None:
+    out = traits.with_name("out")
+    convert(["miappe", str(traits), str(out)])
+    numbers = read_table(out / "observations.csv")
     assert len(numbers) == 9  # the missing one is left out
-    units = {row["Observation unit ID"] for row in read_table(tmp_path / "out" / "observation_unit.csv")}
-    variables = {row["Variable ID"]: row for row in read_table(tmp_path / "out" / "observed_variable.csv")}
+    units = {row["Observation unit ID"] for row in read_table(out / "observation_unit.csv")}
+    variables = {row["Variable ID"]: row for row in read_table(out / "observed_variable.csv")}
+    assert len(variables) == len(read_table(out / "observed_variable.csv")) == 3
     assert {row["Observation unit ID"] for row in numbers} == units
     assert {row["Variable ID"] for row in numbers} == variables.keys()
     assert variables["leaf_area_mvseg_mm2"]["Trait accession number"] == "TO:0000540"
     assert variables["leaf_area_mvseg_mm2"]["Scale"] == "mm^2"
     assert DEFINITIONS["area"].meaning in variables["leaf_area_mvseg_mm2"]["Method description"]
     assert (numbers[1]["leaf"], numbers[1]["value"], numbers[1]["sd"]) == ("1", "812.5", "3.1")
-    assert not (tmp_path / "out" / "experimental_factor.csv").exists()
+    assert not (out / "experimental_factor.csv").exists()
 
 
-def test_brapi_observations_are_text_under_known_keys(tmp_path: Path) -> None:
-    batch = write_batch(tmp_path / "batch", plants())
-    assert main(["export", str(batch), "--brapi"]) == 0
-    answer = json.loads((batch / "export" / "brapi_observations.json").read_text())
+def test_brapi_observations_are_text_under_known_keys(traits: Path) -> None:
+    convert(["brapi", str(traits), str(traits.with_name("night.json"))])
+    answer = json.loads(traits.with_name("night.json").read_text())
     assert answer["metadata"]["pagination"]["totalCount"] == len(answer["result"]["data"]) == 9
     for observation in answer["result"]["data"]:
         more = observation.pop("additionalInfo")
@@ -131,44 +135,35 @@ def test_brapi_observations_are_text_under_known_keys(tmp_path: Path) -> None:
     assert "observationTimeStamp" not in last  # "first day" is no date
 
 
-def test_what_the_batch_does_not_say_is_asked_for(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    rows = [{key: cell for key, cell in row.items() if key not in ("Organism", "Study title")} for row in plants()]
-    batch = write_batch(tmp_path / "batch", rows)
-    assert main(["export", str(batch), "--miappe"]) == 2
-    assert "expected a column for each, filled in every row: Study title, Organism; mvseg batch" in complaint(capsys)
-    assert not (batch / "export").exists()
-    assert main(["export", str(batch), "--brapi"]) == 0  # which asks for nothing
-
-
 @pytest.mark.parametrize(
-    ("changes", "arguments", "message"),
+    ("changes", "factors", "facts"),
     [
-        ({}, [], "neither --miappe nor --brapi is given, expected one or both"),
-        ({}, ["--miappe", "--factors", "light"], "the batch's table has no column 'light', found scene, plant"),
-        ({}, ["--miappe", "--factors", "Organism"], "'Organism' is NCBI:39350 for all plants, expected two values"),
-        ({"Organism": ""}, ["--miappe"], "filled in every row: Organism"),
-        ({"Investigation title": "Another"}, ["--miappe"], "is 'Drought in basil' and 'Another' for one investigation"),
-        ({"plant": "p1", "Spatial distribution": "row:5"}, ["--miappe"], "for one Observation unit ID (p1)"),
-        ({"Study title": "Another"}, ["--miappe"], "for one Study unique ID (study-1), expected one of them"),
+        ({}, "light", "no column 'light', found scene, plant"),
+        ({}, "Organism", "'Organism' is NCBI:39350 for all plants, expected two values"),
+        ({"Organism": "", "Study title": ""}, "", "in every row, Study title, Organism; expected columns"),
+        ({"Investigation title": "Another"}, "", "is 'Drought in basil' and 'Another' for one investigation"),
+        ({"plant": "p1", "Spatial distribution": "row:5"}, "", "for one observation_unit (p1)"),
+        ({"Study title": "Another"}, "", "for one study (study-1)"),
     ],
-)  # fmt: skip
-def test_wrong_tables_are_named(
-    changes: dict[str, str], arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    batch = write_batch(tmp_path / "batch", plants(**changes))
-    assert main(["export", str(batch), *arguments]) == 2
-    assert message in complaint(capsys)
+)
+def test_wrong_tables_are_named(changes: dict[str, str], factors: str, facts: str, tmp_path: Path) -> None:
+    traits = write_traits(tmp_path / "traits.csv", plants(**changes))
+    with pytest.raises(SystemExit, match=re.escape(facts)):
+        convert(["miappe", str(traits), str(tmp_path / "out"), "--factors", factors])
+    assert not (tmp_path / "out").exists()
 
 
-def test_what_is_no_batch_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["export", str(tmp_path), "--brapi"]) == 2
-    assert "is not an output of mvseg batch (tables/traits.csv is missing)" in complaint(capsys)
+def test_nothing_is_overwritten(traits: Path) -> None:
+    out = traits.with_name("mine")
+    out.mkdir()
+    for standard in ("miappe", "brapi"):
+        with pytest.raises(SystemExit, match="mine: exists already"):
+            convert([standard, str(traits), str(out)])
+    assert list(out.iterdir()) == []
 
 
-def test_files_of_the_user_stay(tmp_path: Path) -> None:
-    batch = write_batch(tmp_path / "batch", plants())
-    assert main(["export", str(batch), "--brapi"]) == 0
-    (batch / "export" / "notes.txt").write_text("mine")
-    assert main(["export", str(batch), "--miappe"]) == 0
-    assert (batch / "export" / "notes.txt").read_text() == "mine"
-    assert not (batch / "export" / "brapi_observations.json").exists()
+def test_what_is_no_batch_is_said(tmp_path: Path) -> None:
+    (tmp_path / "other.csv").write_text("a,b\n1,2\n")
+    for name, facts in (("other.csv", "is not tables/traits.csv of a batch"), ("absent.csv", "no such file")):
+        with pytest.raises(SystemExit, match=facts):
+            convert(["brapi", str(tmp_path / name), str(tmp_path / "out.json")])
