@@ -10,7 +10,7 @@ from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.traits.config import ColorCard, TraitsConfig, Up
+from mvseg.traits.config import TraitsConfig, Up
 
 ENOUGH_VIEWS = 20  # benchmarks/fewer_views.py: more add time, and next to nothing else
 
@@ -32,8 +32,6 @@ class RunConfig:
             level, "board" from ArUco markers that lie flat; None for that of the scene.
         refine_poses: refine poses that are a few pixels off, with the masks as the only evidence; used only if held-out
             leaves agree clearly better.
-        color_card: correction of the photos' colours before they are measured, see
-            `mvseg.traits.color_correction.read_color_card`; "find" detects a card in them; None for no correction.
         split_merged: cut a mask that seems to cover two instances in two.
         report: write report.html, the result as one page.
         coco_crowd: how annotations with `iscrowd` in a COCO file are treated: "mask": as all others; "ignore": left
@@ -51,7 +49,6 @@ class RunConfig:
     unit: str | None = None
     up: Up | None = None
     refine_poses: bool = False
-    color_card: ColorCard | None = None
     split_merged: bool = False
     report: bool = True
     coco_crowd: Literal["mask", "ignore"] = "mask"

@@ -363,7 +363,6 @@ def settle_edits(state: State) -> State:
 
 def measure(state: State) -> State:
     """Traits of the leaves and of the plant, see `measure_plant`."""
-    from mvseg.traits.color_correction import correct_views
     from mvseg.traits.measure import measure_plant
 
     traits = measure_plant(
@@ -373,6 +372,5 @@ def measure(state: State) -> State:
         voxels=state.voxels or {},
         photos=state.photos,
         config=state.config.traits,
-        corrections=correct_views(state.scene, state.config.color_card),
     )
     return replace(state, instances=replace(state.instances, traits=traits))

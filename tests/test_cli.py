@@ -23,14 +23,12 @@ import pytest
 import trimesh
 
 import mvseg
-from color_cards import LAMP, photograph_card
 from mvseg.cli import main
 from mvseg.cli.command import VERBS
 from mvseg.demo import demo_scene
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputWarning
 from mvseg.formats.coco import encode_mask
-from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
@@ -213,7 +211,6 @@ def test_config_file_then_command_line(plant: Path, tmp_path: Path, capsys: pyte
         "scale": None,
         "unit": None,
         "up": None,
-        "color_card": None,
         "report": True,
     }
     assert run["mvseg"] == mvseg.__version__
@@ -241,23 +238,6 @@ def test_which_way_is_up(words: list[str], up: list[float] | None, plant: Path, 
     said = json.loads((tmp_path / "out" / "run.json").read_text())["traits"]
     assert said["up"] == up
     assert said["unit"] == ("cm" if "cm" in words else "mm")
-
-
-def test_a_colour_card_corrects_all_photos(
-    plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    photo, corners = photograph_card(LAMP)
-    write_png(tmp_path / "card.png", photo)
-    content = {"format": "mvseg-color-card/1", "cards": [{"photo": "card.png", "corners": corners.tolist()}]}
-    (tmp_path / "card.json").write_text(json.dumps(content))
-    arguments = ["infer", str(plant), "--masks", "masks", "--out", str(tmp_path / "out"), "--quiet", *COARSE]
-    assert main([*arguments, "--color_card", str(tmp_path / "card.json")]) == 0
-    (said,) = json.loads((tmp_path / "out" / "run.json").read_text())["traits"]["colors"]
-    assert (said["views"], said["photo"]) == ("*", "card.png")
-    assert said["delta_e"] < 1
-    capsys.readouterr()
-    assert main([*arguments, "--color_card", str(tmp_path / "absent.png")]) == 2
-    assert complaint(capsys).startswith(f"{tmp_path / 'absent.png'}: the photo of a colour card cannot be read")
 
 
 @pytest.mark.parametrize("verb", ["infer", "match"])

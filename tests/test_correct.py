@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,6 +20,7 @@ import numpy as np
 import pytest
 import torch
 
+from mvseg import load_result
 from mvseg.cli import main
 from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections, name_edits
@@ -310,6 +312,26 @@ def test_results_that_cannot_be_corrected(folder: Path, tmp_path: Path) -> None:
     notice = OpenResult(tmp_path).notice
     assert notice.startswith("What you see is computed anew. mvseg 0.0 made this result")
     assert OpenResult(folder).config.match == MatchConfig()
+
+
+def test_a_result_whose_colours_a_card_corrected(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By an option of earlier versions: the result is read, and is made again without it, which is said."""
+    out = shutil.copytree(folder, tmp_path / "result")
+    run = json.loads((out / "run.json").read_text())
+    card = {"views": "*", "matrix": [1, 0, 0, 0, 1, 0, 0, 0, 1], "delta_e": 0.5, "photo": "card.png"}
+    for option in (None, "find", [card]):
+        config = run["config"] | {"color_card": option}
+        changes = {"config": config, "traits": {"unit": "mm", "up": None, "colors": [card]}}
+        (out / "run.json").write_text(json.dumps(run | changes))
+        result = load_result(out)
+        assert result.run is not None
+        assert result.run.as_json()["traits"]["colors"] == [card]
+        assert main(["infer", "--again", str(out), "--out", str(tmp_path / "new"), "--quiet"]) == 0
+        said = capsys.readouterr().err
+        assert ("its colours were corrected by a colour card, and will be those of the photos" in said) == bool(option)
+        assert "color_card" not in json.loads((tmp_path / "new" / "run.json").read_text())["config"]
 
 
 def test_a_folder_that_cannot_be_written_to(

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import runpy
 import shlex
 import shutil
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
 import recipe_files
 from mvseg.cli import main
@@ -77,3 +80,25 @@ def test_what_cellpose_leaves_beside_the_photos_is_read(tmp_path: Path, capsys: 
         path.unlink()
     assert main(["match", str(plant), "--masks", "images", "--out", str(tmp_path / "ids"), "--quiet"]) == 2
     assert "is a pickle, which may run anything when it is read; in cellpose, save" in capsys.readouterr().err
+
+
+def test_a_colour_card_undoes_the_light(tmp_path: Path) -> None:
+    """Of a card and leaves, drawn flat, in a bluish light; the second time, nothing is overwritten."""
+    pcv = pytest.importorskip("plantcv.plantcv", exc_type=ImportError)
+    published = np.rint(255 * pcv.transform.std_color_matrix(pos=0)[:, 1:])
+    leaves = np.array([(60, 140, 50), (120, 160, 40), (150, 120, 60), (90, 60, 40)])
+    light = [0.6, 0.7, 0.8]  # of sRGB values
+    card = np.full((800, 1200, 3), 25.0)
+    for patch, color in enumerate(published):
+        y, x = (60 + 180 * step for step in divmod(patch, 6))
+        card[y : y + 144, x : x + 144] = color
+    photos = tmp_path / "photos"
+    photos.mkdir()
+    for path, colors in ((tmp_path / "card.png", card), (photos / "leaves.png", np.tile(leaves, (40, 1, 1)))):
+        Image.fromarray(np.rint(colors * light).astype(np.uint8)).save(path)
+    correct = runpy.run_path(str(ROOT / "docs" / "recipes" / "color_card.py"))["main"]
+    correct(tmp_path / "card.png", photos, tmp_path / "out")
+    corrected = np.asarray(Image.open(tmp_path / "out" / "leaves.png")).astype(int)
+    assert np.abs(corrected[0] - leaves).max() <= 2
+    with pytest.raises(FileExistsError):
+        correct(tmp_path / "card.png", photos, tmp_path / "out")

@@ -42,10 +42,10 @@ VERBS: dict[str, tuple[ModuleType, str]] = {
 # The verbs with more options than a screen has lines, and what `--help` shows of them.
 MOST_USED = {
     "pose": ("photos", "out", "marker", "board", "distance", "positions", "unit", "up", "turntable"),
-    "infer": ("scene", "masks", "out", "config", "scale", "unit", "up", "color_card", "detect.weights",
-              "detect.image_size", "split_merged", "num_workers"),
+    "infer": ("scene", "masks", "out", "config", "scale", "unit", "up", "detect.weights", "detect.image_size",
+              "split_merged", "num_workers"),
     "batch": ("scenes", "masks", "out", "config", "resume", "num_workers", "scheduler", "scale", "unit", "up",
-              "color_card", "detect.weights"),
+              "detect.weights"),
     "match": ("scenes", "masks", "out", "config", "split_merged", "categories", "match.method", "refine_poses"),
     "train": ("photos", "labels", "output", "val_photos", "val_labels", "config", "arch", "weights", "image_size",
               "epochs", "resume"),

@@ -122,17 +122,10 @@ def add_run_options(parser: ArgumentParser) -> None:
     help_unit = "name of the world's unit, after --scale (default: the scene's)"
     parser.add_argument("--unit", type=str | None, help=help_unit)
     add_shared(parser, "up")
-    help_card = "24-patch colour card that corrects the colours: a photo of it, a card file, or 'find' it in the photos"
-    parser.add_argument("--color_card", type=str | None, help=help_card)
 
 
 def build_run(args: Namespace) -> RunConfig:
     """The options that `add_run_options` added."""
-    card = args.color_card
-    if card is not None:
-        from mvseg.traits.color_correction import read_color_card  # keeps --help quick
-
-        card = read_color_card(card)
     plain = ("views", "scale", "unit", "refine_poses", "split_merged", "report", "coco_crowd", "categories")
     return RunConfig(
         detect=build_options(DetectConfig, args.detect, "detect."),
@@ -140,7 +133,6 @@ def build_run(args: Namespace) -> RunConfig:
         reconstruct=build_options(ReconstructConfig, args.reconstruct, "reconstruct."),
         traits=build_options(TraitsConfig, args.traits, "traits."),
         up=read_up(args.up),
-        color_card=card,
         **{name: args[name] for name in plain},
     )
 

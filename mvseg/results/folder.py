@@ -99,8 +99,7 @@ def describe_result(result: Result) -> dict[str, Any]:
         residuals = [_or_none(round(residual, 3)) for residual in poses.residual_px]
         said["poses"] = {"refined": poses.is_refined, "residual_px": residuals}
     if (traits := result.traits) is not None:
-        colors = {"colors": [asdict(correction) for correction in traits.corrections]} if traits.corrections else {}
-        said["traits"] = {"unit": traits.unit or None, "up": traits.up, **colors, "rejected": traits.rejected}
+        said["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
     if result.corrections is not None and result.corrections.edits:
         said["edits"] = dump_edits(result.corrections.edits)
     if result.fates:

@@ -283,7 +283,7 @@ def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:
     from mvseg.traits.table import read_traits
 
     world, paths = run.traits, (folder / "traits.csv", folder / "traits_wide.csv")
-    return read_traits(*paths, plant=scene.name, unit=world.unit or "", up=world.up, corrections=world.colors)
+    return read_traits(*paths, plant=scene.name, unit=world.unit or "", up=world.up)
 
 
 def _instances_of(

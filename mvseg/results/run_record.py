@@ -12,7 +12,6 @@ from mvseg.corrections.apply import Fate
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE
-from mvseg.traits.config import ColorCorrection
 
 FORMAT = 2  # of the folder; 1, of earlier versions, says no "format" and holds neither cameras nor surfaces.npz
 
@@ -37,11 +36,10 @@ class PosesRecord(_Part):
 
 
 class TraitsRecord(_Part):
-    """The world that traits were measured in, and the corrections of colours."""
+    """The world that traits were measured in."""
 
     unit: str | None = None
     up: Vector3 | None = None
-    colors: tuple[ColorCorrection, ...] = ()
 
 
 class RunRecord(_Part):

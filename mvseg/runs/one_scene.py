@@ -175,7 +175,7 @@ def describe_run(
     if masks is not None:
         del options["detect"]
     if config.reconstruct is None:
-        for name in ("reconstruct", "traits", "scale", "unit", "up", "color_card"):
+        for name in ("reconstruct", "traits", "scale", "unit", "up"):
             del options[name]
     if masks is None:
         from mvseg.detectors.zoo import weights_path  # loads torchvision

@@ -17,6 +17,9 @@ from mvseg.results.earlier import RUN_FILE
 from mvseg.results.run_record import RunRecord, find_place, load_run
 from mvseg.system.file_hash import hash_files
 
+GONE = {  # options of earlier versions: what to say of a result that was made with one
+    "color_card": "its colours were corrected by a colour card, and will be those of the photos as they are now.",
+}
 PLACES = ("scene", "out", "masks", "corrections")  # of run.json's config: what the run read and wrote
 
 
@@ -31,7 +34,8 @@ class RecordedRun:
         scene: folder of the scene.
         masks: that were given; None: a detector found them.
         corrections: file of a person's edits; None without any.
-        changes: a sentence for each input that is another one now, and for another version of mvseg.
+        changes: a sentence for each input that is another one now, for another version of mvseg, and for an option
+            that this version no longer has.
     """
 
     folder: Path
@@ -104,12 +108,13 @@ def _list_changes(folder: Path, said: RunRecord) -> list[str]:
             changes.append(f"{path}: is gone since this result was made.")
         elif hash_files(path) != sha256:
             changes.append(f"{path}: has changed since this result was made.")
+    changes += [f"{folder}: {change}" for name, change in GONE.items() if said.config.get(name) is not None]
     return changes
 
 
 def _read_config(folder: Path, said: RunRecord) -> RunConfig:
     """The options of the stages."""
-    options = {name: value for name, value in said.config.items() if name not in (*PLACES, "from_here")}
+    options = {name: value for name, value in said.config.items() if name not in (*PLACES, *GONE, "from_here")}
     known = asdict(RunConfig())
     unknown = [name for name in options if name not in known]
     for stage, inside in options.items():

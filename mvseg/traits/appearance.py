@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import cv2
 import numpy as np
@@ -14,8 +14,6 @@ from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.traits.color_correction import correct_colors
-from mvseg.traits.config import ColorCorrection
 from mvseg.traits.leaf import Measurement, missing
 
 Floats = NDArray[np.float64]
@@ -30,12 +28,7 @@ GREY = missing("not measured: the photos are grey")
 
 
 def measure_appearance(
-    surfaces: Mapping[int, LeafSurface],
-    masks: Masks,
-    cameras: Cameras,
-    *,
-    photos: Photos,
-    corrections: Sequence[ColorCorrection | None] = (),
+    surfaces: Mapping[int, LeafSurface], masks: Masks, cameras: Cameras, *, photos: Photos
 ) -> dict[int, dict[str, Measurement]]:
     """Visible share, mean colour and greenness of leaves.
 
@@ -44,7 +37,6 @@ def measure_appearance(
         masks: D masks of the scene, with ids.
         cameras: V cameras.
         photos: used, if they exist.
-        corrections: of the colours, one per view; where there is any, views without one have no part in the colours.
 
     Returns:
         {instance id: {trait: number}}. The standard deviation of a colour is the standard error over the views, so
@@ -53,8 +45,7 @@ def measure_appearance(
     Raises:
         InputError: a photo is broken, or missing while others exist.
     """
-    has_photos, is_corrected = bool(surfaces) and photos.exist, any(corrections)
-    method, has_colors = describe_colors(corrections), False
+    has_photos, has_colors = bool(surfaces) and photos.exist, False
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
     colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # see `mean_colors`
     on_cpu = cameras.to("cpu")
@@ -63,7 +54,6 @@ def measure_appearance(
         if photo is not None and is_grey(photo):
             photo = None
         has_colors |= photo is not None
-        correction = corrections[view] if is_corrected else None
         labels = masks.regions.label_map(view, masks.instance_ids, size).cpu().numpy().astype(np.uint16)
         is_sure = sure_pixels(labels)
         for instance, surface in surfaces.items():
@@ -72,9 +62,8 @@ def measure_appearance(
             own = covered & (labels[window] == instance)
             pixels[instance] += (covered.sum(), own.sum())
             sure = own & is_sure[window]
-            if photo is not None and (correction is not None or not is_corrected) and sure.any():
-                seen = photo[window][sure]
-                shown = seen / 255 if correction is None else correct_colors(correction, seen)
+            if photo is not None and sure.any():
+                shown = photo[window][sure] / 255
                 is_senescent = hues(shown) < YELLOW_DEG
                 colors[instance].append((int(sure.sum()), np.append(shown.mean(0), is_senescent.mean())))
     found = {}
@@ -82,7 +71,7 @@ def measure_appearance(
         projected, visible = pixels[instance].tolist()
         share = Measurement(visible / projected, float("nan"), "masks") if projected else OUTSIDE
         without = dict.fromkeys(COLORS, GREY if has_photos else NO_PHOTOS)
-        found[instance] = {"visible_share": share} | (mean_colors(colors[instance], method) if has_colors else without)
+        found[instance] = {"visible_share": share} | (mean_colors(colors[instance]) if has_colors else without)
     return found
 
 
@@ -93,13 +82,7 @@ def sure_pixels(labels: NDArray[np.uint16]) -> NDArray[np.bool_]:
     return np.asarray(low == high)
 
 
-def describe_colors(corrections: Sequence[ColorCorrection | None]) -> str:
-    """How the colours of photos were measured, with the residual of the worst card."""
-    residuals = [correction.delta_e for correction in corrections if correction is not None]
-    return f"photographs, corrected (Delta E {max(residuals):.1f})" if residuals else "photographs, uncorrected"
-
-
-def mean_colors(views: list[tuple[int, Floats]], method: str) -> dict[str, Measurement]:
+def mean_colors(views: list[tuple[int, Floats]]) -> dict[str, Measurement]:
     """The traits in COLORS from the number of pixels of each view and (4,): their mean colour, 0 to 1, and the share of
     them that is yellow, brown or red."""
     if not views:
@@ -115,7 +98,7 @@ def mean_colors(views: list[tuple[int, Floats]], method: str) -> dict[str, Measu
     means[-1] = hue
     errors = table.std(0, ddof=1) / np.sqrt(len(views)) if len(views) > 1 else np.full(len(COLORS), np.nan)
     return {
-        name: Measurement(float(mean), float(error), method)
+        name: Measurement(float(mean), float(error), "photographs")
         for name, mean, error in zip(COLORS, means, errors, strict=True)
     }
 

@@ -1,5 +1,5 @@
-"""Which instances count as leaves, and how colours are corrected. The fields of `TraitsConfig` are keys in YAML files
-and options on the command line."""
+"""Which instances count as leaves. The fields of `TraitsConfig` are keys in YAML files and options on the command
+line."""
 
 from __future__ import annotations
 
@@ -8,25 +8,6 @@ from typing import Literal
 
 from mvseg.errors import InputError
 
-
-@dataclass(frozen=True)
-class ColorCorrection:
-    """How the colours in the photos of some views are corrected, see `color_correction`.
-
-    Attributes:
-        views: pattern of their names; or the names, where the card was found in one of their photos.
-        matrix: the nine numbers of M, row by row.
-        delta_e: mean distance (CIEDE2000) of the corrected patches of a colour card from the published ones.
-        photo: name of the file, or of the view, that shows the card.
-    """
-
-    views: str
-    matrix: tuple[float, ...]
-    delta_e: float
-    photo: str
-
-
-ColorCard = tuple[ColorCorrection, ...] | Literal["find"]  # "find": by a card in the photos of the scene
 Up = tuple[float, float, float] | Literal["rig", "board"]  # the direction that points up, or what shows it
 
 

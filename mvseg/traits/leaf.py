@@ -28,7 +28,7 @@ class Measurement:
     Attributes:
         value: NaN where there is none.
         sd: standard deviation; NaN where there is none.
-        method: what it was measured on ("surface", "voxels", "masks", "photographs, uncorrected"); the reason where
+        method: what it was measured on ("surface", "voxels", "masks", "photographs"); the reason where
             there is none.
     """
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +15,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.scene import Scene
 from mvseg.traits.appearance import measure_appearance
-from mvseg.traits.config import ColorCorrection, TraitsConfig
+from mvseg.traits.config import TraitsConfig
 from mvseg.traits.filters import Rejection, find_rejected, median_iou
 from mvseg.traits.from_above import look_from_above
 from mvseg.traits.leaf import UP_UNKNOWN, Measurement, measure_leaf, measure_voxels, missing
@@ -56,7 +56,6 @@ class Traits:
         leaves: one entry per instance, by id.
         whole: {trait: number} of all `PLANT_TRAITS`.
         up: unit vector, None when unknown.
-        corrections: of the colours of the photos; empty where they were not corrected.
     """
 
     plant: str
@@ -64,7 +63,6 @@ class Traits:
     leaves: tuple[LeafTraits, ...]
     whole: Mapping[str, Measurement]
     up: tuple[float, float, float] | None
-    corrections: tuple[ColorCorrection, ...] = ()
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -80,7 +78,6 @@ def measure_plant(
     voxels: Voxels,
     photos: Photos | None = None,
     config: TraitsConfig = TraitsConfig(),
-    corrections: Sequence[ColorCorrection | None] = (),
 ) -> Traits:
     """Measure all instances, and the plant that those make which count as leaves; on the CPU, wherever the inputs are.
 
@@ -91,7 +88,6 @@ def measure_plant(
         voxels: {instance id: voxels}.
         photos: of the scene; None: they are read.
         config: what counts as a leaf.
-        corrections: of the photos' colours, see `correct_views`.
 
     Returns:
         The traits; an instance that cannot be measured, or is rejected, has empty numbers that say why.
@@ -106,7 +102,7 @@ def measure_plant(
     frame = None if scene.up is None else level_frame(scene.up)
     sure_views = {} if matching.support is None else dict(zip(instances, matching.support.tolist(), strict=True))
     photos = photos or Photos(scene)
-    appearance = measure_appearance(every, masks, scene.cameras, photos=photos, corrections=corrections)
+    appearance = measure_appearance(every, masks, scene.cameras, photos=photos)
     visible = {instance: found["visible_share"].value for instance, found in appearance.items()}
     rejected = find_rejected(
         shapes, None if frame is None else frame[2], config=config, sure_views=sure_views, visible_shares=visible
@@ -131,8 +127,7 @@ def measure_plant(
         rejection = rejected.get(instance)
         leaves.append(describe_leaf(instance, numbers, best[instance], fitted=fitted, rejection=rejection))
     whole = measure_whole(blades, cells, frame, num_leaves=len(instances) - len(rejected))
-    known = tuple(dict.fromkeys(each for each in corrections if each is not None))
-    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up, corrections=known)
+    return Traits(plant=scene.name, unit=scene.unit, leaves=tuple(leaves), whole=whole, up=scene.up)
 
 
 def describe_leaf(

@@ -15,7 +15,6 @@ from types import MappingProxyType
 import numpy as np
 
 from mvseg.errors import InputError
-from mvseg.traits.config import ColorCorrection
 from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
@@ -68,13 +67,7 @@ def wide_columns() -> list[str]:
 
 
 def read_traits(
-    long: Path,
-    wide: Path,
-    *,
-    plant: str,
-    unit: str,
-    up: tuple[float, float, float] | None,
-    corrections: Sequence[ColorCorrection] = (),
+    long: Path, wide: Path, *, plant: str, unit: str, up: tuple[float, float, float] | None
 ) -> Traits:
     """The traits that `write_long` and `write_wide` wrote, with six digits; what the tables do not say is given.
 
@@ -94,9 +87,7 @@ def read_traits(
         if isinstance(error, InputError):
             raise
         raise InputError(f"{long}: is no table of traits that mvseg wrote ({error})") from None
-    return Traits(
-        plant=plant, unit=unit, leaves=tuple(leaves), whole=numbers[0], up=up, corrections=tuple(corrections)
-    )
+    return Traits(plant=plant, unit=unit, leaves=tuple(leaves), whole=numbers[0], up=up)
 
 
 def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurement]) -> LeafTraits:

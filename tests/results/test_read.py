@@ -36,7 +36,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.regions import mask_box
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
-from mvseg.traits.config import ColorCorrection, TraitsConfig
+from mvseg.traits.config import TraitsConfig
 from mvseg.traits.measure import measure_plant
 from scene_folders import HEIGHT, WIDTH, K, edit_rig, write_image, write_scene
 
@@ -65,7 +65,7 @@ def balls(plant: Path) -> Result:
 @pytest.fixture(scope="module")
 def rich(balls: Result) -> Result:
     """Something of everything that a result may hold: a surface, one with doubts, voxels, and a leaf without a shape;
-    masks of every origin, one of two leaves, one unmatched; corrections, colours, and refined poses."""
+    masks of every origin, one of two leaves, one unmatched; corrections, and refined poses."""
     part = torch.zeros_like(balls.regions.crop(3))
     part[: len(part) // 2] = True
     masks = balls.masks.with_merged([MergedMask(region=3, own=int(balls.masks.instance_ids[3]), other=3, part=part)])
@@ -81,13 +81,9 @@ def rich(balls: Result) -> Result:
     assert balls.voxels is not None
     surfaces = {1: bent_blade(), 2: doubtful, 3: LeafSurface.none(torch.tensor([0]), "seen in one view only")}
     scene = replace(balls.scene, up=(0.0, 0.6, 0.8))
-    colors = ColorCorrection(views="00[01]", matrix=(1.0, 0, 0, 0, 1, 0, 0, 0, 1), delta_e=2.5, photo="card.jpg")
-    colors_of = [colors, colors, None, None]
     config = TraitsConfig(min_sure_views=0, min_visible_share=0, min_quality=0.9, leaves_only=False)
     voxels = {1: balls.voxels[1]}
-    traits = measure_plant(
-        scene, matching, surfaces=surfaces, voxels=voxels, config=config, corrections=colors_of
-    )  # fmt: skip
+    traits = measure_plant(scene, matching, surfaces=surfaces, voxels=voxels, config=config)
     assert traits.rejected == {"low_quality": 1}
     return Result(
         scene=scene,

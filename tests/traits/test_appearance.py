@@ -16,8 +16,6 @@ from mvseg.masks import Masks
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from mvseg.traits.appearance import COLORS, hues, mean_colors, measure_appearance, sure_pixels
-from mvseg.traits.color_correction import from_linear, to_linear
-from mvseg.traits.config import ColorCorrection
 
 CAMERAS = ring_cameras(3)
 LEAF = flat_leaf(length=2, half_width=0.45, at=(-1, 0, 0))
@@ -67,21 +65,6 @@ def test_grey_photos_have_no_colour(num_grey: int, tmp_path: Path) -> None:
         assert {found[name].method for name in COLORS} == {"not measured: the photos are grey"}
 
 
-def test_colours_say_whether_they_were_corrected(tmp_path: Path) -> None:
-    """Of three views one has no card: it has no part in the colours."""
-    masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
-    scene = scene_of(tmp_path, [painted(mask, color) for mask, color in zip(masks, (GREEN, GREEN, RED), strict=True)])
-    halves = ColorCorrection("*", (0.5, 0, 0, 0, 0.5, 0, 0, 0, 0.5), 1.74, "card.png")  # of the light
-    found = measure_appearance({1: LEAF}, labels_of(masks), CAMERAS, photos=Photos(scene))[1]
-    assert {found[name].method for name in COLORS} == {"photographs, uncorrected"}
-    cards = [halves, halves, None]
-    found = measure_appearance({1: LEAF}, labels_of(masks), CAMERAS, photos=Photos(scene), corrections=cards)[1]
-    assert {found[name].method for name in COLORS} == {"photographs, corrected (Delta E 1.7)"}
-    expected = from_linear(to_linear(np.array(GREEN) / 255) / 2)
-    assert [found[name].value for name in COLORS[:3]] == pytest.approx(expected)
-    assert found["mean_green"].sd == pytest.approx(0, abs=1e-9)
-
-
 def test_masks_that_reach_beyond_the_leaf_add_no_colour(tmp_path: Path) -> None:
     masks = [mask.numpy() for mask in LEAF.project(CAMERAS)]
     wide = [cv2.dilate(mask.astype(np.uint8), np.ones((21, 21), np.uint8)) for mask in masks]
@@ -121,14 +104,14 @@ def test_pixels_at_the_edge_of_the_picture_are_sure() -> None:
 
 def test_views_weigh_as_much_as_their_pixels() -> None:
     views = [(300, np.array([0.2, 0.4, 0.2, 0.0])), (100, np.array([0.6, 0.8, 0.4, 0.4]))]
-    found = mean_colors(views, "photographs")
+    found = mean_colors(views)
     assert found["mean_red"].value == pytest.approx(0.3)
     assert found["mean_red"].sd == pytest.approx(0.2)  # (0.6 - 0.2) / sqrt(2) between views, / sqrt(2) of their mean
     (first, second) = ((0.8 - 0.4) / (0.8 + 0.4), (1.6 - 1.0) / (1.6 + 1.0))
     assert found["greenness_index"].value == pytest.approx(0.75 * first + 0.25 * second)
     assert found["senescent_share"].value == pytest.approx(0.1)
-    assert not np.isfinite(mean_colors(views[:1], "photographs")["mean_red"].sd)
-    assert not mean_colors([], "photographs")["mean_red"].exists
+    assert not np.isfinite(mean_colors(views[:1])["mean_red"].sd)
+    assert not mean_colors([])["mean_red"].exists
 
 
 def test_hues_are_those_of_a_library() -> None:
