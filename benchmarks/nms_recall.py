@@ -21,7 +21,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.found_leaves import credit_masks, is_found
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.nms import cluster_aware_nms
-from mvseg.detection.proposals import Proposals
+from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -41,12 +41,13 @@ def is_crowded(truth: Regions) -> torch.Tensor:
     return (overlap > 0.5).any(1)
 
 
-def plain_nms(proposals: Proposals, iou: float) -> torch.Tensor:
+def plain_nms(proposals: Masks, iou: float) -> torch.Tensor:
     """Indices of the proposals that are kept."""
-    return cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, iou)
+    boxes, scores = proposals.regions.boxes.float(), proposals.detection_scores
+    return cluster_aware_nms(boxes, scores, proposals.view_index, iou)
 
 
-def run_all_nms(proposals: Proposals, cameras: Cameras, match: MatchConfig) -> dict[str, torch.Tensor]:
+def run_all_nms(proposals: Masks, cameras: Cameras, match: MatchConfig) -> dict[str, torch.Tensor]:
     """{row of the table: indices of the proposals that are kept}."""
     kept = {f"plain NMS {iou}": plain_nms(proposals, iou) for iou in (0.3, 0.5, 0.7)}
     for iterations in (1, 2, 3):
@@ -74,15 +75,11 @@ def main() -> None:
         num_leaves, num_crowded = num_leaves + len(truth), num_crowded + int(crowded.sum())
         proposals, _ = simulate_proposals(maps, seed=seed)
         first = plain_nms(proposals, 0.7)
-        proposals = Proposals(
-            regions=replace(proposals.regions.select(first), labels=torch.arange(len(first))),
-            boxes=proposals.boxes[first],
-            scores=proposals.scores[first],
-            classes=proposals.classes[first],
-        )
+        proposals = proposals.select(first)
+        proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(first))))
         for name, keep in run_all_nms(proposals, cameras, MatchConfig(method=args.method)).items():
             kept = proposals.regions.select(keep)
-            found = is_found(truth, kept, credit_masks(kept, proposals.scores[keep], maps))
+            found = is_found(truth, kept, credit_masks(kept, proposals.detection_scores[keep], maps))
             counts = torch.stack((found.sum(), found[crowded].sum(), torch.tensor(len(keep))))
             totals[name] = totals.get(name, 0) + counts
     report: dict[str, object] = {"crowded": num_crowded, "leaves": num_leaves}

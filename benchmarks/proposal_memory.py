@@ -62,11 +62,11 @@ def main() -> None:
     ]
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     start, start_cpu = time.perf_counter(), time.process_time()
-    proposals = gather_proposals(outputs, cameras.sizes.tolist())
+    proposals, boxes = gather_proposals(outputs, cameras.sizes.tolist())
     gathered, gathered_cpu = time.perf_counter(), time.process_time()
-    matching = match_proposals(proposals, cameras)
+    matching = match_proposals(proposals, cameras, boxes=boxes)
     report = {
-        "proposals": len(proposals.boxes),
+        "proposals": len(proposals),
         "mean_crop_px": int(proposals.regions.crop_sizes.prod(1).float().mean()),
         "kept": len(matching),
         "instances": matching.num_instances,

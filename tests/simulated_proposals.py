@@ -9,13 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.detection.proposals import Proposals
+from mvseg.masks import Masks, Origin
 from mvseg.regions import mask_box, regions_from_label_maps, stack_regions
 
 
 def simulate_proposals(
     label_maps: Sequence[np.ndarray], *, seed: int, copies: int = 5, jitter: float = 0.08
-) -> tuple[Proposals, Tensor]:
+) -> tuple[Masks, Tensor]:
     """Several proposals of every visible instance.
 
     Each copy is the true mask, scaled and shifted so that the edges of its box move by a normal error of `jitter` of
@@ -55,9 +55,7 @@ def simulate_proposals(
             scores.append(0.2 + 0.4 * prominence + 0.3 * quality + 0.1 * rng.random())
             labels.append(int(truth.labels[index]))
     regions = stack_regions(view_index, boxes, crops, labels=labels, num_views=len(label_maps))
-    classes = torch.ones(len(regions), dtype=torch.int64)
-    proposals = Proposals(regions=regions, boxes=regions.boxes.float(), scores=torch.tensor(scores), classes=classes)
-    return proposals, regions.labels
+    return Masks.of(regions, detection_scores=torch.tensor(scores), origin=Origin.DETECTED), regions.labels
 
 
 def _move_mask(mask: np.ndarray, box: np.ndarray, *, error: np.ndarray, grow_px: int) -> np.ndarray:

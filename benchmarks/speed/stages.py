@@ -105,8 +105,8 @@ def time_all(watch: Stopwatch, regions: Regions, matching: Matching, cameras: Ca
     threads = torch.get_num_threads()
     watch.time("shapes", lambda: fit_shapes(regions, matching.instance_ids, cameras, num_workers=threads))
     outputs = propose(maps, PROPOSALS, seed=0)
-    found = watch.time("gather", lambda: gather_proposals(outputs, cameras.sizes.tolist()))
-    watch.time("loop", lambda: match_proposals(found, cameras))
+    found, boxes = watch.time("gather", lambda: gather_proposals(outputs, cameras.sizes.tolist()))
+    watch.time("loop", lambda: match_proposals(found, cameras, boxes=boxes))
     detector, photo = load_detector(DETECTOR, image_size=PHOTO_SIDE), load_photos(load_scene(demo_scene()))[0]
     with torch.no_grad():
         run_heads(detector, photo)  # warms up

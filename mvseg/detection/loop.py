@@ -10,7 +10,6 @@ from torch import Tensor
 
 from mvseg.detection.assignment import EpipolarAssignment
 from mvseg.detection.nms import cluster_aware_nms, confirmed
-from mvseg.detection.proposals import Proposals
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_masks
@@ -19,9 +18,10 @@ from mvseg.scene import Cameras
 
 
 def match_proposals(
-    proposals: Proposals,
+    proposals: Masks,
     cameras: Cameras,
     *,
+    boxes: Tensor | None = None,
     num_iterations: int = 1,
     cluster_iou: float = 0.3,
     detections_per_view: int = 100,
@@ -30,8 +30,9 @@ def match_proposals(
     """Match first, alternate assignment and NMS, then discard unconfirmed boxes (steps 2 to 4 of `MultiViewMaskRCNN`).
 
     Args:
-        proposals: the excessive set of all V views.
+        proposals: R scored masks of V views, the excessive set; objects of different classes are never matched.
         cameras: V cameras on the same device.
+        boxes: (R, 4) float32 xyxy, what NMS compares; None: those of the masks.
         num_iterations: rounds of assignment and NMS.
         cluster_iou: NMS threshold; at first per view and class, then inside a cluster.
         detections_per_view: at most this many are kept in a view, best scores first.
@@ -41,15 +42,16 @@ def match_proposals(
         The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns of
         what `match_regions` says of it; what that said of earlier rounds is forgotten.
     """
-    masks = proposals.as_masks()
-    if not len(masks):
-        return Matching(masks, MatchReport(match.resolved_method))
+    if not len(proposals):
+        return Matching(proposals, MatchReport(match.resolved_method))
     assignment = EpipolarAssignment()
-    per_class = torch.stack((masks.view_index, masks.classes), 1)
+    boxes = proposals.regions.boxes.float() if boxes is None else boxes
+    suppress = partial(_suppress, proposals, boxes, cluster_iou, detections_per_view=detections_per_view)
+    per_class = torch.stack((proposals.view_index, proposals.classes), 1)
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        keep = _suppress(proposals, per_class, cluster_iou, detections_per_view=detections_per_view)
-        matching = match_masks(masks.select(keep), cameras, match)
+        keep = suppress(per_class)
+        matching = match_masks(proposals.select(keep), cameras, match)
         rematch = partial(
             match_masks,
             cameras=cameras,
@@ -59,16 +61,14 @@ def match_proposals(
         )
         for _ in range(num_iterations):
             matched = matching.masks
-            ids, _ = assignment(
-                proposals.regions, matched.regions, matched.instance_ids, cameras=cameras
-            )
+            ids, _ = assignment(proposals.regions, matched.regions, matched.instance_ids, cameras=cameras)
             groups = torch.cat((per_class, ids[:, None]), 1)
-            keep = _suppress(proposals, groups, cluster_iou, detections_per_view=detections_per_view)
+            keep = suppress(groups)
             caught.clear()
-            matching = rematch(masks.select(keep))
+            matching = rematch(proposals.select(keep))
         if num_iterations and matching.report.has_probabilities:
             stays = confirmed(
-                proposals.boxes[keep],
+                boxes[keep],
                 per_class[keep],
                 matching.instance_ids,
                 match_scores=matching.match_scores,
@@ -76,7 +76,7 @@ def match_proposals(
             )
             if not stays.all():
                 caught.clear()
-                matching = rematch(masks.select(keep[stays]))
+                matching = rematch(proposals.select(keep[stays]))
     for each in caught:
         warnings.warn(each.message, stacklevel=2)
     return matching
@@ -88,9 +88,11 @@ def _count_instances(masks: Masks) -> dict[int, int]:
     return {label: len(ids[ids > 0].unique()) for label, ids in of_class.items()}
 
 
-def _suppress(proposals: Proposals, groups: Tensor, iou_threshold: float, *, detections_per_view: int) -> Tensor:
+def _suppress(
+    proposals: Masks, boxes: Tensor, iou_threshold: float, groups: Tensor, *, detections_per_view: int
+) -> Tensor:
     """NMS by group, then the limit of detections per view, as torchvision has it."""
-    keep = cluster_aware_nms(proposals.boxes, proposals.scores, groups, iou_threshold)
-    view = proposals.regions.view_index[keep]
+    keep = cluster_aware_nms(boxes, proposals.detection_scores, groups, iou_threshold)
+    view = proposals.view_index[keep]
     earlier = (view[:, None] == view).tril(-1).sum(1)
     return keep[earlier < detections_per_view]

@@ -15,7 +15,7 @@ from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
 from mvseg.detection.config import MORE_SCORE, SURE_SCORE
 from mvseg.detection.loop import match_proposals
-from mvseg.detection.proposals import Proposals, gather_proposals
+from mvseg.detection.proposals import gather_proposals
 from mvseg.detectors.run import run_heads
 from mvseg.errors import InputError
 from mvseg.masks import Masks
@@ -120,10 +120,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
             detections = [self._propose(image) for image in images]
-        # Pixel counts need single precision.
-        with torch.no_grad(), torch.autocast(images[0].device.type, enabled=False):
-            proposals = gather_proposals(detections, sizes)
-            matching = self._match(proposals, cameras.to(images[0].device))
+            matching = self._match(detections, cameras.to(images[0].device))
             return self._collect(detections, sizes, masks=matching.masks)
 
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> Matching:
@@ -178,22 +175,23 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     ) -> Matching:
         """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals
         that score `min_score` or more. `labels` of its regions are rows of `list_proposals`."""
-        with torch.autocast("cpu", enabled=False):
-            proposals = gather_proposals(detections, cameras.sizes.tolist())
-            matching = self._match(proposals, cameras.to("cpu"), min_score=min_score)
+        matching = self._match(detections, cameras.to("cpu"), min_score=min_score)
         return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
 
-    def _match(self, proposals: Proposals, cameras: Cameras, *, min_score: float = 0.0) -> Matching:
+    def _match(self, detections: list[dict[str, Tensor]], cameras: Cameras, *, min_score: float = 0.0) -> Matching:
         """The proposals that are kept, of those whose mask is not empty, matched; `labels` say which they are."""
-        is_asked = (proposals.regions.areas > 0) & (proposals.scores >= min_score)
-        return match_proposals(
-            proposals.select(is_asked.nonzero()[:, 0]),
-            cameras,
-            num_iterations=self.num_iterations,
-            cluster_iou=self.cluster_iou,
-            detections_per_view=self.roi_heads.detections_per_img,
-            match=self.match,
-        )
+        with torch.autocast(cameras.K.device.type, enabled=False):  # pixel counts need single precision
+            proposals, boxes = gather_proposals(detections, cameras.sizes.tolist())
+            is_asked = (proposals.regions.areas > 0) & (proposals.detection_scores >= min_score)
+            return match_proposals(
+                proposals.select(is_asked),
+                cameras,
+                boxes=boxes[is_asked],
+                num_iterations=self.num_iterations,
+                cluster_iou=self.cluster_iou,
+                detections_per_view=self.roi_heads.detections_per_img,
+                match=self.match,
+            )
 
     def _propose(self, image: Tensor) -> dict[str, Tensor]:
         """One view's excessive set, as from `run_heads`, without masks that score too low once they are cut."""
@@ -220,7 +218,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
 def list_proposals(detections: list[dict[str, Tensor]], cameras: Cameras) -> Masks:
     """The excessive set of V images, as `MultiViewMaskRCNN.detect` gives it, as masks on the CPU that are matched to
     nothing; those that are empty are in it, too."""
-    return gather_proposals(detections, cameras.sizes.tolist()).as_masks()
+    return gather_proposals(detections, cameras.sizes.tolist())[0]
 
 
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:

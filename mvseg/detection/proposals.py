@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 from torchvision.models.detection.roi_heads import expand_boxes, expand_masks, paste_mask_in_image
@@ -11,42 +9,10 @@ from torchvision.models.detection.transform import resize_boxes
 
 from mvseg.detectors.mask_cut import CUT
 from mvseg.masks import Masks, Origin
-from mvseg.regions import Regions, stack_regions
+from mvseg.regions import stack_regions
 
 
-@dataclass(frozen=True, eq=False)
-class Proposals:
-    """R scored masks of V views before matching, many of them of the same object.
-
-    Attributes:
-        regions: the R masks as box crops, in the frame of the images; `labels` counts them.
-        boxes: (R, 4) float32 xyxy in the frame of the images; what NMS compares.
-        scores: (R,) float32.
-        classes: (R,) int64; objects of different classes are never matched.
-    """
-
-    regions: Regions
-    boxes: Tensor
-    scores: Tensor
-    classes: Tensor
-
-    def select(self, index: Tensor) -> Proposals:
-        """The proposals at an int64 index, in that order."""
-        return Proposals(
-            regions=self.regions.select(index),
-            boxes=self.boxes[index],
-            scores=self.scores[index],
-            classes=self.classes[index],
-        )
-
-    def as_masks(self) -> Masks:
-        """The table of these masks, matched to nothing."""
-        return Masks.of(
-            self.regions, detection_scores=self.scores, classes=self.classes, origin=Origin.DETECTED
-        )
-
-
-def gather_proposals(detections: list[dict[str, Tensor]], sizes: list[list[int]]) -> Proposals:
+def gather_proposals(detections: list[dict[str, Tensor]], sizes: list[list[int]]) -> tuple[Masks, Tensor]:
     """Proposals of all views, moved to the frame of the images; masks become box crops, never full frames.
 
     Args:
@@ -55,7 +21,8 @@ def gather_proposals(detections: list[dict[str, Tensor]], sizes: list[list[int]]
         sizes: per view the width and height of the image.
 
     Returns:
-        The proposals, view after view. The crops are what torchvision pastes, exactly, where it exceeds 0.5.
+        The R proposals, view after view, matched to nothing; `labels` count them. Crops are what torchvision pastes,
+        exactly, where it exceeds 0.5. And (R, 4) float32 xyxy, the detector's boxes in the frames of the images.
     """
     boxes, view_index, windows, crops = [], [], [], []
     for view, (shown, (width, height)) in enumerate(zip(detections, sizes, strict=True)):
@@ -74,4 +41,4 @@ def gather_proposals(detections: list[dict[str, Tensor]], sizes: list[list[int]]
     parts = [crop.cpu() for crop in crops]
     regions = stack_regions(view_index, windows, parts, labels=range(len(crops)), num_views=len(sizes)).to(device)
     scores, classes = (torch.cat([shown[key] for shown in detections]) for key in ("scores", "labels"))
-    return Proposals(regions=regions, boxes=torch.cat(boxes), scores=scores, classes=classes)
+    return Masks.of(regions, detection_scores=scores, classes=classes, origin=Origin.DETECTED), torch.cat(boxes)

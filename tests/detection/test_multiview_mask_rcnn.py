@@ -16,7 +16,7 @@ from matched import matched
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
 from mvseg.detection.nms import cluster_aware_nms
-from mvseg.detection.proposals import Proposals, gather_proposals
+from mvseg.detection.proposals import gather_proposals
 from mvseg.detectors.mask_cut import decide_masks
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.photos import load_photos
@@ -202,25 +202,29 @@ def test_crops_hold_exactly_what_torchvision_pastes() -> None:
     boxes = boxes.clamp(min=torch.zeros(4), max=torch.tensor([80.0, 60, 80, 60]))
     masks = torch.rand(12, 1, 28, 28, generator=generator)
     detections = {"boxes": boxes, "masks": masks, "scores": torch.rand(12), "labels": torch.ones(12, dtype=torch.int64)}
-    proposals = gather_proposals([detections | {"frame": torch.tensor([80, 60])}], [[160, 120]])
-    torch.testing.assert_close(proposals.boxes, boxes * 2)
-    pasted = paste_masks_in_image(masks, proposals.boxes, (120, 160))[:, 0] > 0.5
+    proposals, placed = gather_proposals([detections | {"frame": torch.tensor([80, 60])}], [[160, 120]])
+    torch.testing.assert_close(placed, boxes * 2)
+    pasted = paste_masks_in_image(masks, placed, (120, 160))[:, 0] > 0.5
     for number in range(12):
         assert torch.equal(proposals.regions.mask(number, 160, 120), pasted[number])
 
 
-def crowded_scene() -> tuple[BallScene, Proposals, torch.Tensor]:
+def crowded_scene() -> tuple[BallScene, Masks, torch.Tensor]:
     scene = ball_scene(14, 8, seed=3, radius=0.5, spread=1.3)
     proposals, labels = simulate_proposals(scene.label_maps, seed=0)
-    excess = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.7)
-    chosen = (proposals.boxes[excess], proposals.scores[excess], proposals.classes[excess])
-    regions = replace(proposals.regions.select(excess), labels=torch.arange(len(excess)))
-    return scene, Proposals(regions, *chosen), labels[excess]
+    excess = plain_nms(proposals, 0.7)
+    chosen = proposals.select(excess)
+    return scene, replace(chosen, regions=replace(chosen.regions, labels=torch.arange(len(excess)))), labels[excess]
 
 
-def places(proposals: Proposals, matching: Matching) -> torch.Tensor:
+def plain_nms(proposals: Masks, iou: float) -> torch.Tensor:
+    boxes, scores = proposals.regions.boxes.float(), proposals.detection_scores
+    return cluster_aware_nms(boxes, scores, proposals.view_index, iou)
+
+
+def places(proposals: Masks, matching: Matching) -> torch.Tensor:
     """(S,) int64, which of the proposals were kept."""
-    assert torch.equal(proposals.scores[matching.masks.regions.labels], matching.masks.detection_scores)
+    assert torch.equal(proposals.detection_scores[matching.masks.regions.labels], matching.masks.detection_scores)
     return matching.masks.regions.labels
 
 
@@ -243,7 +247,7 @@ def test_cluster_aware_nms_finds_more_than_plain_nms_does() -> None:
         kept = set(zip(proposals.regions.view_index[keep].tolist(), labels[keep].tolist(), strict=True))
         return sum(pair in kept for pair in crowded) / len(crowded)
 
-    plain = cluster_aware_nms(proposals.boxes, proposals.scores, proposals.regions.view_index, 0.3)
+    plain = plain_nms(proposals, 0.3)
     matching = match_proposals(proposals, scene.cameras)
     keep = places(proposals, matching)
     assert recall(keep) > recall(plain)
@@ -257,8 +261,7 @@ def test_iterating_is_deterministic_and_zero_iterations_only_match() -> None:
     assert torch.equal(first.masks.regions.labels, second.masks.regions.labels)
     assert torch.equal(first.instance_ids, second.instance_ids)
     keep = places(proposals, match_proposals(proposals, scene.cameras, num_iterations=0))
-    groups = torch.stack((proposals.regions.view_index, proposals.classes), 1)
-    assert torch.equal(keep, cluster_aware_nms(proposals.boxes, proposals.scores, groups, 0.3))
+    assert torch.equal(keep, plain_nms(proposals, 0.3))
 
 
 def test_views_that_disagree_are_warned_of_once() -> None:
@@ -279,7 +282,7 @@ def test_classes_are_matched_apart_and_their_matchings_joined() -> None:
     first = (regions.labels == small) | (regions.labels == large)
     classes = torch.where(first | (regions.labels % 2 == 1), 1, 2)
     order = torch.randperm(len(regions), generator=torch.Generator().manual_seed(0))
-    proposals = Proposals(regions, regions.boxes.float(), torch.rand(len(regions)), classes).select(order)
+    proposals = Masks.of(regions, detection_scores=torch.rand(len(regions)), classes=classes).select(order)
     matching = match_proposals(proposals, scene.cameras, num_iterations=0, cluster_iou=0.99)
     labels = matching.masks.regions.labels
     assert matching.support is not None
