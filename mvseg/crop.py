@@ -36,6 +36,11 @@ class Crop:
         """Pixels of the mask."""
         return int(self.pixels.sum())
 
+    def holds(self, x: int, y: int) -> bool:
+        """Whether the pixel in column x, row y of the photo is one of the mask."""
+        x1, y1, x2, y2 = self.box
+        return x1 <= x < x2 and y1 <= y < y2 and bool(self.pixels[y - y1, x - x1])
+
     def cut(self, frame: Frame) -> Frame:
         """(h, w, ...) a view of what a frame (H, W, ...) holds in the box, which must lie inside."""
         x1, y1, x2, y2 = self.box

@@ -28,6 +28,8 @@ def test_crops_agree_with_full_frames(seed: int) -> None:
     assert torch.equal(one.paste(SIZE), first)
     assert one.area == int(first.sum())
     assert torch.equal(one.cut(first), one.pixels)
+    assert all(one.holds(x, y) == bool(first[y, x]) for x in range(SIZE[0]) for y in range(SIZE[1]))
+    assert not one.holds(-1, 3)
     assert torch.equal(one.union(other).paste(SIZE), first | second)
     assert torch.equal(one.intersect(other).paste(SIZE), first & second)
     assert one.iou(other) == int((first & second).sum()) / int((first | second).sum())

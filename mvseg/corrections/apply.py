@@ -16,8 +16,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.corrections.edited_mask import EditedMask, as_table, cut_out, hang_together, side_of
+from mvseg.corrections.edited_mask import EditedMask, as_table, hang_together, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
+from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.find_views import find_views
@@ -125,9 +126,9 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     """
     masks = masks.to("cpu")
     regions, origins = masks.regions, masks.origin.tolist()
-    views, boxes = regions.view_index.tolist(), regions.boxes.tolist()
+    views = regions.view_index.tolist()
     rows = range(len(masks))
-    work = _Work(scene, [EditedMask(views[n], tuple(boxes[n]), regions.crop(n), n, origins[n]) for n in rows])
+    work = _Work(scene, [EditedMask(views[n], regions.placed(n), n, origins[n]) for n in rows])
     for number, edit in enumerate(corrections.edits, start=1):
         try:
             work.fates[number] = Fate(number, edit.op, PASSED if isinstance(edit, TrackLink) else APPLIED)
@@ -236,18 +237,17 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
     frame = undistort(drawn, work.scene.views[view].lens, work.scene.cameras.K[view].cpu().numpy()) > 0
     if not frame.any():
         raise _Lost(f"its polygon covers no pixel of view {edit.view}")
-    box, crop = cut_out(torch.from_numpy(frame), (0, 0))
+    crop = Crop.of(frame)
     covered = []
     for mask in [each for each in work.masks if each.view == view and not work.is_rejected(each)]:
-        x1, y1, x2, y2 = mask.box
-        if int((mask.crop & torch.from_numpy(frame[y1:y2, x1:x2])).sum()) > COVERED * int(mask.crop.sum()):
+        if mask.crop.intersect(crop).area > COVERED * mask.crop.area:
             covered.append(mask)
-    row = max(covered, key=lambda mask: int(mask.crop.sum())).row if covered else -1
+    row = max(covered, key=lambda mask: mask.crop.area).row if covered else -1
     for mask in covered:
         _remove(work, number, mask)
     if len(covered) > MOST_COVERED:
         work.fates[number] = Fate(number, edit.op, APPLIED, f"it replaces {len(covered)} masks")
-    made = EditedMask(view, box, crop, row, int(Origin.CORRECTED), [number])
+    made = EditedMask(view, crop, row, int(Origin.CORRECTED), [number])
     work.masks.append(made)
     if edit.leaf is not None:
         work.words.setdefault(edit.leaf, []).append((number, made))
@@ -258,13 +258,11 @@ def _split(work: _Work, number: int, edit: Split) -> None:
     line = _to_pinhole(work.scene, mask.view, edit.line)
     if np.ptp(line, axis=0).max() < 1:
         raise _Lost("its line is a point")
-    is_left = side_of(line, mask) & mask.crop
-    if not is_left.any() or not (mask.crop & ~is_left).any():
+    pixels, is_left = mask.crop.pixels, side_of(line, mask.crop)
+    halves = [replace(mask.crop, pixels=pixels & side) for side in (is_left, ~is_left)]
+    if not all(half.area for half in halves):
         raise _Lost("its line does not cut the mask")
-    parts = []
-    for part in (is_left, mask.crop & ~is_left):
-        box, crop = cut_out(part, mask.box[:2])
-        parts.append(EditedMask(mask.view, box, crop, mask.row, int(Origin.CUT), [number]))
+    parts = [EditedMask(mask.view, half.tighten(), mask.row, int(Origin.CUT), [number]) for half in halves]
     _remove(work, number, mask)
     work.masks += parts
     work.links.append((number, False, parts[0], parts[1]))
@@ -352,7 +350,7 @@ def _mask_at(work: _Work, place: Place) -> EditedMask:
     if not here:
         name, x, y = place
         raise _Lost(f"there is no mask at ({x:g}, {y:g}) in view {name}")
-    return min(here, key=lambda mask: (work.is_rejected(mask), int(mask.crop.sum())))
+    return min(here, key=lambda mask: (work.is_rejected(mask), mask.crop.area))
 
 
 def _kept_mask_at(work: _Work, number: int, place: Place) -> EditedMask:
@@ -372,7 +370,7 @@ def _kept_mask_at(work: _Work, number: int, place: Place) -> EditedMask:
 def _masks_at(work: _Work, place: Place, masks: Sequence[EditedMask]) -> list[EditedMask]:
     """Those of these masks that a place lies in."""
     view, column, row = _pixel_at(work, place)
-    return [mask for mask in masks if mask.view == view and mask.holds(column, row)]
+    return [mask for mask in masks if mask.view == view and mask.crop.holds(column, row)]
 
 
 def _pixel_at(work: _Work, place: Place) -> tuple[int, int, int]:

@@ -139,8 +139,8 @@ def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
     """The rows of the masks of a view of which `taken` (H, W) covers one half at most."""
     free = []
     for row in (masks.view_index == view).nonzero()[:, 0].tolist():
-        x1, y1, x2, y2 = masks.regions.boxes[row].tolist()
-        if float(taken[y1:y2, x1:x2][masks.regions.crop(row).numpy()].mean()) <= SHARED:
+        crop = masks.regions.placed(row)
+        if float(crop.cut(taken)[crop.pixels.numpy()].mean()) <= SHARED:
             free.append(row)
     return free
 

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from mvseg.crop import Crop
 from mvseg.masks import Masks, Origin
-from mvseg.regions import mask_box, stack_regions
+from mvseg.regions import stack_regions
 
 FINE = 4  # bits of a pixel's fraction, along a cut
 TOUCHES_PX = 2  # between masks of one leaf in one photo
@@ -24,22 +25,16 @@ class EditedMask:
     """One mask while edits are applied: the row of the table it began as (-1: none) and the edits that made it."""
 
     view: int
-    box: tuple[int, int, int, int]
-    crop: Tensor
+    crop: Crop
     row: int
     origin: int
     edits: list[int] = field(default_factory=list)
 
-    def holds(self, column: int, row: int) -> bool:
-        """Whether a pixel of its view is in it."""
-        x1, y1, x2, y2 = self.box
-        return x1 <= column < x2 and y1 <= row < y2 and bool(self.crop[row - y1, column - x1])
 
-
-def side_of(line: NDArray[np.float64], mask: EditedMask) -> Tensor:
+def side_of(line: NDArray[np.float64], crop: Crop) -> Tensor:
     """(h, w) bool: the pixels of a mask's box on one side of a line, which goes on straight at its ends."""
-    height, width = mask.crop.shape
-    line = line - mask.box[:2]
+    height, width = crop.pixels.shape
+    line = line - crop.box[:2]
     far = 4.0 * (width + height + np.abs(line).max())
     steps = [line[0] - line[1], line[-1] - line[-2]]
     ends = [step / max(float(np.hypot(*step)), 1e-9) * far for step in steps]
@@ -54,26 +49,17 @@ def side_of(line: NDArray[np.float64], mask: EditedMask) -> Tensor:
 
 def hang_together(masks: Sequence[EditedMask]) -> bool:
     """Do masks of one view touch, or nearly, so that one can go from each to all others?"""
-    touching = np.array([[touch(mask, other) for other in masks] for mask in masks])
+    touching = np.array([[touch(mask.crop, other.crop) for other in masks] for mask in masks])
     return connected_components(touching, directed=False)[0] == 1
 
 
-def touch(one: EditedMask, other: EditedMask) -> bool:
+def touch(one: Crop, other: Crop) -> bool:
     """Do two masks of one view touch, or nearly?"""
-    x1, y1 = (min(one.box[axis], other.box[axis]) - TOUCHES_PX for axis in (0, 1))
-    x2, y2 = (max(one.box[axis], other.box[axis]) + TOUCHES_PX for axis in (2, 3))
-    frames = np.zeros((2, y2 - y1, x2 - x1), np.uint8)
-    for mask, frame in zip((one, other), frames, strict=True):
-        frame[mask.box[1] - y1 : mask.box[3] - y1, mask.box[0] - x1 : mask.box[2] - x1] = mask.crop.numpy()
-    near = cv2.dilate(frames[0], np.ones((2 * TOUCHES_PX + 1, 2 * TOUCHES_PX + 1), np.uint8))
-    return bool((near & frames[1]).any())
-
-
-def cut_out(part: Tensor, corner: Sequence[int]) -> tuple[tuple[int, int, int, int], Tensor]:
-    """The box and the crop of a mask in a frame whose top-left pixel is `corner`."""
-    x1, y1, x2, y2 = mask_box(part)
-    left, top = corner
-    return (left + x1, top + y1, left + x2, top + y2), part[y1:y2, x1:x2].clone()
+    x1, y1, x2, y2 = one.union(other).box
+    around = (x1 - TOUCHES_PX, y1 - TOUCHES_PX, x2 + TOUCHES_PX, y2 + TOUCHES_PX)
+    kernel = np.ones((2 * TOUCHES_PX + 1, 2 * TOUCHES_PX + 1), np.uint8)
+    near = cv2.dilate(one.within(around).pixels.numpy().astype(np.uint8), kernel)
+    return bool((near & other.within(around).pixels.numpy()).any())
 
 
 def as_table(masks: Masks, made: Sequence[EditedMask]) -> Masks:
@@ -91,8 +77,8 @@ def as_table(masks: Masks, made: Sequence[EditedMask]) -> Masks:
         labels = torch.where(is_new, 0, masks.regions.labels[chosen])
     regions = stack_regions(
         [mask.view for mask in made],
-        [mask.box for mask in made],
-        [mask.crop.flatten() for mask in made],
+        [mask.crop.box for mask in made],
+        [mask.crop.pixels.flatten() for mask in made],
         labels=labels.tolist(),
         num_views=masks.regions.num_views,
     )

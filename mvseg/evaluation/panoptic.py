@@ -156,11 +156,8 @@ def _covered_labels(
     """The segments that have masks in a view, and the labels of the pixels that these cover together."""
     members = (regions.view_index == view).nonzero()[:, 0].cpu().numpy()
     for segment in np.unique(segments[members]).tolist():
-        covered = np.zeros(labels.shape, bool)
-        for index in members[segments[members] == segment].tolist():
-            x1, y1, x2, y2 = regions.boxes[index].tolist()
-            covered[y1:y2, x1:x2] |= regions.crop(index).cpu().numpy()
-        yield segment, labels[covered]
+        covered = regions.union(members[segments[members] == segment].tolist())
+        yield segment, covered.cut(labels)[covered.pixels.cpu().numpy()]
 
 
 def count_shared_pairs(masks: Found, ids: np.ndarray, leaf: np.ndarray) -> tuple[int, int, int]:

@@ -39,7 +39,6 @@ def shown_instances(regions: Regions, truth: Sequence[np.ndarray], *, count_back
 
 def region_crops(regions: Regions, truth: Sequence[np.ndarray]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """The truth in each region's box, and the region's mask there."""
-    for index, (view, (x1, y1, x2, y2)) in enumerate(
-        zip(regions.view_index.tolist(), regions.boxes.tolist(), strict=True)
-    ):
-        yield truth[view][y1:y2, x1:x2], regions.crop(index).cpu().numpy()
+    for index, view in enumerate(regions.view_index.tolist()):
+        crop = regions.placed(index)
+        yield crop.cut(truth[view]), crop.pixels.cpu().numpy()

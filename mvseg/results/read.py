@@ -29,7 +29,7 @@ from mvseg.formats.lens import undistort
 from mvseg.masks import Masks, MergedMask, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.poses.refine_poses import RefinedPoses
-from mvseg.regions import Regions, mask_box, stack_regions
+from mvseg.regions import Regions, stack_regions
 from mvseg.results.folder import CORRECTED
 from mvseg.results.photo_masks import regions_in_photos
 from mvseg.results.result import Instances, Result
@@ -261,8 +261,8 @@ def _decode(mask: _Mask, scene: Scene, view: int) -> tuple[Box, np.ndarray]:
         return decode_crop(rle.counts, width, height)
     found = decode_rle(rle.counts, width, height).astype(np.uint8)
     pixels = torch.from_numpy(undistort(found, lens, scene.cameras.K[view].numpy())).bool()
-    x1, y1, x2, y2 = mask_box(pixels) if pixels.any() else (0, 0, 1, 1)
-    return (x1, y1, x2, y2), pixels[y1:y2, x1:x2].numpy()
+    crop = Crop.of(pixels) if pixels.any() else Crop((0, 0, 1, 1), pixels[:1, :1])
+    return crop.box, crop.pixels.numpy()
 
 
 def _report_of(run: RunRecord) -> MatchReport:

@@ -57,13 +57,12 @@ def measure_appearance(
         labels = masks.regions.label_map(view, masks.instance_ids, size).cpu().numpy().astype(np.uint16)
         is_sure = sure_pixels(labels)
         for instance, surface in surfaces.items():
-            (x1, y1, x2, y2), covered = surface.project_parts(on_cpu)[view]
-            window = np.s_[y1:y2, x1:x2]
-            own = covered & (labels[window] == instance)
-            pixels[instance] += (covered.sum(), own.sum())
-            sure = own & is_sure[window]
+            part = surface.project_parts(on_cpu)[view]
+            own = part.pixels.numpy() & (part.cut(labels) == instance)
+            pixels[instance] += (part.area, own.sum())
+            sure = own & part.cut(is_sure)
             if photo is not None and sure.any():
-                shown = photo[window][sure] / 255
+                shown = part.cut(photo)[sure] / 255
                 is_senescent = hues(shown) < YELLOW_DEG
                 colors[instance].append((int(sure.sum()), np.append(shown.mean(0), is_senescent.mean())))
     found = {}

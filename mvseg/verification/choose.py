@@ -161,15 +161,11 @@ def _without(proposals: Masks, gone: Masks | None) -> Bools:
     boxes, views = proposals.regions.boxes, proposals.view_index
     for row in range(0 if gone is None else len(gone)):
         assert gone is not None
-        x1, y1, x2, y2 = gone.regions.boxes[row].tolist()
-        crop, area = gone.regions.crop(row), int(gone.regions.areas[row])
+        crop = gone.regions.placed(row)
+        x1, y1, x2, y2 = crop.box
         near = (views == gone.view_index[row]) & (boxes[:, 0] < x2) & (boxes[:, 1] < y2)
         for other in (near & (boxes[:, 2] > x1) & (boxes[:, 3] > y1)).nonzero()[:, 0].tolist():
-            left, top, right, bottom = boxes[other].tolist()
-            a, b, c, d = max(x1, left), max(y1, top), min(x2, right), min(y2, bottom)
-            there = proposals.regions.crop(other)[b - top : d - top, a - left : c - left]
-            both = int((crop[b - y1 : d - y1, a - x1 : c - x1] & there).sum())
-            stays[other] &= 2 * both <= area + int(proposals.regions.areas[other]) - both
+            stays[other] &= crop.iou(proposals.regions.placed(other)) <= 0.5
     return stays
 
 

@@ -129,8 +129,7 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
     places = surface.project_parts(cameras)
     ids, parts = masks.instance_ids.clone(), {}
     for view in _views_without(masks, leaf):
-        box, covered = places[view]
-        whole = Crop(box, torch.from_numpy(covered))
+        whole = places[view]
         visible = replace(whole, pixels=whole.pixels & ~whole.cut(_others(masks, leaf, view, cameras)))
         leaf_colored = replace(visible, pixels=visible.pixels & whole.cut(torch.from_numpy(colored[view])))
         is_open = visible.area >= max(LEAST_PIXELS, LEAST_VISIBLE * whole.area)
@@ -209,11 +208,11 @@ def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Fram
 def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame]) -> dict[int, Frame]:
     """{view: (H, W) bool} where a surface is, and around it."""
     around = {}
-    for view, (box, covered) in enumerate(surface.project_parts(cameras)):
+    for view, part in enumerate(surface.project_parts(cameras)):
         if view in frames:
             height, width = frames[view].shape
-            frame = Crop(box, torch.from_numpy(covered)).paste((width, height)).numpy()
-            around[view] = _dilate(frame, max(BESIDE_PX, round(AROUND * float(covered.sum()) ** 0.5)))
+            frame = part.paste((width, height)).numpy()
+            around[view] = _dilate(frame, max(BESIDE_PX, round(AROUND * part.area**0.5)))
     return around
 
 

@@ -13,9 +13,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.sparse import csc_array
 
+from mvseg.crop import Crop
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -23,7 +25,6 @@ from mvseg.scene import Cameras
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-Placed = tuple[tuple[int, int, int, int], Bools]  # a box x1, y1, x2, y2 and the pixels in it
 
 MOST_PX = 800  # of a photo's longer side, that are compared; a limit of time: at 400 the evidence is as good
 SHARED = 0.5  # of the smaller of two masks, that the other covers: with more, they show one leaf (a definition)
@@ -80,12 +81,12 @@ class Evidence:
 def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> tuple[Drawn, ...]:
     """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out."""
     drawn, all_depths = [], _depths(surfaces, cameras)
-    nothing: Placed = (0, 0, 0, 0), np.zeros((0, 0), bool)
+    nothing = Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         step = -(-max(width, height) // MOST_PX)
         size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
         camera, rows = cameras[[view]], (regions.view_index == view).nonzero()[:, 0].numpy()
-        masks: list[Placed] = [(tuple(regions.boxes[row].tolist()), regions.crop(row).numpy()) for row in rows.tolist()]
+        masks = [regions.placed(row) for row in rows.tolist()]
         parts = [nothing if each is None else each.project_parts(camera)[0] for each in surfaces]
         pixels, covered = _columns(masks, size, step), _columns(parts, size, step)
         drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view]))
@@ -109,21 +110,22 @@ def paint_view(surfaces: Mapping[int, LeafSurface], cameras: Cameras, view: int)
     credible = {instance: each for instance, each in surfaces.items() if each.is_credible}
     names, parts = list(credible), list(credible.values())
     for index in np.argsort(_depths(parts, camera)[0], kind="stable")[::-1].tolist():  # the farthest first
-        (x1, y1, x2, y2), covered = parts[index].project_parts(camera)[0]
-        shown[y1:y2, x1:x2][covered] = names[index]
+        part = parts[index].project_parts(camera)[0]
+        part.cut(shown)[part.pixels.numpy()] = names[index]
     return shown
 
 
-def _columns(placed: Sequence[Placed], size: tuple[int, int], step: int) -> csc_array:
+def _columns(crops: Sequence[Crop], size: tuple[int, int], step: int) -> csc_array:
     """(P, N) of masks in their boxes: every `step`-th pixel of the frame, from the middle of the first step on."""
     indices, ends = [np.zeros(0, np.int64)], [0]
-    for (x1, y1, _, _), mask in placed:
+    for crop in crops:
+        x1, y1, _, _ = crop.box
         first_x, first_y = ((step // 2 - start) % step for start in (x1, y1))
-        y, x = np.nonzero(mask[first_y::step, first_x::step])
+        y, x = np.nonzero(crop.pixels.numpy()[first_y::step, first_x::step])
         indices.append((y + (y1 + first_y) // step) * size[1] + x + (x1 + first_x) // step)
         ends.append(ends[-1] + len(y))
     ones = np.ones(ends[-1], np.int32)
-    return csc_array((ones, np.concatenate(indices), np.array(ends)), shape=(size[0] * size[1], len(placed)))
+    return csc_array((ones, np.concatenate(indices), np.array(ends)), shape=(size[0] * size[1], len(crops)))
 
 
 def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:

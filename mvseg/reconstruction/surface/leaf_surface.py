@@ -9,7 +9,6 @@ from functools import cached_property
 import numpy as np
 import torch
 import trimesh
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.crop import Crop
@@ -23,8 +22,6 @@ from mvseg.reconstruction.surface.leaf_patch import (
 )
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
-
-Part = tuple[tuple[int, int, int, int], NDArray[np.bool_]]  # a box, and the mask in it
 
 MESH_SHAPE = (64, 17)
 LEAST_CREDIBLE_IOU = 0.7
@@ -71,7 +68,7 @@ class LeafSurface:
     iou: Tensor
     is_oriented: bool
     quality: Quality
-    _drawn: dict[bytes, list[Part]] = field(default_factory=dict, init=False, repr=False)
+    _drawn: dict[bytes, list[Crop]] = field(default_factory=dict, init=False, repr=False)
 
     @staticmethod
     def none(views: Tensor, reason: str) -> LeafSurface:
@@ -178,12 +175,12 @@ class LeafSurface:
         Parts behind a camera are left out.
         """
         return [
-            Crop(box, torch.from_numpy(part)).paste((width, height)).to(cameras.device)
-            for (width, height), (box, part) in zip(cameras.sizes.tolist(), self.project_parts(cameras), strict=True)
+            part.paste((width, height)).to(cameras.device)
+            for (width, height), part in zip(cameras.sizes.tolist(), self.project_parts(cameras), strict=True)
         ]
 
-    def project_parts(self, cameras: Cameras) -> list[Part]:
-        """V boxes x1, y1, x2, y2 that hold what `project` shows, and these parts (y2 - y1, x2 - x1) of its masks.
+    def project_parts(self, cameras: Cameras) -> list[Crop]:
+        """What `project` shows, as V crops on the CPU; empty ones where the surface is not in the view.
 
         Drawn once for the same cameras: many stages ask, and so does each edit of a person.
         """
@@ -193,9 +190,9 @@ class LeafSurface:
             self._drawn[key] = self._draw_parts(cameras)
         return self._drawn[key]
 
-    def _draw_parts(self, cameras: Cameras) -> list[Part]:
+    def _draw_parts(self, cameras: Cameras) -> list[Crop]:
         sizes = cameras.sizes.tolist()
-        nothing = (0, 0, 0, 0), np.zeros((0, 0), bool)
+        nothing = Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))
         if not self.exists:
             return [nothing] * len(sizes)
         points = self.points()
@@ -213,8 +210,8 @@ class LeafSurface:
             if width == 0 or height == 0:
                 parts.append(nothing)
                 continue
-            shown = draw_polygons(quads, (width, height), corner) >= 0.5
-            parts.append(((*low.tolist(), *high.tolist()), shown))
+            shown = torch.from_numpy(draw_polygons(quads, (width, height), corner) >= 0.5)
+            parts.append(Crop((*low.tolist(), *high.tolist()), shown))
         return parts
 
 
