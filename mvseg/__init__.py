@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mvseg.config import RunConfig as RunConfig
     from mvseg.corrections.file import Corrections as Corrections
     from mvseg.corrections.file import load_corrections as load_corrections
+    from mvseg.corrections.track_links import LeafLink as LeafLink
     from mvseg.demo import demo_scene as demo_scene
     from mvseg.detection.assignment import EpipolarAssignment as EpipolarAssignment
     from mvseg.detection.config import DetectConfig as DetectConfig
@@ -60,7 +61,6 @@ if TYPE_CHECKING:
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
     from mvseg.system.running import running as running
-    from mvseg.tracking.track import LeafLink as LeafLink
     from mvseg.tracking.track import Tracks as Tracks
     from mvseg.tracking.track import track_leaves as track_leaves
     from mvseg.traits.config import TraitsConfig as TraitsConfig
@@ -103,10 +103,11 @@ _HOME = {
     "checks.check_scene": ("Check", "check_scene"),
     "config": ("RunConfig",),
     "corrections.file": ("Corrections", "load_corrections"),
+    "corrections.track_links": ("LeafLink",),
     "results.read": ("load_result",),
     "results.same_result": ("assert_same_result",),
     "pipeline": ("run_scene",),
-    "tracking.track": ("LeafLink", "Tracks", "track_leaves"),
+    "tracking.track": ("Tracks", "track_leaves"),
     "system.running": ("running",),
 }
 __all__ = [name for names in _HOME.values() for name in names]

@@ -15,13 +15,13 @@ from mvseg._version import made_by
 from mvseg.batch.tables import read_table
 from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import TrackLink
+from mvseg.corrections.track_links import find_links, read_track_links
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
 from mvseg.system.atomic import folder_whole
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import progress_bar
 from mvseg.tracking.config import Pots
-from mvseg.tracking.corrections import find_links, read_track_links
 from mvseg.tracking.dates import name_apart, read_date
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
@@ -152,8 +152,11 @@ def _track_plant(
         missing = [where.name for where, time in zip(plant.folders, plant.times, strict=True) if not time]
         if missing:
             raise InputError(f"{missing[0]} has no time, expected a number (days) or an ISO date (column time)")
-        dates = name_apart([read_date(where, time) for where, time in zip(plant.folders, plant.times, strict=True)])
-        links, lost = find_links(edits, dates)
+        dates = name_apart([
+            read_date(where, time, pictures=report)
+            for where, time in zip(plant.folders, plant.times, strict=True)
+        ])  # fmt: skip
+        links, lost = find_links(edits, {date.scene: date.folder for date in dates if date.folder is not None})
         tracks = track_leaves(dates, links=links, pots=pots, plant=plant.plant)
     except InputError as error:
         return TrackedPlant(sentence=f"plant {plant.plant}: {error}")

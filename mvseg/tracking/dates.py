@@ -4,22 +4,24 @@ from __future__ import annotations
 
 import datetime
 import math
+import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
+from mvseg.tracking.pictures import picture_leaves
 from mvseg.traits.leaf import Measurement, cell_normals
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
@@ -85,6 +87,7 @@ class PlantOnDate:
         leaves: those that count as leaves, or may do so, by id.
         whole: {trait: number} of the plant.
         folder: of the result; None in memory.
+        pictures: {leaf: JPEG} for a page; empty where nobody asked for them.
     """
 
     scene: str
@@ -95,6 +98,7 @@ class PlantOnDate:
     leaves: tuple[SeenLeaf, ...]
     whole: Mapping[str, Number]
     folder: Path | None = None
+    pictures: Mapping[int, bytes] = field(default_factory=dict)
 
     @property
     def shaped(self) -> list[int]:
@@ -102,17 +106,23 @@ class PlantOnDate:
         return [index for index, leaf in enumerate(self.leaves) if leaf.midrib is not None]
 
 
-def read_date(folder: Path, time: str | float) -> PlantOnDate:
+def read_date(folder: Path, time: str | float, *, pictures: bool = False) -> PlantOnDate:
     """One date from a result folder of `mvseg infer` or `mvseg batch`; `time` as in `read_time`.
+
+    With `pictures` of its leaves, if asked for.
 
     Raises:
         InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
     """
     folder = find_result(folder)
-    result = load_result(folder)
+    with warnings.catch_warnings(action="ignore", category=InputWarning):  # of cameras, which nobody needs here
+        result = load_result(folder)
     if result.traits is None:
         raise InputError(f"{folder}: has ids but no surfaces, run mvseg infer or mvseg batch with these masks first")
-    return replace(date_of(result, time), scene=folder.name, folder=folder)
+    date = replace(date_of(result, time), scene=folder.name, folder=folder)
+    if not pictures:
+        return date
+    return replace(date, pictures=picture_leaves(result, [leaf.leaf for leaf in date.leaves]))
 
 
 def date_of(result: Result, time: str | float) -> PlantOnDate:

@@ -5,28 +5,24 @@ from __future__ import annotations
 import base64
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from importlib.resources import files
 from itertools import groupby
 from pathlib import Path
 from string import Template
 from typing import Any
 
-import cv2
 import numpy as np
-from PIL import Image, ImageDraw, ImageOps
+from PIL import Image, ImageDraw
 
-from mvseg.formats.image_file import encode_jpeg, write_png
+from mvseg.formats.image_file import write_png
 from mvseg.results.overlay import instance_color
-from mvseg.results.photo_masks import labels_in_photo
-from mvseg.results.read import load_result
 from mvseg.results.report.page import dump_inside_script
-from mvseg.tracking.dates import ROWS, PlantOnDate
+from mvseg.tracking.dates import ROWS
 from mvseg.tracking.growth import SIZES, Growth
 from mvseg.tracking.track import Tracks
 
 PAGE_FILE, CHART_FILE = "tracks.html", "growth.png"
-CROP, QUALITY = 72, 70  # pixels and JPEG quality of a leaf's picture
 CURVE_STEPS = 40
 CHART = (1500, 1000)  # pixels of growth.png
 ASSETS = files("mvseg.tracking") / "assets"
@@ -72,7 +68,6 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
     leaves: list[dict[str, Any]] = []
     for index, date in enumerate(tracks.dates):
         rows = {row.leaf: row for row in tracks.rows if row.date == index and row.leaf is not None}
-        crops = _crops(date, {leaf: row.track for leaf, row in rows.items()})
         pose, middle = tracks.poses[index], middles.get(tracks.roots[index], np.zeros(3))
         for leaf in date.leaves:
             row, shape = rows[leaf.leaf], np.zeros((0, 3))
@@ -82,7 +77,8 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
             placed = (shape @ pose[:3, :3].T + pose[:3, 3] - middle) / scale * 1000
             leaves.append(
                 {"date": index, "leaf": leaf.leaf, "track": row.track, "p": _round(row.probability, 3),
-                 "state": row.state, "flat": "length" in leaf.numbers, "crop": crops.get(leaf.leaf, ""),
+                 "state": row.state, "flat": "length" in leaf.numbers,
+                 "crop": base64.b64encode(date.pictures.get(leaf.leaf, b"")).decode("ascii"),
                  "shape": np.round(placed).astype(int).ravel().tolist()}
             )  # fmt: skip
     return {
@@ -168,37 +164,3 @@ def _extent(tracks: Tracks) -> tuple[float, dict[int, np.ndarray]]:
     boxes = {root: (cloud.min(0), cloud.max(0)) for root, cloud in placed.items() if len(cloud)}
     half = max((float((high - low).max()) / 2 for low, high in boxes.values()), default=0.0)
     return max(half, 1e-9), {root: (low + high) / 2 for root, (low, high) in boxes.items()}
-
-
-def _crops(date: PlantOnDate, track_of: Mapping[int, int]) -> dict[int, str]:
-    """{leaf: JPEG in base64} of where each leaf is largest: of the photo if it is still there, else of its mask."""
-    if date.folder is None:
-        return {}
-    result = load_result(date.folder)
-    labels = [labels_in_photo(result, view) for view in range(len(result.scene.views))]
-    count = max(track_of, default=0) + 1
-    sizes = np.array([np.bincount(np.minimum(view, count).ravel(), minlength=count + 1) for view in labels])
-    crops: dict[int, str] = {}
-    for view, about in enumerate(result.scene.views):
-        shown = [leaf for leaf in track_of if sizes[:, leaf].argmax() == view and sizes[view, leaf]]
-        photo = _photo(about.path, labels[view].shape) if shown else None
-        for leaf in shown:
-            crops[leaf] = _crop(photo, labels[view] == leaf, instance_color(track_of[leaf]))
-    return crops
-
-
-def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
-    """A photo, if it still is where the run found it and has its size."""
-    photo = cv2.imread(str(path)) if path.is_file() else None
-    return None if photo is None or photo.shape[:2] != shape else np.asarray(photo[..., ::-1])
-
-
-def _crop(photo: np.ndarray | None, mask: np.ndarray, color: tuple[int, int, int]) -> str:
-    """A square around the mask, the rest of it dark."""
-    x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
-    half, row, column = max(width, height) // 2 + 4, y + height // 2, x + width // 2
-    box = np.s_[max(row - half, 0) : row + half, max(column - half, 0) : column + half]
-    lit, is_leaf = np.array(color, np.uint8) if photo is None else photo[box], mask[box][..., None]
-    shown = np.where(is_leaf, lit, np.uint8(24) if photo is None else photo[box] // 2)
-    image = ImageOps.contain(Image.fromarray(np.ascontiguousarray(shown)), (CROP, CROP), Image.Resampling.BOX)
-    return base64.b64encode(encode_jpeg(np.asarray(image), quality=QUALITY)).decode("ascii")

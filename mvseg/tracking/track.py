@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.tracking.associate import Association, Sight, link_leaves, sum_over_poses
 from mvseg.tracking.compare import Comparison, compare_dates
@@ -23,14 +24,6 @@ if TYPE_CHECKING:
 
 TOLD = 0.9  # probability of an alignment, below which it is a guess that a person should know of
 State = Literal["born", "seen", "hidden", "gone"]
-
-
-@dataclass(frozen=True)
-class LeafLink:
-    """What a person says of leaves: `leaves` are (scene, leaf) pairs, all of one leaf, or of different ones."""
-
-    is_same: bool
-    leaves: tuple[tuple[str, int], ...]
 
 
 @dataclass(frozen=True)

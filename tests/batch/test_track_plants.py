@@ -7,6 +7,7 @@ import json
 import re
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from mvseg import demo_scene
 from mvseg.batch.track_plants import list_plants, track_plants
 from mvseg.cli import main
 from mvseg.errors import InputError
+from mvseg.formats.json_file import read_json
 from mvseg.formats.label_png import read_labels, write_label_png
 from mvseg.tracking.dates import read_date
 from tests.plants_over_days import grow_blades, grown, write_result
@@ -65,6 +67,20 @@ def test_results_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     (out / "notes.txt").write_text("mine")
     assert main(arguments) == 0  # once more: replaced, and the user's file stays
     assert (out / "notes.txt").read_text() == "mine"
+
+
+def test_each_result_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    batch, read_files = write_batch(tmp_path / "batch", [("a0", "a", "0"), ("a1", "a", "1")]), list[Path]()
+
+    def read_and_note(path: Path, content: Any) -> Any:
+        read_files.append(path)
+        return read_json(path, content)
+
+    monkeypatch.setattr("mvseg.results.read.read_json", read_and_note)
+    track_plants(list_plants(batch)[0], tmp_path / "out")
+    assert read_files == [batch / scene / "instances.json" for scene in ("a0", "a1")]
+    page = (tmp_path / "out" / "tracks.html").read_text(encoding="utf-8")
+    assert len(re.findall(r'"crop": ?"/9j/', page)) == 2 * len(BLADES)  # a JPEG of each leaf
 
 
 def test_all_plants_of_a_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

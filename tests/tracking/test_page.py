@@ -3,27 +3,25 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mvseg.tracking import page
-from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import describe_tracks, write_page
+from mvseg.tracking.pictures import cut_picture
 from mvseg.tracking.track import TrackRow, Tracks
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
 from tests.plants_over_days import grow_blades, grown, see
 
 
-def noisy_crops(date: PlantOnDate, track_of: Mapping[int, int]) -> dict[int, str]:
-    """Pictures that compress worst."""
-    rng = np.random.default_rng(int(date.time))
-    photo, mask = rng.integers(0, 256, (90, 90, 3), np.uint8), np.zeros((90, 90), bool)
+def noisy_picture() -> bytes:
+    """One that compresses worst."""
+    photo, mask = np.random.default_rng(0).integers(0, 256, (90, 90, 3), np.uint8), np.zeros((90, 90), bool)
     mask[5:85, 5:85] = True
-    return {leaf: page._crop(photo, mask, (0, 255, 0)) for leaf in track_of}
+    return cut_picture(photo, mask)
 
 
 def many_dates(num_dates: int, num_leaves: int) -> Tracks:
@@ -33,12 +31,12 @@ def many_dates(num_dates: int, num_leaves: int) -> Tracks:
         for day, (_, truth) in enumerate(seen)
         for leaf in sorted(truth)
     )
-    poses = np.tile(np.eye(4), (num_dates, 1, 1))
-    return Tracks("=<b>basil", tuple(date for date, _ in seen), rows, poses, (0,) * num_dates, ("a <warning>",))
+    poses, pictures = np.tile(np.eye(4), (num_dates, 1, 1)), dict.fromkeys(range(1, num_leaves + 1), noisy_picture())
+    dates = tuple(replace(date, pictures=pictures) for date, _ in seen)
+    return Tracks("=<b>basil", dates, rows, poses, (0,) * num_dates, ("a <warning>",))
 
 
-def test_forty_dates_stay_under_six_megabytes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "_crops", noisy_crops)
+def test_forty_dates_stay_under_six_megabytes(tmp_path: Path) -> None:
     tracks = many_dates(40, 17)
     write_page(tmp_path, tracks, measure_growth(tracks))
     size = (tmp_path / "tracks.html").stat().st_size
@@ -55,8 +53,7 @@ def test_plants_are_shown_in_one_frame_where_they_are_aligned() -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
-def test_the_page_in_a_browser(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(page, "_crops", noisy_crops)
+def test_the_page_in_a_browser(tmp_path: Path) -> None:
     tracks = many_dates(6, 4)
     write_page(tmp_path, tracks, measure_growth(tracks))
     with sync_api.sync_playwright() as playwright:

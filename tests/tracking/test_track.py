@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.tracking.align import Habit, list_poses
 from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
-from mvseg.tracking.track import LeafLink, track_leaves
+from mvseg.tracking.track import track_leaves
 from tests.plants_over_days import Blades, grow_blades, grown, see, true_tracks
 
 BLADES = grow_blades(10, 4)

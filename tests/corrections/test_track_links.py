@@ -8,10 +8,8 @@ from typing import Any
 
 import pytest
 
+from mvseg.corrections.track_links import LeafLink, find_links, read_track_links
 from mvseg.errors import InputError
-from mvseg.tracking.corrections import find_links, read_track_links
-from mvseg.tracking.dates import name_apart, read_date
-from mvseg.tracking.track import LeafLink
 from tests.plants_over_days import grow_blades, write_result
 
 
@@ -23,7 +21,7 @@ def write(path: Path, *edits: dict[str, Any]) -> Path:
 def test_points_become_leaves(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_result(tmp_path / name, grow_blades(3, 1))
-    dates = [read_date(tmp_path / name, time) for time, name in enumerate(("a", "b"))]
+    folders = {name: tmp_path / name for name in ("a", "b")}
     path = write(
         tmp_path / "corrections.json",
         {"op": "reject", "view": "000", "at": [1.0, 2.0]},  # of a single scene
@@ -31,7 +29,7 @@ def test_points_become_leaves(tmp_path: Path) -> None:
         {"op": "different_track", "at": [["a", "000", 5.5, 20], ["b", "000", 0.5, 0.5]]},  # no leaf is there
         {"op": "same_track", "at": [["x", "000", 5, 5], ["y", "000", 5, 5]]},  # another plant
     )
-    links, lost = find_links(read_track_links(path), dates)
+    links, lost = find_links(read_track_links(path), folders)
     assert links == [LeafLink(True, (("a", 1), ("b", 2)))]
     assert lost == ["different_track: there is no leaf at (0.5, 0.5) in view 000 of b"]
 
@@ -39,13 +37,13 @@ def test_points_become_leaves(tmp_path: Path) -> None:
 def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
     for place in ("mon/plant", "fri/plant"):
         write_result(tmp_path / place, grow_blades(3, 1))
-    dates = name_apart([read_date(tmp_path / place, time) for time, place in enumerate(("mon/plant", "fri/plant"))])
+    folders = {place: tmp_path / place for place in ("mon/plant", "fri/plant")}
     path = write(
         tmp_path / "corrections.json",
         {"op": "same_track", "at": [["mon/plant", "000", 5.5, 20], ["fri/plant", "000", 30.2, 20]]},
         {"op": "same_track", "at": [["plant", "000", 5.5, 20], ["fri/plant", "000", 30.2, 20]]},
     )
-    links, lost = find_links(read_track_links(path), dates)
+    links, lost = find_links(read_track_links(path), folders)
     assert links == [LeafLink(True, (("mon/plant", 1), ("fri/plant", 2)))]
     assert lost == ["same_track: plant fits mon/plant and fri/plant, expected one of them"]
 
@@ -54,9 +52,9 @@ def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
 def test_views_that_are_not_there(tmp_path: Path, view: str) -> None:
     for name in ("a", "b"):
         write_result(tmp_path / name, grow_blades(3, 1))
-    dates = [read_date(tmp_path / name, time) for time, name in enumerate(("a", "b"))]
+    folders = {name: tmp_path / name for name in ("a", "b")}
     path = write(tmp_path / "c.json", {"op": "same_track", "at": [["a", view, 900, 900], ["b", "000", 5.5, 20]]})
-    assert find_links(read_track_links(path), dates)[0] == []
+    assert find_links(read_track_links(path), folders)[0] == []
 
 
 @pytest.mark.parametrize("at", [None, [["a", "000", 1, 2]], [["a", 1], ["b", 2]]])

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.corrections.file import TrackLink, load_corrections
 from mvseg.formats.label_png import read_labels
-from mvseg.tracking.dates import PlantOnDate
-from mvseg.tracking.track import LeafLink
+
+
+@dataclass(frozen=True)
+class LeafLink:
+    """What a person says of leaves: `leaves` are (scene, leaf) pairs, all of one leaf, or of different ones."""
+
+    is_same: bool
+    leaves: tuple[tuple[str, int], ...]
 
 
 def read_track_links(path: Path) -> list[TrackLink]:
@@ -20,13 +27,12 @@ def read_track_links(path: Path) -> list[TrackLink]:
     return [edit for edit in load_corrections(path).edits if isinstance(edit, TrackLink)]
 
 
-def find_links(edits: Sequence[TrackLink], dates: Sequence[PlantOnDate]) -> tuple[list[LeafLink], list[str]]:
-    """The links between leaves of these dates, and a sentence for each edit that points at no leaf.
+def find_links(edits: Sequence[TrackLink], folders: Mapping[str, Path]) -> tuple[list[LeafLink], list[str]]:
+    """The links between leaves of a plant, and a sentence for each edit that points at no leaf.
 
-    Edits that name none of the scenes are another plant's: they are passed over. A scene may be named by the end of its
-    path, if no other one ends so.
+    `folders` are {scene: result folder} of its dates. Edits that name none of these scenes are another plant's: they
+    are passed over. A scene may be named by the end of its path, if no other one ends so.
     """
-    folders = {date.scene: date.folder for date in dates if date.folder is not None}
     links, lost = [], []
     for original in edits:
         edit, unclear = _with_full_names(original, list(folders))
