@@ -70,7 +70,7 @@ def run_scene(
     has_edits = corrections is not None and len(corrections.edits) > 0
     state = load(folder, masks, config, corrections=corrections, cache=cache)
     if corrections is not None and not force_corrections:
-        check_made_for(corrections, state.scene)
+        check_made_for(corrections, state.photos)
     seconds = {"load": time.perf_counter() - begun}
     with running(keep=True):
         for name, stage in list_stages(config, has_masks=masks is not None, has_edits=has_edits).items():

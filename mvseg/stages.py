@@ -106,13 +106,16 @@ def load(
 
     Warns (InputWarning) of given masks in views that are left out.
     """
-    whole = place_scene(load_scene(folder), scale=config.scale, unit=config.unit, up=config.up)
+    loaded = load_scene(folder)
+    photos = Photos(loaded)
+    whole = place_scene(loaded, photos, scale=config.scale, unit=config.unit, up=config.up)
     taken = _take_views(whole, config.views or ("all" if masks else ENOUGH_VIEWS), corrections)
     scene = whole.select(taken)
     left_out = tuple(view.name for index, view in enumerate(whole.views) if index not in taken)
     check_photos(scene)
     check_baselines(scene.cameras)
-    state = State(config=config, scene=scene, photos=Photos(scene), views_left_out=left_out, **how)
+    photos = photos.select(scene, taken.tolist())
+    state = State(config=config, scene=scene, photos=photos, views_left_out=left_out, **how)
     state = replace(state, corrections=corrections)
     if masks is None:
         require_photos(scene, folder)
@@ -300,7 +303,7 @@ def check_cameras(state: State) -> State:
     """Warns where masks or photos contradict the cameras, see `warn_of_contradictions`; photos are not asked where ids
     alone are wanted."""
     has_photos = state.config.reconstruct is not None and state.photos.exist
-    warn_of_contradictions(state.scene, state.regions, photos=has_photos)
+    warn_of_contradictions(state.scene, state.regions, photos=state.photos if has_photos else None)
     return state
 
 

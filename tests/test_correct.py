@@ -189,7 +189,7 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     opened = OpenResult(folder)
     view, at = middle(opened, 1)
     (folder / "corrections.json").write_bytes(text_of([{"op": "reject", "view": view, "at": at}]))
-    corrections = with_marks(opened.saved_corrections(), opened.found.scene, mark_photos(opened.found.scene))
+    corrections = with_marks(opened.saved_corrections(), opened.found.scene, mark_photos(opened.found.photos))
     shown, outcomes, _ = opened.recompute(corrections, lambda: False)
     run = run_scene(opened.run.scene, opened.run.masks, RunConfig(reconstruct=None), corrections=corrections)
     assert outcomes == [""]

@@ -18,6 +18,7 @@ from mvseg.checks.target_masks import cut_shapes
 from mvseg.cli import main
 from mvseg.demo import demo_scene
 from mvseg.formats.markers import find_markers, read_grey
+from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, leaf_outline, list_shapes, tag_corners, tag_distance
 from mvseg.pipeline import run_scene
@@ -209,7 +210,7 @@ def test_options_that_do_not_fit(words: list[str], message: str, capsys: pytest.
 def test_tags_are_where_the_page_says(photos: Path) -> None:
     """Corners in the order of `find_markers`, no half pixel off."""
     scene = load_scene(photos)
-    found = find_markers(read_grey(scene, 0), FAMILY)
+    found = find_markers(read_grey(Photos(scene), 0), FAMILY)
     assert found.keys() <= tag_corners().keys()
     misses = []
     for number, quad in found.items():

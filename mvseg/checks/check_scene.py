@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 from mvseg.checks.cameras import Coverage, camera_findings, find_coverage
 from mvseg.checks.epipolar_distances import distance_findings
@@ -14,7 +13,7 @@ from mvseg.checks.photo_matches import match_photos
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
 from mvseg.errors import warn
-from mvseg.formats.photos import read_photo
+from mvseg.formats.photos import Photos
 from mvseg.matching.match import check_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.regions import Regions
@@ -46,14 +45,17 @@ class Check:
         return any(finding.level == "error" for finding in self.findings)
 
 
-def check_scene(scene: Scene, regions: Regions | None = None, *, features: bool = True) -> Check:
+def check_scene(
+    scene: Scene, regions: Regions | None = None, *, photos: Photos | None = None, features: bool = True
+) -> Check:
     """Check the cameras, the photos and, where given, the masks of a scene, and the poses by the masks and the photos.
 
-    No ids are given. Photos are decoded, one at a time. Everything runs on the CPU, wherever the inputs are.
+    No ids are given. Everything runs on the CPU, wherever the inputs are.
 
     Args:
         scene: of V views; photos may be absent.
         regions: its masks.
+        photos: of the scene, where somebody has read them; None: they are read.
         features: compare features of neighbouring photos with the cameras.
 
     Raises:
@@ -63,8 +65,9 @@ def check_scene(scene: Scene, regions: Regions | None = None, *, features: bool 
     regions = None if regions is None else regions.to("cpu")
     names = tuple(view.name for view in scene.views)
     coverage = find_coverage(scene.cameras)
-    photos = read_photo_facts(scene)
-    findings = camera_findings(scene, coverage) + photo_findings(photos, scene, has_masks=regions is not None)
+    photos = photos or Photos(scene)
+    facts = read_photo_facts(photos)
+    findings = camera_findings(scene, coverage) + photo_findings(facts, scene, has_masks=regions is not None)
     agreement = None
     if regions is not None:
         check_views(regions, scene.cameras)
@@ -74,18 +77,18 @@ def check_scene(scene: Scene, regions: Regions | None = None, *, features: bool 
             findings += pose_findings(agreement, names) + group_findings(agreement, names)
     if features:
         is_said = any(each.where == "poses" and each.level == "error" for each in findings)
-        findings += _compare_photos(scene, only_focal=is_said)
+        findings += _compare_photos(photos, scene, only_focal=is_said)
     return Check(
         scene=scene,
         regions=regions,
         findings=tuple(findings),
         coverage=coverage,
-        photos=tuple(photos),
+        photos=tuple(facts),
         agreement=agreement,
     )
 
 
-def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = True) -> None:
+def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: Photos | None = None) -> None:
     """Warn (InputWarning) of views that agree in groups only, and of focal lengths that the photos contradict.
 
     Groups of views are found by masks, or else by photos. The matching warns of single views that disagree.
@@ -93,17 +96,18 @@ def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: bool = Tru
     Args:
         scene: of V >= 2 views.
         regions: its masks.
-        photos: compare features of the photos, if there are any, too; takes about 0.1 s per photo.
+        photos: compare their features, too, which takes about 0.1 s per photo; None: there are none, or they are not
+            asked.
     """
     scene = replace(scene, cameras=scene.cameras.to("cpu"))
     agreement = pairwise_agreement(regions, scene.cameras)
     findings = group_findings(agreement, tuple(view.name for view in scene.views))
-    if photos:
-        findings += _compare_photos(scene, only_focal=bool(findings))
+    if photos is not None:
+        findings += _compare_photos(photos, scene, only_focal=bool(findings))
     for finding in findings:
         warn(finding.what)
 
 
-def _compare_photos(scene: Scene, *, only_focal: bool) -> list[Finding]:
-    matches = match_photos(partial(read_photo, scene), scene.cameras)
+def _compare_photos(photos: Photos, scene: Scene, *, only_focal: bool) -> list[Finding]:
+    matches = match_photos(photos, scene.cameras)
     return distance_findings(matches, scene.cameras, tuple(view.name for view in scene.views), only_focal=only_focal)

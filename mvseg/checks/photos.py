@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from dataclasses import dataclass
 
-import numpy as np
-
 from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.errors import InputError
-from mvseg.formats.image_file import is_grey, is_turned, read_image_size, read_rgb
-from mvseg.formats.photos import describe_folder, photo_bits
+from mvseg.formats.image_file import is_turned, read_image_size, read_rgb
+from mvseg.formats.photo_content import PhotoContent, measure_content
+from mvseg.formats.photos import Photos, describe_folder, photo_bits
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
 
@@ -19,8 +17,9 @@ from mvseg.system.running import progress_bar
 # have a fifth), but no less than rounding makes.
 BLANK, BLANK_SHARE, ROUNDING = 4.0, 0.03, 1.0
 DARK = 30  # grey level that 99 % of the pixels stay below
-BRIGHT, BURNT = 250, 0.7  # grey level of all channels; share of the pixels from which a photo is overexposed
-STEP = 4  # every fourth row and column is used
+BURNT = 0.7  # a photo is overexposed if more than this share of its pixels is white
+
+NOTHING = PhotoContent(contrast=0.0, level=0.0, burnt=0.0, grey=False)
 
 
 @dataclass(frozen=True)
@@ -31,32 +30,26 @@ class PhotoFacts:
         size: width and height as stored; None for a photo that is missing or cannot be read.
         problem: why it cannot be read; "" otherwise, also for a missing one.
         turned: EXIF asks viewers to turn it.
-        contrast: standard deviation of its grey levels.
-        level: grey level that 99 % of the pixels stay below.
-        burnt: share of its pixels that are white.
-        grey: it has no colours.
+        content: what it shows.
         digest: hash of the file.
     """
 
     size: tuple[int, int] | None = None
     problem: str = ""
     turned: bool = False
-    contrast: float = 0.0
-    level: float = 0.0
-    burnt: float = 0.0
-    grey: bool = False
+    content: PhotoContent = NOTHING
     digest: str = ""
 
     @property
     def is_blank(self) -> bool:
         """Whether it has one colour all over. A dark photo of a plant has little contrast, too."""
-        return self.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * self.level))
+        return self.content.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * self.content.level))
 
 
-def read_photo_facts(scene: Scene) -> list[PhotoFacts]:
-    """One entry per view; each photo is decoded once."""
-    views = progress_bar(range(len(scene.views)), name="photos", unit="photo")
-    return [_read_facts(scene, view) for view in views]
+def read_photo_facts(photos: Photos) -> list[PhotoFacts]:
+    """One entry per view."""
+    views = progress_bar(range(len(photos.scene.views)), name="photos", unit="photo")
+    return [_read_facts(photos, view) for view in views]
 
 
 def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) -> list[Finding]:
@@ -101,9 +94,9 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     whole = [view for view, each in enumerate(facts) if each.size is not None]
     blank = [view for view in whole if facts[view].is_blank]
     shown = [view for view in whole if view not in blank]
-    dark = [view for view in shown if facts[view].level < DARK]
-    burnt = [view for view in shown if facts[view].burnt > BURNT]
-    grey = [view for view in shown if facts[view].grey]
+    dark = [view for view in shown if facts[view].content.level < DARK]
+    burnt = [view for view in shown if facts[view].content.burnt > BURNT]
+    grey = [view for view in shown if facts[view].content.grey]
     few = "detectors will find few leaves there"
     same: dict[str, list[int]] = defaultdict(list)
     for view in whole:
@@ -118,22 +111,16 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     ]
 
 
-def _read_facts(scene: Scene, view: int) -> PhotoFacts:
-    path = scene.views[view].path
+def _read_facts(photos: Photos, view: int) -> PhotoFacts:
+    scene, path = photos.scene, photos.scene.views[view].path
     if not path.is_file():
         return PhotoFacts()
     try:
         size = read_image_size(path)
-        pixels = read_rgb(path, bits=photo_bits(scene, view))[::STEP, ::STEP]
+        if size == tuple(scene.cameras.sizes[view].tolist()):
+            content = photos.content(view)
+        else:  # no stage can use it
+            content = measure_content(read_rgb(path, bits=photo_bits(scene, view)))
     except InputError as error:
-        return PhotoFacts(problem=str(error))
-    grey = pixels.mean(2)
-    return PhotoFacts(
-        size=size,
-        turned=is_turned(path),
-        contrast=float(grey.std()),
-        level=float(np.quantile(grey, 0.99)),
-        grey=is_grey(pixels),
-        burnt=float((pixels.min(2) >= BRIGHT).mean()),
-        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
-    )
+        return PhotoFacts(problem=str(error.__cause__ or error))  # the reason alone
+    return PhotoFacts(size=size, turned=is_turned(path), content=content, digest=photos.sha256(view))

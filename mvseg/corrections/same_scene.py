@@ -10,17 +10,19 @@ from pathlib import Path
 from mvseg.corrections.file import Corrections, Edit, Link, PhotoMark, TrackLink
 from mvseg.errors import InputError, warn
 from mvseg.formats.find_views import find_views
+from mvseg.formats.photos import Photos
 from mvseg.scene import Scene
-from mvseg.system.file_hash import hash_files
 
 
-def mark_photos(scene: Scene) -> dict[str, PhotoMark]:
+def mark_photos(photos: Photos) -> dict[str, PhotoMark]:
     """{name of a view: what tells its photo from others}, of all views."""
-    sizes = scene.cameras.sizes.tolist()
-    return {
-        view.name: PhotoMark(width=width, height=height, sha256=hash_files(view.path) if view.path.is_file() else None)
-        for view, (width, height) in zip(scene.views, sizes, strict=True)
-    }
+    return {view.name: _mark_photo(photos, index) for index, view in enumerate(photos.scene.views)}
+
+
+def _mark_photo(photos: Photos, view: int) -> PhotoMark:
+    width, height = photos.scene.cameras.sizes[view].tolist()
+    is_there = photos.scene.views[view].path.is_file()
+    return PhotoMark(width=width, height=height, sha256=photos.sha256(view) if is_there else None)
 
 
 def with_marks(corrections: Corrections, scene: Scene, marks: Mapping[str, PhotoMark]) -> Corrections:
@@ -52,7 +54,7 @@ def _names(edit: Edit) -> list[str]:
     return [name for name, *_ in edit.at] if isinstance(edit, Link) else [edit.view]
 
 
-def check_made_for(corrections: Corrections, scene: Scene) -> None:
+def check_made_for(corrections: Corrections, photos: Photos) -> None:
     """Check that the photos are those that the corrections were made for; views that the scene does not have are left
     to `apply`.
 
@@ -61,15 +63,14 @@ def check_made_for(corrections: Corrections, scene: Scene) -> None:
     Raises:
         InputError: a photo is another one, or of another size.
     """
-    source = corrections.source or "the corrections"
+    scene, source = photos.scene, corrections.source or "the corrections"
     if corrections.source is not None and views_of(corrections) and not corrections.photos:
         warn(f"{source}: does not say which photos it was made for, and is taken for this scene's")
     named = find_views(list(corrections.photos), scene, source=Path(str(source)))
-    marks = mark_photos(scene)
     for (name, stated), view in zip(corrections.photos.items(), named, strict=True):
         if view is None:
             continue
-        actual = marks[scene.views[view].name]
+        actual = _mark_photo(photos, view)
         is_other = None not in (stated.sha256, actual.sha256) and stated.sha256 != actual.sha256
         if is_other or (stated.width, stated.height) != (actual.width, actual.height):
             raise InputError(

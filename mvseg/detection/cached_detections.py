@@ -21,8 +21,7 @@ import safetensors.torch
 from torch import Tensor
 
 from mvseg.errors import InputError
-from mvseg.formats.photos import photo_bits
-from mvseg.scene import Scene
+from mvseg.formats.photos import Photos, photo_bits
 from mvseg.system.atomic import is_partial, lock_folder, write_whole
 
 CACHED_NAME = re.compile(r"[0-9a-f]{64}\.safetensors")
@@ -42,14 +41,13 @@ class CachedDetections:
     folder: Path
     made_by: str
 
-    def path(self, scene: Scene, view: int, box: Sequence[int] | None = None) -> Path:
+    def path(self, photos: Photos, view: int, box: Sequence[int] | None = None) -> Path:
         """The file for the detections in the photo of a view, or in a box (xyxy) of it; the photo must exist."""
+        scene = photos.scene
         lens, K = scene.views[view].lens, scene.cameras.K[view].tolist()
         size = scene.cameras.sizes[view].tolist()
         camera = [None if lens is None else [lens.model_name, list(lens.params)], K, size]
-        with scene.views[view].path.open("rb") as file:
-            photo = hashlib.file_digest(file, "sha256").hexdigest()
-        text = json.dumps([photo, photo_bits(scene, view), camera, self.made_by, box])
+        text = json.dumps([photos.sha256(view), photo_bits(scene, view), camera, self.made_by, box])
         return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.safetensors"
 
 

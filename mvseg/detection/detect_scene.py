@@ -199,7 +199,7 @@ def _detect_photos(
     device = next(model.parameters()).device
     for view in progress_bar(range(len(scene.views)), name="detection", unit="view"):
         box = None if boxes is None else boxes[view].tolist()
-        path = cached.path(scene, view, box) if cached is not None and photos.exist else None
+        path = cached.path(photos, view, box) if cached is not None and photos.exist else None
         detections = None if path is None else read_detections(path)
         if detections is None:
             x1, y1, x2, y2 = box or (0, 0, *scene.cameras.sizes[view].tolist())

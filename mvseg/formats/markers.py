@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.formats.board import FAMILIES, BoardConfig, Family, marker_dictionary
-from mvseg.formats.photos import read_photo
-from mvseg.scene import Scene
+from mvseg.formats.photos import Photos
 from mvseg.system.running import progress_bar
 
 Floats = NDArray[np.float64]
@@ -40,15 +39,15 @@ def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
     return {number: quad for number, quad in zip(numbers, corners, strict=True) if numbers.count(number) == 1}
 
 
-def find_scene_markers(scene: Scene) -> dict[Family, Seen]:
+def find_scene_markers(photos: Photos) -> dict[Family, Seen]:
     """Corners of the markers in all photos of a scene, by family.
 
     Raises:
         InputError: a photo is missing or broken.
     """
     found: dict[Family, Seen] = {family: {} for family in FAMILIES}
-    for view in progress_bar(range(len(scene.views)), name="markers", unit="photo"):
-        photo = read_grey(scene, view)
+    for view in progress_bar(range(len(photos.scene.views)), name="markers", unit="photo"):
+        photo = read_grey(photos, view)
         for family, seen in found.items():
             for marker, quad in find_markers(photo, family).items():
                 for corner, px in enumerate(quad):
@@ -56,9 +55,9 @@ def find_scene_markers(scene: Scene) -> dict[Family, Seen]:
     return found
 
 
-def read_grey(scene: Scene, view: int) -> Grey:
-    """(H, W) uint8: the photo of a view without colours and lens distortion, see `read_photo`."""
-    return np.asarray(cv2.cvtColor(read_photo(scene, view), cv2.COLOR_RGB2GRAY), np.uint8)
+def read_grey(photos: Photos, view: int) -> Grey:
+    """(H, W) uint8: the photo of a view without colours and lens distortion."""
+    return np.asarray(cv2.cvtColor(photos(view), cv2.COLOR_RGB2GRAY), np.uint8)
 
 
 def find_board(photo: Grey, board: BoardConfig) -> tuple[NDArray[np.int64], Floats]:

@@ -26,7 +26,9 @@ from mvseg.formats.image_file import (
     sensor_bits,
 )
 from mvseg.formats.lens import undistort
+from mvseg.formats.photo_content import PhotoContent, measure_content
 from mvseg.scene import Cameras, Scene, View, camera_problem
+from mvseg.system.file_hash import hash_files
 
 CACHED_BYTES = 256 * 2**20  # 12 photos of 7 megapixels
 
@@ -243,8 +245,12 @@ def load_photos(scene: Scene) -> list[torch.Tensor]:
 class Photos:
     """The photos of a scene: `photos(view)` is (H, W, 3) uint8 RGB with its lens distortion removed, see `read_photo`.
 
-    The most recent ones are cached, up to `CACHED_BYTES` in all, so that a scene that fits is decoded once, however
-    many stages use it. What is returned is shared: it must not be written to.
+    One object goes through all stages of a run, and whoever asks for a photo asks it. `CACHED_BYTES` of photos are kept
+    in all, so that a scene that fits is decoded once. Of a larger one those that came first are kept, since every
+    stage goes through the photos in one order; each of the others is decoded once per stage. Content and hash of every
+    photo are kept, however large the scene is. (A photo of 16 bits is decoded once more, see `photo_bits`.)
+
+    What is returned is shared: it must not be written to.
 
     Attributes:
         scene: whose photos these are.
@@ -254,24 +260,58 @@ class Photos:
     def __init__(self, scene: Scene) -> None:
         self.scene = scene
         self._cached: dict[int, np.ndarray] = {}
+        self._contents: dict[int, PhotoContent] = {}
+        self._hashes: dict[int, str] = {}
 
     @property
     def exist(self) -> bool:
         return self.scene.views[0].path.is_file()
 
     def __call__(self, view: int) -> np.ndarray:
-        photo = self._cached.pop(view, None)
+        photo = self._cached.get(view)
         if photo is None:
-            photo = read_photo(self.scene, view)
+            stored = read_stored(self.scene, view)
+            if view not in self._contents:
+                self._contents[view] = measure_content(stored)
+            photo = _undistort(stored, self.scene, view)
             photo.flags.writeable = False
-        self._cached[view] = photo  # the most recent ones come last
-        while len(self._cached) > 1 and sum(each.nbytes for each in self._cached.values()) > CACHED_BYTES:
-            del self._cached[next(iter(self._cached))]
+            while self._cached and sum(each.nbytes for each in (photo, *self._cached.values())) > CACHED_BYTES:
+                self._cached.popitem()  # the one that came last
+            self._cached[view] = photo
         return photo
+
+    def content(self, view: int) -> PhotoContent:
+        """What the photo of a view shows; raises InputError as `read_photo` does."""
+        if view not in self._contents:
+            self(view)
+        return self._contents[view]
+
+    def sha256(self, view: int) -> str:
+        """Of the file of a view, which must exist."""
+        if view not in self._hashes:
+            self._hashes[view] = hash_files(self.scene.views[view].path)
+        return self._hashes[view]
+
+    def select(self, scene: Scene, views: Sequence[int]) -> Photos:
+        """Those of some views, which `scene` has in this order; what is known of them stays known."""
+        chosen, places = Photos(scene), {view: place for place, view in enumerate(views)}
+        chosen._cached = {places[view]: photo for view, photo in self._cached.items() if view in places}
+        chosen._contents = {places[view]: each for view, each in self._contents.items() if view in places}
+        chosen._hashes = {places[view]: each for view, each in self._hashes.items() if view in places}
+        return chosen
 
 
 def read_photo(scene: Scene, view: int) -> np.ndarray:
-    """(H, W, 3) uint8 RGB, the photo of a view with its lens distortion removed.
+    """(H, W, 3) uint8 RGB, the photo of a view with its lens distortion removed; see `read_stored`."""
+    return _undistort(read_stored(scene, view), scene, view)
+
+
+def _undistort(stored: np.ndarray, scene: Scene, view: int) -> np.ndarray:
+    return undistort(stored, scene.views[view].lens, scene.cameras.K[view].cpu().numpy())
+
+
+def read_stored(scene: Scene, view: int) -> np.ndarray:
+    """(H, W, 3) uint8 RGB, the photo of a view as its lens saw it.
 
     Rows and columns are those that the file stores, whatever EXIF says; see `check_photos`. Photos of 10, 12 or 14 bits
     in files of 16 are brightened, all of a scene alike; see `photo_bits`.
@@ -293,5 +333,5 @@ def read_photo(scene: Scene, view: int) -> np.ndarray:
         raise InputError(message) from None
     except InputError as error:
         message = f"{path}: the image of view {view} cannot be read, expected a whole image file: {error}"
-        raise InputError(message) from None
-    return undistort(pixels, scene.views[view].lens, scene.cameras.K[view].cpu().numpy())
+        raise InputError(message) from error
+    return pixels

@@ -14,6 +14,7 @@ from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.find_views import find_views, list_some
 from mvseg.formats.markers import Corner, find_board, find_scene_markers, read_grey
+from mvseg.formats.photos import Photos
 from mvseg.formats.positions import read_positions
 from mvseg.poses.alignment import align, is_one_line, scale_by, spreads
 from mvseg.poses.config import Known
@@ -80,8 +81,9 @@ def place(scene: Scene, known: Known) -> Placement:
 
 def _by_board(scene: Scene, board: BoardConfig, unit: str) -> Placement:
     seen: dict[int, list[tuple[int, Floats]]] = {}
+    photos = Photos(scene)
     for view in progress_bar(range(len(scene.views)), name="board", unit="photo"):
-        for number, px in zip(*find_board(read_grey(scene, view), board), strict=True):
+        for number, px in zip(*find_board(read_grey(photos, view), board), strict=True):
             seen.setdefault(int(number), []).append((view, px))
     points = triangulate_points(scene.cameras, seen)
     try:
@@ -128,7 +130,7 @@ def marker_sides(corners: dict[Corner, Floats]) -> Floats:
 
 def _marker_corners(scene: Scene) -> dict[Corner, Floats]:
     """The corners of the family of markers that has the most of them in space."""
-    found = find_scene_markers(scene)
+    found = find_scene_markers(Photos(scene))
     return max((triangulate_points(scene.cameras, seen) for seen in found.values()), key=len)
 
 

@@ -21,7 +21,7 @@ from mvseg.errors import InputError, faults_of
 from mvseg.formats.label_png import write_label_png
 from mvseg.formats.lens import distort
 from mvseg.formats.markers import find_markers, read_grey
-from mvseg.formats.photos import read_photo, require_photos
+from mvseg.formats.photos import Photos, require_photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.target import BAR, FAMILY, Shape, list_shapes, tag_corners
 from mvseg.pipeline import run_scene
@@ -29,7 +29,6 @@ from mvseg.poses.alignment import align
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.results.plant_files import METRES
 from mvseg.results.result import Result
-from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
 from mvseg.traits.leaf import missing
 
@@ -143,7 +142,8 @@ def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
         said = f"their unit is {scene.unit}" if scene.unit else "they say no unit"
         raise InputError(f"{scene.source}: {said}, expected mm, cm or m, as mvseg pose --unit mm states it")
     mm = 1000 * METRES[scene.unit.lower()]
-    corners = _find_corners(scene)
+    photos = Photos(scene)
+    corners = _find_corners(photos)
     with faults_of(f"{folder}: {len(corners)} corners of the page's tags"):
         places = tag_corners()
         page = np.array([[*places[number][corner], 0] for number, corner in corners])
@@ -151,7 +151,7 @@ def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
     shapes = dict(enumerate(list_shapes(), start=1))
     with tempfile.TemporaryDirectory() as masks:
         for view in progress_bar(range(len(scene.views)), name="masks", unit="photo"):
-            labels = _cut_view(scene, view, shapes=shapes, world_from_page=alignment.similarity)
+            labels = _cut_view(photos, view, shapes=shapes, world_from_page=alignment.similarity)
             write_label_png(Path(masks) / f"{scene.views[view].name}.png", labels)
         result = run_scene(folder, masks)
     printed = bar / BAR
@@ -163,12 +163,12 @@ def check_target(folder: Path, *, bar: float = BAR) -> TargetCheck:
     )
 
 
-def _find_corners(scene: Scene) -> Mapping[tuple[int, int], Floats]:
+def _find_corners(photos: Photos) -> Mapping[tuple[int, int], Floats]:
     """{(tag, corner): (3,) where it is} of the page's tags, in the world."""
     seen: dict[tuple[int, int], list[tuple[int, Floats]]] = {}
-    on_page = tag_corners()
+    scene, on_page = photos.scene, tag_corners()
     for view in progress_bar(range(len(scene.views)), name="tags", unit="photo"):
-        for number, quad in find_markers(read_grey(scene, view), FAMILY).items():
+        for number, quad in find_markers(read_grey(photos, view), FAMILY).items():
             for corner in range(4 if number in on_page else 0):
                 seen.setdefault((number, corner), []).append((view, quad[corner]))
     corners = triangulate_points(scene.cameras, seen)
@@ -181,20 +181,21 @@ def _find_corners(scene: Scene) -> Mapping[tuple[int, int], Floats]:
 
 
 def _cut_view(
-    scene: Scene, view: int, *, shapes: Mapping[int, Shape], world_from_page: pycolmap.Sim3d
+    photos: Photos, view: int, *, shapes: Mapping[int, Shape], world_from_page: pycolmap.Sim3d
 ) -> NDArray[np.uint16]:
     """(H, W) masks of the shapes that are whole in a photo, as the photo has them: with its lens distortion.
 
     Raises:
         InputError: none is there.
     """
+    scene = photos.scene
     camera, size, places = scene.cameras[[view]], scene.cameras.sizes[view].numpy(), {}
     for label, shape in shapes.items():
         points = world_from_page * np.pad(np.concatenate([shape.cell, shape.outline]), ((0, 0), (0, 1)))
         px, depth = (each[0].numpy() for each in camera.project(torch.from_numpy(points)))
         if (depth > 0).all() and (px[4:] > 0).all() and (px[4:] < size).all():
             places[label] = px[:4], px[4:]
-    labels = cut_shapes(read_photo(scene, view), places)
+    labels = cut_shapes(photos(view), places)
     if not labels.any():
         problem = "none of the page's shapes is found"
         expected = "expected one whole, printed in colour; leave the photo out"

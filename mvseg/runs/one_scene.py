@@ -161,7 +161,8 @@ def save_scene(
     corrections = None if result.corrections is None else result.corrections.source
     run["config"] |= record_places(scene, out, masks, corrections)
     if config.report:
-        check = check_scene(result.scene, result.regions, features=False)  # of which the run has warned
+        # of what features say the run has warned
+        check = check_scene(result.scene, result.regions, photos=result.photos, features=False)
         run["checks"] = [asdict(finding) for finding in check.findings]
     save_result(result, out, run, report=config.report)
 

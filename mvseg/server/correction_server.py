@@ -61,7 +61,7 @@ class Corrector:
         """Raises InputError: the corrections saved in the folder, or a photo, cannot be read, or they are another
         scene's."""
         self.opened = opened
-        self.written, self.marks = self._stamp(), mark_photos(opened.found.scene)
+        self.written, self.marks = self._stamp(), mark_photos(opened.found.photos)
         self.corrections, self.notice = self._read_edits()
         self.shown = opened.matched()
         photos, views = opened.found.photos, range(len(opened.found.scene.views))
@@ -112,7 +112,7 @@ class Corrector:
         found = self.opened.saved_corrections()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", InputWarning)
-            check_made_for(found, self.opened.found.scene)
+            check_made_for(found, self.opened.found.photos)
         return found, " ".join(filter(None, (self.opened.notice, *(f"{each.message}." for each in caught))))
 
     def _stamp(self) -> tuple[int, int] | None:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.markers import find_scene_markers
+from mvseg.formats.photos import Photos
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.scene import Cameras, Scene
 from mvseg.traits.config import Up
@@ -24,7 +25,14 @@ MOST_DOUBT = np.radians(6.0)  # standard deviation of the answer
 MOST_BEND = 0.1  # smallest standard deviation of markers' corners over the middle one: they lie in one plane
 
 
-def place_scene(scene: Scene, *, scale: float | None = None, unit: str | None = None, up: Up | None = None) -> Scene:
+def place_scene(
+    scene: Scene,
+    photos: Photos | None = None,
+    *,
+    scale: float | None = None,
+    unit: str | None = None,
+    up: Up | None = None,
+) -> Scene:
     """The scene in the world that the user asks for; None leaves what the scene says.
 
     Warns (InputWarning) of a unit that contradicts the scene's and comes without a scale, and of an up that the cameras
@@ -32,6 +40,7 @@ def place_scene(scene: Scene, *, scale: float | None = None, unit: str | None = 
 
     Args:
         scene: as it was loaded.
+        photos: of the scene; None: they are read where `up` is "board".
         scale: its lengths are multiplied by this.
         unit: name of the unit of the lengths after that.
         up: see `find_up`.
@@ -50,14 +59,14 @@ def place_scene(scene: Scene, *, scale: float | None = None, unit: str | None = 
             message = f"the cameras are in {scene.unit}: unit {unit} without a scale only renames it"
             warnings.warn(message, InputWarning, stacklevel=4)
         scene = replace(scene, unit=unit)
-    scene = find_up(scene, up)
+    scene = find_up(scene, up, photos)
     if scene.seems_upside_down:
         message = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
         warnings.warn(message, InputWarning, stacklevel=4)
     return scene
 
 
-def find_up(scene: Scene, up: Up | None) -> Scene:
+def find_up(scene: Scene, up: Up | None, photos: Photos | None = None) -> Scene:
     """The scene with the direction of up that the user says, or else its own.
 
     Raises:
@@ -67,7 +76,7 @@ def find_up(scene: Scene, up: Up | None) -> Scene:
     if up is None:
         return scene
     if isinstance(up, str):
-        x, y, z = (up_of_board(scene) if up == "board" else up_of_cameras(scene.cameras)).tolist()
+        x, y, z = (up_of_board(scene, photos) if up == "board" else up_of_cameras(scene.cameras)).tolist()
         up = x, y, z
     return replace(scene, up=up)
 
@@ -91,7 +100,7 @@ def up_of_cameras(cameras: Cameras) -> Floats:
     return axes[2] if axes[2] @ towards >= 0 else -axes[2]
 
 
-def up_of_board(scene: Scene) -> Floats:
+def up_of_board(scene: Scene, photos: Photos | None = None) -> Floats:
     """(3,) unit vector up: the normal of the plane of all ArUco or ChArUco markers, on the side of the cameras.
 
     The family of markers with the most corners in space counts.
@@ -99,7 +108,7 @@ def up_of_board(scene: Scene) -> Floats:
     Raises:
         InputError: a photo is missing or broken; no marker is seen in two photos, or the markers lie in no one plane.
     """
-    found = [triangulate_points(scene.cameras, seen) for seen in find_scene_markers(scene).values()]
+    found = [triangulate_points(scene.cameras, seen) for seen in find_scene_markers(photos or Photos(scene)).values()]
     corners = np.array(list(max(found, key=len).values()))
     if not len(corners):
         raise InputError("up is 'board', but no ArUco marker is seen in two photos, expected one that lies flat")

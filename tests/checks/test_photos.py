@@ -13,6 +13,7 @@ from PIL import Image
 
 from mvseg.checks.finding import Finding
 from mvseg.checks.photos import photo_findings, read_photo_facts
+from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import HEIGHT, WIDTH, cut_file, edit_rig, write_image, write_scene
 
@@ -21,7 +22,7 @@ Fault = Callable[[Path], object]
 
 def findings_of(folder: Path, *, has_masks: bool = False) -> list[Finding]:
     scene = load_scene(folder)
-    return photo_findings(read_photo_facts(scene), scene, has_masks=has_masks)
+    return photo_findings(read_photo_facts(Photos(scene)), scene, has_masks=has_masks)
 
 
 def photo(folder: Path, view: int) -> Path:

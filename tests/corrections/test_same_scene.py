@@ -13,6 +13,7 @@ from mvseg.corrections.file import Confirm, Corrections, load_corrections, write
 from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.image_file import write_png
+from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from scene_folders import HEIGHT, WIDTH, write_scene
 
@@ -20,7 +21,7 @@ from scene_folders import HEIGHT, WIDTH, write_scene
 def corrections_of(folder: Path) -> Corrections:
     scene = load_scene(folder)
     edits = Corrections((Confirm(view="001.png", at=(1.0, 1.0)),))
-    return with_marks(edits, scene, mark_photos(scene))
+    return with_marks(edits, scene, mark_photos(Photos(scene)))
 
 
 def test_the_file_names_the_photos_of_its_edits(tmp_path: Path) -> None:
@@ -34,15 +35,15 @@ def test_the_file_names_the_photos_of_its_edits(tmp_path: Path) -> None:
 def test_another_plant_with_the_same_names_is_refused(tmp_path: Path) -> None:
     made = corrections_of(write_scene(tmp_path / "balls"))
     other = write_scene(tmp_path / "others")
-    check_made_for(made, load_scene(other))  # the same photos
+    check_made_for(made, Photos(load_scene(other)))  # the same photos
     write_png(other / "images" / "001.png", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
     with pytest.raises(InputError, match=r"was made for another scene .photo 001 is another one here"):
-        check_made_for(made, load_scene(other))
+        check_made_for(made, Photos(load_scene(other)))
     masks_only = {name: mark.model_copy(update={"sha256": None}) for name, mark in made.photos.items()}
-    check_made_for(replace(made, photos=masks_only), load_scene(other))
+    check_made_for(replace(made, photos=masks_only), Photos(load_scene(other)))
     wider = {name: mark.model_copy(update={"width": 7}) for name, mark in masks_only.items()}
     with pytest.raises(InputError, match="another scene"):
-        check_made_for(replace(made, photos=wider), load_scene(other))
+        check_made_for(replace(made, photos=wider), Photos(load_scene(other)))
 
 
 def test_a_run_stops_unless_it_is_forced(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -60,6 +61,6 @@ def test_a_file_that_does_not_say_is_taken_with_a_warning(tmp_path: Path) -> Non
     scene = load_scene(write_scene(tmp_path / "balls"))
     old = Corrections((Confirm(view="001", at=(1.0, 1.0)),), source=Path("old.json"))
     with pytest.warns(InputWarning, match="old.json: does not say which photos it was made for"):
-        check_made_for(old, scene)
-    check_made_for(replace(old, source=None), scene)
-    check_made_for(Corrections(source=Path("empty.json")), scene)
+        check_made_for(old, Photos(scene))
+    check_made_for(replace(old, source=None), Photos(scene))
+    check_made_for(Corrections(source=Path("empty.json")), Photos(scene))

@@ -55,7 +55,7 @@ def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> No
     names = []
 
     def note(made_by: str = "leaf-lite") -> None:
-        names.append(CachedDetections(tmp_path / "kept", made_by).path(load_scene(folder), 1))
+        names.append(CachedDetections(tmp_path / "kept", made_by).path(Photos(load_scene(folder)), 1))
 
     note()
     note("another")

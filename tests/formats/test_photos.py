@@ -8,12 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.photos import Photo, build_scene, check_photos, load_photos, read_photo, view_names
+from mvseg.formats import photos as photos_module
+from mvseg.formats.image_file import read_rgb
+from mvseg.formats.photo_content import measure_content
+from mvseg.formats.photos import Photo, Photos, build_scene, check_photos, load_photos, read_photo, view_names
 from mvseg.formats.scene_folder import load_scene
 from mvseg.scene import Scene
+from mvseg.system.file_hash import hash_files
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, write_image, write_scene
 
 
@@ -126,6 +131,49 @@ class TestReadPhoto:
         picture.rename(scene.views[1].path)
         with pytest.raises(InputError, match=r"001\.png: the image of view 1 cannot be read, expected a whole image"):
             read_photo(scene, 1)
+
+
+class TestPhotos:
+    """Two of four photos fit into the cache."""
+
+    @pytest.fixture
+    def scene(self, tmp_path: Path) -> Scene:
+        folder = write_scene(tmp_path / "plant")
+        edit_rig(folder, 2, distortion=[-0.3, 0, 0, 0, 0])
+        return load_scene(folder)
+
+    @pytest.fixture
+    def decoded(self, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+        names, read = list[str](), photos_module.read_rgb
+
+        def read_rgb(path: Path, *size: tuple[int, int], bits: int = 8) -> np.ndarray:
+            names.append(path.stem)
+            return read(path, *size, bits=bits)
+
+        monkeypatch.setattr(photos_module, "read_rgb", read_rgb)
+        monkeypatch.setattr(photos_module, "CACHED_BYTES", 2 * HEIGHT * WIDTH * 3)
+        return names
+
+    def test_what_does_not_fit_is_decoded_once_by_each_stage(self, scene: Scene, decoded: list[str]) -> None:
+        photos, expected = Photos(scene), [read_photo(scene, view) for view in range(4)]
+        decoded.clear()
+        for _ in range(2):
+            for view in (0, 1, 1, 2, 2, 3):
+                np.testing.assert_array_equal(photos(view), expected[view])
+        assert decoded == ["000", "001", "002", "003", "001", "002", "003"]  # the first one is kept, and one at work
+
+    def test_content_and_hash_are_known_from_then_on(self, scene: Scene, decoded: list[str]) -> None:
+        """Content is that of the stored photo: it has no black corners."""
+        photos = Photos(scene)
+        known = [photos.content(view) for view in range(4)]
+        assert known == [measure_content(read_rgb(view.path)) for view in scene.views]
+        assert [photos.content(view) for view in range(4)] == known
+        assert len(decoded) == 4
+        few = photos.select(scene.select(torch.tensor([2, 0])), [2, 0])
+        assert [few.content(view) for view in range(2)] == [known[2], known[0]]
+        assert len(decoded) == 4
+        np.testing.assert_array_equal(few(0), read_photo(scene, 2))
+        assert few.sha256(0) == photos.sha256(2) == hash_files(scene.views[2].path)
 
 
 def test_photos_for_a_detector_and_photos_that_are_missing(tmp_path: Path) -> None:

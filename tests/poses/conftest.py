@@ -9,6 +9,7 @@ import pytest
 
 from mvseg.formats.board import Family
 from mvseg.formats.markers import Seen, find_scene_markers
+from mvseg.formats.photos import Photos
 from mvseg.poses.config import PoseConfig
 from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
@@ -37,4 +38,4 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
     files = copy_photos(source, names, folder / IMAGES)
     structure = find_structure(folder / IMAGES, files, config=PoseConfig(), work=folder)
     scene = write_structure(structure, folder)
-    return MappedRoom(folder, truth, files, structure, scene, find_scene_markers(scene))
+    return MappedRoom(folder, truth, files, structure, scene, find_scene_markers(Photos(scene)))

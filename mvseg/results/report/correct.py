@@ -15,6 +15,7 @@ from mvseg.corrections.doubtful import Doubt, list_doubts
 from mvseg.corrections.file import dump_edits, name_edits
 from mvseg.corrections.same_scene import mark_photos
 from mvseg.formats.lens import photo_from_pinhole
+from mvseg.formats.photos import Photos
 from mvseg.results.report.pictures import UNITS, Picture
 from mvseg.results.result import Result
 from mvseg.scene import Scene
@@ -25,6 +26,7 @@ COLUMNS = 33  # of the grid of a lens: between its points, straight lines are le
 def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mapping[str, Any]) -> dict[str, Any]:
     """The data of the mode "Correct": the edits of the result, and the problem of each, if any;
     `run` is what run.json says."""
+    marks = mark_photos(result.photos or Photos(result.scene))
     made = () if result.corrections is None else result.corrections.edits
     edits = dump_edits(made)
     name = json.dumps([result.scene.name, run.get("inputs"), run.get("code"), edits], default=str)
@@ -32,7 +34,7 @@ def describe_correct(result: Result, pictures: Sequence[Picture], *, run: Mappin
     return {
         "key": hashlib.sha256(name.encode()).hexdigest()[:16],
         "edits": edits,
-        "photos": {name: mark.model_dump(exclude_none=True) for name, mark in mark_photos(result.scene).items()},
+        "photos": {name: mark.model_dump(exclude_none=True) for name, mark in marks.items()},
         "revision": name_edits(made),
         "outcomes": [describe_fate(fate) for fate in result.fates],
         "lenses": lenses,
