@@ -94,6 +94,12 @@ def warp_plane(
     photo[shown > 127] = drawn[shown > 127]
 
 
+def as_coded(light: np.ndarray) -> np.ndarray:
+    """The values of a photo that took this light in [0, 1] (sRGB)."""
+    coded = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+    return np.asarray(np.rint(255 * coded), np.uint8)
+
+
 def draw_room(cameras: Cameras, *, with_board: bool = True) -> list[np.ndarray]:
     """V photos (H, W, 3) uint8."""
     pictures = [(texture(1), (0, 2)), (texture(2), (1, 2)), (floor_picture(with_board=with_board), (0, 1))]
@@ -104,7 +110,7 @@ def draw_room(cameras: Cameras, *, with_board: bool = True) -> list[np.ndarray]:
         pose = torch.cat([cameras.R[view], cameras.t[view][:, None]], 1)
         for picture, axes in pictures:
             warp_plane(photo, picture, (cameras.K[view] @ pose).numpy(), plane_points(axes))
-        photos.append(photo)
+        photos.append(as_coded(photo / 255))
     return photos
 
 

@@ -8,9 +8,9 @@ import pytest
 import torch
 
 from mvseg.errors import InputError
-from mvseg.formats.board import BoardConfig
+from mvseg.formats.board import BoardConfig, marker_dictionary
 from mvseg.formats.markers import find_board, find_markers
-from room_scene import BOARD, BOARD_AT, draw_room, room_cameras
+from room_scene import BOARD, BOARD_AT, as_coded, draw_room, room_cameras
 
 
 def grey_room(view: int) -> tuple[np.ndarray, object]:
@@ -44,6 +44,24 @@ def test_sides_of_markers_have_no_bias() -> None:
         misses.append(found[int(number)] - true[0].numpy())
     assert np.abs(misses).max() < 0.5
     assert np.abs(np.mean(misses, axis=(0, 1))).max() < 0.1  # no half pixel
+
+
+@pytest.mark.parametrize(("side", "blur_px"), [(40, 0.5), (40, 0.8), (80, 1.2)])
+@pytest.mark.parametrize("brightest", [1.0, 0.1])
+def test_blur_makes_markers_no_smaller(side: int, blur_px: float, brightest: float) -> None:
+    """A lens blurs light, not the values of a photo."""
+    fine = 8
+    size = 2 * side * fine
+    page = np.full((size, size), 0.85)
+    tag = cv2.aruco.generateImageMarker(marker_dictionary("APRILTAG_36H11"), 7, side * fine) / 255
+    turned = cv2.getRotationMatrix2D((side * fine / 2, side * fine / 2), 25, 1)
+    turned[:, 2] += side * fine / 2
+    page = cv2.warpAffine(0.04 + 0.81 * tag, turned, (size, size), page, flags=cv2.INTER_LINEAR,
+                          borderMode=cv2.BORDER_TRANSPARENT)  # fmt: skip
+    page = cv2.GaussianBlur(page, (0, 0), blur_px * fine)
+    light = page.reshape(2 * side, fine, 2 * side, fine).mean((1, 3))
+    quad = find_markers(as_coded(brightest * light), "APRILTAG_36H11")[7]
+    assert np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1) == pytest.approx(side, rel=0.004)
 
 
 def test_a_marker_that_is_there_twice_says_nothing() -> None:

@@ -33,7 +33,7 @@ def test_instances_without_a_credible_surface_get_voxels(
     two_blades: tuple[Regions, torch.Tensor], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The voxels that voxels alone would give: other instances hide as before."""
-    monkeypatch.setattr(shapes, "fit_surfaces", lambda *_, **__: {
+    monkeypatch.setattr(shapes, "fit_kept", lambda *_, **__: {
         1: LeafSurface.none(torch.arange(4), "for the test"), 2: LeafSurface.none(torch.arange(2), "for the test")
     })  # fmt: skip
     with pytest.warns(UserWarning, match="instance 2 has no shape"):

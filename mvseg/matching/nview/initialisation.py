@@ -19,8 +19,8 @@ from mvseg.matching.view_graph import ViewGraph
 # A third more or less of any of these changes no id of degraded masks of 8 to 32 leaves: the search finds the same.
 SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the hypotheses of a pixel, one per iteration
 EMPTY_COST = 0.7  # of a hypothesis in which all views show no region
-# Iteration whose affinity is clustered, and where the linkage stops. Without the second, degraded masks of 32 leaves in 5
-# and 8 views lose 0.03 and 0.01 of ARI on one plant of two each, and those of 16 leaves nothing.
+# Iteration whose affinity is clustered, and where the linkage stops. Without the second, degraded masks of 32 leaves in
+# 5 and 8 views lose up to 0.03 of ARI on two plants of six, those of 16 leaves nothing.
 INITIALISATIONS = ((-1, 0.3), (1, 0.1))
 MANY_VIEWS = 8  # with more than this, one start will do
 EM_PIXELS = 12  # limit: pixels per region, at most
