@@ -10,19 +10,17 @@ from typing import Any
 import pytest
 from PIL import Image
 
-from mvseg import demo_scene
 from mvseg.cli import main
 from mvseg.formats import image_file
-
-SCENE = demo_scene()
+from scene_folders import write_scene
 
 
 class Reads:
-    """How often each photo of the shipped plant was decoded and hashed."""
+    """How often each photo of a scene was decoded and hashed."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.decoded, self.hashed = Counter[str](), Counter[str]()
-        names = {path.read_bytes(): path.name for path in sorted((SCENE / "images").iterdir())}
+    def __init__(self, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.scene, self.decoded, self.hashed = scene, Counter[str](), Counter[str]()
+        names = {path.read_bytes(): path.name for path in sorted((scene / "images").iterdir())}
         self.num_photos = len(names)
         decode, sha256 = image_file.read_image, hashlib.sha256
 
@@ -37,21 +35,24 @@ class Reads:
         monkeypatch.setattr(image_file, "read_image", read_image)
         monkeypatch.setattr(hashlib, "sha256", count_hash)
 
+    def check(self) -> None:
+        assert len(self.decoded) == len(self.hashed) == self.num_photos
+        assert {*self.decoded.values(), *self.hashed.values()} == {1}
+
 
 @pytest.fixture
-def reads(monkeypatch: pytest.MonkeyPatch) -> Reads:
-    return Reads(monkeypatch)
+def reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Reads:
+    return Reads(write_scene(tmp_path / "plant"), monkeypatch)
 
 
-@pytest.mark.parametrize("masks", [True, False])
-def test_infer_decodes_and_hashes_each_photo_once(masks: bool, tmp_path: Path, reads: Reads) -> None:
-    given = ["--masks", "masks"] if masks else []
-    assert main(["infer", str(SCENE), *given, "--out", str(tmp_path / "out"), "--quiet"]) == 0
-    assert len(reads.decoded) == len(reads.hashed) == reads.num_photos
-    assert {*reads.decoded.values(), *reads.hashed.values()} == {1}
+@pytest.mark.parametrize("given", [["--masks", "masks"], ["--detect.min_score", "0.05"]])
+def test_infer_decodes_and_hashes_each_photo_once(given: list[str], tmp_path: Path, reads: Reads) -> None:
+    coarse = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
+    out = ["--out", str(tmp_path / "out"), "--quiet"]
+    assert main(["infer", str(reads.scene), *given, *coarse, *out]) == 0
+    reads.check()
 
 
 def test_check_decodes_and_hashes_each_photo_once(reads: Reads) -> None:
-    main(["check", str(SCENE), "--masks", "masks", "--quiet"])
-    assert len(reads.decoded) == len(reads.hashed) == reads.num_photos
-    assert {*reads.decoded.values(), *reads.hashed.values()} == {1}
+    main(["check", str(reads.scene), "--masks", "masks", "--quiet"])
+    reads.check()
