@@ -87,6 +87,7 @@ def check_ids(
     checked = rematch_misfits(checked, known, shown=shown, cameras=cameras, free=free, config=config)
     ids = checked.instance_ids.cpu().numpy()
     merged = {each.region: each for each in checked.merged}
+    left = {instance: surface for instance, surface in left.items() if (ids == instance).any()}
     shared = find_shared(on_cpu, ids, left, shown=shown, cameras=cameras, named=list(merged.values()))
     merged |= {each.region: each for each in shared}
     return checked.with_merged(merged.values())

@@ -102,6 +102,21 @@ def test_a_mask_that_shows_two_surfaces_is_listed(share: float, is_named: bool, 
         assert torch.equal(mask.part, is_second)
 
 
+def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> None:
+    """The only mask of instance 4 shows leaf 2, drawn too large to be a piece of it; its surface lies over leaf 1."""
+    maps = true_maps()
+    grown = distance_transform_edt(maps[3] != 2) <= 6
+    maps[3] = np.where(grown & (maps[3] == 0), 2, maps[3])
+    regions, leaves = as_regions(maps)
+    ids = leaves.clone()
+    ids[place_of(regions, leaves, 3, 2)] = 4
+    over = flat_leaf(length=0.8, half_width=0.35, at=(-0.8, -0.3, 0.42))
+    checked = check(regions, ids, LEAVES | {4: over})
+    assert torch.equal(checked.instance_ids, leaves)
+    assert checked.merged == ()
+    assert torch.equal(checked.close_gaps().instance_ids, leaves)
+
+
 def test_what_no_surface_explains_goes_to_the_nearest_part() -> None:
     """A merged mask that is drawn three pixels too large; and what the matcher alone calls merged stays on the list."""
     maps = merged_maps(3, 1)
