@@ -1,44 +1,75 @@
-"""What does a third more or less of each number of matching change? `python benchmarks/thirds.py --cache DIR`
+"""What does a third more or less of a room's numbers change? `python benchmarks/thirds.py --cache DIR [--room NAME]`
 
-Numbers are those at the head of the modules of matching, and the fields of `NViewConfig`; one at a time is divided and
-multiplied by 1.33, whole numbers change by 1 at least. The scenes are development plants with degraded masks. A line
-says of each scene how many ids of "nview" and of "one-per-view" change, by how much their pair F1, and how far match
-scores move.
+Numbers are those at the head of the modules, and for matching the fields of `NViewConfig`; one at a time is divided and
+multiplied by 1.33, whole numbers change by 1 at least. The scenes are development plants.
+
+Of matching, with degraded masks: a line says of each scene how many ids of "nview" and of "one-per-view" change, by how
+much their pair F1, and how far match scores move. Of verification: how many masks change their instance or their
+pixels, and by how much pair F1 and MV-PQ change, where surfaces check the ids of degraded masks and of straps in pieces
+and masks are cut; where the views choose what the shipped detector found, also in the folders of `--scenes`; and where
+every third leaf of these was missed, and a person drew it in two photos, or in three (half of its other masks are still
+there, matched to nothing).
 """
 
 from __future__ import annotations
 
 import argparse
 import ast
+import hashlib
 import importlib
 import pkgutil
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any
 
 import numpy as np
 import torch
+from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import mvseg.matching
-from benchmarks.label_maps import LabelledScene, load_maps
+import mvseg.reconstruction.shapes
+import mvseg.verification
+from benchmarks.corrections import Case, compute, detect_case, render
+from benchmarks.drawn_leaves import draw_from, open_views
+from benchmarks.label_maps import LabelledScene, load_maps, visible_ids
+from benchmarks.simulated_person import Look
+from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
+from mvseg.config import RunConfig
+from mvseg.corrections.file import Corrections
+from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
+from mvseg.evaluation.panoptic import LeafMetrics, leaf_metrics
+from mvseg.formats.photos import Photos
+from mvseg.masks import Masks, Origin
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
+from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.view_graph import ViewGraph
-from mvseg.simulation.dataset import PRESETS, list_scenes
+from mvseg.pipeline import State, check_ids, follow, match, reconstruct, split
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.regions import Regions, regions_from_label_maps
+from mvseg.scene import Cameras, Scene, View
+from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
+from mvseg.simulation.growth import grow_plant
+from mvseg.verification.known_surfaces import name_each
 
 FACTOR = 1.33
 SCENES = ((3, 16), (5, 32), (10, 8), (20, 8))  # views and leaves
+CHECKED = ((3, 16, 0), (5, 32, 1), (10, 16, 0), (10, 32, 2))  # views, leaves and plant, where surfaces check ids
+STRAPS = 12  # leaves of the straps in pieces
+FOUND = ((10, 16, 1),)  # where a detector finds leaves, beside the plant that ships
 
 
 def scaled(value: Any, factor: float) -> Any:
@@ -104,18 +135,14 @@ def compare_matchings(before: list[tuple[np.ndarray, ...]], after: list[tuple[np
     return " | ".join(parts)
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--cache", type=Path, required=True, help="folder for rendered label maps")
-    parser.add_argument("--numbers", nargs="+", help="only these")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
-    warnings.simplefilter("ignore", InputWarning)
-    specs = [spec for spec in list_scenes(PRESETS["paper-eval"], 0) if spec.split == "dev"]
-    scenes = [
-        load_maps(next(spec for spec in specs if (spec.num_views, spec.num_leaves) == cell), args.cache)
-        for cell in SCENES
-    ]
+def spec_of(num_views: int, num_leaves: int, plant: int = 0) -> SceneSpec:
+    specs = (spec for spec in list_scenes(PRESETS["paper-eval"], 0) if spec.split == "dev")
+    wanted = num_views, num_leaves, plant
+    return next(spec for spec in specs if (spec.num_views, spec.num_leaves, plant_index(spec)) == wanted)
+
+
+def thirds_of_matching(args: argparse.Namespace) -> None:
+    scenes = [load_maps(spec_of(*cell), args.cache) for cell in SCENES]
     before = match_all(scenes)
     for module, name in list_numbers(mvseg.matching):
         for factor in (1 / FACTOR, FACTOR) if args.numbers is None or name in args.numbers else ():
@@ -134,6 +161,182 @@ def main() -> None:
                 said = compare_matchings(before, match_all(scenes, replace(config, **{part.name: other})))
                 print(f"{part.name}.{field.name} x {factor:.2f}: {said}", flush=True)
 
+
+# --- verification
+
+
+@dataclass(frozen=True, eq=False)
+class Trial:
+    """One way through verification on one scene.
+
+    Attributes:
+        name: what is done, and to which scene.
+        modules: of verification, that work there.
+        run: gives the masks.
+        truth: V label maps.
+    """
+
+    name: str
+    modules: tuple[str, ...]
+    run: Callable[[], Masks]
+    truth: Any
+
+
+CHECKING = ("checked_ids", "rematched_masks", "evidence")
+CHOOSING = ("choose", "leaf_scores", "rough_surfaces", "evidence", "snap_edges")
+DRAWING = ("drawn_leaves", "leaf_color", "rough_surfaces")
+
+
+def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
+    for cell in CHECKED:
+        maps = load_maps(spec_of(*cell), args.cache)
+        name, regions = f"{cell[1]} leaves in {cell[0]} views", maps.masks("degraded")[0]
+        yield check_trial(name, regions, maps.cameras, maps.true)
+    plant = grow_plant("strap", STRAPS, FIRST_SEED)
+    cameras = strap_cameras(plant)
+    true = visible_ids(plant, cameras)
+    pieces = regions_from_label_maps([cut_pieces(labels) for labels in true])
+    yield check_trial("pieces of straps", pieces, cameras, true)
+    for folder in (demo_scene(), *(render(spec_of(*cell), args.cache) for cell in FOUND), *args.scenes):
+        case = detect_case(folder, RunConfig(reconstruct=None), cache=args.cache / "kept" / folder.name)
+        case = replace(case, fit=None, unedited=None)
+        first = compute(case, Corrections()).masks.to("cpu")
+        yield Trial(f"choose {folder.name}", CHOOSING, partial(choose_anew, case), case.truth)
+        for number in (2, 3):
+            drawn = draw(case, first, number)
+            yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, drawn), case.truth)
+
+
+def check_trial(name: str, regions: Regions, cameras: Cameras, truth: np.ndarray) -> Trial:
+    """Surfaces check the ids of given masks, and those that show two leaves are cut."""
+    views = tuple(View(f"{view:03d}", Path(f"{view:03d}.png")) for view in range(len(cameras)))
+    scene = Scene(name=name, views=views, cameras=cameras)
+    matching = Matching(Masks.of(regions), MatchReport("none"))
+    given = State(config=RunConfig(), scene=scene, photos=Photos(scene), matching=matching, mask_kind="label images")
+    state = reconstruct(match(given), with_voxels=False)
+    return Trial(f"check {name}", CHECKING, partial(check_anew, state), list(truth))
+
+
+def check_anew(state: State) -> Masks:
+    return split(check_ids(state)).masks
+
+
+def choose_anew(case: Case) -> Masks:
+    return compute(case, Corrections()).masks
+
+
+def follow_anew(state: State) -> Masks:
+    return follow(state).masks
+
+
+def draw(case: Case, first: Masks, number: int) -> State:
+    """Every third leaf that enough photos show was missed, and is drawn in so many of them."""
+    look, ids = Look(first, case.truth, case.found.scene, ()), first.instance_ids.clone()
+    views = [(leaf, open_views(look.visible[:, leaf])) for leaf in range(1, len(look.size))]
+    chosen = [(leaf, shown) for leaf, shown in views if len(shown) > number][number - 2 :: 3]
+    maps = [np.zeros_like(labels) for labels in case.truth]
+    for leaf, shown in chosen:
+        ids[torch.from_numpy(look.leaf == leaf)] = -1
+        for view in draw_from(case, shown, number):
+            maps[view][case.truth[view] == leaf] = leaf
+    outlines = regions_from_label_maps(maps)
+    drawn = Masks.of(outlines, outlines.labels, torch.ones(len(outlines)), origin=Origin.CORRECTED)
+    left = replace(first, instance_ids=ids).select((ids > 0) | (first.view_index % 2 == 0))
+    masks = Masks.concatenate((left.with_merged(()), drawn)).close_gaps()
+    return replace(case.found, matching=Matching(masks, MatchReport("none")))
+
+
+def keep_fits() -> None:
+    """From now on a fit of surfaces to the same masks is done once."""
+    kept: dict[str, dict[int, LeafSurface]] = {}
+
+    def fit(*args: Any, **how: Any) -> dict[int, LeafSurface]:
+        digest = hashlib.sha256()
+        add_content(digest, (args, {k: v for k, v in how.items() if k not in ("workers", "progress")}))
+        name = digest.hexdigest()
+        if name not in kept:
+            kept[name] = fit_surfaces(*args, **how)
+        return dict(kept[name])
+
+    for key, module in [*sys.modules.items()]:
+        if key.startswith("mvseg.") and vars(module).get("fit_surfaces") is fit_surfaces:
+            setattr(module, "fit_surfaces", fit)  # noqa: B010
+
+
+def add_content(digest: Any, value: Any) -> None:
+    if isinstance(value, torch.Tensor):
+        digest.update(value.cpu().numpy().tobytes())
+    elif isinstance(value, LeafSurface):
+        digest.update(value.points().numpy().tobytes())
+    elif isinstance(value, Mapping):
+        for key in value:
+            add_content(digest, (key, value[key]))
+    elif isinstance(value, tuple):
+        for each in value:
+            add_content(digest, each)
+    elif hasattr(value, "__dataclass_fields__"):
+        add_content(digest, tuple(getattr(value, each.name) for each in fields(value)))
+    else:
+        digest.update(repr(value).encode())
+
+
+def count_changed(before: Masks, after: Masks) -> int:
+    """The masks of one that the other has not, with the same pixels and in the same instance."""
+    one, other = (dict(zip(name_each(each), each.instance_ids.tolist(), strict=True)) for each in (before, after))
+    both = one.keys() & other.keys()
+    votes = np.zeros((before.num_instances + 1, after.num_instances + 1))
+    for name in both:
+        votes[max(one[name], 0), max(other[name], 0)] += 1
+    twins = set(zip(*(side.tolist() for side in linear_sum_assignment(votes, maximize=True)), strict=True))
+    same = sum((max(one[name], 0), max(other[name], 0)) in twins for name in both)
+    return max(len(before), len(after)) - same
+
+
+def thirds_of_verification(args: argparse.Namespace) -> None:
+    numbers = [each for each in list_numbers(mvseg.verification) if args.numbers is None or each[1] in args.numbers]
+    keep_fits()
+    trials = list(list_trials(args))
+    before = [(masks := trial.run().to("cpu"), judge(masks, trial)) for trial in trials]
+    for trial, (masks, metrics) in zip(trials, before, strict=True):
+        scores = f"pair F1 {metrics.all_pair_f1:.3f}, MV-PQ {metrics.mv_pq:.3f}"
+        print(f"{trial.name}: {len(masks)} masks, {scores}", flush=True)
+    for module, name in numbers:
+        room = module.__name__.rpartition(".")[2]
+        for factor in (1 / FACTOR, FACTOR):
+            said = []
+            for trial, (masks, metrics) in zip(trials, before, strict=True):
+                if room not in trial.modules:
+                    continue
+                try:
+                    with changed(module, name, scaled(getattr(module, name), factor)):
+                        now = trial.run().to("cpu")
+                except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
+                    said.append(f"{trial.name} cannot be: {error}")
+                    continue
+                if count := count_changed(masks, now):
+                    new = judge(now, trial)
+                    change = new.all_pair_f1 - metrics.all_pair_f1, new.mv_pq - metrics.mv_pq
+                    said.append(f"{trial.name} {count} masks, F1 {change[0]:+.3f}, PQ {change[1]:+.3f}")
+            print(f"{room} {name} x {factor:.2f}: {' | '.join(said) or 'nothing'}", flush=True)
+
+
+def judge(masks: Masks, trial: Trial) -> LeafMetrics:
+    return leaf_metrics(masks.regions, masks.instance_ids, trial.truth)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, required=True, help="folder for rendered scenes and detections")
+    parser.add_argument("--room", choices=ROOMS, default="matching")
+    parser.add_argument("--numbers", nargs="+", help="only these")
+    parser.add_argument("--scenes", type=Path, nargs="*", default=[], help="more to verify, with photos and truth/")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    warnings.simplefilter("ignore", InputWarning)
+    ROOMS[args.room](args)
+
+
+ROOMS = {"matching": thirds_of_matching, "verification": thirds_of_verification}
 
 if __name__ == "__main__":
     main()
