@@ -20,6 +20,7 @@ from mvseg.regions import Regions, stack_regions
 T = TypeVar("T")
 
 SURE = 0.5  # match score from which a mask counts for its instance's support
+VERY_SURE = 0.9  # match score from which an id is hardly ever wrong
 COLUMNS = ("instance_ids", "match_scores", "detection_scores", "classes", "origin", "second_ids")  # that are tensors
 
 

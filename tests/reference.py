@@ -159,7 +159,7 @@ def cluster_aware_nms_reference(boxes: Tensor, scores: Tensor, groups: Tensor, i
     return kept
 
 
-def confirmed_reference(
+def backed_by_views_reference(
     boxes: Tensor, groups: Tensor, ids: Tensor, scores: Tensor, iou_threshold: float, min_score: float
 ) -> list[bool]:
     """Best box first; one is discarded when a box that stays overlaps it, unless it is surely another instance."""

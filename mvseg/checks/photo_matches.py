@@ -5,7 +5,6 @@ SIFT is OpenCV's: it finds as many matches as COLMAP's, in half the time, and pr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +13,7 @@ from numpy.typing import NDArray
 
 from mvseg.checks.cameras import find_coverage
 from mvseg.errors import InputError
+from mvseg.formats.photos import ReadPhoto
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
@@ -55,11 +55,11 @@ class PhotoMatches:
         return bool(self.is_rigid.sum() >= max(FEWEST, LEAST_SHARE * len(self.is_rigid)))
 
 
-def match_photos(read: Callable[[int], NDArray[np.uint8]], cameras: Cameras) -> list[PhotoMatches]:
+def match_photos(read: ReadPhoto, cameras: Cameras) -> list[PhotoMatches]:
     """The features that neighbouring photos share.
 
     Args:
-        read: the photo of a view, (H, W, 3) RGB without distortion; one for which it raises InputError is skipped.
+        read: the photo of a view; one for which it raises InputError is skipped.
         cameras: V cameras on the CPU, which say what neighbours are.
     """
     pairs = neighbours(cameras)

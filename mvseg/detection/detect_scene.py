@@ -20,7 +20,7 @@ from mvseg.detection.mask_rcnn import MultiViewMaskRCNN, list_proposals
 from mvseg.detectors.folded_norms import fold_norms
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.formats.photos import Photos
-from mvseg.masks import Masks
+from mvseg.masks import VERY_SURE, Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
@@ -28,7 +28,6 @@ from mvseg.system.file_hash import hash_files
 from mvseg.system.running import progress_bar
 
 UNSURE = 0.5  # share of the masks that are surely matched: with fewer, leaves may be too large for the detector
-SURE_MATCH = 0.9  # match score
 # Root of the area of masks, in pixels as the detector sees them, from which both sizes are better than either: nine in
 # ten leaves that detectors train on are smaller (`python benchmarks/training_leaves.py`). The medians of plants that
 # fill the photo are about 40, of close-ups 83 to 100 (docs/notes/detector.md).
@@ -184,7 +183,7 @@ def area_of_sure(masks: Masks) -> float:
 
 
 def _is_sure(masks: Masks) -> Tensor:
-    return (masks.instance_ids > 0) & (masks.match_scores >= SURE_MATCH)
+    return (masks.instance_ids > 0) & (masks.match_scores >= VERY_SURE)
 
 
 def _detect_photos(

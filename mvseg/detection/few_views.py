@@ -13,9 +13,9 @@ from torch import Tensor
 
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
+from mvseg.verification.evidence import SHARED
 
 FEW = 2  # views, in which no more show a leaf than can be verified
-MOST_TAKEN = 0.5  # of a mask, that other masks of its photo cover: with more it shows the same leaf
 
 
 def select_by_views(masks: Masks, detected: Masks, *, min_views: int) -> Masks:
@@ -66,7 +66,7 @@ def _few(masks: Masks, detected: Masks) -> Masks:
         taken = shown.label_map(view, torch.ones_like(shown.view_index), (right, bottom)) > 0
         for row in own[detected.detection_scores[own].argsort(descending=True, stable=True)].tolist():
             mask = detected.regions.mask(row, right, bottom)
-            if int((mask & taken).sum()) <= MOST_TAKEN * int(mask.sum()):
+            if int((mask & taken).sum()) <= SHARED * int(mask.sum()):
                 kept.append(row)
                 taken |= mask
     added = detected.select(torch.tensor(sorted(kept), dtype=torch.int64))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from mvseg.detection.assignment import EpipolarAssignment
-from mvseg.detection.nms import cluster_aware_nms, confirmed
+from mvseg.detection.nms import backed_by_views, cluster_aware_nms
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_masks
@@ -27,7 +27,8 @@ def match_proposals(
     detections_per_view: int = 100,
     match: MatchConfig = MatchConfig(),
 ) -> Matching:
-    """Match first, alternate assignment and NMS, then discard unconfirmed boxes (steps 2 to 4 of `MultiViewMaskRCNN`).
+    """Match first, alternate assignment and NMS, then discard boxes that no other view backs: steps 2 to 4 of
+    `MultiViewMaskRCNN`.
 
     Args:
         proposals: R scored masks of V views, the excessive set; objects of different classes are never matched.
@@ -67,7 +68,7 @@ def match_proposals(
             caught.clear()
             matching = rematch(proposals.select(keep))
         if num_iterations and matching.report.has_probabilities:
-            stays = confirmed(
+            stays = backed_by_views(
                 boxes[keep],
                 per_class[keep],
                 matching.instance_ids,

@@ -41,7 +41,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        it resembles most (Eq. 5); NMS with a small threshold (`cluster_iou`, 0.3) inside each instance; match the
        survivors again. Masks that resemble no map form one more group.
     4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
-       better one stays only if the other views confirm it as another instance (`confirmed`); match what is left.
+       better one stays only if the other views show it to be another instance (`backed_by_views`); match what is left.
     5. With `verify`, what is matched of the sure proposals (`SURE_SCORE`), and of many more (`MORE_SCORE`), are
        candidates only, and the views choose leaves and masks from the whole excessive set (`verification.choose`).
 

@@ -36,7 +36,7 @@ def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_thresho
     return torchvision.ops.batched_nms(boxes.double(), scores.double(), group, iou_threshold)
 
 
-def confirmed(
+def backed_by_views(
     boxes: Tensor,
     groups: Tensor,
     instance_ids: Tensor,
@@ -44,8 +44,8 @@ def confirmed(
     match_scores: Tensor,
     iou_threshold: float = 0.3,
 ) -> Tensor:
-    """Which boxes stay: those that no better box overlaps, and those that the other views confirm as another instance,
-    by another id with a match score of at least 0.5.
+    """Which boxes stay: those that no better box overlaps, and those that the other views show to be another
+    instance, by another id with a match score of at least 0.5.
 
     Cluster-aware NMS keeps a duplicate as well as a half-hidden leaf when it takes another cluster than the better box.
     Only the half-hidden leaf finds its match in the other views. Not in the paper.

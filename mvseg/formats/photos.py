@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 import posixpath
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pycolmap
 import torch
+from numpy.typing import NDArray
 
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.find_views import list_some
@@ -29,6 +30,8 @@ from mvseg.formats.lens import undistort
 from mvseg.formats.photo_content import PhotoContent, measure_content
 from mvseg.scene import Cameras, Scene, View, camera_problem
 from mvseg.system.file_hash import hash_files
+
+ReadPhoto = Callable[[int], NDArray[np.uint8]]  # view index -> (H, W, 3) RGB, undistorted: `Photos`, or a stand-in
 
 CACHED_BYTES = 256 * 2**20  # 12 photos of 7 megapixels
 

@@ -25,15 +25,14 @@ from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import Bools, Ints, Shown, paint_view
+from mvseg.verification.evidence import FITS, Bools, Ints, Shown, paint_view
 from mvseg.verification.rematched_masks import rematch_misfits
 
 Surfaces = Mapping[int, LeafSurface]
 
-ENOUGH_VIEWS = 5  # with fewer, a surface fits wrong masks about as well as right ones: sure ids stay
-FITS = 0.5  # IoU of a mask with what its view shows of a surface, from which it shows that surface
+VIEWS_TO_CHECK = 5  # with fewer, a surface fits wrong masks about as well as right ones: sure ids stay
 FEW_VIEWS = 0.75  # instances that at most this share of the views shows may be made of pieces
-INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
+PIECE_INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
 MOST_PIECES = 0.5  # an instance is made of pieces when more than this share of its masks are pieces
 OFTEN_SPLIT = 0.1  # of all instances in all views: from here on, several masks of one leaf are nothing unusual
 MOST_SPLIT = 1  # photos that show both parts of a leaf as masks of their own, where masks are whole as a rule
@@ -56,7 +55,7 @@ def check_ids(
     First the pieces (`move_pieces`), then the masks that fit another surface than their own (`move_misfits`), then the
     halves of leaves (`join_halves`). What still lies outside its own surface is matched once more (`rematch_misfits`).
     No mask loses its id without getting another. An instance may have several masks in a view afterwards: they show it
-    together. With fewer than `ENOUGH_VIEWS` views, masks that are surely matched stay. Last, the masks that show two
+    together. With fewer than `VIEWS_TO_CHECK` views, masks that are surely matched stay. Last, the masks that show two
     surfaces are marked as merged (`find_shared`).
 
     Args:
@@ -74,7 +73,7 @@ def check_ids(
     on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
     old, shown = masks.instance_ids.cpu().numpy(), Shown.of(on_cpu, surfaces, cameras)
     is_held = _is_held(masks, held)
-    if masks.regions.num_views < ENOUGH_VIEWS:
+    if masks.regions.num_views < VIEWS_TO_CHECK:
         is_held |= (masks.match_scores >= SURE).cpu().numpy()
     ids = np.where(is_held, old, move_pieces(on_cpu, old, shown))
     left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
@@ -138,7 +137,7 @@ def move_pieces(regions: Regions, ids: Ints, shown: Shown) -> Ints:
     """
     few = _seen_rarely(regions, ids)
     inside = shown.compare(set(shown.instances.tolist()) - set(few)).inside
-    is_inside = inside.max(1) >= INSIDE
+    is_inside = inside.max(1) >= PIECE_INSIDE
     revised = ids.copy()
     for instance in few:
         own = ids == instance

@@ -22,7 +22,7 @@ from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, draw_views, see
+from mvseg.verification.evidence import FITS, Bools, Drawn, Floats, Ints, draw_views, see
 from mvseg.verification.leaf_scores import (
     FITTED,
     Candidates,
@@ -156,7 +156,7 @@ def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
 
 
 def _without(proposals: Masks, gone: Masks | None) -> Bools:
-    """(R,) bool: the proposals that are not masks which a person took away, by an IoU of one half."""
+    """(R,) bool: the proposals that are not masks which a person took away, by `FITS`."""
     stays = np.ones(len(proposals), bool)
     boxes, views = proposals.regions.boxes, proposals.view_index
     for row in range(0 if gone is None else len(gone)):
@@ -165,7 +165,7 @@ def _without(proposals: Masks, gone: Masks | None) -> Bools:
         x1, y1, x2, y2 = crop.box
         near = (views == gone.view_index[row]) & (boxes[:, 0] < x2) & (boxes[:, 1] < y2)
         for other in (near & (boxes[:, 2] > x1) & (boxes[:, 3] > y1)).nonzero()[:, 0].tolist():
-            stays[other] &= crop.iou(proposals.regions.placed(other)) <= 0.5
+            stays[other] &= crop.iou(proposals.regions.placed(other)) <= FITS
     return stays
 
 

@@ -8,7 +8,7 @@ is fitted to those parts as well, and then says what each view shows of the leaf
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -20,6 +20,7 @@ from torch import Tensor
 
 from mvseg.crop import Crop
 from mvseg.errors import InputWarning
+from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -27,13 +28,12 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
+from mvseg.verification.evidence import FITS
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
 from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
 
-Photos = Callable[[int], NDArray[np.uint8]]
 Frame = NDArray[np.bool_]
 
-AGREES = 0.5  # IoU of a mask with what its view shows of a surface, from which they show the same leaf
 LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this share of it is unhidden
 LEAST_PIXELS = 64  # and so many of its pixels
 LEAST_COLORED = 0.8  # the visible part of a surface becomes a mask if this share of it has the colour of leaves
@@ -49,19 +49,19 @@ def follow_drawn(
     masks: Masks,
     *,
     cameras: Cameras,
-    photos: Photos | None,
+    photos: ReadPhoto | None,
     colors: Frame | None = None,
 ) -> tuple[Masks, dict[int, LeafSurface]]:
     """Give the leaves that a person drew a mask in each other view that shows them openly.
 
     That is where at least `LEAST_VISIBLE` of the leaf's surface, and `LEAST_PIXELS`, lie in no mask of another leaf,
     and `LEAST_COLORED` of it have the colour of leaves. There, a mask that was matched to nothing and agrees with it
-    (`AGREES`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
+    (`FITS`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
 
     Args:
         masks: D masks, matched; those that a person drew have `Origin.CORRECTED`.
         cameras: V cameras.
-        photos: view index -> (H, W, 3) uint8 RGB, undistorted. None: the outlines alone tell.
+        photos: of the views. None: the outlines alone tell.
         colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
 
     Returns:
@@ -119,7 +119,7 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
             break
         around = _around(best, cameras, left)
     is_own = None if best is None else torch.isin(best.views, own.view_index)
-    if best is None or is_own is None or float(best.iou[is_own].min()) < AGREES:  # the outlines are certain
+    if best is None or is_own is None or float(best.iou[is_own].min()) < FITS:  # the outlines are certain
         return fit({}, None)
     return best
 
@@ -138,7 +138,7 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
         fits = {row: masks.regions.placed(row).iou(visible) for row in free}
         best = max(fits, key=lambda row: fits[row], default=-1)
-        if best >= 0 and fits[best] >= AGREES:
+        if best >= 0 and fits[best] >= FITS:
             ids[best] = leaf
         else:
             parts[view] = leaf_colored.tighten()

@@ -27,6 +27,7 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
 MOST_PX = 800  # of a photo's longer side, that are compared; a limit of time: at 400 the evidence is as good
+FITS = 0.5  # IoU of a mask with what its view shows of a leaf, from which it shows that leaf (a definition)
 SHARED = 0.5  # of the smaller of two masks, that the other covers: with more, they show one leaf (a definition)
 
 

@@ -1,8 +1,7 @@
-"""What has the colour of the confirmed masks: unconfirmed pixels of that colour may be leaves that were missed."""
+"""What has the colour of leaves that were found: other pixels of that colour may be leaves that were missed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -11,9 +10,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks
-
-Photos = Callable[[int], NDArray[np.uint8]]
 
 SURE_VIEWS = 4  # of an instance whose masks tell that colour
 BINS = 16  # per channel
@@ -26,7 +24,7 @@ class ColorCounts:
     """How often each colour occurs.
 
     Attributes:
-        inside: (BINS, BINS, BINS) int64, pixels of confirmed masks by red, green and blue.
+        inside: (BINS, BINS, BINS) int64, pixels of masks by red, green and blue.
         outside: the same for all other pixels.
     """
 
@@ -74,7 +72,7 @@ def _count(photo: np.ndarray, part: np.ndarray) -> np.ndarray:
     return counted.astype(np.int64)
 
 
-def colors_of_leaves(masks: Masks, photos: Photos) -> NDArray[np.bool_]:
+def colors_of_leaves(masks: Masks, photos: ReadPhoto) -> NDArray[np.bool_]:
     """The colours of masks that are surely matched, of instances that are so in `SURE_VIEWS` views, or in all where
     there are fewer; where there are no such masks, those of all that are matched."""
     enough = masks.count_sure_views() >= min(SURE_VIEWS, masks.regions.num_views)

@@ -22,11 +22,10 @@ from scipy.special import expit
 from mvseg.masks import Masks
 from mvseg.scene import Cameras
 from mvseg.verification.choose import Leaves
-from mvseg.verification.evidence import Bools, Floats, Ints, draw_views
+from mvseg.verification.evidence import FITS, Bools, Floats, Ints, draw_views
 from mvseg.verification.leaf_scores import FITTED, LeafScores, log_odds
 
 LEAF_SHIFT = 0.45  # standard deviation of the prior, log odds
-AGREES = 0.5  # IoU from which a person's mask shows what a mask of the detector does
 DIGITS = 6  # of a shift that count
 
 Rejection = tuple[int, int, int, bool]  # view, x, y (pixels, undistorted), whether in all photos
@@ -109,11 +108,11 @@ def label_leaves(
 
 
 def _agreeing(one: Masks, two: Masks, cameras: Cameras) -> tuple[Ints, Ints]:
-    """The pairs of rows of two tables that show the same pixels, by `AGREES`."""
+    """The pairs of rows of two tables that show the same pixels, by `FITS`."""
     pairs = [np.zeros((0, 2), np.int64)]
     for each in draw_views(Masks.concatenate((one, two)).regions, (), cameras):
         areas, both = each.masks.sum(0), (each.masks.T @ each.masks).toarray()
-        agrees = np.argwhere(both > AGREES * (areas[:, None] + areas - both))
+        agrees = np.argwhere(both > FITS * (areas[:, None] + areas - both))
         rows = each.rows[agrees]
         pairs.append(rows[(rows[:, 0] < len(one)) & (rows[:, 1] >= len(one))])
     first, second = np.concatenate(pairs).T

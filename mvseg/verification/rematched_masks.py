@@ -15,17 +15,15 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import InputWarning
-from mvseg.masks import Masks
+from mvseg.masks import VERY_SURE, Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links
 from mvseg.matching.match import match_masks
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import Shown
+from mvseg.verification.evidence import FITS, Shown
 
-INSIDE = 0.4  # of a mask, within the outline of its surface: with less of it, it shows something else
-FITS = 0.5  # IoU of the surface, fitted to it and to others, from which it shows that surface all the same
-SURE = 0.9  # match score from which the other views know better
+LEAST_INSIDE = 0.4  # of a mask, within the outline of its surface: with less of it, it shows something else
 
 
 def rematch_misfits(
@@ -78,8 +76,8 @@ def find_misfits(masks: Masks, surfaces: Mapping[int, LeafSurface], shown: Shown
         if not surface.exists:
             continue
         ious = dict(zip(surface.views.tolist(), surface.iou.nan_to_num(0).tolist(), strict=True))
-        for row in ((ids == instance) & (masks.match_scores.cpu() < SURE)).nonzero()[:, 0].tolist():
-            is_misfit[row] = bool(ious.get(views[row], 0.0) < FITS and inside[row, instance] < INSIDE)
+        for row in ((ids == instance) & (masks.match_scores.cpu() < VERY_SURE)).nonzero()[:, 0].tolist():
+            is_misfit[row] = bool(ious.get(views[row], 0.0) < FITS and inside[row, instance] < LEAST_INSIDE)
     return is_misfit.to(masks.view_index.device)
 
 

@@ -8,7 +8,6 @@ what lies deeper inside stays leaf, what lies farther outside stays background. 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
 import cv2
 import numpy as np
@@ -16,6 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from mvseg.crop import Crop
+from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
 
 BAND = 0.05  # of the root of a mask's area, that its edge may move; from 0.025 to 0.07 MV-PQ changes by 0.005
@@ -25,19 +25,18 @@ LEAST_PIXELS = 10  # of leaf and of background, that their colours are learned f
 
 FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])  # who confirmed a mask saw it with this edge
 
-Photos = Callable[[int], NDArray[np.uint8]]
 Pixels = NDArray[np.uint8]
 Bools = NDArray[np.bool_]
 
 
-def snap_masks(masks: Masks, photos: Photos) -> Masks:
+def snap_masks(masks: Masks, photos: ReadPhoto) -> Masks:
     """Move the edges of the masks that a detector found to those of colour, see `snap`.
 
     None grows into another mask of its view, nor do two grow into the same pixel: the first row has it.
 
     Args:
         masks: D masks.
-        photos: view index -> (H, W, 3) uint8 RGB, undistorted.
+        photos: of the views.
 
     Returns:
         The same rows, on the CPU. Masks that no detector found, and those that show two instances, stay as they are.

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import NDArray
 
+from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
 from mvseg.verification.evidence import MOST_PX
 from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
-
-Photos = Callable[[int], NDArray[np.uint8]]
 
 # Of the pixels of leaf colour, outside all leaves: more than inside. Of plants that were found whole, 0.15 to 0.39 are
 # (stems, soil and pots), of those of which a quarter was found, 0.48 to 0.84 (docs/notes/detector.md).
@@ -19,12 +15,12 @@ MUCH = 0.5
 HELP = "what helps most: correct a few leaves (mvseg correct), fine-tune on them (mvseg train), or give masks (--masks)"
 
 
-def share_unexplained(masks: Masks, photos: Photos) -> float:
+def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
     """Of all pixels that are in masks, or have the colours of these, the share that is in none; 0 without any.
 
     Args:
         masks: D masks, those of leaves with an id.
-        photos: view index -> (H, W, 3) uint8 RGB, undistorted; every second, third ... pixel of large ones counts.
+        photos: of the views; every second, third ... pixel of large ones counts.
     """
     counts, views = ColorCounts.none(), []
     for view in range(masks.regions.num_views):
@@ -42,7 +38,7 @@ def share_unexplained(masks: Masks, photos: Photos) -> float:
     return beside / max(total, 1)
 
 
-def describe_missing(masks: Masks, photos: Photos, *, sure_score: float) -> str:
+def describe_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float) -> str:
     """A sentence where leaves were probably missed, "" elsewhere.
 
     Args:

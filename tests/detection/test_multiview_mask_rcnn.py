@@ -157,9 +157,9 @@ def test_boxes_that_the_other_views_do_not_confirm_are_discarded(monkeypatch: py
     def refuse_first(boxes: torch.Tensor, *others: torch.Tensor, **options: object) -> torch.Tensor:
         return torch.arange(len(boxes)) > 0
 
-    monkeypatch.setattr("mvseg.detection.loop.confirmed", refuse_first)
+    monkeypatch.setattr("mvseg.detection.loop.backed_by_views", refuse_first)
     after = wrapped.find_regions(images, cameras)
-    monkeypatch.setattr("mvseg.detection.loop.confirmed", lambda boxes, *_, **__: torch.ones(len(boxes)) > 0)
+    monkeypatch.setattr("mvseg.detection.loop.backed_by_views", lambda boxes, *_, **__: torch.ones(len(boxes)) > 0)
     assert len(after) == len(wrapped.find_regions(images, cameras)) - 1
 
 

@@ -7,9 +7,9 @@ import torch
 import torchvision
 
 from mvseg.detection.assignment import MAX_PIXELS, EpipolarAssignment, ruzicka_similarity
-from mvseg.detection.nms import cluster_aware_nms, confirmed
+from mvseg.detection.nms import backed_by_views, cluster_aware_nms
 from mvseg.errors import InputError
-from reference import cluster_aware_nms_reference, confirmed_reference, epipolar_map_reference, ruzicka_reference
+from reference import backed_by_views_reference, cluster_aware_nms_reference, epipolar_map_reference, ruzicka_reference
 from synthetic import ball_scene
 
 
@@ -128,21 +128,21 @@ def test_an_overlap_is_settled_by_the_other_views() -> None:
     ids = torch.tensor([3, 3, 4, 5, -1, 3])
     scores = torch.tensor([0.2, 0.9, 0.9, 0.4, 0.0, 0.1])
     # the best; the same instance; surely another; not sure; nothing; alone in its view
-    assert confirmed(box, groups, ids, match_scores=scores).tolist() == [True, False, True, False, False, True]
+    assert backed_by_views(box, groups, ids, match_scores=scores).tolist() == [True, False, True, False, False, True]
     apart = box + 20 * torch.arange(6)[:, None]
-    assert confirmed(apart, groups, ids, match_scores=scores).all()
-    assert confirmed(box[:0], groups[:0], ids[:0], match_scores=scores[:0]).shape == (0,)
+    assert backed_by_views(apart, groups, ids, match_scores=scores).all()
+    assert backed_by_views(box[:0], groups[:0], ids[:0], match_scores=scores[:0]).shape == (0,)
 
 
 @pytest.mark.parametrize("seed", [0, 1])
-def test_confirmed_agrees_with_a_loop(seed: int) -> None:
+def test_backing_agrees_with_a_loop(seed: int) -> None:
     boxes, scores = random_boxes(120, seed)
     generator = torch.Generator().manual_seed(seed)
     groups = torch.randint(2, (120, 2), generator=generator)
     ids = torch.randint(0, 10, (120,), generator=generator)
     ids[ids == 0] = -1
-    stays = confirmed(boxes, groups, ids, match_scores=scores)
-    assert stays.tolist() == confirmed_reference(boxes, groups, ids, scores, 0.3, 0.5)
+    stays = backed_by_views(boxes, groups, ids, match_scores=scores)
+    assert stays.tolist() == backed_by_views_reference(boxes, groups, ids, scores, 0.3, 0.5)
     assert 10 < stays.sum() < 110
-    again = confirmed(boxes[stays], groups[stays], ids[stays], match_scores=scores[stays])
+    again = backed_by_views(boxes[stays], groups[stays], ids[stays], match_scores=scores[stays])
     assert again.all()  # idempotent
