@@ -5,7 +5,7 @@ again after each. He makes the edits that repair most ("repair"), or answers the
 ("ask"). An outline that he draws counts 3, any other edit 1, and so does an answer, whatever edits its key makes; a
 question that no answer fits counts nothing. Beside it, the same edits to the masks of the first result alone: what the
 cameras bring is the difference. And harm: leaves that were right, that no edit of the round was about, and that are
-wrong after it. The orders that end in "-learn" learn the plant. Of "degraded" masks (`label_maps.py`) the
+wrong after it. Of "degraded" masks (`label_maps.py`) the
 ids are corrected, as `mvseg match` gives them; "detected" are the same scenes from pixels; --scenes are folders with
 photos and `truth/`. Rounds that are in the folder are not run again.
 """
@@ -68,12 +68,10 @@ Record = dict[str, Any]
 BEFORE_EDITS = ("detect", "match", "split", "choose")  # of detected masks: done once
 NOT_SHOWN = ("say_what_is_missing", "check", "measure")
 MOST, ROUNDS = 2.0, 8  # edits' worth per leaf, and in how many rounds, as a rule
-LEARN = "-learn"  # the same person, and `--detect.learn_plant true`
-ORDERS = ("repair", "ask", f"repair{LEARN}", f"ask{LEARN}")
+ORDERS: tuple[Order, ...] = ("repair", "ask")
 CURVES = (
     ("corrected, what repairs most first", "repair", "", "C2-"),
     ("the page's questions answered", "ask", "", "C0-"),
-    ("these, and the plant is learnt", f"ask{LEARN}", "", "C0:"),
     ("the same edits, masks alone", "repair", "alone_", "C7--"),
 )
 PANELS = (
@@ -173,18 +171,8 @@ def judge(masks: Masks, truth: Sequence[Labels]) -> dict[str, float]:
     }
 
 
-def with_learning(case: Case) -> Case:
-    """The same scene with `--detect.learn_plant true`; surfaces are shared."""
-    config = case.found.config
-    config = replace(config, detect=replace(config.detect, learn_plant=True))
-    return replace(case, found=replace(case.found, config=config))
-
-
-def correct(case: Case, order: str, out: Path) -> list[Record]:
-    """The records of all rounds, until edits are worth `MOST` for each leaf; those in the folder are read. The order is
-    one of `ORDERS`."""
-    person: Order = "ask" if order.startswith("ask") else "repair"
-    case = with_learning(case) if order.endswith(LEARN) else case
+def correct(case: Case, order: Order, out: Path) -> list[Record]:
+    """The records of all rounds, until edits are worth `MOST` for each leaf; those in the folder are read."""
     path = out / f"{case.name}_{order}.csv"
     records, edits = read_records(path), tuple[Edit, ...]()
     if records and records[-1]["is_last"]:
@@ -201,12 +189,12 @@ def correct(case: Case, order: str, out: Path) -> list[Record]:
         first = masks if first is None else first
         doubts = list_doubts(masks, state.surfaces, cameras=state.scene.cameras, left=state.left)
         look = Look(masks, case.truth, state.scene, doubts, ids_only=case.has_masks)
-        listed = list_answers(look, edits) if person == "ask" else list_repairs(look)
+        listed = list_answers(look, edits) if order == "ask" else list_repairs(look)
         done = {str(edit.by) for edit in edits}
         most = math.ceil(MOST * case.num_leaves)
         left = most - count_worth(edits)
         step = min(left, math.ceil(most / ROUNDS))
-        chosen = choose_repairs(listed, order=person, worth=(step, left), done=done)
+        chosen = choose_repairs(listed, order=order, worth=(step, left), done=done)
         about = {"scene": case.name, "order": order, "leaves": case.num_leaves}
         alone = judge(change_masks_alone(first, edits, state.scene), case.truth)
         record = about | {"edits": len(edits), "worth": count_worth(edits)} | judge(masks, case.truth)

@@ -227,21 +227,13 @@ def choose(state: State) -> State:
 
 
 def choose_corrected(state: State) -> State:
-    """The same after edits. What is known without them stays among the candidates, and says how the scores judge this
-    plant."""
-    from mvseg.verification.learnt_plant import label_leaves, learn_plant
-
-    known, corrected, shown = state.unedited, state.corrected, state.shown
+    """The same after edits. What is known without them stays among the candidates."""
+    known, shown = state.unedited, state.shown
     assert known is not None
-    assert corrected is not None
     assert shown is not None
-    masks, is_linked = state.masks.to("cpu"), _is_linked(state)
-    how: dict[str, Any] = {"linked": is_linked, "gone": _taken_away(shown, masks)}
-    if state.config.detect.learn_plant:
-        is_held, cameras = (masks.is_corrected | is_linked).numpy(), state.scene.cameras.to("cpu")
-        labels = label_leaves(known.leaves, masks, is_held=is_held, rejected=corrected.no_leaves, cameras=cameras)
-        how["fitted"] = learn_plant(labels)
-    return _with_leaves(state, _choose_leaves(state, known.matched, **how))
+    masks = state.masks.to("cpu")
+    leaves = _choose_leaves(state, known.matched, linked=_is_linked(state), gone=_taken_away(shown, masks))
+    return _with_leaves(state, leaves)
 
 
 def _choose_leaves(state: State, more: Sequence[Masks], **how: Any) -> Leaves:

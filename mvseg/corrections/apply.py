@@ -63,7 +63,6 @@ class Corrected:
         everywhere: (edit number, row, whether its instance is rejected) of each edit about a whole instance.
         refused: (edit number, view, x, y, whether in all photos) of each pixel where a person says that no leaf is,
             and where no mask is: it may be the answer to a question, see `settle`.
-        rejected: the same of all such pixels, whatever is there.
         fates: of the edits, in their order.
     """
 
@@ -73,20 +72,12 @@ class Corrected:
     last_edits: Tensor
     everywhere: tuple[tuple[int, int, bool], ...]
     refused: tuple[tuple[int, int, int, int, bool], ...]
-    rejected: tuple[tuple[int, int, int, int, bool], ...]
     fates: tuple[Fate, ...]
 
     @property
     def messages(self) -> list[str]:
         """A sentence for each edit that was not applied, or is odd."""
         return [each.message for each in self.fates if each.message]
-
-    @property
-    def no_leaves(self) -> list[tuple[int, int, int, bool]]:
-        """View, x, y, and whether in all photos, of each pixel where a person says that no leaf is, but for what later
-        edits contradict."""
-        kept = {each.edit for each in self.fates if each.fate in (APPLIED, NOTHING)}
-        return [(view, x, y, is_about_all) for number, view, x, y, is_about_all in self.rejected if number in kept]
 
 
 @dataclass(eq=False)
@@ -101,7 +92,6 @@ class _Work:
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
     rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
     refused: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
-    said_no: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
@@ -157,7 +147,6 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         last_edits=last_edits,
         everywhere=everywhere,
         refused=tuple(work.refused),
-        rejected=tuple(work.said_no),
         fates=tuple(work.fates.values()),
     )
 
@@ -204,9 +193,9 @@ def _apply_one(work: _Work, number: int, edit: Edit) -> None:
         _outline(work, number, edit)
     elif isinstance(edit, Reject):
         place = edit.view, *edit.at
-        work.said_no.append((number, *_pixel_at(work, place), edit.everywhere))
+        pixel = _pixel_at(work, place)
         if not _masks_at(work, place, work.masks):
-            work.refused.append(work.said_no[-1])
+            work.refused.append((number, *pixel, edit.everywhere))
         mask = _mask_at(work, place)
         if edit.everywhere:
             _contradict(work, number, mask.edits)

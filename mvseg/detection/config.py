@@ -33,9 +33,6 @@ class DetectConfig:
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.
         verify: let the views choose leaves and masks from everything that the detector proposes, weak proposals
             included, by one score (`mvseg.verification.choose`). It was fitted on leaves.
-        learn_plant: leaves that a person confirmed, drew or rejected say how well the score judges this plant, and
-            shift the probabilities of its other leaves (`mvseg.verification.learnt_plant`). Seven plants gained nothing
-            by it.
         min_views: a leaf must have masks in so many photos. 1 keeps, too, what one or two photos show and no other view
             verifies: as it was found, and marked.
     """
@@ -47,7 +44,6 @@ class DetectConfig:
     crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
     verify: bool = True
-    learn_plant: bool = False
     min_views: int = 2
 
     def __post_init__(self) -> None:

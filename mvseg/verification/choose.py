@@ -78,7 +78,6 @@ def choose_leaves(
     linked: Tensor | None = None,
     gone: Masks | None = None,
     min_probability: float | None = None,
-    fitted: LeafScores = FITTED,
 ) -> Leaves:
     """Choose leaves and their masks from the excessive set.
 
@@ -95,7 +94,6 @@ def choose_leaves(
             person's masks are candidates here, and `more` has the others.
         gone: masks that a person took away; None: none.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
-        fitted: the numbers of the two scores.
 
     Returns:
         The leaves. Where the cameras see the plant from one side only, by less than `LEAST_PARALLAX`, surfaces are too
@@ -120,7 +118,7 @@ def choose_leaves(
     candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)
     drawn = draw_views(table.regions, candidates.surfaces, cameras)
     usable = np.concatenate((left, np.ones(len(added), bool)))
-    chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability, fitted=fitted)
+    chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability)
     return _take(chosen, candidates, table, is_held=held)
 
 

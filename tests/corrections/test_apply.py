@@ -260,13 +260,6 @@ def test_saying_no_where_no_mask_is_answers_a_question() -> None:
     assert settle(answered, left, {}, cameras=SCENE.cameras)[0] == (other,)
 
 
-def test_where_a_person_says_that_no_leaf_is_unless_he_says_otherwise_later() -> None:
-    corrected = correct(at("reject", 15, 15), at("reject", 35, 15, "b", everywhere=True), at("reject", 1, 2, "b"))
-    assert corrected.no_leaves == [(0, 15, 15, False), (1, 35, 15, True), (1, 1, 2, False)]
-    assert correct(at("reject", 15, 15), at("confirm", 15, 15)).no_leaves == []
-    assert correct(at("reject", 15, 15, "c")).no_leaves == []  # there is no such photo
-
-
 def test_links_stay_with_their_masks_when_an_instance_goes() -> None:
     corrected = correct(at("reject", 15, 15, everywhere=True), link("same", ("a", 35, 15), ("b", 35, 15)))
     assert corrected.is_linked.tolist() == [False, True, False, True]

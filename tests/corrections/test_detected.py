@@ -12,8 +12,7 @@ import torch
 from blade_scene import as_regions
 from mvseg.config import RunConfig
 from mvseg.corrections.apply import APPLIED
-from mvseg.corrections.file import Confirm, Corrections, Edit, Reject
-from mvseg.detection.config import DetectConfig
+from mvseg.corrections.file import Corrections, Edit, Reject
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
@@ -22,8 +21,6 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras, Scene, View
 from mvseg.stages import State
 from mvseg.verification import choose as choosing
-from mvseg.verification.choose import Leaves, choose_leaves
-from mvseg.verification.leaf_scores import FITTED, LeafScores
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 REGIONS, IDS = as_regions(true_maps())
@@ -66,10 +63,10 @@ def at(leaf: int, view: int) -> tuple[float, float]:
     return float(x) + 0.5, float(y) + 0.5
 
 
-def run(*edits: Edit, learn_plant: bool = True) -> State:
+def run(*edits: Edit) -> State:
     found = Found()
     state = State(
-        config=RunConfig(detect=DetectConfig(learn_plant=learn_plant)),
+        config=RunConfig(),
         scene=SCENE,
         photos=Photos(SCENE),
         found=found,  # type: ignore[arg-type]
@@ -109,26 +106,6 @@ def test_an_answer_that_changes_nothing_changes_nothing() -> None:
     assert before.instances.probabilities == after.instances.probabilities
     assert torch.equal(before.masks.instance_ids, after.masks.instance_ids)
     assert torch.equal(before.masks.regions.crops, after.masks.regions.crops)
-
-
-@pytest.mark.parametrize("learn_plant", [True, False])
-def test_the_plant_is_learnt_if_one_wants_it(learn_plant: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    seen: list[LeafScores] = []
-
-    def watched(*args: object, fitted: LeafScores = FITTED, **how: object) -> Leaves:
-        seen.append(fitted)
-        return choose_leaves(*args, fitted=fitted, **how)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(choosing, "choose_leaves", watched)
-    run(
-        Reject(view="v0", at=at(1, 0), everywhere=True), Confirm(view="v1", at=at(2, 1), everywhere=True),
-        learn_plant=learn_plant,
-    )  # fmt: skip
-    first, last = seen
-    assert first == FITTED
-    assert (last == FITTED) is not learn_plant
-    if learn_plant:
-        assert last.leaf[0] < FITTED.leaf[0]  # a sure leaf was none
 
 
 def test_what_is_known_without_a_person_is_found_once() -> None:
