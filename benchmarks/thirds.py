@@ -7,8 +7,8 @@ Of matching, with degraded masks: a line says of each scene how many ids of "nvi
 much their pair F1, and how far match scores move. Of verification: how many masks change their instance or their
 pixels, and by how much pair F1 and MV-PQ change, where surfaces check the ids of degraded masks and of straps in pieces
 and masks are cut; where the views choose what the shipped detector found, also in the folders of `--scenes`; and where
-every third leaf of these was missed, and a person drew it in two photos, or in three (half of its other masks are still
-there, matched to nothing).
+up to `MOST_DRAWN` of these leaves were missed, and a person drew them in two photos, or in three (half of their other
+masks are still there, matched to nothing).
 """
 
 from __future__ import annotations
@@ -69,7 +69,8 @@ from mvseg.simulation.growth import grow_plant
 FACTOR = 1.33
 SCENES = ((3, 16), (5, 32), (10, 8), (20, 8))  # views and leaves
 CHECKED = ((3, 16, 0), (5, 32, 1), (10, 16, 0), (10, 32, 2))  # views, leaves and plant, where surfaces check ids
-STRAPS = 12  # leaves of the straps in pieces
+STRAPS = 12  # leaves of either plant of straps in pieces
+MOST_DRAWN = 4  # leaves of a scene
 FOUND = ((10, 16, 0), (10, 32, 1))  # where a detector finds leaves, beside the plant that ships
 
 
@@ -88,8 +89,13 @@ def list_numbers(package: ModuleType) -> Iterator[tuple[ModuleType, str]]:
         for statement in ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8")).body:
             for target in statement.targets if isinstance(statement, ast.Assign) else ():
                 for name in target.elts if isinstance(target, ast.Tuple) else [target]:
-                    if isinstance(name, ast.Name) and isinstance(getattr(module, name.id), int | float | tuple):
+                    if isinstance(name, ast.Name) and is_number(getattr(module, name.id)):
                         yield module, name.id
+
+
+def is_number(value: Any) -> bool:
+    """Whether it is a number, or several."""
+    return all(map(is_number, value)) if isinstance(value, tuple) else isinstance(value, int | float)
 
 
 @contextmanager
@@ -185,7 +191,7 @@ class Trial:
 
 CHECKING = ("checked_ids", "rematched_masks", "evidence")
 CHOOSING = ("choose", "leaf_scores", "rough_surfaces", "evidence", "snap_edges")
-DRAWING = ("drawn_leaves", "leaf_color", "rough_surfaces")
+DRAWING = ("drawn_leaves", "leaf_color")
 
 
 def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
@@ -193,11 +199,12 @@ def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
         maps = load_maps(spec_of(*cell), args.cache)
         name, regions = f"{cell[1]} leaves in {cell[0]} views", maps.masks("degraded")[0]
         yield check_trial(name, regions, maps.cameras, maps.true)
-    plant = grow_plant("strap", STRAPS, FIRST_SEED)
-    cameras = strap_cameras(plant)
-    true = visible_ids(plant, cameras)
-    pieces = regions_from_label_maps([cut_pieces(labels) for labels in true])
-    yield check_trial("pieces of straps", pieces, cameras, true)
+    for number in (0, 1):
+        plant = grow_plant("strap", STRAPS, FIRST_SEED + number)
+        cameras = strap_cameras(plant)
+        true = visible_ids(plant, cameras)
+        pieces = regions_from_label_maps([cut_pieces(labels) for labels in true])
+        yield check_trial(f"pieces of straps {number}", pieces, cameras, true)
     for folder in (demo_scene(), *(render(spec_of(*cell), args.cache) for cell in FOUND), *args.scenes):
         case = detect_case(folder, RunConfig(reconstruct=None), cache=args.cache / "kept" / folder.name)
         case = replace(case, fit=None, unedited=None)
@@ -231,10 +238,10 @@ def follow_anew(state: State) -> Masks:
 
 
 def draw(case: Case, first: Masks, number: int) -> State:
-    """Every third leaf that enough photos show was missed, and is drawn in so many of them."""
+    """Every third leaf that enough photos show, up to `MOST_DRAWN`, was missed, and is drawn in so many of them."""
     look, ids = Look(first, case.truth, case.found.scene, ()), first.instance_ids.clone()
     views = [(leaf, open_views(look.visible[:, leaf])) for leaf in range(1, len(look.size))]
-    chosen = [(leaf, shown) for leaf, shown in views if len(shown) > number][number - 2 :: 3]
+    chosen = [(leaf, shown) for leaf, shown in views if len(shown) > number][number - 2 :: 3][:MOST_DRAWN]
     maps = [np.zeros_like(labels) for labels in case.truth]
     for leaf, shown in chosen:
         ids[torch.from_numpy(look.leaf == leaf)] = -1

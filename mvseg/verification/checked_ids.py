@@ -30,16 +30,14 @@ from mvseg.verification.rematched_masks import rematch_misfits
 
 Surfaces = Mapping[int, LeafSurface]
 
-VIEWS_TO_CHECK = 5  # with fewer, a surface fits wrong masks about as well as right ones: sure ids stay
-FEW_VIEWS = 0.75  # instances that at most this share of the views shows may be made of pieces
-PIECE_INSIDE = 0.8  # of a piece, that lies in what its view shows of its leaf
-MOST_PIECES = 0.5  # an instance is made of pieces when more than this share of its masks are pieces
-OFTEN_SPLIT = 0.1  # of all instances in all views: from here on, several masks of one leaf are nothing unusual
-MOST_SPLIT = 1  # photos that show both parts of a leaf as masks of their own, where masks are whole as a rule
-AS_NEAR = 1.1  # times as far from the masks' edges, as the outline of one surface in place of two may lie
-TOUCHES = 0.02  # of a surface's length, to the nearest point of one that may be the rest of its leaf
-EACH, BOTH = 0.2, 0.7  # of a merged mask, that shows either of its two surfaces, and both together
-MOST = 0.5  # of what its view shows of the second one, that lies in the mask
+VIEWS_TO_CHECK = 5  # sure ids stay where there are fewer views: surfaces fit wrong masks about as well as right ones
+FEW_VIEWS = 0.75  # an instance may be made of pieces if at most this fraction of the views shows it
+PIECE_INSIDE = 0.8  # a mask may be a piece of a leaf if at least this fraction of it lies in what is seen of the leaf
+OFTEN_SPLIT = 0.1  # masks are in pieces as a rule if at least this fraction of instances, view by view, has several
+MOST_SPLIT = 1  # elsewhere two instances are two leaves if more views than this have masks of both
+AS_NEAR = 1.1  # one surface fits as well as two if its outline is at most so many times as far off as the worse of theirs
+TOUCHES = 0.02  # a surface touches another one if it is at most this fraction of its length away
+EACH, BOTH = 0.2, 0.7  # a mask shows two leaves if at least these fractions of it show each of them, and both together
 
 
 def check_ids(
@@ -141,7 +139,7 @@ def move_pieces(regions: Regions, ids: Ints, shown: Shown) -> Ints:
     revised = ids.copy()
     for instance in few:
         own = ids == instance
-        if (own & is_inside).sum() > MOST_PIECES * own.sum():
+        if 2 * (own & is_inside).sum() > own.sum():
             revised[own & is_inside] = inside[own & is_inside].argmax(1)
     return revised
 
@@ -272,7 +270,7 @@ def find_shared(
             crop = regions.placed(region)
             mask = crop.pixels.numpy()
             seen = np.where(mask, crop.cut(painted), 0)
-            if (region, *pair) in pairs or (seen == pair[1]).sum() >= MOST * (painted == pair[1]).sum():
+            if (region, *pair) in pairs or 2 * (seen == pair[1]).sum() >= (painted == pair[1]).sum():
                 to_first, to_second = (distance_transform_edt(seen != instance) for instance in pair)
                 part = torch.from_numpy(mask & (to_second < to_first))
                 shared.append(MergedMask(region=region, own=pair[0], other=pair[1], part=part))

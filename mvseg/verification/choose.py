@@ -36,10 +36,10 @@ from mvseg.verification.leaf_scores import (
 from mvseg.verification.rough_surfaces import LEAST_PARALLAX, fit_roughly, median_parallax
 
 ROUNDS = 2  # in the first nothing hides anything, in the second the leaves of the first do
-SAME = 0.8  # Jaccard index of the masks of two candidates, from which they are one: the second is not fitted
-LEAST_SHOWN = 0.2  # q from which a mask stays with its leaf; between 0.05 and 0.3 nothing changes
-LEAST_VIEWS = 2  # that show a leaf: one alone is no agreement
-DIGITS = 9  # of q and P that count: what differs less is a tie, on every processor
+SAME = 0.8  # two candidates are one if the Jaccard index of their masks, by area, is more than this
+LEAST_SHOWN = 0.2  # a mask may show a leaf if q is at least this
+LEAST_VIEWS = 2  # a leaf has masks in at least so many views: a definition, as one view alone is no agreement
+DIGITS = 9  # q and P are rounded to so many digits: what differs less is a tie, on every processor
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,14 +156,11 @@ def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
 def _without(proposals: Masks, gone: Masks | None) -> Bools:
     """(R,) bool: the proposals that are not masks which a person took away, by `FITS`."""
     stays = np.ones(len(proposals), bool)
-    boxes, views = proposals.regions.boxes, proposals.view_index
     for row in range(0 if gone is None else len(gone)):
         assert gone is not None
-        crop = gone.regions.placed(row)
-        x1, y1, x2, y2 = crop.box
-        near = (views == gone.view_index[row]) & (boxes[:, 0] < x2) & (boxes[:, 1] < y2)
-        for other in (near & (boxes[:, 2] > x1) & (boxes[:, 3] > y1)).nonzero()[:, 0].tolist():
-            stays[other] &= crop.iou(proposals.regions.placed(other)) <= FITS
+        mask = gone.regions.placed(row)
+        for other in (proposals.view_index == gone.view_index[row]).nonzero()[:, 0].tolist():
+            stays[other] &= proposals.regions.placed(other).iou(mask) <= FITS
     return stays
 
 

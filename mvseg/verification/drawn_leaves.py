@@ -34,15 +34,15 @@ from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
 
 Frame = NDArray[np.bool_]
 
-LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this share of it is unhidden
-LEAST_PIXELS = 64  # and so many of its pixels
-LEAST_COLORED = 0.8  # the visible part of a surface becomes a mask if this share of it has the colour of leaves
-HULL = ReconstructConfig(voxel_budget=25_000)
-ROUNDS = 2  # the second one looks only where the surface of the first one is
-BESIDE_PX = 2  # from leaf colour, that a point of a leaf may be shown
-MOST_AGAINST = 0.15  # of the views that look past a point: stakes and labels hide leaves, too
+LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this fraction of it is unhidden,
+LEAST_PIXELS = 64  # and at least so many pixels
+LEAST_COLORED = 0.8  # the unhidden part becomes a mask if at least this fraction of it has the colour of leaves
+HULL = ReconstructConfig(voxel_budget=25_000)  # of what outlines allow; a limit of time
+ROUNDS = 2  # fits: the second one is to what is found where the surface of the first one is
+BESIDE_PX = 2  # a view may show a leaf at a pixel if leaf colour is at most so many pixels away
+MOST_AGAINST = 0.15  # a point may be a leaf's if at most this fraction of views shows another colour: stakes hide it
 COLUMNS = ("view_index", "boxes", "crops", "labels")
-AROUND = 0.1  # of the root of a surface's area in a view, that the leaf may reach beyond it
+AROUND = 0.1  # a leaf may reach beyond its first surface by at most this fraction of the root of the surface's area
 
 
 def follow_drawn(

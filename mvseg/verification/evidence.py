@@ -26,9 +26,9 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-MOST_PX = 800  # of a photo's longer side, that are compared; a limit of time: at 400 the evidence is as good
-FITS = 0.5  # IoU of a mask with what its view shows of a leaf, from which it shows that leaf (a definition)
-SHARED = 0.5  # of the smaller of two masks, that the other covers: with more, they show one leaf (a definition)
+MOST_PX = 800  # masks are compared on photos whose longer side has at most so many pixels: a limit of time
+FITS = 0.5  # a mask shows a leaf if its IoU with what the view shows of it is at least this: a definition
+SHARED = 0.5  # two masks show one leaf if more than this fraction of the smaller one is in both: a definition
 
 
 @dataclass(frozen=True, eq=False)

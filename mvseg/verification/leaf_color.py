@@ -13,9 +13,9 @@ from scipy.ndimage import gaussian_filter
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks
 
-SURE_VIEWS = 4  # of an instance whose masks tell that colour
-BINS = 16  # per channel
-BLUR = 1.0  # bins
+SURE_VIEWS = 4  # an instance tells the colours if at least so many views show it surely
+BINS = 16  # colours are counted in so many bins of each channel
+BLUR = 1.0  # bins: standard deviation of the Gaussian that smooths the counts
 CHANNELS, RANGES = (0, 1, 2), (0, 256) * 3  # as OpenCV asks for them
 
 

@@ -16,8 +16,8 @@ from scipy.special import expit, logit
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.verification.evidence import Bools, Evidence, Floats, Ints
 
-EPS = 0.01  # shares and scores are kept this far from 0 and 1, where log odds are infinite
-CLEAR = 0.6  # share of what the views must show of a candidate, that they do show, for it to be a clear leaf
+EPS = 0.01  # log odds are those of the nearest value that is at least so far from 0 and 1, where they are infinite
+CLEAR = 0.6  # a candidate is a clear leaf if the views show at least this fraction of what they must show of it
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.evidence import FITS, Shown
 
-LEAST_INSIDE = 0.4  # of a mask, within the outline of its surface: with less of it, it shows something else
+LEAST_INSIDE = 0.4  # a mask shows something else if less than this fraction of it lies within its surface's outline
 
 
 def rematch_misfits(

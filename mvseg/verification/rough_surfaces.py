@@ -12,8 +12,8 @@ from mvseg.reconstruction.surface.kept_surfaces import fit_kept
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 
-ROUGH_VIEWS = 12  # of an instance, that tell well enough where all views must show it
-LEAST_PARALLAX = 30.0  # degrees between the views of an instance, from which its surface tells what they show
+ROUGH_VIEWS = 12  # a rough surface is fitted to at most so many views of an instance: a limit of time
+LEAST_PARALLAX = 30.0  # surfaces judge masks if most instances are seen from directions at least so many degrees apart
 
 
 def fit_roughly(masks: Masks, cameras: Cameras) -> dict[int, LeafSurface]:

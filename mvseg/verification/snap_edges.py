@@ -18,10 +18,10 @@ from mvseg.crop import Crop
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
 
-BAND = 0.05  # of the root of a mask's area, that its edge may move; from 0.025 to 0.07 MV-PQ changes by 0.005
-AROUND = 3  # bands, of the photo around a mask, that tell what the background looks like
-MOST_PX = 100  # the root of a mask's area, in pixels that are compared; a limit of time: with all of them it is as good
-LEAST_PIXELS = 10  # of leaf and of background, that their colours are learned from
+BAND = 0.05  # an edge may move by at most this fraction of the root of its mask's area
+AROUND = 3  # the photo at most so many bands away from a mask tells what the background looks like
+MOST_PX = 100  # larger masks are scaled to this root of their area: a limit of time, with all pixels it is as good
+LEAST_PIXELS = 10  # an edge stays if fewer pixels than this are surely leaf, or surely background
 
 FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])  # who confirmed a mask saw it with this edge
 
