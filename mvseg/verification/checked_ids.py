@@ -35,7 +35,7 @@ FEW_VIEWS = 0.75  # an instance may be made of pieces if at most this fraction o
 PIECE_INSIDE = 0.8  # a mask may be a piece of a leaf if at least this fraction of it lies in what is seen of the leaf
 OFTEN_SPLIT = 0.1  # masks are in pieces as a rule if at least this fraction of instances, view by view, has several
 MOST_SPLIT = 1  # elsewhere two instances are two leaves if more views than this have masks of both
-AS_NEAR = 1.1  # one surface fits as well as two if its outline is at most so many times as far off as the worse of theirs
+AS_NEAR = 1.1  # one surface fits as well as two if its outline is at most so many times as far off as theirs
 TOUCHES = 0.02  # a surface touches another one if it is at most this fraction of its length away
 EACH, BOTH = 0.2, 0.7  # a mask shows two leaves if at least these fractions of it show each of them, and both together
 

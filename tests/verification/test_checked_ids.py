@@ -72,6 +72,15 @@ def test_two_masks_with_each_others_ids_are_swapped(scene: tuple[Regions, Tensor
     assert checked.merged == ()
 
 
+@pytest.mark.parametrize(("num_views", "is_certain"), [(4, True), (5, False)])
+def test_few_views_do_not_overrule_a_sure_match(num_views: int, is_certain: bool) -> None:
+    regions, leaves = as_regions(true_maps()[:num_views])
+    ids = leaves.clone()
+    ids[place_of(regions, leaves, 2, 1)], ids[place_of(regions, leaves, 2, 2)] = 2, 1
+    checked = check_ids(matched(regions, ids).masks, LEAVES, cameras=CAMERAS[list(range(num_views))])
+    assert torch.equal(checked.instance_ids, ids if is_certain else leaves)
+
+
 def merged_maps(view: int, share: float) -> list[np.ndarray]:
     """In this view, the mask of leaf 1 covers this share of leaf 2 as well, what is nearest, and leaf 2 has none."""
     maps = true_maps()
@@ -100,6 +109,34 @@ def test_a_mask_that_shows_two_surfaces_is_listed(share: float, is_named: bool, 
     assert is_second.sum() > 0.2 * regions.areas[region]
     for mask in checked.merged:
         assert torch.equal(mask.part, is_second)
+
+
+def is_listed(maps: list[np.ndarray]) -> bool:
+    """Whether the mask of leaf 1 in view 3, which the matcher says shows leaf 2 as well, does so by their surfaces."""
+    regions, ids = as_regions(maps)
+    region = place_of(regions, ids, 3, 1)
+    named = MergedMask(region=region, own=1, other=2, part=torch.zeros_like(regions.crop(region)))
+    merged = check_ids(matched(regions, ids).masks.with_merged([named]), LEAVES, cameras=CAMERAS).merged
+    return any(mask.part.any() for mask in merged)  # what the matcher named stays on the list
+
+
+@pytest.mark.parametrize(("second", "is_merged"), [(0.18, False), (0.22, True)])
+def test_a_mask_shows_two_leaves_from_a_fifth_of_it_on(second: float, is_merged: bool) -> None:
+    true = true_maps()[3]
+    sizes = [(true == leaf).sum() for leaf in (1, 2)]
+    assert is_listed(merged_maps(3, second / (1 - second) * sizes[0] / sizes[1])) == is_merged
+
+
+@pytest.mark.parametrize(("explained", "is_merged"), [(0.62, False), (0.78, True)])
+def test_two_surfaces_must_explain_most_of_a_mask(explained: float, is_merged: bool) -> None:
+    """The mask of leaves 1 and 2 is drawn too large, over what shows nothing."""
+    maps = merged_maps(3, 1)
+    maps[3][maps[3] != 1] = 0
+    number = int((maps[3] == 1).sum() * (1 / explained - 1))
+    gap = distance_transform_edt(maps[3] != 1) + 1000 * (true_maps()[3] == 3)
+    nearest = np.unravel_index(np.argsort(np.where(gap > 0, gap, np.inf), axis=None, kind="stable")[:number], gap.shape)
+    maps[3][nearest] = 1
+    assert is_listed(maps) == is_merged
 
 
 def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> None:
@@ -177,6 +214,20 @@ def test_pieces_join_their_leaf_and_ids_close_up(has_surface: bool) -> None:
     assert known == {3: LEAVES[2], 4: LEAVES[3]}
     assert checked.renumber(known) == {2: LEAVES[2], 3: LEAVES[3]}
     assert checked.close_gaps().count_sure_views().tolist() == [6, 6, 6]
+
+
+@pytest.mark.parametrize(("inside", "is_piece"), [(0.7, False), (0.9, True)])
+def test_a_piece_lies_in_its_leaf(inside: float, is_piece: bool) -> None:
+    """Pieces of leaf 1 that are drawn too large, over what shows nothing."""
+    maps = cut_maps((0, 1, 2, 3))
+    for labels in maps:
+        gap = np.where(labels == 0, distance_transform_edt(labels != 11), np.inf)
+        number = int((labels == 11).sum() * (1 / inside - 1))
+        labels[np.unravel_index(np.argsort(gap, axis=None, kind="stable")[:number], labels.shape)] = 11
+    regions, numbers = as_regions(maps)
+    ids = torch.where(numbers == 11, 4, numbers)
+    checked = check(regions, ids, LEAVES | {4: LEAVES[1]})
+    assert torch.equal(checked.instance_ids, numbers % 10 if is_piece else ids)
 
 
 def test_a_small_leaf_before_a_large_one_is_no_piece() -> None:

@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 import torch
 
-from blade_scene import SIZE, as_regions
+from blade_scene import SIZE, as_regions, ring_cameras
 from known_leaves import flat_leaf
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-from mvseg.verification.choose import Leaves, add_beside, assign_masks, choose_leaves, least_chance
+from mvseg.verification.choose import Leaves, add_beside, assign_masks, choose_leaves, gather_candidates, least_chance
 from mvseg.verification.evidence import draw_views
+from mvseg.verification.leaf_scores import Candidates, leaf_features
+from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 TRUE = true_maps()
@@ -205,6 +207,36 @@ def test_cameras_on_one_side_are_said() -> None:
     assert len(leaves.masks) == len(REGIONS)
 
 
+@pytest.mark.parametrize(("arc_deg", "is_around"), [(26, False), (38, True)])
+def test_surfaces_judge_where_cameras_look_from_enough_sides(arc_deg: float, is_around: bool) -> None:
+    cameras = ring_cameras(2, elevations_deg=(0,), arc_deg=2 * arc_deg)
+    square = np.zeros((SIZE, SIZE), np.int64)
+    square[95:105, 95:105] = 1
+    regions, ids = as_regions([square, square])
+    matched = matched_of(proposals_of(regions, torch.full((2,), 0.8)), ids)
+    assert (median_parallax(matched, cameras) >= LEAST_PARALLAX) == is_around
+
+
+@pytest.mark.parametrize(("number", "is_new"), [(15, True), (17, False)])
+def test_nearly_the_same_masks_are_one_candidate(number: int, is_new: bool) -> None:
+    """Twenty masks of one size, of which another matching has some."""
+    square = np.zeros((SIZE, SIZE), np.int64)
+    square[:10, :10] = 1
+    table = proposals_of(as_regions([square] * 20)[0], torch.full((20,), 0.8))
+    found = [(matched_of(table, torch.where(torch.arange(20) < n, 1, -1)), torch.arange(20)) for n in (20, number)]
+    candidates = gather_candidates(found, None, table=table, is_held=torch.zeros(20, dtype=torch.bool))
+    assert len(candidates) == 1 + is_new
+
+
+def test_clear_leaves_are_what_others_are_held_against() -> None:
+    """Of two of which the views show 0.55 and 0.75, the second."""
+    candidates = Candidates((None, None), np.zeros((2, 2)), np.zeros((2, 2), bool))
+    best, sure = np.array([[0.55, 0.75]] * 3), np.array([[0.2, 1.2]] * 3)
+    features, clear = leaf_features(candidates, best, sure, share=np.ones((3, 2)), clear=None)
+    assert clear.score == pytest.approx(1.2)
+    np.testing.assert_allclose(features[:, 3], [-1, 0], atol=1e-12)
+
+
 def test_nothing_is_an_answer() -> None:
     empty = PROPOSALS.select(torch.zeros(0, dtype=torch.int64))
     assert len(choose(empty, empty).masks) == 0
@@ -258,3 +290,9 @@ def test_assignment_is_the_best_one_per_view() -> None:
                    for order in permutations(range(3), min(len(each.rows), 3)))  # fmt: skip
         assert shown[each.rows].sum() == pytest.approx(best)
         assert len({k for k in leaf[each.rows] if k >= 0}) == (leaf[each.rows] >= 0).sum()
+
+
+def test_a_mask_may_stay_with_its_leaf_by_half_a_chance_or_less() -> None:
+    q = np.where(IDS.numpy() == 1, 0.25, 0.17)[:, None]
+    leaf, _ = assign_masks(q, draw_views(REGIONS, [None], CAMERAS))
+    np.testing.assert_array_equal(leaf, np.where(IDS.numpy() == 1, 0, -1))
