@@ -16,14 +16,13 @@ from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import LEAST_VIEWS, LeftOut
-from mvseg.verification.evidence import SHARED, Evidence, Ints, Shown, paint_view
+from mvseg.verification.evidence import OPEN_PIXELS, SHARED, Evidence, Ints, Shown, paint_view
 
 Bools = NDArray[np.bool_]
 
 LEAST_DOUBT = 0.3  # what is surer is not asked
 MOST_DOUBTS = 200  # nobody answers more
-OPEN = 0.5  # share of a surface that no nearer one hides, from which its view should show a mask of it
-OPEN_PIXELS = 100  # of that part
+OPEN = 0.5  # a view should show a mask of a surface if at least this fraction of it is unhidden, and `OPEN_PIXELS`
 EMPTY = 0.6  # of that part, outside all masks: the mask is missing
 SIMILAR = 0.4  # IoU of that part with a mask of another leaf, that may be it
 SMOOTH = 1.5  # pixels that a proposed outline may be off

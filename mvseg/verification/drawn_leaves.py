@@ -28,21 +28,20 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import FITS
+from mvseg.verification.evidence import FITS, OPEN_PIXELS
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
 from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
 
 Frame = NDArray[np.bool_]
 
-LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this fraction of it is unhidden,
-LEAST_PIXELS = 64  # and at least so many pixels
+LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this fraction of it is unhidden, and `OPEN_PIXELS`
 LEAST_COLORED = 0.8  # the unhidden part becomes a mask if at least this fraction of it has the colour of leaves
 HULL = ReconstructConfig(voxel_budget=25_000)  # of what outlines allow; a limit of time
 ROUNDS = 2  # fits: the second one is to what is found where the surface of the first one is
 BESIDE_PX = 2  # a view may show a leaf at a pixel if leaf colour is at most so many pixels away
 MOST_AGAINST = 0.15  # a point may be a leaf's if at most this fraction of views shows another colour: stakes hide it
 COLUMNS = ("view_index", "boxes", "crops", "labels")
-AROUND = 0.1  # a leaf may reach beyond its first surface by at most this fraction of the root of the surface's area
+REACH = 0.1  # a leaf may reach beyond its first surface by at most this fraction of the root of the surface's area
 
 
 def follow_drawn(
@@ -54,7 +53,7 @@ def follow_drawn(
 ) -> tuple[Masks, dict[int, LeafSurface]]:
     """Give the leaves that a person drew a mask in each other view that shows them openly.
 
-    That is where at least `LEAST_VISIBLE` of the leaf's surface, and `LEAST_PIXELS`, lie in no mask of another leaf,
+    That is where at least `LEAST_VISIBLE` of the leaf's surface, and `OPEN_PIXELS`, lie in no mask of another leaf,
     and `LEAST_COLORED` of it have the colour of leaves. There, a mask that was matched to nothing and agrees with it
     (`FITS`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
 
@@ -111,7 +110,7 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
     around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in left})
     for _ in range(ROUNDS):
         found = {view: _largest_part(left[view] & around[view]) for view in left if view in around}
-        parts = {view: Crop.of(part) for view, part in found.items() if int(part.sum()) >= LEAST_PIXELS}
+        parts = {view: Crop.of(part) for view, part in found.items() if int(part.sum()) >= OPEN_PIXELS}
         if not parts:
             break
         best = fit(parts, best)
@@ -132,7 +131,7 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         whole = places[view]
         visible = replace(whole, pixels=whole.pixels & ~whole.cut(_others(masks, leaf, view, cameras)))
         leaf_colored = replace(visible, pixels=visible.pixels & whole.cut(torch.from_numpy(colored[view])))
-        is_open = visible.area >= max(LEAST_PIXELS, LEAST_VISIBLE * whole.area)
+        is_open = visible.area >= max(OPEN_PIXELS, LEAST_VISIBLE * whole.area)
         if not is_open or leaf_colored.area < LEAST_COLORED * visible.area:
             continue
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
@@ -212,7 +211,7 @@ def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame])
         if view in frames:
             height, width = frames[view].shape
             frame = part.paste((width, height)).numpy()
-            around[view] = _dilate(frame, max(BESIDE_PX, round(AROUND * part.area**0.5)))
+            around[view] = _dilate(frame, max(BESIDE_PX, round(REACH * part.area**0.5)))
     return around
 
 

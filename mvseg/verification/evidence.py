@@ -28,6 +28,7 @@ Bools = NDArray[np.bool_]
 
 MOST_PX = 800  # masks are compared on photos whose longer side has at most so many pixels: a limit of time
 FITS = 0.5  # a mask shows a leaf if its IoU with what the view shows of it is at least this: a definition
+OPEN_PIXELS = 100  # a view sees a surface openly only if at least so many pixels of it are unhidden
 SHARED = 0.5  # two masks show one leaf if more than this fraction of the smaller one is in both: a definition
 
 

@@ -6,14 +6,12 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks
 
-SURE_VIEWS = 4  # an instance tells the colours if at least so many views show it surely
 BINS = 16  # colours are counted in so many bins of each channel
 BLUR = 1.0  # bins: standard deviation of the Gaussian that smooths the counts
 CHANNELS, RANGES = (0, 1, 2), (0, 256) * 3  # as OpenCV asks for them
@@ -73,12 +71,10 @@ def _count(photo: np.ndarray, part: np.ndarray) -> np.ndarray:
 
 
 def colors_of_leaves(masks: Masks, photos: ReadPhoto) -> NDArray[np.bool_]:
-    """The colours of masks that are surely matched, of instances that are so in `SURE_VIEWS` views, or in all where
-    there are fewer; where there are no such masks, those of all that are matched."""
-    enough = masks.count_sure_views() >= min(SURE_VIEWS, masks.regions.num_views)
-    of_instance = torch.cat((enough, enough.new_zeros(1)))[masks.instance_ids.clamp(min=0) - 1]
-    is_sure = (masks.instance_ids > 0) & of_instance & (masks.match_scores >= SURE)
-    chosen = is_sure if is_sure.any() else masks.instance_ids > 0
+    """The colours of masks that are surely matched; where there are none, those of all that are matched."""
+    is_matched = masks.instance_ids > 0
+    is_sure = is_matched & (masks.match_scores >= SURE)
+    chosen = is_sure if is_sure.any() else is_matched
     counts = ColorCounts.none()
     for view in range(masks.regions.num_views):
         photo = photos(view)

@@ -21,7 +21,7 @@ from mvseg.masks import Masks, Origin, replace_crops
 BAND = 0.05  # an edge may move by at most this fraction of the root of its mask's area
 AROUND = 3  # the photo at most so many bands away from a mask tells what the background looks like
 MOST_PX = 100  # larger masks are scaled to this root of their area: a limit of time, with all pixels it is as good
-LEAST_PIXELS = 10  # an edge stays if fewer pixels than this are surely leaf, or surely background
+LEAST_PIXELS = 10  # an edge stays if fewer pixels are surely leaf, or background: GrabCut needs five of each
 
 FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])  # who confirmed a mask saw it with this edge
 

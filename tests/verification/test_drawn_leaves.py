@@ -9,6 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from blade_scene import as_regions
+from matched import matched
 from mvseg.demo import demo_scene
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_masks, load_scene
@@ -16,6 +18,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 from mvseg.verification.drawn_leaves import follow_drawn
+from three_leaves import CAMERAS, true_maps
 
 
 @pytest.fixture(scope="module")
@@ -98,3 +101,36 @@ def test_outlines_of_two_leaves_change_nothing_else(plant: tuple[Scene, Regions]
     after, _ = follow_drawn(both, cameras=scene.cameras, photos=Photos(scene))
     for name in ("instance_ids", "origin", "match_scores"):
         assert torch.equal(getattr(after, name)[: len(both)], getattr(both, name))
+
+
+GREEN, BROWN = (60, 160, 40), (120, 80, 40)
+
+
+def follow_painted(view: int, *, colored: float = 1.0, visible: float = 1.0) -> list[int]:
+    """The views where leaf 3 of three gets a mask, that a person drew in two; in one view, only a part of it has the
+    colour of leaves, or only a part lies in no mask of another leaf. Its pixels go from one end."""
+    painted = true_maps()
+    rows, columns = np.nonzero(painted[view] == 3)
+    order = np.argsort(rows + 0.01 * columns, kind="stable")
+    masks = [np.where((labels == 3) & (other not in (0, 3)), 0, labels) for other, labels in enumerate(painted)]
+    hidden = order[: round((1 - visible) * len(order))]
+    masks[view][rows[hidden], columns[hidden]] = 2
+    bare = order[: round((1 - colored) * len(order))]
+    painted[view][rows[bare], columns[bare]] = 0
+    regions, ids = as_regions(masks)
+    given = matched(regions, ids).masks
+    given = replace(given, origin=torch.where(ids == 3, int(Origin.CORRECTED), int(Origin.GIVEN)))
+    photos = [np.where(labels[..., None] > 0, GREEN, BROWN).astype(np.uint8) for labels in painted]
+    after, _ = follow_drawn(given, cameras=CAMERAS, photos=photos.__getitem__)
+    return after.view_index[(after.origin == Origin.OTHER_VIEWS) & (after.instance_ids == 3)].tolist()
+
+
+@pytest.mark.parametrize(("how", "is_shown"), [
+    ({}, True),
+    ({"colored": 0.7}, False), ({"colored": 0.88}, True),
+    ({"visible": 0.26}, False), ({"visible": 0.37}, True),
+])  # fmt: skip
+def test_a_view_must_show_enough_of_it(how: dict[str, float], is_shown: bool) -> None:
+    views = follow_painted(4, **how)
+    assert (4 in views) == is_shown
+    assert {1, 5} <= {*views}
