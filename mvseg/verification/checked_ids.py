@@ -33,10 +33,7 @@ Surfaces = Mapping[int, LeafSurface]
 VIEWS_TO_CHECK = 5  # sure ids stay where there are fewer views: surfaces fit wrong masks about as well as right ones
 FEW_VIEWS = 0.75  # an instance may be made of pieces if at most this fraction of the views shows it
 PIECE_INSIDE = 0.8  # a mask may be a piece of a leaf if at least this fraction of it lies in what is seen of the leaf
-OFTEN_SPLIT = 0.1  # masks are in pieces as a rule if at least this fraction of instances, view by view, has several
-MOST_SPLIT = 1  # elsewhere two instances are two leaves if more views than this have masks of both
 AS_NEAR = 1.1  # one surface fits as well as two if its outline is at most so many times as far off as theirs
-TOUCHES = 0.02  # a surface touches another one if it is at most this fraction of its length away
 EACH, BOTH = 0.2, 0.7  # a mask shows two leaves if at least these fractions of it show each of them, and both together
 
 
@@ -169,20 +166,16 @@ def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     """Instances that are parts of one leaf become one; for the arguments see `move_pieces`.
 
     Where something crosses a leaf, masks on either side may form an instance each, and neither lies in the other's
-    surface. So a credible surface of an instance that few views show is doubted where it touches another one. Two masks
-    in one photo speak for two leaves: one photo may split a leaf by accident, several do so only where masks are often
-    in pieces (`OFTEN_SPLIT`). If no more than that speaks against it, and one surface that is fitted to the masks of
-    both fits them as well as two do (`fits_as_well`), they are the same leaf. All join the one of them that has most
-    masks.
+    surface. So a credible surface of an instance that few views show is held against the nearest other one: if one
+    surface that is fitted to the masks of both fits them as well as two do (`fits_as_well`), they are the same leaf.
+    All join the one of them that has most masks.
     """
     shown = {instance: each for instance, each in surfaces.items() if each.exists and (ids == instance).any()}
     few = [part for part in _seen_rarely(regions, ids) if part in shown and shown[part].is_credible]
-    touching = {(part, whole) for part in few if (whole := touched_surface(part, shown))}
-    most = regions.num_views if _share_split(regions, ids) >= OFTEN_SPLIT else MOST_SPLIT
+    nearest = {(part, whole) for part in few if (whole := nearest_surface(part, shown))}
     pairs = [
-        pair for pair in sorted({(min(pair), max(pair)) for pair in touching})
-        if _num_shared_views(regions, ids, pair) <= most
-        and _is_one_leaf(regions, ids, pair, surfaces=shown, cameras=cameras)
+        pair for pair in sorted({(min(pair), max(pair)) for pair in nearest})
+        if _is_one_leaf(regions, ids, pair, surfaces=shown, cameras=cameras)
     ]  # fmt: skip
     if not pairs:
         return ids
@@ -194,32 +187,18 @@ def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     return np.where(ids > 0, largest[leaf[ids]], ids)
 
 
-def _share_split(regions: Regions, ids: Ints) -> float:
-    """Of all instances in all views that show them, how many have several masks there."""
-    is_matched = ids > 0
-    places = np.stack((ids[is_matched], regions.view_index.numpy()[is_matched]))
-    _, counts = np.unique(places, axis=1, return_counts=True)
-    return float((counts > 1).mean()) if len(counts) else 0.0
-
-
-def _num_shared_views(regions: Regions, ids: Ints, pair: tuple[int, int]) -> int:
-    one, other = (regions.view_index.numpy()[ids == instance] for instance in pair)
-    return len(np.intersect1d(one, other))
-
-
 def _seen_rarely(regions: Regions, ids: Ints) -> list[int]:
     """The instances that at most `FEW_VIEWS` of the views show, in ascending order."""
     views, most = regions.view_index.numpy(), FEW_VIEWS * regions.num_views
     return [number for number in np.unique(ids[ids > 0]).tolist() if len(np.unique(views[ids == number])) <= most]
 
 
-def touched_surface(part: int, surfaces: Surfaces) -> int | None:
-    """The nearest of the other surfaces, if it touches this one."""
+def nearest_surface(part: int, surfaces: Surfaces) -> int | None:
+    """Of the other surfaces, the one that comes nearest to this one; None without any."""
     points = {instance: surface.points().reshape(-1, 3).numpy() for instance, surface in surfaces.items()}
     tree = cKDTree(points.pop(part))
     gaps = {instance: float(tree.query(there)[0].min()) for instance, there in points.items()}
-    nearest = min(gaps, key=lambda instance: gaps[instance], default=None)
-    return nearest if nearest is not None and gaps[nearest] <= TOUCHES * surfaces[part].length else None
+    return min(gaps, key=lambda instance: gaps[instance], default=None)
 
 
 def _is_one_leaf(regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras) -> bool:
