@@ -74,6 +74,14 @@ def test_no_edge_moves_farther_than_the_band() -> None:
     assert (grown(found, -reach) & ~new).sum() == 0
 
 
+def test_the_band_is_three_pixels_of_a_mask_of_sixty() -> None:
+    """Where the leaf is larger than its mask (root of the area: 62), the edge moves so far and no farther."""
+    found = ellipse()
+    new = snap(found, paint(grown(found, 4).astype(int)), others=NOTHING)
+    assert not (new & ~grown(found, 3)).any()
+    assert (new & ~grown(found, 2)).sum() > 30
+
+
 def test_large_photos_are_compared_at_fewer_pixels(monkeypatch: pytest.MonkeyPatch) -> None:
     large = cv2.resize(ellipse().astype(np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR) > 0
     photo, found, nothing = paint(large.astype(int)), grown(large, 8), np.zeros_like(large)
