@@ -27,7 +27,7 @@ from mvseg.scene import Cameras
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import progress_bar
 
-UNSURE = 0.5  # share of the masks that are surely matched: with fewer, leaves may be too large for the detector
+UNSURE = 0.5  # leaves may be too large for the detector if less than this fraction of the masks is surely matched
 # Root of the area of masks, in pixels as the detector sees them, from which both sizes are better than either: nine in
 # ten leaves that detectors train on are smaller (`python benchmarks/training_leaves.py`). The medians of plants that
 # fill the photo are about 40, of close-ups 83 to 100 (docs/notes/detector.md).

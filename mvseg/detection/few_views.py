@@ -15,7 +15,7 @@ from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.verification.evidence import SHARED
 
-FEW = 2  # views, in which no more show a leaf than can be verified
+FEW = 2  # a leaf may be added as it was found if at most so many views show it
 
 
 def select_by_views(masks: Masks, detected: Masks, *, min_views: int) -> Masks:

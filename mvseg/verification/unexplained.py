@@ -9,8 +9,8 @@ from mvseg.masks import Masks
 from mvseg.verification.evidence import MOST_PX
 from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 
-# Of the pixels of leaf colour, outside all leaves: more than inside. Of plants that were found whole, 0.15 to 0.39 are
-# (stems, soil and pots), of those of which a quarter was found, 0.48 to 0.84 (docs/notes/detector.md).
+# Leaves were missed if more than this fraction of the pixels of leaf colour lies in no mask. On plants that were found
+# whole, 0.15 to 0.39 does (stems, soil and pots), where a quarter was found, 0.48 to 0.84 (docs/notes/detector.md).
 MUCH = 0.5
 HELP = "what helps most: correct a few leaves (mvseg correct), fine-tune on them (mvseg train), or give masks (--masks)"
 
