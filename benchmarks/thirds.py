@@ -15,12 +15,11 @@ from __future__ import annotations
 
 import argparse
 import ast
-import hashlib
 import importlib
 import pkgutil
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -34,18 +33,15 @@ from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from mvseg.verification.known_surfaces import name_each
-
 import mvseg.matching
 import mvseg.reconstruction.shapes
 import mvseg.verification
-from benchmarks.corrections import Case, compute, detect_case, render
+from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
 from benchmarks.label_maps import LabelledScene, load_maps, visible_ids
 from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from mvseg.config import RunConfig
-from mvseg.corrections.file import Corrections
 from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
@@ -58,13 +54,13 @@ from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.view_graph import ViewGraph
-from mvseg.pipeline import State, check_ids, follow, match, reconstruct, split
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
 from mvseg.simulation.growth import grow_plant
+from mvseg.stages import State, check_ids, choose, follow, match, reconstruct, snap, split
+from mvseg.system.running import running
 
 FACTOR = 1.33
 SCENES = ((3, 16), (5, 32), (10, 8), (20, 8))  # views and leaves
@@ -206,10 +202,11 @@ def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
         pieces = regions_from_label_maps([cut_pieces(labels) for labels in true])
         yield check_trial(f"pieces of straps {number}", pieces, cameras, true)
     for folder in (demo_scene(), *(render(spec_of(*cell), args.cache) for cell in FOUND), *args.scenes):
-        case = detect_case(folder, RunConfig(reconstruct=None), cache=args.cache / "kept" / folder.name)
-        case = replace(case, fit=None, unedited=None)
-        first = compute(case, Corrections()).masks.to("cpu")
-        yield Trial(f"choose {folder.name}", CHOOSING, partial(choose_anew, case), case.truth)
+        config = RunConfig(reconstruct=None)
+        case = detect_case(folder, config, cache=args.cache / "kept" / folder.name)
+        matched = match(replace(case.found, unedited=None))
+        first = choose_anew(matched).to("cpu")
+        yield Trial(f"choose {folder.name}", CHOOSING, partial(choose_anew, matched), case.truth)
         for number in (2, 3):
             drawn = draw(case, first, number)
             yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, drawn), case.truth)
@@ -229,8 +226,8 @@ def check_anew(state: State) -> Masks:
     return split(check_ids(state)).masks
 
 
-def choose_anew(case: Case) -> Masks:
-    return compute(case, Corrections()).masks
+def choose_anew(state: State) -> Masks:
+    return snap(choose(state)).masks
 
 
 def follow_anew(state: State) -> Masks:
@@ -254,43 +251,11 @@ def draw(case: Case, first: Masks, number: int) -> State:
     return replace(case.found, matching=Matching(masks, MatchReport("none")))
 
 
-def keep_fits() -> None:
-    """From now on a fit of surfaces to the same masks is done once."""
-    kept: dict[str, dict[int, LeafSurface]] = {}
-
-    def fit(*args: Any, **how: Any) -> dict[int, LeafSurface]:
-        digest = hashlib.sha256()
-        add_content(digest, (args, {k: v for k, v in how.items() if k not in ("workers", "progress")}))
-        name = digest.hexdigest()
-        if name not in kept:
-            kept[name] = fit_surfaces(*args, **how)
-        return dict(kept[name])
-
-    for key, module in [*sys.modules.items()]:
-        if key.startswith("mvseg.") and vars(module).get("fit_surfaces") is fit_surfaces:
-            setattr(module, "fit_surfaces", fit)  # noqa: B010
-
-
-def add_content(digest: Any, value: Any) -> None:
-    if isinstance(value, torch.Tensor):
-        digest.update(value.cpu().numpy().tobytes())
-    elif isinstance(value, LeafSurface):
-        digest.update(value.points().numpy().tobytes())
-    elif isinstance(value, Mapping):
-        for key in value:
-            add_content(digest, (key, value[key]))
-    elif isinstance(value, tuple):
-        for each in value:
-            add_content(digest, each)
-    elif hasattr(value, "__dataclass_fields__"):
-        add_content(digest, tuple(getattr(value, each.name) for each in fields(value)))
-    else:
-        digest.update(repr(value).encode())
-
-
 def count_changed(before: Masks, after: Masks) -> int:
     """The masks of one that the other has not, with the same pixels and in the same instance."""
-    one, other = (dict(zip(name_each(each), each.instance_ids.tolist(), strict=True)) for each in (before, after))
+    one, other = (
+        dict(zip(name_each(each.regions), each.instance_ids.tolist(), strict=True)) for each in (before, after)
+    )
     both = one.keys() & other.keys()
     votes = np.zeros((before.num_instances + 1, after.num_instances + 1))
     for name in both:
@@ -302,7 +267,6 @@ def count_changed(before: Masks, after: Masks) -> int:
 
 def thirds_of_verification(args: argparse.Namespace) -> None:
     numbers = [each for each in list_numbers(mvseg.verification) if args.numbers is None or each[1] in args.numbers]
-    keep_fits()
     trials = list(list_trials(args))
     before = [(masks := trial.run().to("cpu"), judge(masks, trial)) for trial in trials]
     for trial, (masks, metrics) in zip(trials, before, strict=True):
@@ -342,7 +306,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore", InputWarning)
-    ROOMS[args.room](args)
+    with running(keep=True):
+        ROOMS[args.room](args)
 
 
 ROOMS = {"matching": thirds_of_matching, "verification": thirds_of_verification}
