@@ -84,6 +84,11 @@ def forbidden_rooms(source: str, module: str) -> set[str]:
     return {room for room in others if FLOOR_OF.get(room, len(FLOORS)) >= FLOOR_OF[own]}
 
 
+def test_contributors_read_the_floors_as_they_are() -> None:
+    page = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
+    assert "\n".join("  ".join(rooms) for rooms in FLOORS) in page
+
+
 @pytest.mark.parametrize("module", MODULES)
 def test_imports_go_one_way(module: str) -> None:
     assert room_of(module) in FLOOR_OF
