@@ -188,6 +188,7 @@ def work_here(work: Any, items: Any, started: Any, *, num_workers: int) -> Itera
         yield key, work(item)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [2] if KILLS < 5 else [0, 2])
 def test_a_resumed_training_run_ends_as_one_that_was_never_killed(
     num_workers: int, runs: Runs, tmp_path: Path

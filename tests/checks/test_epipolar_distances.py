@@ -151,11 +151,10 @@ def test_epipolar_distances_are_pixels(demo_scene: Scene) -> None:
 
 
 @pytest.mark.shared_data
-@pytest.mark.parametrize("plant", ["basil-0729", "fern-llff", "maize-plant1"])
-def test_real_photos_do_not_accuse_right_cameras(plant: str, shared_data: Path) -> None:
-    scene = load_scene(shared_data / plant)
+def test_real_photos_accuse_wrong_focal_lengths_only(shared_data: Path) -> None:
+    scene = load_scene(shared_data / "basil-0729")
     names = tuple(view.name for view in scene.views)
     shared = match_photos(partial(read_photo, scene), scene.cameras)
     assert distance_findings(shared, scene.cameras, names) == []
-    found = distance_findings(shared, scale_focal(scene.cameras, 1.1), names)
-    assert [each.what[:32] for each in found] == ["the focal lengths seem wrong, ex"] * (plant != "maize-plant1")
+    (found,) = distance_findings(shared, scale_focal(scene.cameras, 1.1), names)
+    assert found.what.startswith("the focal lengths seem wrong")
