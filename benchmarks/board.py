@@ -45,7 +45,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
-from mvseg.results.overlay import draw_contact_sheet, draw_tile
+from mvseg.results.overlay import draw_overlay
 from mvseg.scene import Scene
 from mvseg.stages import State, choose, detect, match, snap
 from mvseg.training.data import list_samples
@@ -209,11 +209,9 @@ def draw_found(
     if args.pictures is not None and options.image_size is None:
         views = range(0, len(scene.views), max(1, len(scene.views) // 4))
         photos = Photos(scene)
-        tiles = [draw_tile(photos(view), masks[1], view=view) for view in views]
+        drawn = [draw_overlay(photos(view), masks[1], view=view) for view in views]
         label = Path(weights).parent.name or weights
-        write_png(
-            args.pictures / f"{name}-{label}.png", draw_contact_sheet(tiles, [scene.views[v].name for v in views])
-        )
+        write_png(args.pictures / f"{name}-{label}.png", np.concatenate([each[: len(drawn[0])] for each in drawn], 1))
     return masks
 
 

@@ -34,7 +34,7 @@ from mvseg.matching.result import Matching
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.shapes import reconstruct_shapes
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
+from mvseg.results.overlay import draw_overlay
 from mvseg.scene import Cameras
 from mvseg.system.running import running
 
@@ -62,12 +62,9 @@ def cpu_seconds() -> float:
 
 
 def draw_pictures(masks: Masks, cameras: Cameras) -> None:
-    tiles, names = [], [str(view) for view in range(len(cameras))]
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         photo = np.full((height, width, 3), 40, np.uint8)
         draw_overlay(photo, masks, view=view)
-        tiles.append(draw_tile(photo, masks, view=view))
-    draw_contact_sheet(tiles, names)
 
 
 def fit_shapes(regions: Regions, instance_ids: Tensor, cameras: Cameras, *, num_workers: int) -> None:

@@ -5,9 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from functools import partial
 
-import mvseg.detectors  # noqa: F401  # before torchvision, which it loads quickly
-
-# isort: split
 import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN

@@ -26,7 +26,7 @@ from mvseg.formats.photos import Photos
 from mvseg.formats.rig import write_rig
 from mvseg.masks import Origin
 from mvseg.results.earlier import replace_result
-from mvseg.results.overlay import draw_contact_sheet, draw_overlay, draw_tile
+from mvseg.results.overlay import draw_overlay
 from mvseg.results.photo_masks import labels_in_photo, mask_in_photo
 from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
@@ -121,22 +121,19 @@ def _photos_folder(view: View) -> Path:
 
 
 def _write_images(result: Result, folder: Path) -> list[Picture]:
-    """Write labels, overlays and the contact sheet; returns the report's pictures, so that photos are read only
-    once."""
+    """Write labels and overlays; returns the report's pictures, so that photos are read only once."""
     scene, masks, photos = result.scene, result.masks, result.photos or Photos(result.scene)
-    tiles, pictures = [], []
+    pictures = []
     views = list(enumerate(scene.views))
     for index, view in progress_bar(views, name="pictures", unit="view"):
         width, height = scene.cameras.sizes[index].tolist()
         write_label_png(folder / "labels" / f"{view.name}.png", labels_in_photo(result, index))
         photo = photos(index) if photos.exist else np.full((height, width, 3), 40, np.uint8)
         drawn = draw_overlay(photo, masks, view=index)
-        tiles.append(draw_tile(photo, masks, view=index))
         pictures.append(draw_picture(photo, masks, view=index))
         overlay = folder / "overlay" / f"{view.name}.png"
         overlay.parent.mkdir(parents=True, exist_ok=True)
         write_png(overlay, drawn)
-    write_png(folder / "contact.png", draw_contact_sheet(tiles, [view.name for view in scene.views]))
     return pictures
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import colorsys
-import math
 from collections.abc import Sequence
 
 import cv2
@@ -12,9 +11,8 @@ import numpy as np
 from mvseg.masks import SURE, Masks
 
 MAX_SIDE = 1600  # pixels of an overlay's longer side
-TILE_WIDTH = 480
-MARGIN = 0.06  # around the plant in a tile, of its longer side
-LEAST_SHARE = 0.05  # of the photo's width that a tile shows; a photo has no more detail
+MARGIN = 0.06  # around the plant in a picture, of its longer side
+LEAST_SHARE = 0.05  # of the photo's width that a picture shows; a photo has no more detail
 UNMATCHED = (150, 150, 150)
 CAPITAL = 26  # pixels, height of a digit at scale 1
 
@@ -48,47 +46,15 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
     height, width = photo.shape[:2]
     scale = min(1.0, MAX_SIDE / max(height, width))
     size = (max(1, round(width * scale)), max(1, round(height * scale)))
-    return _draw(photo, masks, view=view, box=(0, 0, width, height), size=size)
-
-
-def draw_tile(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
-    """The overlay of one view for the contact sheet: 480 pixels wide, cropped to the plant (`find_plant`).
-
-    Arguments as in `draw_overlay`.
-    """
-    height, width = photo.shape[:2]
-    box = find_plant(masks, view=view, size=(width, height))
-    return _draw(photo, masks, view=view, box=box, size=(TILE_WIDTH, max(1, round(TILE_WIDTH * height / width))))
-
-
-def find_plant(masks: Masks, *, view: int, size: tuple[int, int]) -> Box:
-    """Box (xyxy, pixels) around all matched masks of one view, with a margin, and inside the photo of this width and
-    height, whose proportions it has; the whole photo where nothing is matched."""
-    regions = masks.regions
-    boxes = regions.boxes[(regions.view_index == view) & (masks.instance_ids > 0) & (regions.areas > 0)]
-    if not len(boxes):
-        return 0, 0, *size
-    low, high = boxes[:, :2].amin(0).cpu().numpy(), boxes[:, 2:].amax(0).cpu().numpy()
-    share = np.clip((1 + 2 * MARGIN) * ((high - low) / size).max(), LEAST_SHARE, 1.0)
-    wanted = np.maximum(np.round(share * np.array(size)), 1)
-    x, y = np.clip(np.round((low + high - wanted) / 2), 0, size - wanted).astype(int).tolist()
-    width, height = wanted.astype(int).tolist()
-    return x, y, x + width, y + height
-
-
-def _draw(photo: np.ndarray, masks: Masks, *, view: int, box: Box, size: tuple[int, int]) -> np.ndarray:
-    """A box (xyxy, pixels) of a photo as a picture of this width and height."""
-    (height, width), longer, regions = photo.shape[:2], max(size), masks.regions
-    part = np.s_[box[1] : box[3], box[0] : box[2]]
-    interpolation = cv2.INTER_CUBIC if size[0] > box[2] - box[0] else cv2.INTER_AREA
-    canvas = np.asarray(cv2.resize(photo[part], size, interpolation=interpolation))
+    longer, regions = max(size), masks.regions
+    canvas = np.asarray(cv2.resize(photo, size, interpolation=cv2.INTER_AREA))
     painted, numbers = canvas.copy(), list[_Number]()
     members = (regions.view_index == view).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]  # small ones on top
     for index in members.tolist():
         instance = int(masks.instance_ids[index])
         whole = regions.mask(index, width, height).cpu().numpy().astype(np.uint8)
-        mask = np.asarray(cv2.resize(whole[part], size, interpolation=cv2.INTER_NEAREST))
+        mask = np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_NEAREST))
         x, y, mask_width, mask_height = cv2.boundingRect(mask)
         if not mask_width:  # too small to be seen here
             continue
@@ -106,30 +72,27 @@ def _draw(photo: np.ndarray, masks: Masks, *, view: int, box: Box, size: tuple[i
     return painted
 
 
+def find_plant(masks: Masks, *, view: int, size: tuple[int, int]) -> Box:
+    """Box (xyxy, pixels) around all matched masks of one view, with a margin, and inside the photo of this width and
+    height, whose proportions it has; the whole photo where nothing is matched."""
+    regions = masks.regions
+    boxes = regions.boxes[(regions.view_index == view) & (masks.instance_ids > 0) & (regions.areas > 0)]
+    if not len(boxes):
+        return 0, 0, *size
+    low, high = boxes[:, :2].amin(0).cpu().numpy(), boxes[:, 2:].amax(0).cpu().numpy()
+    share = np.clip((1 + 2 * MARGIN) * ((high - low) / size).max(), LEAST_SHARE, 1.0)
+    wanted = np.maximum(np.round(share * np.array(size)), 1)
+    x, y = np.clip(np.round((low + high - wanted) / 2), 0, size - wanted).astype(int).tolist()
+    width, height = wanted.astype(int).tolist()
+    return x, y, x + width, y + height
+
+
 def find_thickest(mask: np.ndarray) -> tuple[tuple[int, int], float]:
     """Column and row of the middle of the largest circle in a mask (h, w) uint8, which is always inside it, and its
     radius."""
     depth = cv2.distanceTransform(np.pad(mask, 1), cv2.DIST_L2, 3)[1:-1, 1:-1]
     row, column = np.unravel_index(int(depth.argmax()), depth.shape)
     return (int(column), int(row)), float(depth.max())
-
-
-def draw_contact_sheet(overlays: Sequence[np.ndarray], names: Sequence[str]) -> np.ndarray:
-    """All overlays of a scene, or their tiles, on one sheet, row by row, each under its view's name: uint8 RGB."""
-    columns = max(math.ceil(math.sqrt(len(overlays))), min(len(overlays), 4))
-    tiles = []
-    for overlay, name in zip(overlays, names, strict=True):
-        size = TILE_WIDTH, max(1, round(TILE_WIDTH * overlay.shape[0] / overlay.shape[1]))
-        tile = cv2.resize(overlay, size, interpolation=cv2.INTER_AREA)
-        tile = cv2.copyMakeBorder(tile, 26, 4, 2, 2, cv2.BORDER_CONSTANT, value=(255, 255, 255))
-        cv2.putText(tile, name, (6, 18), cv2.FONT_HERSHEY_SIMPLEX, 0.5, (0, 0, 0), 1, cv2.LINE_AA)
-        tiles.append(tile)
-    tallest = max(tile.shape[0] for tile in tiles)
-    blank = np.full((tallest, TILE_WIDTH + 4, 3), 255, np.uint8)
-    filled = [np.concatenate((tile, blank[tile.shape[0] :])) for tile in tiles]
-    filled += [blank] * (-len(filled) % columns)
-    rows = [np.concatenate(filled[start : start + columns], axis=1) for start in range(0, len(filled), columns)]
-    return np.concatenate(rows)
 
 
 def _write(canvas: np.ndarray, numbers: Sequence[_Number], *, scale: float) -> None:

@@ -58,7 +58,6 @@ VOXELS = ReconstructConfig(shape="voxels", voxel_budget=8000)
 IDS_FILES = {
     *(f"labels/{view:03d}.png" for view in range(4)),
     *(f"overlay/{view:03d}.png" for view in range(4)),
-    "contact.png",
     "instances.json",
     "report.html",
     "run.json",
@@ -239,7 +238,6 @@ class TestContent:
         untouched = read_label_png(saved / "labels" / "000.png", WIDTH, HEIGHT) == 0
         overlay = cv2.imread(str(saved / "overlay" / "000.png"))
         assert (overlay == photo)[untouched].mean() > 0.8  # numbers stick out of small balls
-        assert cv2.imread(str(saved / "contact.png")).shape[1] == 4 * 484
 
     def test_run_file(self, saved: Path) -> None:
         run = json.loads((saved / "run.json").read_text())
@@ -381,13 +379,13 @@ class TestBrokenPhotos:
 
 
 WRITERS = [
-    "write_label_png", "draw_overlay", "draw_tile", "draw_picture", "write_png", "draw_contact_sheet", "write_coco",
+    "write_label_png", "draw_overlay", "draw_picture", "write_png", "write_coco",
     "write_voxels", "write_ply", "write_glb", "write_long", "write_wide", "write_report",
 ]  # fmt: skip
 
 
 OF_A_PLANT = ("write_voxels", "write_ply", "write_glb", "write_long", "write_wide")
-SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_tile", "draw_picture", "write_png", "write_ply")
+SEVERAL_TIMES = ("write_label_png", "draw_overlay", "draw_picture", "write_png", "write_ply")
 
 
 class TestWholeOrNotAtAll:
