@@ -8,7 +8,7 @@ Names are imported when they are first used, so that `import mvseg` and `mvseg -
 
 from __future__ import annotations
 
-from importlib import import_module
+from mvseg.system.lazy_names import lazy_names
 
 TYPE_CHECKING = False  # type checkers take it for true; to import `typing` takes longer than all of this
 if TYPE_CHECKING:
@@ -113,8 +113,4 @@ _HOME = {
 __all__ = [name for names in _HOME.values() for name in names]
 
 
-def __getattr__(name: str) -> object:
-    for module, names in _HOME.items():
-        if name in names:
-            return getattr(import_module(f"mvseg.{module}"), name)
-    raise AttributeError(f"module 'mvseg' has no attribute '{name}'")
+__getattr__ = lazy_names(__name__, _HOME)

@@ -7,8 +7,9 @@ The public names of this room; they are imported when they are first used.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from mvseg.system.lazy_names import lazy_names
 
 if TYPE_CHECKING:
     from mvseg.matching.affinity import Affinity as Affinity
@@ -33,8 +34,4 @@ _HOME = {
 __all__ = [name for names in _HOME.values() for name in names]
 
 
-def __getattr__(name: str) -> Any:
-    for module, names in _HOME.items():
-        if name in names:
-            return getattr(import_module(f"mvseg.matching.{module}"), name)
-    raise AttributeError(f"module 'mvseg.matching' has no attribute '{name}'")
+__getattr__ = lazy_names(__name__, _HOME)
