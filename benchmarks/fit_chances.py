@@ -29,8 +29,8 @@ from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import Alignment, Habit, Poses, judge, link_gain, list_poses, refine
 from mvseg.tracking.associate import link_leaves
 from mvseg.tracking.compare import MOST_GAP, compare_dates
-from mvseg.tracking.costs import Leaves, Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
+from mvseg.tracking.leaves import Leaves, Pair, leaves_of
 from mvseg.tracking.place_dates import place_dates
 
 NUM_OTHER, RIDGE, EPS = 60, 0.01, 1e-6

@@ -28,9 +28,9 @@ from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.series import SeriesSpec, draw_specs
 from mvseg.tracking.align import _fit
 from mvseg.tracking.compare import MOST_GAP
-from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.fitted_costs import LINKS, POSES, Scales, fitted_costs
+from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.track import track_leaves
 
 SMALL, RIDGE = 16, 3e-3

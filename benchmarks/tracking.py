@@ -52,8 +52,8 @@ from mvseg.simulation.series import (
     move_plant,
     plan_plant,
 )
-from mvseg.tracking.costs import Leaves, leaves_of
 from mvseg.tracking.dates import STATIONS, Number, PlantOnDate, SeenLeaf, read_date, see_surface
+from mvseg.tracking.leaves import Leaves, leaves_of
 from mvseg.tracking.track import Tracks, track_leaves
 from mvseg.traits.measure import measure_plant
 

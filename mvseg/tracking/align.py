@@ -18,25 +18,22 @@ from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
 from mvseg.tracking.config import Pots
-from mvseg.tracking.costs import Pair
 from mvseg.tracking.dates import Floats
-from mvseg.tracking.fitted_costs import LINKS, fitted_costs
+from mvseg.tracking.fitted_costs import LINKS, POSES, fitted_costs
+from mvseg.tracking.leaves import Pair
 
-NUM_REFINED = 20  # hypotheses, of those that look best
-UPRIGHT = 2.0  # weight of "up stays up", in leaves
-MOST_LEAN = np.radians(20.0)
-COARSE = (0.18, 0.45, 0.5)  # scales of base (median lengths), direction (radians) and log length while searching
-ROUNDS = 5  # of pairing and fitting, at most
-PARTS = (0.7, 0.7, 0.3)  # weights of base, middle and tip: growing petioles carry bases, and tips sway
-LEAST_PAIRS = 3  # one pair of leaves fits any two plants, two fit many
-TURNS = 30  # poses that a pot may be turned to, and that leaves can tell apart: of 12 degrees (a definition)
-TEMPER = 0.41  # of a gain, that counts as log odds; `python benchmarks/fit_chances.py` fits it
-GUESS = (-1.16, 0.58, 1.36)  # see `guess_chance`; `python benchmarks/fit_chances.py` fits them
-NEAR, NEAR_SHIFT = np.radians(12.0), 0.3  # angle and median lengths up to which two poses are one
-SAME = 0.5  # distance of hypotheses of which one is refined, in these
+NUM_REFINED = 20  # poses of two dates that are refined at most, those that look best
+UPRIGHT = 2.0  # "up stays up" weighs as much as this many leaves where a pose is fitted
+COARSE = 0.5  # scale of log lengths while poses are looked for, between leaves of any age
+ROUNDS = 5  # of pairing leaves and fitting a pose to them, at most
+PARTS = (0.7, 0.7, 0.3)  # weights of base, middle and tip where a pose is fitted: petioles carry bases, and tips sway
+LEAST_PAIRS = 3  # a pose other than "as it stood" needs this many leaves: two fit many plants
+TURNS = 30  # turns of a pot that leaves can tell apart, of 12 degrees (a definition)
+TEMPER = 0.45  # of a gain, that counts as log odds; `python benchmarks/fit_chances.py` fits it
+GUESS = (-1.18, 0.55, 1.23)  # see `guess_chance`; `python benchmarks/fit_chances.py` fits them
+NEAR_SHIFT = 0.3  # two poses that move the plant's middle by less than this apart are one, in `Pair.scale`
 DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
-LARGE_NEW = 3.0  # cost of a large leaf that appears from nowhere: it was missed, or the pose is wrong
-NEARLY_ALL = 0.9  # of the leaves of the date with fewer: where these are paired, large ones were missed there
+LARGE_NEW = 3.0  # a pose is less likely by this log odds for each large leaf that it lets appear from nowhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,7 +128,7 @@ def list_poses(pair: Pair) -> Poses:
     while len(left) and len(found) < NUM_REFINED:
         if left[0] or pair.fewer >= LEAST_PAIRS:
             found.append(refine(pair, poses[left[0]]))
-        left = left[pose_distances(pair, poses[left[0]], poses[left]) > SAME]
+        left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]
     every = np.stack([each.pose for each in found])
     gains = np.array([each.gain - large_new(pair, each.pairs) for each in found])
     return Poses(pair, tuple(found), gains, near_world(pair, every))
@@ -172,9 +169,9 @@ def _as_it_stood(pair: Pair) -> Alignment:
 
 
 def large_new(pair: Pair, pairs: np.ndarray) -> float:
-    """What leaves of the larger half that are in no pair cost; 0 where nearly all leaves of the date with fewer are in
-    one. A plant that is turned onto its own older leaves has many."""
-    if len(pairs) >= NEARLY_ALL * pair.fewer:
+    """What leaves of the larger half that are in no pair cost; 0 where all leaves of the date with fewer are in one:
+    then large ones were missed there. A plant that is turned onto its own older leaves has many."""
+    if len(pairs) == pair.fewer:
         return 0.0
     is_large = pair.second.lengths >= np.median(pair.second.lengths)
     return LARGE_NEW * float(np.delete(is_large, pairs[:, 1]).sum())
@@ -188,11 +185,12 @@ def near_world(pair: Pair, poses: Floats) -> Floats:
 
 
 def pose_distances(pair: Pair, pose: Floats, others: Floats) -> Floats:
-    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of NEAR and, for the plant's middle, NEAR_SHIFT."""
+    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of one of the TURNS and, for the plant's middle, of
+    NEAR_SHIFT: below 1, they are one."""
     middle = np.append(pair.first.midribs.mean((0, 1)), 1.0)
     turned = np.arccos(np.clip((np.einsum("ij,hij->h", pose[:3, :3], others[:, :3, :3]) - 1) / 2, -1, 1))
     moved = np.linalg.norm((others - pose)[:, :3] @ middle, axis=1)
-    return np.hypot(turned / NEAR, moved / (NEAR_SHIFT * pair.scale))
+    return np.hypot(turned / (2 * np.pi / TURNS), moved / (NEAR_SHIFT * pair.scale))
 
 
 def draw_poses(pair: Pair) -> Floats:
@@ -236,13 +234,13 @@ def make_poses(rotations: Floats, shifts: Floats) -> Floats:
 def alikeness(pair: Pair, poses: Floats) -> Floats:
     """(H, N + M) in [0, 1] how alike the most alike leaf of the other date is under each of the poses (H, 4, 4)."""
     first, second = pair.first, pair.second
-    size = np.square(np.log(second.lengths[None] / first.lengths[:, None]) / COARSE[2])
+    size = np.square(np.log(second.lengths[None] / first.lengths[:, None]) / COARSE)
     found = []
     for part in np.array_split(poses, 1 + len(poses) // 200):  # bounds the memory
         bases = np.einsum("hij,nj->hni", part[:, :3, :3], first.bases) + part[:, None, :3, 3]
         chords = np.einsum("hij,nj->hni", part[:, :3, :3], first.chords)
-        away = np.square(bases[:, :, None] - second.bases).sum(-1) / (COARSE[0] * pair.scale) ** 2
-        turn = 2 * (1 - np.einsum("hni,mi->hnm", chords, second.chords)) / COARSE[1] ** 2
+        away = np.square(bases[:, :, None] - second.bases).sum(-1) / (POSES.across * pair.scale) ** 2
+        turn = 2 * (1 - np.einsum("hni,mi->hnm", chords, second.chords)) / POSES.turn**2
         alike = np.exp(-0.25 * (away + turn + size))
         found.append(np.concatenate([alike.max(2), alike.max(1)], 1))
     return np.concatenate(found)
@@ -292,7 +290,4 @@ def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Fl
         mass = np.append(mass, UPRIGHT / max(len(pairs), 1) * np.linalg.norm(moment))
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # on one line, any of the best will do
         rotation = Rotation.align_vectors(target, source, mass)[0].as_matrix()
-    if pair.knows_up and np.arccos(np.clip(rotation[2, 2], -1, 1)) > MOST_LEAN:
-        turn = np.arctan2(moment[1, 0] - moment[0, 1], moment[0, 0] + moment[1, 1])
-        rotation = Rotation.from_rotvec((0, 0, turn)).as_matrix()
     return make_poses(rotation, aim - rotation @ middle)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,21 +18,18 @@ from mvseg.tracking.align import (
     pose_distances,
     refine,
 )
+from mvseg.tracking.bent_costs import bent_costs
 from mvseg.tracking.config import Pots
-from mvseg.tracking.costs import ACROSS, Leaves, Pair, cloud_costs, pair_costs
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
+from mvseg.tracking.leaves import Leaves, Pair
 from mvseg.tracking.motions import Motion, find_motion
 from mvseg.tracking.place_dates import place_dates
 
 MOST_GAP = 3  # dates from one sight to another that it is compared with, at most: two dates may hide a leaf
-UNLINKED = 2.0  # a pair may cost that much in a track before two tracks are cheaper than one; / dates in between
-CLOUD_COUNTS = 0.3  # of the points of two surfaces, whose midribs say most already, and the other way round
-MOST_HELP = 8.0
-IN_PART = 0.3  # change of log length from which one of two surfaces may show a part of the leaf only
-ENOUGH = 6  # pairs, from which the others say how the plant bent where a leaf is; with 7 all is the same, 5 are too few
-LIKE_RIGID = 0.3  # weight of "the plant moved as a whole", in leaves
-RARE = 1e-4  # poses that are less likely say nothing of a link (a technical limit)
+UNLINKED = 2.0  # a pair of leaves may cost this much in a track before two tracks are cheaper than one
+ENOUGH = 6  # a plant is bent as its leaves moved if at least this many are paired: fewer do not tell
+RARE = 1e-4  # a pose that is less likely than this says nothing of a link
 MOST_ODDS = 40.0  # of log odds, whose exponentials are numbers then (a technical limit)
 
 
@@ -125,35 +122,7 @@ def _link_costs(pair: Pair, alignment: Alignment) -> Floats:
     plant bent."""
     if len(alignment.pairs) < ENOUGH:
         return fitted_costs(pair.moved(alignment.pose), LINKS)
-    return _bent_costs(pair, alignment)
-
-
-def _bent_costs(pair: Pair, alignment: Alignment) -> Floats:
-    """Costs after the plant was let bend and stretch: each leaf moves as the other pairs say, not as its own does."""
-    first, second, scale, pairs = pair.first, pair.second, pair.scale, alignment.pairs
-    moved = first.moved(alignment.pose)
-    one, other = moved.bases[pairs[:, 0]], second.bases[pairs[:, 1]]
-    middle = one.mean(0)
-    terms = np.column_stack([np.ones(len(one)), (one - middle) / scale])
-    away = other - one
-    weight = 1 / (1 + np.square(np.linalg.norm(away - np.median(away, 0), axis=1) / (3 * ACROSS * scale)))
-    ridge = LIKE_RIGID * np.diag([1.0, 1.0, 1.0, 1.0])
-    inverse = np.linalg.inv(terms.T @ (terms * weight[:, None]) + ridge)
-    factors = inverse @ (terms * weight[:, None]).T @ away
-    everywhere = np.column_stack([np.ones(len(moved)), (moved.bases - middle) / scale]) @ factors
-    leverage = np.einsum("pi,ij,pj->p", terms, inverse, terms) * weight
-    fitted = terms @ factors
-    everywhere[pairs[:, 0]] = away - (away - fitted) / np.maximum(1 - leverage, 0.1)[:, None]  # without its own pair
-    bent = moved.shifted(everywhere)
-    rest = np.linalg.norm((other - bent.bases[pairs[:, 0]])[:, :2], axis=1) / (1.18 * ACROSS * scale)
-    spread = float(np.clip(np.median(rest), 0.7, 2.0))
-    in_place = replace(pair, first=bent)
-    costs, clouds = pair_costs(in_place, spread=spread), cloud_costs(in_place, spread=spread)
-    both = first.is_surface[:, None] & second.is_surface[None]
-    by_midrib = costs + CLOUD_COUNTS * np.minimum(clouds, 0.0)
-    by_cloud = clouds + CLOUD_COUNTS * np.clip(costs, -MOST_HELP, MOST_HELP)
-    in_part = np.abs(np.log(second.lengths[None] / first.lengths[:, None])) > IN_PART
-    return np.where(both, np.where(in_part, np.minimum(by_midrib, by_cloud), by_midrib), by_cloud)
+    return bent_costs(pair, alignment)
 
 
 def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:

@@ -31,8 +31,7 @@ STATIONS = 9  # points of a midrib, base and tip included
 ROWS = 12  # of points from base to tip, three in each: edge, midrib, edge
 CLOUD = 3 * ROWS  # points that stand for a leaf
 UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}  # in millimetres
-REJECTED = "rejected:"
-MOST_PARTS = 256  # of a path: as many as there can be
+MOST_PARTS = 256  # of a path, at most (a technical limit)
 
 
 @dataclass(frozen=True)

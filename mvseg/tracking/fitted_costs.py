@@ -13,8 +13,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from mvseg.tracking.costs import FLIPPED, MOST_SD, Pair, student_tail
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.leaves import Pair
+
+TAIL = 3.0  # degrees of freedom of Student's t, which the differences follow
+FLIPPED = 0.5  # a midrib that runs the other way on the other date costs this much more
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,7 @@ class Scales:
         across: of the base, away from the stem.
         along, stretch: of the base up the stem, and more of it per height above the foot, for internodes stretch.
         turn: of the direction from base to tip.
-        growth: log length that is expected per day and room to grow, see `_length_costs`.
+        growth: log length that is expected per day and room to grow, see `length_costs`.
         size, spurt: of the log length, and more of it per growth that is expected.
         loose: of the log length of leaves that only voxels show.
         lines, near: weight and scale of the distances between midribs, see `_line_costs`; 0: they do not count.
@@ -58,7 +61,7 @@ def fitted_costs(pair: Pair, scales: Scales = POSES) -> Floats:
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
     likelier than not."""
     turned = replace(pair, first=replace(pair.first, midribs=pair.first.midribs[:, ::-1]))
-    costs = np.minimum(_base_costs(pair, scales), _base_costs(turned, scales) + FLIPPED) + _length_costs(pair, scales)
+    costs = np.minimum(_base_costs(pair, scales), _base_costs(turned, scales) + FLIPPED) + length_costs(pair, scales)
     if scales.lines:
         costs += scales.lines * _line_costs(pair, scales)
     return costs + np.log(max(len(pair.first), len(pair.second), 1)) - scales.parting
@@ -74,15 +77,15 @@ def _base_costs(pair: Pair, scales: Scales) -> Floats:
     apart = (second.bases[None] - first.bases[:, None]) / scale
     lowest = first.bases[:, 2].min(initial=np.inf)
     height = (first.bases[:, 2] - lowest + np.clip(lowest, 0, scale)) / scale
-    noise = np.clip(np.hypot(first.base_sd[:, None], second.base_sd[None]) / scale, 0, MOST_SD)
+    noise = np.hypot(first.base_sd[:, None], second.base_sd[None]) / scale
     across = np.linalg.norm(apart[..., :2], axis=-1) / np.hypot(scales.across, noise)
     along = apart[..., 2] / np.hypot(scales.along + scales.stretch * height[:, None], noise)
-    turn_noise = np.minimum(np.hypot(first.turn_sd[:, None], second.turn_sd[None]), 1.0)
+    turn_noise = np.hypot(first.turn_sd[:, None], second.turn_sd[None])
     turn = np.arccos(np.clip(first.chords @ second.chords.T, -1, 1)) / np.hypot(scales.turn, turn_noise)
     return 0.5 * (student_tail(across, 2) + student_tail(along, 1) + student_tail(turn, 2))
 
 
-def _length_costs(pair: Pair, scales: Scales) -> Floats:
+def length_costs(pair: Pair, scales: Scales) -> Floats:
     """Of lengths: a leaf has room to grow until it is as long as the longest one of the later date, and grows the
     faster the more it has, up to a factor of e."""
     first, second = pair.first, pair.second
@@ -100,3 +103,8 @@ def _line_costs(pair: Pair, scales: Scales) -> Floats:
     ways = apart.min(3).mean(2), apart.min(2).mean(2)
     wide = scales.near * pair.scale
     return 0.5 * (student_tail(np.minimum(*ways) / wide, 2) + student_tail(np.maximum(*ways) / (3 * wide), 1))
+
+
+def student_tail(x: Floats, dimensions: int) -> Floats:
+    """Minus twice the log of Student's density in units of its peak."""
+    return (TAIL + dimensions) * np.log1p(np.square(x) / TAIL)

@@ -13,20 +13,19 @@ import numpy as np
 
 from mvseg.tracking.align import (
     LEAST_PAIRS,
-    SAME,
     alikeness,
     best_pairs,
     draw_poses,
     pose_distances,
     refine,
 )
-from mvseg.tracking.costs import Pair, pair_costs
+from mvseg.tracking.bent_costs import pair_costs
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.leaves import Pair
 
-TRIED = 8  # poses, of those that explain most of what the alignment does not
-LEAST_GAIN = 20.0  # of a second motion; of plants whose leaves only grew the largest are about 15
-SURE_MARGIN = 7.0  # of a second motion over others
-CLEARLY = 2.0  # a leaf is of the second motion where that is so much cheaper
+TRIED = 8  # poses that are tried as a second motion at most, those that explain most of what the alignment does not
+LEAST_GAIN = 20.0  # a second motion is believed from this log odds on; where leaves only grew, about 15 are reached
+SURE_MARGIN = 7.0  # a second motion is sure if its log odds exceed those of every other one by this
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,13 +64,13 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
         if not len(left) or not better[left[0]]:
             break
         at, own = poses[left[0]], np.flatnonzero(alike[left[0]] > alike[0])
-        left = left[pose_distances(pair, at, poses[left]) > SAME]
+        left = left[pose_distances(pair, at, poses[left]) >= 1]
         refined = refine(pair.take(own, np.arange(len(pair.second))), at)
         is_other = pose_distances(pair, pose, refined.pose[None])[0] >= 1
         if len(refined.pairs) >= LEAST_PAIRS and is_other:
             others = pair_costs(pair.moved(refined.pose))
             rows, columns = best_pairs(np.minimum(costs, others)).T
-            keep = others[rows, columns] < costs[rows, columns] - CLEARLY
+            keep = others[rows, columns] < costs[rows, columns]
             pairs = np.stack([rows[keep], columns[keep]], 1)
             found.append(Motion(refined.pose, pairs, alone - _total(np.minimum(costs, others)), margin=0.0))
     best = max(found, key=lambda motion: motion.gain, default=None)

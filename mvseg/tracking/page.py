@@ -23,7 +23,7 @@ from mvseg.tracking.growth import SIZES, Growth
 from mvseg.tracking.track import Tracks
 
 PAGE_FILE, CHART_FILE = "tracks.html", "growth.png"
-CURVE_STEPS = 40
+CURVE_STEPS = 40  # points of a drawn curve
 CHART = (1500, 1000)  # pixels of growth.png
 ASSETS = files("mvseg.tracking") / "assets"
 

@@ -1,8 +1,8 @@
-"""How all dates of a plant stand to each other: of the poses that pairs of dates allow, those that go together best.
+"""How all dates of a plant stand to each other: of the poses that pairs of dates suggest, those that go together best.
 
-Two dates that look alike in more than one way are settled by the others. One date after the other takes, of the poses
-that its pairs with the others suggest, that under which all of these pairs are likeliest, until none changes; from two
-starts: the likeliest alignments, and all frames alike. The likelier outcome counts.
+Two dates that look alike in more than one way are settled by the others. From the chain of the likeliest alignments on,
+one date after the other takes, of the poses that its pairs with the others suggest, that under which all of these pairs
+are likeliest, until none changes.
 """
 
 from __future__ import annotations
@@ -29,8 +29,7 @@ from mvseg.tracking.align import (
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import fitted_costs
 
-TRIED = 3  # poses of each pair, the likeliest; with five, nothing changes
-ROUNDS = 6  # at most; two or three are enough
+ROUNDS = 6  # of placing all dates anew, at most; two or three are enough (a technical limit)
 Looked = Mapping[tuple[int, int], Poses]
 Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
 
@@ -50,13 +49,10 @@ def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, n
     """
     if habit.still == 1:  # somebody says so
         return np.tile(np.eye(4), (num_dates, 1, 1)), np.zeros(num_dates, int), np.ones(num_dates - 1)
-    chained, roots = chain_dates(num_dates, {pair: judge(poses, habit) for pair, poses in looked.items()})
-    starts = chained, np.tile(np.eye(4), (num_dates, 1, 1))
+    alignments = {pair: judge(poses, habit) for pair, poses in looked.items()}
+    chained, roots = chain_dates(num_dates, alignments)
     likeliness = _remembered(looked, habit)
-    suggested = {pair: _likeliest(poses, habit) for pair, poses in looked.items()}
-    found = [_search(start, roots, suggested, likeliness) for start in starts]
-    totals = [sum(likeliness(poses, pair) for pair in looked) for poses in found]
-    poses = found[int(np.argmax(np.round(totals, DIGITS)))]
+    poses = _search(chained, roots, alignments, likeliness)
     return poses, roots, weigh_turns(poses, looked, likeliness)
 
 
@@ -99,17 +95,18 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
 
 
 def _search(
-    poses: Floats, roots: np.ndarray, suggested: Mapping[tuple[int, int], Floats], likeliness: Likeliness
+    poses: Floats, roots: np.ndarray, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness
 ) -> Floats:
     """One date after the other takes the pose that agrees best with the others, of those that its pairs suggest."""
     poses = poses.copy()
     for _ in range(ROUNDS):
         before = poses.copy()
         for date in np.flatnonzero(roots != np.arange(len(roots))).tolist():
-            pairs = [pair for pair in suggested if date in pair]
+            pairs = [pair for pair in alignments if date in pair]
             options = [poses[date], *(
-                poses[earlier] @ np.linalg.inv(step) if date == later else poses[later] @ step
-                for earlier, later in pairs for step in suggested[earlier, later]
+                poses[earlier] @ np.linalg.inv(alignments[earlier, later].pose) if date == later
+                else poses[later] @ alignments[earlier, later].pose
+                for earlier, later in pairs
             )]  # fmt: skip
             totals = []
             for option in options:
@@ -120,12 +117,6 @@ def _search(
         if np.array_equal(poses, before):
             break
     return poses
-
-
-def _likeliest(poses: Poses, habit: Habit) -> Floats:
-    """(TRIED, 4, 4) the likeliest poses of two dates, or all there are."""
-    order = np.argsort(-np.round(poses.scores(habit), DIGITS), kind="stable")[:TRIED]
-    return np.stack([poses.refined[place].pose for place in order])
 
 
 def _remembered(looked: Looked, habit: Habit) -> Likeliness:

@@ -16,13 +16,13 @@ from mvseg.errors import InputError
 from mvseg.tracking.associate import Association, Sight, link_leaves, sum_over_poses
 from mvseg.tracking.compare import Comparison, compare_dates
 from mvseg.tracking.config import Pots
-from mvseg.tracking.costs import leaves_of
 from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
+from mvseg.tracking.leaves import leaves_of
 
 if TYPE_CHECKING:
     from mvseg.results.result import Result
 
-TOLD = 0.9  # probability of an alignment, below which it is a guess that a person should know of
+TOLD = 0.9  # a person is told of an alignment that is less likely than this
 State = Literal["born", "seen", "hidden", "gone"]
 
 

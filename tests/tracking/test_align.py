@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.tracking import see_series
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import Alignment, Habit, judge, list_poses
-from mvseg.tracking.costs import Pair, leaves_of
+from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.place_dates import place_dates
 from mvseg.tracking.track import TOLD
 from tests.plants_over_days import grow_blades, grown, see

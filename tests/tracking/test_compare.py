@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from mvseg.tracking.associate import Association, link_leaves, sum_over_poses
 from mvseg.tracking.compare import Comparison, compare_dates
-from mvseg.tracking.costs import leaves_of
+from mvseg.tracking.leaves import leaves_of
 from tests.plants_over_days import Blades, grow_blades, see
 
 HALF_TURN = Rotation.from_euler("z", 180, degrees=True)

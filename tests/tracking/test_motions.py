@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvseg.tracking.align import make_poses
-from mvseg.tracking.costs import Leaves, Pair, leaves_of
+from mvseg.tracking.leaves import Leaves, Pair, leaves_of
 from mvseg.tracking.motions import Motion, find_motion
 from tests.plants_over_days import Blades, grow_blades, grown, see
 

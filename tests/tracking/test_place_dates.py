@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from mvseg.tracking.align import Habit, Poses, judge, list_poses, make_poses
-from mvseg.tracking.costs import Pair, leaves_of
+from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.place_dates import place_dates
 from tests.plants_over_days import grow_blades, grown, see
 

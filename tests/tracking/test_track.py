@@ -12,8 +12,8 @@ from scipy.spatial.transform import Rotation
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
 from mvseg.tracking.align import Habit, list_poses
-from mvseg.tracking.costs import Pair, leaves_of
 from mvseg.tracking.dates import PlantOnDate
+from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.track import track_leaves
 from tests.plants_over_days import Blades, grow_blades, grown, see, true_tracks
 
@@ -47,6 +47,15 @@ def test_births_deaths_and_gaps() -> None:
     assert of_leaf[10] == 10  # in the order of appearance
     linked = [row.probability for row in tracks.rows if row.date > 0 and row.state == "seen"]
     assert min(linked) > 0.9
+
+
+@pytest.mark.parametrize(("num_hidden", "num_tracks"), [(2, 10), (3, 11)])
+def test_a_leaf_that_is_missing_for_more_than_two_dates_gets_a_new_track(num_hidden: int, num_tracks: int) -> None:
+    every = set(BLADES)
+    dates, truths = days(every, *[every - {4}] * num_hidden, every)
+    tracks = track_leaves(dates)
+    assert tracks.num_tracks == num_tracks
+    assert all(len(leaves) == 1 for leaves in true_tracks(tracks, truths).values())
 
 
 def test_poses_bring_all_dates_into_the_first_frame() -> None:

@@ -1,0 +1,131 @@
+"""The leaves of a date as arrays, and those of two dates that are compared."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+
+from mvseg.tracking.dates import CLOUD, STATIONS, Floats, PlantOnDate, SeenLeaf
+
+SPREAD = 0.6  # places are measured in this share of how far bases are spread where leaves are shorter than that
+
+
+@dataclass(frozen=True, eq=False)
+class Leaves:
+    """N leaves with a shape, as arrays, in one frame.
+
+    Attributes:
+        index: (N,) their places in `PlantOnDate.leaves`.
+        midribs: (N, STATIONS, 3) from base to tip.
+        normals: (N, 3).
+        points: (N, CLOUD, 3).
+        lengths: (N,).
+        base_sd, turn_sd: (N,) standard deviations of the base, in lengths, and of the azimuth, in radians.
+        is_oriented, is_surface: (N,) bool.
+    """
+
+    index: np.ndarray
+    midribs: Floats
+    normals: Floats
+    points: Floats
+    lengths: Floats
+    base_sd: Floats
+    turn_sd: Floats
+    is_oriented: np.ndarray
+    is_surface: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.index)
+
+    @property
+    def bases(self) -> Floats:
+        return self.midribs[:, 0]
+
+    @property
+    def chords(self) -> Floats:
+        """(N, 3) unit directions from base to tip."""
+        ahead = self.midribs[:, -1] - self.midribs[:, 0]
+        return ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-12)
+
+    def take(self, rows: np.ndarray) -> Leaves:
+        """Some of the leaves."""
+        return Leaves(**{field.name: getattr(self, field.name)[rows] for field in fields(self)})
+
+    def moved(self, pose: Floats) -> Leaves:
+        """In another frame, by its pose (4, 4)."""
+        rotation, shift = pose[:3, :3], pose[:3, 3]
+        return replace(
+            self,
+            midribs=self.midribs @ rotation.T + shift,
+            normals=self.normals @ rotation.T,
+            points=self.points @ rotation.T + shift,
+        )
+
+    def shifted(self, shifts: Floats) -> Leaves:
+        """Each leaf by its own of the shifts (N, 3)."""
+        return replace(self, midribs=self.midribs + shifts[:, None], points=self.points + shifts[:, None])
+
+
+def leaves_of(date: PlantOnDate) -> Leaves:
+    """The leaves of a date that have a shape."""
+    shaped: Sequence[SeenLeaf] = [date.leaves[index] for index in date.shaped]
+
+    def sd(leaf: SeenLeaf, trait: str) -> float:
+        number = leaf.numbers.get(trait)
+        return number.sd if number is not None and np.isfinite(number.sd) else 0.0
+
+    return Leaves(
+        index=np.array(date.shaped, int),
+        midribs=np.array([leaf.midrib for leaf in shaped]).reshape(-1, STATIONS, 3),
+        normals=np.array([leaf.normal for leaf in shaped]).reshape(-1, 3),
+        points=np.array([leaf.points for leaf in shaped]).reshape(-1, CLOUD, 3),
+        lengths=np.array([leaf.length for leaf in shaped]),
+        base_sd=np.array([sd(leaf, "insertion_height") for leaf in shaped]),
+        turn_sd=np.radians(np.array([sd(leaf, "azimuth") for leaf in shaped])),
+        is_oriented=np.array([leaf.is_oriented for leaf in shaped], bool),
+        is_surface=np.array(["length" in leaf.numbers for leaf in shaped], bool),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """N leaves of one date and M leaves of a later one, which are compared.
+
+    Attributes:
+        first, second: each in its date's frame, until `moved`.
+        days: between the dates, > 0.
+        knows_up: +z is up in both frames.
+        scale: what places are measured in, see `Pair.of`.
+    """
+
+    first: Leaves
+    second: Leaves
+    days: float
+    knows_up: bool
+    scale: float
+
+    @classmethod
+    def of(cls, first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Pair:
+        """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
+        small leaflets, a share of how far their bases are spread."""
+        found = [1e-9]
+        for leaves in (first, second):
+            if len(leaves):
+                spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
+                found += [float(np.median(leaves.lengths)), SPREAD * float(np.sqrt(np.mean(spread**2)))]
+        return cls(first, second, days, knows_up, scale=max(found))
+
+    @property
+    def fewer(self) -> int:
+        """Leaves of the date with fewer."""
+        return min(len(self.first), len(self.second))
+
+    def moved(self, pose: Floats) -> Pair:
+        """The earlier date in the frame of the later one, by its pose (4, 4)."""
+        return replace(self, first=self.first.moved(pose))
+
+    def take(self, rows: np.ndarray, columns: np.ndarray) -> Pair:
+        """Some leaves of either date, with a scale of their own."""
+        return Pair.of(self.first.take(rows), self.second.take(columns), days=self.days, knows_up=self.knows_up)
