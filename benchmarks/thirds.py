@@ -8,7 +8,10 @@ much their pair F1, and how far match scores move. Of verification: how many mas
 pixels, and by how much pair F1 and MV-PQ change, where surfaces check the ids of degraded masks and of straps in pieces
 and masks are cut; where the views choose what the shipped detector found, also in the folders of `--scenes`; and where
 up to `MOST_DRAWN` of these leaves were missed, and a person drew them in two photos, or in three (half of their other
-masks are still there, matched to nothing).
+masks are still there, matched to nothing). Of reconstruction, with degraded masks: of all leaves together, how far area
+and its standard deviation move (median and largest change in percent), of how many it changes whether they are
+credible, doubted or oriented, and how far the volume of voxels moves; ids are true but for one scene, where they are
+those of "nview".
 """
 
 from __future__ import annotations
@@ -34,6 +37,7 @@ from scipy.optimize import linear_sum_assignment
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import mvseg.matching
+import mvseg.reconstruction
 import mvseg.reconstruction.shapes
 import mvseg.verification
 from benchmarks.corrections import Case, detect_case, render
@@ -54,7 +58,10 @@ from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.view_graph import ViewGraph
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.kept_surfaces import name_each
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
@@ -297,6 +304,63 @@ def judge(masks: Masks, trial: Trial) -> LeafMetrics:
     return leaf_metrics(matched.regions, matched.instance_ids, trial.truth)
 
 
+# --- reconstruction
+
+
+# Views, leaves and family: level leaves, long ones, few views, many; and the scene whose ids are found.
+SHAPES = ((5, 8, "rosette"), (5, 8, "strap"), (3, 8, "lanceolate"), (20, 4, "ovate"))
+MATCHED = (5, 16, None)
+
+
+def thirds_of_reconstruction(args: argparse.Namespace) -> None:
+    specs = [spec for spec in list_scenes(PRESETS["paper-eval"], 0) if spec.split == "dev"]
+    scenes = []
+    for num_views, num_leaves, family in (*SHAPES, MATCHED):
+        fits = (each for each in specs if (each.num_views, each.num_leaves) == (num_views, num_leaves))
+        scenes.append(load_maps(next(each for each in fits if family in (None, each.family)), args.cache))
+    before = fit_all(scenes)
+    for module, name in list_numbers(mvseg.reconstruction):
+        for factor in (1 / FACTOR, FACTOR) if args.numbers is None or name in args.numbers else ():
+            try:
+                with changed(module, name, scaled(getattr(module, name), factor)):
+                    said = compare_leaves(before, fit_all(scenes))
+            except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
+                said = f"cannot be: {error}"
+            print(f"{module.__name__.rpartition('.')[2]} {name} x {factor:.2f}: {said}", flush=True)
+
+
+def fit_all(scenes: list[LabelledScene]) -> np.ndarray:
+    """(N, 6) of all leaves that have two masks: area, its standard deviation, credible, reasons, oriented, volume."""
+    rows = []
+    for index, scene in enumerate(scenes):
+        regions, ids = scene.masks("degraded")
+        ids = torch.where(ids > 0, ids, -1)
+        if index == len(SHAPES):
+            graph = ViewGraph.of(region_affinity(regions, scene.cameras), regions)
+            ids = match_nview(regions, scene.cameras, graph).instance_ids
+        voxels = reconstruct_instances(regions, ids, scene.cameras)
+        for instance, leaf in fit_surfaces(regions, ids, scene.cameras).items():
+            volume = voxels[instance].volume if instance in voxels else np.nan
+            rows.append((*describe_leaf(leaf), volume))
+    return np.array(rows)
+
+
+def describe_leaf(leaf: LeafSurface) -> tuple[float, ...]:
+    if not leaf.exists:
+        return np.nan, np.nan, 0.0, 1.0, 0.0
+    return leaf.area, leaf.deviations[0], leaf.is_credible, len(leaf.quality.reasons), leaf.is_oriented
+
+
+def compare_leaves(before: np.ndarray, after: np.ndarray) -> str:
+    if np.array_equal(before, after, equal_nan=True):
+        return "nothing"
+    area, sd, volume = (100 * np.abs(np.log(after[:, column] / before[:, column])) for column in (0, 1, 5))
+    parts = [f"{name} {np.nanmedian(each):.1f} / {np.nanmax(each):.1f}" for name, each in (("area", area), ("sd", sd))]
+    turned = zip((before[:, 2:5] != after[:, 2:5]).sum(0), ("credible", "doubted", "oriented"), strict=True)
+    parts += [f"{count} {name}" for count, name in turned if count]
+    return ", ".join([*parts, f"volume {np.nanmax(volume):.1f}"])
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--cache", type=Path, required=True, help="folder for rendered scenes and detections")
@@ -310,7 +374,7 @@ def main() -> None:
         ROOMS[args.room](args)
 
 
-ROOMS = {"matching": thirds_of_matching, "verification": thirds_of_verification}
+ROOMS = {"matching": thirds_of_matching, "verification": thirds_of_verification, "reconstruction": thirds_of_reconstruction}
 
 if __name__ == "__main__":
     main()

@@ -13,9 +13,10 @@ from torch import Tensor
 
 from mvseg.scene import Cameras
 
-SAME = np.radians(1.0)  # directions that differ by less count as one
-PARALLEL = np.radians(2.0)  # root mean square of the angles between axes and their mean, that tells no common point
-TIE = 1e-6  # of the sum; what differs by less is equal, and of equal ones the first is taken
+SAME = np.radians(1.0)  # directions that differ by less than this crowd each other no more (a technical limit)
+# Axes meet in no point if the root mean square of their angles to the mean axis is less than this.
+PARALLEL = np.radians(2.0)
+TIE = 1e-6  # sums that differ by less than this share are equal, and the first one is taken (a technical limit)
 
 
 def spread_views(cameras: Cameras, most: int) -> Tensor:

@@ -13,8 +13,9 @@ from mvseg.scene import Cameras
 Floats = NDArray[np.float64]
 Key = TypeVar("Key", bound=Hashable)
 
-MOST_ERROR = 0.003  # reprojection error in widths of the photo; more is a mistake, or something that moved
-LEAST_ANGLE = np.radians(1.0)  # between two rays of a point
+# A point is left out if it is missed by this or more in a view, in widths of the photo: a mistake, or it moved.
+MOST_ERROR = 0.003
+LEAST_ANGLE = np.radians(1.0)  # two rays make a point if the angle between them is at least this
 
 
 def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, Floats]]]) -> dict[Key, Floats]:

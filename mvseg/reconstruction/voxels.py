@@ -20,10 +20,10 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
 
-SEARCH_CELLS = 24  # cells along the bounding box of an instance when the search for it ends
-MAX_CELLS = 100_000  # or how many cells there are by then
-MAX_VOXELS = 200_000_000
-CRUMB = 0.02  # of the voxels of the largest piece; smaller pieces are crumbs
+SEARCH_CELLS = 24  # the search for the box of an instance ends at so many cells along it
+MAX_CELLS = 100_000  # or when there are so many cells (a technical limit)
+MAX_VOXELS = 200_000_000  # a grid has at most so many voxels (a technical limit)
+CRUMB = 0.02  # a piece is a crumb if it has less than this share of the voxels of the largest piece
 
 
 @dataclass(frozen=True, eq=False)

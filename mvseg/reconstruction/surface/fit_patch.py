@@ -12,21 +12,27 @@ from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
-FIT_GRID, FAR_GRID = (36, 9), (20, 5)  # rows and columns, the second in the first half of the way
-FIRST_HALF, SECOND_HALF, NUM_STEPS = range(5), range(5, 10), 7  # from a rough start, and when it is nearly right
-FAR_REACH, NEAR_REACH = 14.0, 6.0  # pixels
-FAR_STEP, NEAR_STEP = (0.05, 0.25), (0.005, 0.12)  # damping, and half-widths that no point moves farther than
-SAMPLE_WEIGHT = 0.35  # neighbouring samples are alike
-FAR_SCALE_PX, LEAST_SCALE_PX = 4.0, 0.7  # of the Cauchy weights, at first and in the end
-SCALE_FACTOR = 4.0  # or so many median distances, where masks contradict each other by more
-OFFSET_FROM, OFFSET_SHARE = 6, 0.8  # step from which masks may be too large or small, and the share that is believed
-CLEAN_PX = 1.0  # deviation of the distances up to which masks are clean; beyond it fold and curl stay nearer to none
-NARROW = 0.15  # of the length: steps along narrow leaves may be as long as those of a leaf with this half-width
-NOISY_VIEW = 1.5  # times the usual spread: such views count less
+# Rows and columns at which a patch is drawn, the second where it is still far from the masks.
+FIT_GRID, FAR_GRID = (36, 9), (20, 5)
+# Steps from a rough start, in two halves, and from a start that is nearly right (technical limits).
+FIRST_HALF, SECOND_HALF, NUM_STEPS = range(5), range(5, 10), 7
+FAR_REACH, NEAR_REACH = 14.0, 6.0  # pixels within which a sample looks for an edge, at first and in the end
+# Damping of a step, and half-widths that no point moves farther than; at first and in the end.
+FAR_STEP, NEAR_STEP = (0.05, 0.25), (0.005, 0.12)
+SAMPLE_WEIGHT = 0.35  # weight of one sample, since neighbouring samples are alike
+FAR_SCALE_PX, LEAST_SCALE_PX = 4.0, 0.7  # scale of the Cauchy weights of distances, at first, and the least in the end
+SCALE_FACTOR = 4.0  # the scale is at least so many median distances: masks may contradict each other
+# Masks may be too large or small from this step on, and this share of what is measured is believed.
+OFFSET_FROM, OFFSET_SHARE = 6, 0.8
+CLEAN_PX = 1.0  # masks are clean if the deviation of the distances is less; beyond it fold and curl stay nearer to none
+NARROW = 0.15  # a leaf counts as so wide at least, as a share of its length, where steps are limited by its width
+NOISY_VIEW = 1.5  # a view counts less if its distances deviate by more than this times what is usual
 
 # Of the covariance.
-FIT_FACTOR, QUIET_PX = 2.0, 0.3  # of the deviations; they grow with the distances from this rms on
-CENTRE_FACTOR, LEAST_CENTRE_SD = 1.5, 0.1  # of what all masks may be too large by, pixels
+# Deviations are multiplied by the first, and by more where the root mean square distance is above the second.
+FIT_FACTOR, QUIET_PX = 2.0, 0.3
+# Deviation of what all masks may be too large by: so many times the measured one, and at least so many pixels.
+CENTRE_FACTOR, LEAST_CENTRE_SD = 1.5, 0.1
 # Of the scaled normal matrix. Leaves have 1e-4 and more; where nothing holds a patch in its place, rounding makes 1e-15
 LEAST_EIGENVALUE = 1e-10
 

@@ -36,26 +36,31 @@ from mvseg.scene import Cameras
 from mvseg.system.running import now_running, progress_bar
 from mvseg.system.worker_pool import map_in_order
 
-NUM_FIRST_STEPS = 3  # of a fit that a second one follows
-GOOD_IOU = 0.93  # of a patch, after which no less likely start is tried
-FORGIVEN = 0.5  # of the IoU that masks as a whole too large or small cost: where they are faulty, less is good
-LEAST_GAIN = 0.03  # in IoU, for another start to be better
-AREA_COST = 0.1  # in IoU, of a surface e times as large: bulges can hide behind the outlines of a level leaf
-CLEAR_IOU = 0.75  # of a start that shows how the blade lies
-WIDE_COST = 0.1  # in IoU, of a patch that is wider than long
-UNCLEAR, MOST_STARTS = 0.05, 3  # starts worse by less than this are as likely, and so many are tried of each hull
-HOPELESS = 0.1  # half way, patches that are worse by more go no farther
-SAME = 0.01  # of the length, that two patches half way are apart by on average: they end as one
-SEARCHED_VIEWS = 12  # of a leaf, evenly spread, that starts are compared in
-WRONG_SHARE = 0.25  # of the median share of voxels in a mask: with less of them it is another leaf's
-MOST_WRONG = 0.34  # of a leaf's masks
-BEHIND = 0.03  # of the leaf's length: a neighbour that is farther away by this lies behind
+NUM_FIRST_STEPS = 3  # steps of the fit before the second one (a technical limit)
+GOOD_IOU = 0.93  # no less likely start is tried if the median IoU of a patch is more than this
+# Share of the IoU that is given back where masks as a whole are too large or small: faulty masks reach less.
+FORGIVEN = 0.5
+LEAST_GAIN = 0.03  # another start is better if its score is more by this, in IoU
+# A surface e times as large scores less by this, in IoU: bulges can hide behind the outlines of a level leaf.
+AREA_COST = 0.1
+# A start shows how the blade lies if its median IoU is at least this; else other starts are looked at, too.
+CLEAR_IOU = 0.75
+WIDE_COST = 0.1  # a patch that is wider than long scores less by this, in IoU
+# Starts are as likely if they score less by no more than this; and so many are tried of each hull.
+UNCLEAR, MOST_STARTS = 0.05, 3
+HOPELESS = 0.1  # a patch goes no farther than half way if it scores less than the best by more than this
+SAME = 0.01  # two patches half way end as one if they are apart by less than this share of the length, on average
+SEARCHED_VIEWS = 12  # starts are compared in so many views of a leaf, evenly spread (a technical limit)
+WRONG_SHARE = 0.25  # a mask is another leaf's if its share of the hull's voxels is less than this share of the median
+MOST_WRONG = 0.34  # no mask is, if more than this share of a leaf's masks would be
+BEHIND = 0.03  # a neighbour lies behind if it is farther away by more than this share of the leaf's length
 
 # What a surface must reach not to be doubted.
+# A surface is doubted if its median IoU is less, or the deviation of its area more than this share of it.
 LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
 
-FEW_MASKS = 60  # that one process fits sooner than others start
-MOST_VIEWS = 20  # of an instance that its fit looks at; more add time, and next to nothing else
+FEW_MASKS = 60  # fewer masks are fitted in this process: others would take longer to start (a technical limit)
+MOST_VIEWS = 20  # a fit looks at so many views of an instance at most: more add time, and next to nothing else
 
 
 def fit_surfaces(

@@ -12,11 +12,11 @@ from mvseg.reconstruction.surface.leaf_patch import Floats, Ints
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.patch_image import project_points
 
-SHOWN_SHARE = 0.5  # of the masks that a voxel must be in more than
-SEEN_SHARE = 0.8  # or of those masks that nothing hides it from
-CELL_PX = 6.0  # side of a cell in the photos when the search ends
-MOST_CELLS = 10_000  # or how many there are by then
-NUM_VOXELS = 20_000  # about so many are looked at, in these cells
+SHOWN_SHARE = 0.5  # a voxel is occupied if it is in more than this share of the masks
+SEEN_SHARE = 0.8  # or in at least this share of those masks that nothing hides it from
+CELL_PX = 6.0  # the search ends when the side of a cell is less than this in the photos
+MOST_CELLS = 10_000  # or when there are so many cells (a technical limit)
+NUM_VOXELS = 20_000  # about so many voxels are looked at in these cells (a technical limit)
 
 
 @dataclass(frozen=True, eq=False)

@@ -23,10 +23,10 @@ from mvseg.reconstruction.surface.leaf_patch import (
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
 
-MESH_SHAPE = (64, 17)
-LEAST_CREDIBLE_IOU = 0.7
+MESH_SHAPE = (64, 17)  # rows and columns of vertices of a mesh
+LEAST_CREDIBLE_IOU = 0.7  # a surface is credible if its median IoU is at least this
 BESIDE = 2  # pixels around a drawn surface: OpenCV draws polygons a little too large
-STEP = 1e-4  # of the coefficients' spread, for differences
+STEP = 1e-4  # step of differences, in deviations of the coefficients (a technical limit)
 
 
 @dataclass(frozen=True)

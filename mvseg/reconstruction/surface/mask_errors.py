@@ -16,11 +16,12 @@ from scipy.ndimage import gaussian_filter1d
 
 from mvseg.reconstruction.surface.leaf_patch import Floats
 
+# Times that offsets and their density are found in turn; the fourth changes nothing any more (a technical limit).
 ROUNDS = 4
-LEAST_MASKS = 20  # to learn the spread from
-LEAST_SPREAD_PX = 0.3  # masks whose sizes differ by less are clean
+LEAST_MASKS = 20  # errors are learnt from at least so many masks
+LEAST_SPREAD_PX = 0.3  # masks are clean if their sizes differ by less
 MEASURED_PX = 0.2  # deviation of the measured offset of one mask
-STEP_PX = 0.05
+STEP_PX = 0.05  # step of a density (a technical limit)
 FLOOR = 1e-3  # least density, per pixel: any mask may be wrong in another way
 
 

@@ -19,9 +19,9 @@ from mvseg.reconstruction.surface.leaf_patch import Floats
 
 BLUR_PX = 0.8  # of the masks: makes their edges smooth functions of the position
 MARGIN = 24  # pixels around a mask that are kept
-LARGE_PX = 60.0  # side of a square mask; those of half as much again are made smaller
-LONG_PX = 400  # of the longest side of a mask
-EDGE_SAMPLES = 40  # of each mask's edge
+LARGE_PX = 60.0  # masks are made smaller by the whole number nearest to the root of their median area in this
+LONG_PX = 400  # or by more, so that no side is longer than this (technical limits)
+EDGE_SAMPLES = 40  # samples of each mask's edge (a technical limit)
 FRAME = -1  # label of what lies outside the image
 Labels = NDArray[np.int32]
 

@@ -16,9 +16,10 @@ from mvseg.reconstruction.surface.leaf_patch import COUNTS, NUM_COEFFICIENTS, SI
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 
-LEAST_LEAVES = 4  # to tell where the stem is
-CLEAR = 0.25  # of its length that one end of a leaf must be nearer to the stem
-ROUNDS = 5
+LEAST_LEAVES = 4  # the stem is looked for if so many leaves are there
+# An end is surely the base if it is nearer to the stem than the other by more than this share of the length.
+CLEAR = 0.25
+ROUNDS = 5  # of fitting the stem to the bases (a technical limit)
 
 
 def turn_matrix() -> Floats:

@@ -25,12 +25,12 @@ from mvseg.reconstruction.surface.patch_image import (
     project_points,
 )
 
-BEYOND_PX = (1.0, 2.0)  # beyond an edge, where another instance may begin
+BEYOND_PX = (1.0, 2.0)  # another instance begins beyond an edge if it is seen so far outside of it
 OUTSIDE_PX = 1.6  # beyond the patch's outline, where the patch must not be: the filled quads are half a pixel too wide
-REVERSE_WEIGHT = 0.5  # of the samples of the masks' edges
-PULL_FROM_PX = 4.0  # an edge farther than this outside the patch pulls at its nearest sample
-SIMILAR = 0.5  # least cosine between the normals of matched samples
-MOST_SHIFT_PX = 5.0  # between the outline of a patch and the edge of its image
+REVERSE_WEIGHT = 0.5  # weight of the samples of the masks' edges, beside those of the patch
+PULL_FROM_PX = 4.0  # an edge pulls at its nearest sample if it is farther than this outside the patch
+SIMILAR = 0.5  # two samples match if the cosine between their normals is at least this
+MOST_SHIFT_PX = 5.0  # outline of a patch and edge of its image may be apart by at most this
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,9 @@ from mvseg.reconstruction.surface.mask_stack import BLUR_PX, MaskStack
 SUPERSAMPLED = 3  # side of the small pixels that patches are drawn in
 DRAWN_TOO_FAR = 0.48  # small pixels, measured
 SUB_PIXEL_BITS = 4  # of OpenCV's polygons
-LEAST_GROWTH_PX = 0.15  # offsets that are worth the time
+LEAST_GROWTH_PX = 0.15  # a patch is drawn with an offset if that is at least this: less is not worth the time
 DRAWN_BESIDE = 4  # pixels around a patch that its blurred image reaches
-NEAR_PX = 6  # around a leaf, where it matters what lies in front
+NEAR_PX = 6  # what lies in front of a leaf matters so far around it
 
 
 @dataclass(frozen=True, eq=False)

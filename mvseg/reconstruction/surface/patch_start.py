@@ -18,14 +18,15 @@ from mvseg.reconstruction.surface.leaf_patch import (
     spline_basis,
 )
 
-MOST_POINTS = 1000  # of the voxels; enough for nine windows
-NUM_WINDOWS = 9
-NEIGHBOURS = 8
-ELONGATED = 2.0  # ratio of the two largest spreads from which a leaf may be bent so far that its axis is a curve
-BENT = 1.35  # or from this ratio of the way along the leaf to the straight one; graphs make detours of a tenth
-ROUND = 1.6  # ratio below which the midrib may as well run along the shorter axis
+MOST_POINTS = 1000  # so many voxels are used at most, which is enough for nine windows (a technical limit)
+NUM_WINDOWS = 9  # windows along a leaf, through whose middles the midrib of a start goes
+NEIGHBOURS = 8  # voxels that a voxel is joined to where the way along a leaf is looked for
+# A leaf may be so bent that its axis is a curve if the ratio of its two largest deviations is at least this.
+ELONGATED = 2.0
+BENT = 1.35  # or if the way along it is so many times the straight one: graphs make detours of a tenth
+ROUND = 1.6  # the midrib may as well run along the shorter axis if that ratio is less than this
 TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # of the side about the midrib
-LEAST_POINTS = 12
+LEAST_POINTS = 12  # a start needs so many voxels
 TIE = 1e-6  # relative; distances on a lattice that differ by less are equal but for rounding
 
 
