@@ -374,7 +374,11 @@ def main() -> None:
         ROOMS[args.room](args)
 
 
-ROOMS = {"matching": thirds_of_matching, "verification": thirds_of_verification, "reconstruction": thirds_of_reconstruction}
+ROOMS = {
+    "matching": thirds_of_matching,
+    "verification": thirds_of_verification,
+    "reconstruction": thirds_of_reconstruction,
+}
 
 if __name__ == "__main__":
     main()
