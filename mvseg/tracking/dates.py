@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.shapes import best_shape
-from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, cell_normals
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
 from mvseg.tracking.pictures import picture_leaves
-from mvseg.traits.leaf import Measurement, cell_normals
+from mvseg.traits.leaf import Measurement
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
 

@@ -13,8 +13,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.traits.leaf import cell_normals
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, cell_normals
 
 Floats = NDArray[np.float64]
 

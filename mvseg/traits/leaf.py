@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.reconstruction.surface.leaf_patch import patch_basis, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, cell_normals, grid_sizes
 from mvseg.reconstruction.voxels import VoxelGrid
 
 Floats = NDArray[np.float64]
@@ -72,11 +72,8 @@ def measure_leaf(surface: LeafSurface, frame: Floats | None, *, ground: float = 
 
     def measure(moved: Floats) -> Floats:
         points = patch_grid(*COARSE).points(moved)
-        normals = cell_normals(points)
-        area = np.linalg.norm(normals, axis=-1).sum((1, 2))
-        length = np.linalg.norm(np.diff(points[:, :, COARSE[1] // 2], axis=1), axis=2).sum(1)
-        width = np.linalg.norm(np.diff(points, axis=2), axis=3).sum(2).max(1)
-        pairs = _directions(moved, frame, normal=normals.sum((1, 2)))
+        area, length, width = grid_sizes(points).T
+        pairs = _directions(moved, frame, normal=cell_normals(points).sum((1, 2)))
         turned = [angle.between(*pairs[name]) for name, angle in angles.items()]
         return np.stack([area, length, width, length / width, _base_height(moved, frame), *turned], 1)
 
@@ -108,13 +105,6 @@ def wrap_azimuth(degrees: float) -> float:
     """In [0, 360), in six digits as well: just below 0 or 360 it is 0. NaN stays NaN."""
     turned = degrees % 360  # of -1e-15 that is 360
     return 0.0 if turned >= FULL_TURN_DEG else turned
-
-
-def cell_normals(points: Floats) -> Floats:
-    """(..., rows - 1, columns - 1, 3) normals of the cells of grids (..., rows, columns, 3), as long as their areas."""
-    ax, ay, az = np.moveaxis(points[..., 1:, 1:, :] - points[..., :-1, :-1, :], -1, 0)
-    bx, by, bz = np.moveaxis(points[..., 1:, :-1, :] - points[..., :-1, 1:, :], -1, 0)
-    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1) / 2  # np.cross is slow on few
 
 
 def measure_voxels(grid: VoxelGrid) -> dict[str, Measurement]:

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from mvseg.reconstruction.surface.leaf_patch import patch_grid
-from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, cell_normals
 from mvseg.traits.from_above import Cells
-from mvseg.traits.leaf import UP_UNKNOWN, Measurement, cell_normals, missing
+from mvseg.traits.leaf import UP_UNKNOWN, Measurement, missing
 from mvseg.traits.ontology import PLANT_TRAITS
 
 Floats = NDArray[np.float64]

@@ -9,10 +9,9 @@ from blade_scene import SIZE, EllipticBlade, as_regions, blade_masks, ring_camer
 from known_leaves import flat_leaf
 from mvseg.errors import InputError
 from mvseg.reconstruction.spread_views import spread_views
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, is_same, start_in
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces, start_in
 from mvseg.reconstruction.surface.hull import Hull
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.reconstruction.surface.orientation import mirror_matrix, turn_matrix
 from mvseg.scene import Cameras
 from mvseg.verification.evidence import paint_view
 
@@ -141,13 +140,6 @@ def test_known_surfaces_stay_and_the_others_are_fitted_beside_them(monkeypatch: 
     monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.carve_hull", None)
     kept = {1: gone, 2: both[2]}
     assert fit_surfaces(regions, ids, cameras, known=kept) == kept
-
-
-def test_a_patch_that_begins_at_its_other_end_is_the_same() -> None:
-    leaf = flat_leaf(length=1.4, half_width=0.3).coefficients.numpy()
-    for matrix in (turn_matrix(), mirror_matrix(), turn_matrix() @ mirror_matrix()):
-        assert is_same(matrix @ leaf, leaf)
-    assert not is_same(leaf, flat_leaf(length=1.4, half_width=0.3, at=(0.05, 0.0, 0.0)).coefficients.numpy())
 
 
 def test_one_wrong_mask_in_five_does_little_harm() -> None:

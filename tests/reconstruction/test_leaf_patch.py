@@ -19,7 +19,6 @@ from mvseg.reconstruction.surface.leaf_patch import (
     patch_grid,
     patch_prior,
 )
-from mvseg.reconstruction.surface.leaf_surface import measure_slopes
 from mvseg.reconstruction.surface.orientation import mirror_matrix, stem_distances, turn_matrix
 from mvseg.reconstruction.surface.patch_start import start_patches
 
@@ -88,22 +87,6 @@ def test_prior_does_not_depend_on_the_turn_of_the_world() -> None:
         equations, target = patch_prior(patch, measure_patch(patch), noise=1.0)
         costs.append(((equations @ patch.ravel() - target) ** 2).sum())
     assert costs[0] == pytest.approx(costs[1], rel=1e-9)
-
-
-def test_slopes_of_the_measures_are_their_differences() -> None:
-    coefficients, step = wavy_patch(), 1e-6
-    slopes = measure_slopes(coefficients)
-    rng = np.random.default_rng(2)
-    triangles = grid_triangles(64, 17)
-    for _ in range(3):
-        direction = rng.normal(size=coefficients.shape)
-        areas, lengths = [], []
-        for sign in (1, -1):
-            points = patch_grid(64, 17).points(coefficients + sign * step * direction)
-            areas.append(trimesh.Trimesh(grid_vertices(points), triangles, process=False).area)
-            lengths.append(np.linalg.norm(np.diff(points[:, 8], axis=0), axis=1).sum())
-        assert slopes[0] @ direction.ravel() == pytest.approx((areas[0] - areas[1]) / (2 * step), rel=1e-5)
-        assert slopes[1] @ direction.ravel() == pytest.approx((lengths[0] - lengths[1]) / (2 * step), rel=1e-5)
 
 
 def test_turned_and_mirrored_patches_are_the_same_surface() -> None:

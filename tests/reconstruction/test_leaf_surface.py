@@ -7,7 +7,7 @@ import torch
 from blade_scene import SIZE, ring_cameras
 from known_leaves import bent_blade, fit_coefficients, flat_leaf, flat_sheet, make_surface
 from mvseg.reconstruction.surface.leaf_patch import NUM_COEFFICIENTS, Floats, measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, measure_slopes
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 
 
@@ -37,11 +37,13 @@ def test_deviations_are_those_of_samples() -> None:
     assert surface.deviation(one_by_one) == pytest.approx(measured.std(0), rel=0.06)
 
 
-def test_deviations_agree_with_analytic_slopes() -> None:
-    surface = make_surface(fit_coefficients(flat_sheet, length=30, half_width=9) + 0.02 * np.arange(3), sd=0.03)
-    slopes = measure_slopes(surface.coefficients.numpy())[:2]
-    expected = 0.03 * np.linalg.norm(slopes, axis=1)
-    assert surface.deviation(one_by_one) == pytest.approx(expected, rel=0.02)
+def test_sizes_of_a_leaf_of_unknown_scale() -> None:
+    """Lengths are as uncertain as the scale, and areas twice as much."""
+    coefficients = fit_coefficients(flat_sheet, length=30, half_width=9) + 0.02 * np.arange(3)
+    surface = make_surface(coefficients)
+    object.__setattr__(surface, "covariance", torch.from_numpy(0.03**2 * np.outer(coefficients, coefficients)))
+    expected = 0.03 * np.array([2 * surface.area, surface.length, surface.width])
+    assert surface.deviations == pytest.approx(expected, rel=1e-3)
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1.0, 1e3])

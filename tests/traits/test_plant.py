@@ -6,9 +6,9 @@ import trimesh
 from scipy.spatial import ConvexHull
 
 from known_leaves import bent_blade, flat_leaf, move, turn_about
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, cell_normals
 from mvseg.traits.from_above import look_from_above
-from mvseg.traits.leaf import Measurement, cell_normals, measure_leaf
+from mvseg.traits.leaf import Measurement, measure_leaf
 from mvseg.traits.ontology import PLANT_TRAITS
 from mvseg.traits.plant import NEED_UP, area_deciles, height_of, hull_volume, measure_whole, slopes_of_grid
 from mvseg.traits.up import level_frame

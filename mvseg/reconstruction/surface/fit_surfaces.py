@@ -46,16 +46,12 @@ AREA_COST = 0.1
 # A start shows how the blade lies if its median IoU is at least this; else other starts are looked at, too.
 CLEAR_IOU = 0.75
 WIDE_COST = 0.1  # a patch that is wider than long scores less by this, in IoU
-# Starts are as likely if they score less by no more than this; and so many are tried of each hull.
-UNCLEAR, MOST_STARTS = 0.05, 3
+MOST_STARTS = 3  # so many starts are tried of each hull
 HOPELESS = 0.1  # a patch goes no farther than half way if it scores less than the best by more than this
-SAME = 0.01  # two patches half way end as one if they are apart by less than this share of the length, on average
 SEARCHED_VIEWS = 12  # starts are compared in so many views of a leaf, evenly spread (a technical limit)
 WRONG_SHARE = 0.25  # a mask is another leaf's if its share of the hull's voxels is less than this share of the median
-MOST_WRONG = 0.34  # no mask is, if more than this share of a leaf's masks would be
 BEHIND = 0.03  # a neighbour lies behind if it is farther away by more than this share of the leaf's length
 
-# What a surface must reach not to be doubted.
 # A surface is doubted if its median IoU is less, or the deviation of its area more than this share of it.
 LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
 
@@ -198,24 +194,20 @@ def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """The best patch so far, its score, and is it good enough; and what was tried: scores and patches half way."""
+    """The best patch so far, its score, and is it good enough; and the best score half way."""
 
     patch: Floats | None = None
     score: float = -np.inf
     is_good: bool = False
-    tried: tuple[tuple[float, Floats], ...] = ()
+    half_way: float = -np.inf
 
 
 def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found:
     """Starts moved half the way to the masks, and those of them all of the way that may become the best."""
-    tried = [*found.tried]
-    for start in starts:
-        patch, _ = approach_patch(masks, start, steps=FIRST_HALF)
-        score = _rank(masks, patch) - _area_cost(patch)
-        if not any(score < other_score + LEAST_GAIN and is_same(patch, other) for other_score, other in tried):
-            tried.append((score, patch))
-    most = max(score for score, _ in tried)
-    for score, patch in tried[len(found.tried) :]:
+    patches = [approach_patch(masks, start, steps=FIRST_HALF)[0] for start in starts]
+    scores = [_rank(masks, patch) - _area_cost(patch) for patch in patches]
+    most = max(found.half_way, *scores)
+    for score, patch in zip(scores, patches, strict=True):
         if score > most - HOPELESS:
             moved, offsets = approach_patch(masks, patch, steps=SECOND_HALF)
             rank = _rank(masks, moved, offsets)
@@ -223,15 +215,7 @@ def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found
             if better > found.score + LEAST_GAIN:
                 explained = max(0.0, rank - _rank(masks, moved))
                 found = _Found(moved, better, is_good=rank + FORGIVEN * explained > GOOD_IOU)
-    return replace(found, tried=tuple(tried))
-
-
-def is_same(first: Floats, second: Floats) -> bool:
-    """Are two patches one surface but for SAME of its length, whichever end and side each of them begins at?"""
-    here, there = (patch_grid(*FAR_GRID).points(patch) for patch in (first, second))
-    turned = (there, there[::-1], there[:, ::-1], there[::-1, ::-1])
-    gap = min(float(np.linalg.norm(here - other, axis=2).mean()) for other in turned)
-    return gap < SAME * measure_patch(first).length
+    return replace(found, half_way=most)
 
 
 def _area_cost(coefficients: Floats) -> float:
@@ -240,7 +224,7 @@ def _area_cost(coefficients: Floats) -> float:
 
 
 def _start_groups(masks: MaskStack, hull: Hull) -> list[list[Floats]]:
-    """Starts to compare with each other; the second group is for where the first one ends badly.
+    """The likeliest start, and others for where it ends badly.
 
     How well a start explains the masks, before any fit, tells how likely it is.
     """
@@ -250,8 +234,7 @@ def _start_groups(masks: MaskStack, hull: Hull) -> list[list[Floats]]:
         starts += others
         ranks += [_rank(masks, start) for start in others]
     order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_STARTS]
-    likely = [index for index in order if ranks[index] > ranks[order[0]] - UNCLEAR]
-    return [[starts[index] for index in group] for group in (likely, order[len(likely) :]) if group]
+    return [[starts[index] for index in group] for group in (order[:1], order[1:]) if group]
 
 
 def start_in(hull: Hull) -> tuple[list[Floats], list[Floats]]:
@@ -275,13 +258,12 @@ def _rank(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None)
 def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
     """(S,) bool: masks that hardly any voxel (P, 3) falls into although nothing hides it there: another leaf's.
 
-    None where they are more than MOST_WRONG of all, or where fewer than three would be left.
+    None where fewer than three would be left.
     """
     inside, free = look_at(masks, points)
     shares = inside.sum(1) / np.maximum((inside | free).sum(1), 1)
     is_wrong = shares < WRONG_SHARE * np.median(shares)
-    is_much = is_wrong.sum() > MOST_WRONG * len(masks) or (~is_wrong).sum() < 3
-    return np.zeros(len(masks), bool) if is_much else is_wrong
+    return is_wrong if (~is_wrong).sum() >= 3 else np.zeros(len(masks), bool)
 
 
 def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:

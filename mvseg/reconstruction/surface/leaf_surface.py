@@ -119,12 +119,9 @@ class LeafSurface:
     @cached_property
     def deviations(self) -> tuple[float, float, float]:
         """Standard deviations of area, length and width."""
-        if not self.exists:
-            return (float("nan"),) * 3
-        slopes = measure_slopes(self.coefficients.numpy())
-        variance = np.einsum("ij,jk,ik->i", slopes, self.covariance.numpy(), slopes)
-        area, length, width = np.sqrt(np.maximum(variance, 0))
-        return float(area), float(length), float(width)
+        grid = patch_grid(*MESH_SHAPE)
+        area, length, width = self.deviation(lambda leaves: grid_sizes(grid.points(leaves))).tolist()
+        return area, length, width
 
     def deviation(self, measure: Callable[[Floats], Floats]) -> Floats:
         """Standard deviations of what is measured on the surface: those of the coefficients, propagated linearly.
@@ -223,31 +220,16 @@ def measure_sizes(coefficients: Floats) -> tuple[float, float, float]:
     return float(np.linalg.norm(normals, axis=1).sum() / 2), size.length, 2 * size.half_width
 
 
-def measure_slopes(coefficients: Floats) -> Floats:
-    """(3, 78) derivatives of area, length and width by `coefficients.ravel()`."""
-    grid = patch_grid(*MESH_SHAPE)
-    points = grid.points(coefficients)
-    rows, columns = grid.shape
-    by_point = np.zeros((3, rows, columns, 3))
-    along = _unit(np.diff(points[:, columns // 2], axis=0))
-    by_point[1, 1:, columns // 2] += along
-    by_point[1, :-1, columns // 2] -= along
-    pieces = np.diff(points, axis=1)
-    widest = np.linalg.norm(pieces, axis=2).sum(1).argmax()
-    across = _unit(pieces[widest])
-    by_point[2, widest, 1:] += across
-    by_point[2, widest, :-1] -= across
-    # Of each cell's two triangles; those at the ends of the grid that have no area have no normal either.
-    a, b, c, d = points[:-1, :-1], points[:-1, 1:], points[1:, 1:], points[1:, :-1]
-    places = ((slice(None, -1), slice(None, -1)), (slice(None, -1), slice(1, None)),
-              (slice(1, None), slice(1, None)), (slice(1, None), slice(None, -1)))  # fmt: skip
-    for corners, at in (((a, d, c), (0, 3, 2)), ((a, c, b), (0, 2, 1))):
-        normal = _unit(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
-        for index in range(3):
-            opposite = corners[(index + 2) % 3] - corners[(index + 1) % 3]
-            by_point[(0, *places[at[index]])] += np.cross(normal, opposite) / 2
-    return np.einsum("kpc,pb->kbc", by_point.reshape(3, -1, 3), grid.basis).reshape(3, -1)
+def grid_sizes(points: Floats) -> Floats:
+    """(..., 3) area, length and width of grids (..., rows, columns, 3) whose middle column is the midrib."""
+    area = np.linalg.norm(cell_normals(points), axis=-1).sum((-2, -1))
+    midrib, across = points[..., points.shape[-2] // 2, :], np.diff(points, axis=-2)
+    length = np.linalg.norm(np.diff(midrib, axis=-2), axis=-1).sum(-1)
+    return np.stack([area, length, np.linalg.norm(across, axis=-1).sum(-1).max(-1)], -1)
 
 
-def _unit(vectors: Floats) -> Floats:
-    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)
+def cell_normals(points: Floats) -> Floats:
+    """(..., rows - 1, columns - 1, 3) normals of the cells of grids (..., rows, columns, 3), as long as their areas."""
+    ax, ay, az = np.moveaxis(points[..., 1:, 1:, :] - points[..., :-1, :-1, :], -1, 0)
+    bx, by, bz = np.moveaxis(points[..., 1:, :-1, :] - points[..., :-1, 1:, :], -1, 0)
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], -1) / 2  # np.cross is slow on few
