@@ -31,6 +31,7 @@ ORDER = {
     "Python": ("api.md",),
     "Notes": (
         "notes/matching.md",
+        "notes/surfaces.md",
         "notes/detector.md",
         "notes/check.md",
         "notes/tracking.md",

@@ -13,7 +13,7 @@ from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.patch_image import project_points
 
 SHOWN_SHARE = 0.5  # a voxel is occupied if it is in more than this share of the masks
-SEEN_SHARE = 0.8  # or in at least this share of those masks that nothing hides it from
+SEEN_SHARE = 0.8  # no view looks past a voxel if more than this share of those that nothing hides it from show it
 CELL_PX = 6.0  # the search ends when the side of a cell is less than this in the photos
 MOST_CELLS = 10_000  # or when there are so many cells (a technical limit)
 NUM_VOXELS = 20_000  # about so many voxels are looked at in these cells (a technical limit)

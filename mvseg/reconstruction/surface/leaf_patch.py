@@ -24,14 +24,14 @@ NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
 
 # Standard deviations of the prior, in leaf lengths (SPEED, BEND, SWAY) or half-widths.
-BEND_SD = 0.06  # third differences of m
-SWAY_SD = 0.1  # times length / width: turns of the midrib within the blade, from each of ten pieces to the next one
+BEND_SD = 0.06  # of the third differences of m
+SWAY_SD = 0.1  # times length / width: of the turns of the midrib within the blade, from each of ten pieces to the next
 SPEED_SD = 0.05  # of the speed along the midrib about its mean
-SIDE_SD = 1.0  # second differences of Q
-FOLD_SD, FOLD_STEP_SD = 0.35, 0.2  # R along the normal, and its differences
-CURL_SD = 0.35  # S along the normal
-SHEAR_SD = 0.15  # Q along the midrib, R and S within the blade
-NUM_PIECES = 10  # of the midrib, for SPEED and SWAY
+SIDE_SD = 1.0  # of the second differences of Q
+FOLD_SD, FOLD_STEP_SD = 0.35, 0.2  # of R along the normal, and of its differences
+CURL_SD = 0.35  # of S along the normal
+SHEAR_SD = 0.15  # of Q along the midrib, and of R and S within the blade
+NUM_PIECES = 10  # SPEED and SWAY are those of so many pieces of the midrib
 
 
 def place_stations(num_rows: int) -> Floats:

@@ -26,7 +26,7 @@ from mvseg.scene import Cameras
 MESH_SHAPE = (64, 17)  # rows and columns of vertices of a mesh
 LEAST_CREDIBLE_IOU = 0.7  # a surface is credible if its median IoU is at least this
 BESIDE = 2  # pixels around a drawn surface: OpenCV draws polygons a little too large
-STEP = 1e-4  # step of differences, in deviations of the coefficients (a technical limit)
+STEP = 1e-4  # a coefficient is moved by this share of the spread of all, for differences (a technical limit)
 
 
 @dataclass(frozen=True)

@@ -16,13 +16,12 @@ from scipy.ndimage import gaussian_filter1d
 
 from mvseg.reconstruction.surface.leaf_patch import Floats
 
-# Times that offsets and their density are found in turn; the fourth changes nothing any more (a technical limit).
-ROUNDS = 4
+ROUNDS = 4  # times that the offsets and their density are found in turn (a technical limit)
 LEAST_MASKS = 20  # errors are learnt from at least so many masks
 LEAST_SPREAD_PX = 0.3  # masks are clean if their sizes differ by less
-MEASURED_PX = 0.2  # deviation of the measured offset of one mask
-STEP_PX = 0.05  # step of a density (a technical limit)
-FLOOR = 1e-3  # least density, per pixel: any mask may be wrong in another way
+MEASURED_PX = 0.2  # the measured offset of one mask has this standard deviation
+STEP_PX = 0.05  # a density is given at steps of this (a technical limit)
+FLOOR = 1e-3  # a density is at least this, per pixel: any mask may be wrong in another way
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,9 @@ from mvseg.reconstruction.surface.patch_image import (
 )
 
 BEYOND_PX = (1.0, 2.0)  # another instance begins beyond an edge if it is seen so far outside of it
-OUTSIDE_PX = 1.6  # beyond the patch's outline, where the patch must not be: the filled quads are half a pixel too wide
+# A sample lies on the outline if the patch does not cover the pixel so far outside of it: filled quads are half a pixel
+# too wide.
+OUTSIDE_PX = 1.6
 REVERSE_WEIGHT = 0.5  # weight of the samples of the masks' edges, beside those of the patch
 PULL_FROM_PX = 4.0  # an edge pulls at its nearest sample if it is farther than this outside the patch
 SIMILAR = 0.5  # two samples match if the cosine between their normals is at least this

@@ -25,9 +25,9 @@ NEIGHBOURS = 8  # voxels that a voxel is joined to where the way along a leaf is
 ELONGATED = 2.0
 BENT = 1.35  # or if the way along it is so many times the straight one: graphs make detours of a tenth
 ROUND = 1.6  # the midrib may as well run along the shorter axis if that ratio is less than this
-TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # of the side about the midrib
+TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # starts have their side at these angles about the midrib
 LEAST_POINTS = 12  # a start needs so many voxels
-TIE = 1e-6  # relative; distances on a lattice that differ by less are equal but for rounding
+TIE = 1e-6  # distances on a lattice are equal if they differ by less than this share, by rounding
 
 
 def start_patches(points: Floats) -> tuple[list[Floats], list[Floats]]:
