@@ -18,7 +18,6 @@ from mvseg.batch.tables import write_tables
 from mvseg.batch.work import Finished, work_on_scene
 from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.config import RunConfig
-from mvseg.detectors.zoo import find_weights
 from mvseg.errors import InputError
 from mvseg.results.earlier import check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
@@ -95,6 +94,8 @@ def _find_weights(config: RunConfig) -> RunConfig:
     Raises:
         InputError: there are no such weights.
     """
+    from mvseg.detectors.zoo import find_weights  # loads torchvision
+
     weights = config.detect.weights
     if find_weights(weights) is not None:
         return config

@@ -11,7 +11,6 @@ from typing import Any
 
 from mvseg._version import code_hash
 from mvseg.config import RunConfig
-from mvseg.detectors.zoo import weights_path
 from mvseg.errors import InputError
 from mvseg.formats.masks.yolo import NAME_FILES
 from mvseg.scene import Scene
@@ -31,6 +30,8 @@ def scene_key(scene: Scene, masks: Path | None, config: RunConfig, *, correction
     options = asdict(config)
     try:
         if masks is None:
+            from mvseg.detectors.zoo import weights_path  # loads torchvision
+
             options["detect"]["weights"] = None  # their hash counts, not their name
             others: Any = hash_files(weights_path(config.detect.weights))
         else:

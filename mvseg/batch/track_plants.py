@@ -85,13 +85,13 @@ def track_plants(
 
     Args:
         plants: see `list_plants`.
-        out: tracks.csv, growth.csv, plants.csv, curves.csv, tracks.html, growth.png and run.json; of several plants,
-            pages and pictures lie in `plants/`, and tracks.html is their list.
+        out: tracks.csv, growth.csv, plants.csv, curves.csv, tracks.html and run.json; of several plants, the pages
+            lie in `plants/`, and tracks.html is their list.
         corrections: a file with `same_track` and `different_track`.
         pots: see `track_leaves`.
         num_workers: processes, >= 1; with one, and one plant, everything happens in this one.
         scheduler: of a Dask cluster instead, see `connect`; `out` must be on a disk that it shares.
-        report: write pages and pictures, too.
+        report: write the pages, too.
 
     Raises:
         InputError: `out` cannot be written, the corrections are broken, or every plant failed.

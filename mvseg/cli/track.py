@@ -26,7 +26,7 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--pots", type=Pots, default="auto", help=help_pots)
     help_corrections = "file of corrections with same_track and different_track, see docs/tracking.md"
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)
-    parser.add_argument("--report", type=bool, default=True, help="write tracks.html and growth.png")
+    parser.add_argument("--report", type=bool, default=True, help="write tracks.html")
     parser.add_argument("--num_workers", type=int | None, help="plants tracked at once, each in a process of its own")
     add_shared(parser, "scheduler", "quiet")
 

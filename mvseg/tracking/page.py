@@ -1,4 +1,4 @@
-"""`tracks.html`, one offline page of a plant over days, and `growth.png` for papers."""
+"""`tracks.html`: one offline page of a plant over days."""
 
 from __future__ import annotations
 
@@ -7,32 +7,28 @@ import html
 import math
 from collections.abc import Sequence
 from importlib.resources import files
-from itertools import groupby
 from pathlib import Path
 from string import Template
 from typing import Any
 
 import numpy as np
-from PIL import Image, ImageDraw
 
-from mvseg.formats.image_file import write_png
 from mvseg.results.overlay import instance_color
 from mvseg.results.report.page import dump_inside_script
 from mvseg.tracking.dates import ROWS
 from mvseg.tracking.growth import SIZES, Growth
 from mvseg.tracking.track import Tracks
 
-PAGE_FILE, CHART_FILE = "tracks.html", "growth.png"
+PAGE_FILE = "tracks.html"
 CURVE_STEPS = 40  # points of a drawn curve
-CHART = (1500, 1000)  # pixels of growth.png
 ASSETS = files("mvseg.tracking") / "assets"
 
 
 def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
-    """Write tracks.html and growth.png into a folder.
+    """Write tracks.html into a folder.
 
     Raises:
-        OSError: they cannot be written.
+        OSError: it cannot be written.
     """
     page = Template((ASSETS / "tracks.page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"{tracks.plant} - mvseg track"),
@@ -41,7 +37,6 @@ def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
         script=(ASSETS / "tracks.js").read_text(encoding="utf-8"),
     )
     (folder / PAGE_FILE).write_text(page, encoding="utf-8", newline="\n")
-    write_png(folder / CHART_FILE, draw_growth(tracks, growth))
 
 
 def write_index(path: Path, plants: Sequence[tuple[str, int, int]]) -> None:
@@ -110,49 +105,6 @@ def _describe_growth(tracks: Tracks, growth: Growth) -> dict[str, Any]:
 def _round(value: float, digits: int) -> float | None:
     """With so many significant digits; None for what is not finite, which JSON does not know."""
     return float(f"{value:.{digits}g}") if math.isfinite(value) else None
-
-
-def draw_growth(tracks: Tracks, growth: Growth) -> np.ndarray:
-    """(H, W, 3) uint8: the area of each leaf (its length where no areas are known) over time, with one standard
-    deviation, and its curve where it has one."""
-    trait = "area" if any(point.trait == "area" for point in growth.points) else "length"
-    points = [point for point in growth.points if point.trait == trait]
-    image = Image.new("RGB", CHART, "white")
-    draw, (width, height), (left, bottom) = ImageDraw.Draw(image), CHART, (130, 70)
-    most = max((point.number.value for point in points), default=1.0) * 1.1
-    times = [date.time for date in tracks.dates]
-
-    def place(time: float, value: float) -> tuple[float, float]:
-        right = (time - times[0]) / (times[-1] - times[0]) * (width - left - 90)
-        return left + right, height - bottom - value / most * (height - bottom - 40)
-
-    decade = 10 ** math.floor(math.log10(most / 4))
-    step = decade * next(factor for factor in (1, 2, 5, 10) if factor * decade >= most / 7)
-    for tick in np.arange(0, most, step).tolist():
-        draw.line([place(times[0], tick), place(times[-1], tick)], fill=(225, 225, 225))
-        draw.text((left - 12, place(0, tick)[1]), f"{tick:g}", fill="black", font_size=22, anchor="rm")
-    free = -math.inf
-    for date in tracks.dates:
-        middle, half = place(date.time, 0)[0], 7 * len(date.written)
-        if middle - half > free:
-            draw.text((middle, height - bottom + 12), date.written, fill="black", font_size=22, anchor="mt")
-            free = middle + half
-    unit = points[0].number.unit if points else ""
-    draw.text((left, 8), f"{tracks.plant}: {trait} ({unit}) over time, with one sd", fill="black", font_size=24)
-    curves = {curve.track: curve for curve in growth.curves if curve.trait == trait}
-    for track, own in groupby(points, key=lambda point: point.track):
-        color, sights = instance_color(track), [(times[point.date], point.number) for point in own]
-        line = [(time, number.value) for time, number in sights]
-        if track in curves:
-            steps = np.linspace(sights[0][0], sights[-1][0], CURVE_STEPS)
-            line = list(zip(steps.tolist(), np.clip(curves[track].at(steps), 0, most).tolist(), strict=True))
-        draw.line([place(*point) for point in line], fill=color, width=4 if track in curves else 3)
-        for time, number in sights:
-            sd = number.sd if math.isfinite(number.sd) else 0.0
-            draw.line([place(time, number.value - sd), place(time, number.value + sd)], fill=color, width=2)
-            x, y = place(time, number.value)
-            draw.ellipse([x - 5, y - 5, x + 5, y + 5], fill=color)
-    return np.asarray(image)
 
 
 def _extent(tracks: Tracks) -> tuple[float, dict[int, np.ndarray]]:

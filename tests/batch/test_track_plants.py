@@ -61,7 +61,7 @@ def test_results_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert (before["leaves"], before["total_area"], before["unit"]) == ("7", "5000", "mm^2")
     assert float(after["relative_growth_rate"]) == pytest.approx(0.0238, abs=1e-3)  # ln 1.1 / 4 days
     run = json.loads((out / "run.json").read_text())
-    assert set(run["files"]) == {"tracks.csv", "growth.csv", "plants.csv", "curves.csv", "tracks.html", "growth.png"}
+    assert set(run["files"]) == {"tracks.csv", "growth.csv", "plants.csv", "curves.csv", "tracks.html"}
     page = (out / "tracks.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=[\"']?https?:", page)
     (out / "notes.txt").write_text("mine")
@@ -91,7 +91,7 @@ def test_all_plants_of_a_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert "1 plants have one date and are left out" in said
     assert "plant b: b1 has no time" in said
     assert {row["plant"] for row in read(tmp_path / "out" / "tracks.csv")} == {"a"}
-    assert {path.name for path in (tmp_path / "out" / "plants" / "00001").iterdir()} == {"tracks.html", "growth.png"}
+    assert {path.name for path in (tmp_path / "out" / "plants" / "00001").iterdir()} == {"tracks.html"}
     assert 'href="plants/00001/tracks.html"' in (tmp_path / "out" / "tracks.html").read_text()
 
 
