@@ -60,7 +60,7 @@ def run_batch(
 
     Raises:
         InputError: bad input, before any scene is started: the table, `out`, the scheduler.
-        OSError: the tables cannot be written.
+        OSError: the folder of the batch cannot be written.
     """
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")

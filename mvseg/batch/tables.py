@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +9,7 @@ from typing import Any
 from mvseg.batch.scene_list import SUMMARY_COLUMNS, BatchScene
 from mvseg.batch.status import TABLES, Status
 from mvseg.errors import InputError
-from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
-from mvseg.system.atomic import folder_whole
+from mvseg.results.earlier import replace_result
 from mvseg.traits.table import COLUMNS, as_cells, read_csv, wide_columns, write_csv
 
 
@@ -23,24 +21,19 @@ def write_tables(
     The results of the scenes that are done lie in `out`; `run` goes into run.json besides counts.
 
     Raises:
-        InputError: a result cannot be read, or `folder` cannot be replaced (see `check_out`).
-        OSError: it cannot be written.
+        InputError: a result cannot be read, or `folder` cannot be replaced (see `replace_result`).
     """
-    check_out(folder)
     carried = list(scenes[0][0].carried)
     done = [scene for scene, status in scenes if status.state == "done"]
     summary = [[*_about(scene), *_outcome(status)] for scene, status in scenes]
     failures = [as_cells(scene.name, str(scene.folder), status.sentence)
                 for scene, status in scenes if status.state == "failed"]  # fmt: skip
-    with folder_whole(folder) as partial:
+    counts = {"scenes": len(scenes), "done": len(done), "failed": len(failures)}
+    with replace_result(folder, {**run, "counts": counts}) as partial:
         for name, columns in (("traits.csv", COLUMNS), ("traits_wide.csv", wide_columns())):
             _join(partial / name, columns, done, out, carried=carried)
         write_csv(partial / "summary.csv", ["scene", *carried, *SUMMARY_COLUMNS], summary)
         write_csv(partial / "failures.csv", ("scene", "folder", "sentence"), failures)
-        counts = {"scenes": len(scenes), "done": len(done), "failed": len(failures)}
-        text = json.dumps({**run, "counts": counts, "files": list_files(partial)}, indent=1, default=str)
-        (partial / RUN_FILE).write_text(text + "\n", encoding="utf-8")
-        keep_user_files(folder, partial)
 
 
 def read_table(batch: Path, name: str, columns: Sequence[str]) -> list[dict[str, str]]:

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -17,8 +16,7 @@ from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import TrackLink
 from mvseg.corrections.track_links import find_links, read_track_links
 from mvseg.errors import InputError
-from mvseg.results.earlier import RUN_FILE, check_out, keep_user_files, list_files
-from mvseg.system.atomic import folder_whole
+from mvseg.results.earlier import RUN_FILE, replace_result
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import progress_bar
 from mvseg.tracking.config import Pots
@@ -98,32 +96,27 @@ def track_plants(
     """
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
-    check_out(out)
     edits = [] if corrections is None else read_track_links(corrections)
-    try:
-        with folder_whole(out) as folder:
-            places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
-            places = places if len(plants) > 1 else [folder]
-            work = partial(_track_plant, edits, pots=pots, report=report)
-            items = dict(enumerate(zip(plants, places, strict=True)))
-            with _open(work, min(num_workers, len(items)), scheduler) as engine, closing(engine(items, int)) as answers:
-                bar = progress_bar(answers, total=len(plants), name="track", unit="plant")
-                done = {index: _or_failed(answer, plants[index]) for index, answer in bar}
-            tracked = [done[index] for index in items]
-            if all(plant.sentence for plant in tracked):
-                raise InputError(tracked[0].sentence)
-            if len(plants) > 1:
-                join_tables(folder, places)
-                if report:
-                    pairs = zip(plants, tracked, strict=True)
-                    write_index(folder / PAGE_FILE, [(plant.plant, each.dates, each.tracks) for plant, each in pairs])
-                else:
-                    shutil.rmtree(folder / "plants")
-            config = {"corrections": None if corrections is None else str(corrections), "pots": pots}
-            _write_run(folder, plants, tracked, config)
-            keep_user_files(out, folder)
-    except OSError as error:
-        raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
+    said: dict[str, Any] = {}
+    with replace_result(out, said) as folder:
+        places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
+        places = places if len(plants) > 1 else [folder]
+        work = partial(_track_plant, edits, pots=pots, report=report)
+        items = dict(enumerate(zip(plants, places, strict=True)))
+        with _open(work, min(num_workers, len(items)), scheduler) as engine, closing(engine(items, int)) as answers:
+            bar = progress_bar(answers, total=len(plants), name="track", unit="plant")
+            done = {index: _or_failed(answer, plants[index]) for index, answer in bar}
+        tracked = [done[index] for index in items]
+        if all(plant.sentence for plant in tracked):
+            raise InputError(tracked[0].sentence)
+        if len(plants) > 1:
+            join_tables(folder, places)
+            if report:
+                pairs = zip(plants, tracked, strict=True)
+                write_index(folder / PAGE_FILE, [(plant.plant, each.dates, each.tracks) for plant, each in pairs])
+            else:
+                shutil.rmtree(folder / "plants")
+        said |= _describe_run(plants, tracked, corrections, pots)
     return tracked
 
 
@@ -169,20 +162,18 @@ def _track_plant(
     return TrackedPlant(len(tracks.dates), tracks.num_tracks, warnings)
 
 
-def _write_run(
-    folder: Path, plants: Sequence[PlantResults], tracked: Sequence[TrackedPlant], config: Mapping[str, str | None]
-) -> None:
+def _describe_run(
+    plants: Sequence[PlantResults], tracked: Sequence[TrackedPlant], corrections: Path | None, pots: Pots
+) -> dict[str, Any]:
     inputs = [place / RUN_FILE for plant in plants for place in plant.folders]  # which list the hashes of all files
-    if config["corrections"] is not None:
-        inputs.append(Path(config["corrections"]))
-    said = {
+    if corrections is not None:
+        inputs.append(corrections)
+    return {
         **made_by(),
         "inputs": {str(path): hash_files(path) if path.is_file() else None for path in inputs},
-        "config": config,
+        "config": {"corrections": None if corrections is None else str(corrections), "pots": pots},
         "warnings": [sentence for plant in tracked for sentence in plant.warnings],
         "failures": [plant.sentence for plant in tracked if plant.sentence],
         "counts": {"plants": len(plants), "dates": sum(plant.dates for plant in tracked),
                    "tracks": sum(plant.tracks for plant in tracked)},
-        "files": list_files(folder),
     }  # fmt: skip
-    (folder / RUN_FILE).write_text(json.dumps(said, indent=1) + "\n", encoding="utf-8")

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from dataclasses import dataclass
 
+import numpy as np
+
 from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.errors import InputError
-from mvseg.formats.image_file import is_turned, read_image_size, read_rgb
+from mvseg.formats.image_file import is_turned, read_exposure, read_image_size, read_rgb
 from mvseg.formats.photo_content import PhotoContent, measure_content
 from mvseg.formats.photos import Photos, describe_folder, photo_bits
 from mvseg.scene import Scene
@@ -17,6 +20,7 @@ from mvseg.system.running import progress_bar
 # have a fifth), but no less than rounding makes.
 BLANK, BLANK_SHARE, ROUNDING = 4.0, 0.03, 1.0
 DARK = 30  # grey level that 99 % of the pixels stay below
+STOPS = 1 / 3  # exposures that differ by more are noted: the least step of a camera's dials
 BURNT = 0.7  # a photo is overexposed if more than this share of its pixels is white
 
 NOTHING = PhotoContent(contrast=0.0, level=0.0, burnt=0.0, grey=False)
@@ -32,6 +36,7 @@ class PhotoFacts:
         turned: EXIF asks viewers to turn it.
         content: what it shows.
         digest: hash of the file.
+        exposure: see `read_exposure`.
     """
 
     size: tuple[int, int] | None = None
@@ -39,6 +44,7 @@ class PhotoFacts:
     turned: bool = False
     content: PhotoContent = NOTHING
     digest: str = ""
+    exposure: float = math.nan
 
     @property
     def is_blank(self) -> bool:
@@ -70,7 +76,8 @@ def photo_findings(facts: list[PhotoFacts], scene: Scene, *, has_masks: bool) ->
     for view, each in enumerate(facts):
         if each.problem:
             rules.append(("error", (view,), f"the photo of {{}} cannot be read ({each.problem}): export it again"))
-    return list_findings("photos", [*rules, *_size_rules(facts, scene), *_content_rules(facts)], names)
+    rules += [*_size_rules(facts, scene), *_content_rules(facts), *_exposure_rules(facts)]
+    return list_findings("photos", rules, names)
 
 
 def _size_rules(facts: list[PhotoFacts], scene: Scene) -> list[Rule]:
@@ -111,6 +118,17 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     ]
 
 
+def _exposure_rules(facts: list[PhotoFacts]) -> list[Rule]:
+    """Photos of another exposure than most, where two or more say theirs."""
+    exposures = np.array([each.exposure for each in facts])
+    if np.isfinite(exposures).sum() < 2:
+        return []
+    apart = np.abs(exposures - np.nanmedian(exposures))
+    others = np.flatnonzero(apart > STOPS).tolist()  # NaN is no more than anything
+    what = f"by EXIF, the exposures of {{}} are up to {np.nanmax(apart):.1f} stops from the usual one"
+    return [("note", others, f"{what}: leaf colours differ as much; fix exposure and white balance")]
+
+
 def _read_facts(photos: Photos, view: int) -> PhotoFacts:
     scene, path = photos.scene, photos.scene.views[view].path
     if not path.is_file():
@@ -123,4 +141,5 @@ def _read_facts(photos: Photos, view: int) -> PhotoFacts:
             content = measure_content(read_rgb(path, bits=photo_bits(scene, view)))
     except InputError as error:
         return PhotoFacts(problem=str(error.__cause__ or error))  # the reason alone
-    return PhotoFacts(size=size, turned=is_turned(path), content=content, digest=photos.sha256(view))
+    turned, exposure = is_turned(path), read_exposure(path)
+    return PhotoFacts(size=size, turned=turned, content=content, digest=photos.sha256(view), exposure=exposure)

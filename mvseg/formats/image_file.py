@@ -7,6 +7,7 @@ here. EXIF orientation is ignored: rows and columns are those that the file stor
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import zlib
@@ -35,6 +36,7 @@ MAX_SIDE = 1 << 20  # pixels
 MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
 GREY = 2  # largest difference between the channels of a grey photo
 ORIENTATION = 0x0112  # EXIF tag
+EXPOSURE_BLOCK, SECONDS, APERTURE, ISO = 0x8769, 0x829A, 0x829D, 0x8827  # EXIF tags
 BITS_PER_SAMPLE = 0x0102  # TIFF tag
 LARGE = 1 << 26  # pixels; Pillow's own limit lies above
 
@@ -217,6 +219,17 @@ def is_turned(path: Path) -> bool:
             return JpegImageFile(file).getexif().get(ORIENTATION, 1) != 1
     except InputError:  # no JPEG, or a damaged EXIF block: it says nothing
         return False
+
+
+def read_exposure(path: Path) -> float:
+    """How bright a JPEG shows what stands in the same light, in stops, by EXIF: log2(seconds x ISO / f-number^2); NaN
+    where it does not say all three."""
+    try:
+        with _any_fault(), path.open("rb") as file:
+            said = JpegImageFile(file).getexif().get_ifd(EXPOSURE_BLOCK)
+            return math.log2(float(said[SECONDS]) * float(said[ISO]) / float(said[APERTURE]) ** 2)
+    except InputError:  # as `is_turned`
+        return math.nan
 
 
 def describe_turn(path: Path) -> str:

@@ -35,9 +35,9 @@ def replace_result(out: Path, run: dict[str, Any], run_file: str = RUN_FILE) -> 
     try:
         with folder_whole(out) as folder:
             yield folder
-            text = json.dumps(run | {"files": list_files(folder, run_file)}, indent=1, default=str)
+            text = json.dumps(run | {"files": _list_files(folder, run_file)}, indent=1, default=str)
             (folder / run_file).write_text(text + "\n", encoding="utf-8")
-            keep_user_files(out, folder, run_file)
+            _keep_user_files(out, folder, run_file)
     except OSError as error:
         raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
 
@@ -80,12 +80,12 @@ def check_same_scene(out: Path, scene: Path) -> None:
         raise InputError(f"{out}: {message}; expected another --out, or --overwrite true")
 
 
-def list_files(folder: Path, run_file: str = RUN_FILE) -> dict[str, str]:
+def _list_files(folder: Path, run_file: str) -> dict[str, str]:
     """{path in the folder: SHA-256} of all files but run.json itself; what run.json says of them."""
     return {name: hash_files(folder / name) for name in _names_below(folder) if name != run_file}
 
 
-def keep_user_files(out: Path, folder: Path, run_file: str = RUN_FILE) -> None:
+def _keep_user_files(out: Path, folder: Path, run_file: str) -> None:
     """Copy what the user put into the earlier result at `out` into the new one in `folder`.
 
     Raises:

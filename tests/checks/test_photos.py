@@ -69,6 +69,27 @@ def turn_by_exif(folder: Path, view: int) -> None:
     edit_rig(folder, view, file="images/turned.jpg")
 
 
+def expose(folder: Path, *seconds: float | None) -> None:
+    """Photos with these exposure times in EXIF, at ISO 200 and f/4; None: without."""
+    for view, time in enumerate(seconds):
+        exif = Image.Exif()
+        if time is not None:
+            exif.get_ifd(0x8769).update({0x829A: time, 0x829D: 4.0, 0x8827: 200})
+        Image.open(photo(folder, view)).save(folder / "images" / f"{view}.jpg", exif=exif)
+        edit_rig(folder, view, file=f"images/{view}.jpg")
+
+
+def test_exposures_that_differ_are_noted(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path / "plant")
+    expose(folder, 1 / 50, 1 / 60, 1 / 200, 1 / 50)
+    (found,) = findings_of(folder)
+    assert (found.level, found.views) == ("note", (2,))
+    assert "1.9 stops" in found.what
+    for times in ([1 / 50, 1 / 60, None, 1 / 50], [1 / 50, None, None, None], [0.0, 1 / 50, 1 / 50, 1 / 50]):
+        expose(folder, *times)
+        assert findings_of(folder) == []
+
+
 def test_sound_photos_have_no_finding(tmp_path: Path) -> None:
     assert findings_of(write_scene(tmp_path / "plant")) == []
 
