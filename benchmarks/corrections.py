@@ -53,7 +53,7 @@ from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import list_stages
+from mvseg.pipeline import BEFORE_EDITS, list_stages
 from mvseg.regions import IGNORE_LABEL
 from mvseg.scene import Scene, View
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
@@ -65,7 +65,6 @@ from mvseg.system.running import running
 
 Record = dict[str, Any]
 
-BEFORE_EDITS = ("detect", "match", "split", "choose")  # of detected masks: done once
 NOT_SHOWN = ("say_what_is_missing", "check", "measure")
 MOST, ROUNDS = 2.0, 8  # edits' worth per leaf, and in how many rounds, as a rule
 ORDERS: tuple[Order, ...] = ("repair", "ask")

@@ -151,17 +151,22 @@ def spec_of(num_views: int, num_leaves: int, plant: int = 0) -> SceneSpec:
     return next(spec for spec in specs if (spec.num_views, spec.num_leaves, plant_index(spec)) == wanted)
 
 
-def thirds_of_matching(args: argparse.Namespace) -> None:
-    scenes = [load_maps(spec_of(*cell), args.cache) for cell in SCENES]
-    before = match_all(scenes)
-    for module, name in list_numbers(mvseg.matching):
-        for factor in (1 / FACTOR, FACTOR) if args.numbers is None or name in args.numbers else ():
+def try_numbers(package: ModuleType, only: list[str] | None, compare: Callable[[], str]) -> None:
+    """Print what each number of a package changes, by what `compare` says while it is another."""
+    for module, name in list_numbers(package):
+        for factor in (1 / FACTOR, FACTOR) if only is None or name in only else ():
             try:
                 with changed(module, name, scaled(getattr(module, name), factor)):
-                    said = compare_matchings(before, match_all(scenes))
+                    said = compare()
             except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
                 said = f"cannot be: {error}"
             print(f"{module.__name__.rpartition('.')[2]} {name} x {factor:.2f}: {said}", flush=True)
+
+
+def thirds_of_matching(args: argparse.Namespace) -> None:
+    scenes = [load_maps(spec_of(*cell), args.cache) for cell in SCENES]
+    before = match_all(scenes)
+    try_numbers(mvseg.matching, args.numbers, lambda: compare_matchings(before, match_all(scenes)))
     config = NViewConfig()
     for part in fields(config):
         group = getattr(config, part.name)
@@ -319,14 +324,7 @@ def thirds_of_reconstruction(args: argparse.Namespace) -> None:
         fits = (each for each in specs if (each.num_views, each.num_leaves) == (num_views, num_leaves))
         scenes.append(load_maps(next(each for each in fits if family in (None, each.family)), args.cache))
     before = fit_all(scenes)
-    for module, name in list_numbers(mvseg.reconstruction):
-        for factor in (1 / FACTOR, FACTOR) if args.numbers is None or name in args.numbers else ():
-            try:
-                with changed(module, name, scaled(getattr(module, name), factor)):
-                    said = compare_leaves(before, fit_all(scenes))
-            except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
-                said = f"cannot be: {error}"
-            print(f"{module.__name__.rpartition('.')[2]} {name} x {factor:.2f}: {said}", flush=True)
+    try_numbers(mvseg.reconstruction, args.numbers, lambda: compare_leaves(before, fit_all(scenes)))
 
 
 def fit_all(scenes: list[LabelledScene]) -> np.ndarray:

@@ -34,6 +34,7 @@ from mvseg.stages import (
 from mvseg.system.running import running
 
 Stage = Callable[[State], State]
+BEFORE_EDITS = ("detect", "match", "split", "choose")  # stages of detected masks, that no edit changes
 
 
 def run_scene(

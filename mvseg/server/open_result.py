@@ -20,7 +20,7 @@ from torch import Tensor
 
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, InputWarning
-from mvseg.pipeline import Stage, list_stages
+from mvseg.pipeline import BEFORE_EDITS, Stage, list_stages
 from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Result
@@ -31,7 +31,6 @@ from mvseg.verification.leaf_color import colors_of_leaves
 
 CORRECTIONS_FILE = "corrections.json"
 NOT_SHOWN = ("say_what_is_missing", "check", "measure")  # stages whose outcome the page does not show
-BEFORE_EDITS = ("detect", "match", "split", "choose")  # stages of detected masks that no edit changes
 
 
 class Superseded(Exception):
