@@ -120,12 +120,7 @@ class Cameras:
             views: (N,) int64, from whose camera each ray starts.
             directions: (N, 3) in world axes, of any length.
         """
-        rays = torch.nn.functional.normalize(directions, dim=1)
-        across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
-        # From the mean centre: far from the world's origin the products would cancel.
-        middle = self.centers.mean(0)
-        target = (across @ (self.centers - middle)[views][..., None]).sum(0)
-        return middle + (torch.linalg.pinv(across.sum(0), rtol=1e-9) @ target)[:, 0]
+        return nearest_point(self.centers[views], directions)
 
     def scale(self, factor: float) -> Cameras:
         """The same cameras in a world whose lengths are multiplied by `factor` > 0; every point keeps its pixel."""
@@ -144,6 +139,21 @@ class Cameras:
         cam = points.to(self.K) @ self.R.mT + self.t[:, None, :]
         px = cam @ self.K.mT
         return px[..., :2] / px[..., 2:], cam[..., 2]
+
+
+def nearest_point(origins: Tensor, directions: Tensor) -> Tensor:
+    """(3,) the point nearest to N rays in the least squares; of parallel rays, one of many.
+
+    Args:
+        origins: (N, 3) where each ray starts.
+        directions: (N, 3) of any length.
+    """
+    rays = torch.nn.functional.normalize(directions, dim=1)
+    across = torch.eye(3).to(rays) - rays[:, :, None] * rays[:, None, :]
+    # From the mean origin: far from the world's origin the products would cancel.
+    middle = origins.mean(0)
+    target = (across @ (origins - middle)[..., None]).sum(0)
+    return middle + (torch.linalg.pinv(across.sum(0), rtol=1e-9) @ target)[:, 0]
 
 
 def camera_problem(K: Tensor, R: Tensor, t: Tensor, *, size: Tensor) -> str | None:

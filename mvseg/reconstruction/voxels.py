@@ -5,7 +5,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 import torch
@@ -16,6 +15,7 @@ from torch import Tensor
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
@@ -172,11 +172,17 @@ def back_project(
     """
     cameras = cameras.to(members.device)
     views = members.view_index[members.areas > 0].unique().tolist()
-    masks = [_ViewMask.union(members, view, cameras) for view in views]
-    if len(masks) < 2:
+    if len(views) < 2:
         return None
-    middle = cameras.nearest_point(torch.tensor(views), torch.stack([mask.ray for mask in masks]))
-    box = _bounding_box(masks, middle, config.threshold)
+    rows = [(members.view_index == view).nonzero()[:, 0].tolist() for view in views]
+    crops = [members.union(each) for each in rows]
+    corners = torch.tensor([crop.box[:2] for crop in crops]).to(cameras.K)
+    matrices = cameras.px_from_world[views]
+    silhouettes = Silhouettes(
+        masks=tuple(crop.pixels for crop in crops),
+        px_from_world=torch.cat((matrices[:, :2] - corners[..., None] * matrices[:, 2:], matrices[:, 2:]), 1),
+    )
+    box = _bounding_box(silhouettes, config.threshold)
     if box is None:
         return None
     low, high = box
@@ -187,148 +193,80 @@ def back_project(
         asked = int((last - first).prod())
         raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {MAX_VOXELS}")
     axes = [(first[a] + 0.5 + torch.arange(int(shape[a])).to(low)) * size for a in range(3)]
-    free_maps = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
-    votes = _share_of_masks(masks, axes, free=free_maps, seen_share=config.seen_share)
+    full = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
+    frames = None if full is None else Silhouettes(tuple(full), matrices)
+    votes = _share_of_masks(silhouettes, axes, free=frames, seen_share=config.seen_share)
     return VoxelGrid(
-        origin=first * size, voxel_size=size, votes=votes, num_views=len(masks), threshold=config.threshold
+        origin=first * size, voxel_size=size, votes=votes, num_views=len(views), threshold=config.threshold
     )
 
 
-@dataclass(frozen=True, eq=False)
-class _ViewMask:
-    """The union of an instance's masks in one view."""
-
-    mask: Tensor  # (h, w) bool, a crop
-    corner: tuple[int, int]  # x, y of the crop's top-left pixel
-    px_from_world: Tensor  # (3, 4) float64
-    focal: float
-    slant: float  # largest distance from the camera per unit of depth, over the rays of the crop
-    center: Tensor  # (3,) camera centre
-    ray: Tensor  # (3,) unit viewing ray through the mask's centroid
-
-    @staticmethod
-    def union(members: Regions, view: int, cameras: Cameras) -> _ViewMask:
-        crop = members.union((members.view_index == view).nonzero()[:, 0].tolist())
-        x1, y1, x2, y2 = crop.box
-        rows, columns = crop.pixels.nonzero().double().mean(0) + 0.5
-        ray = cameras.world_from_px[view] @ torch.stack((columns + x1, rows + y1, torch.ones_like(rows)))
-        ray = ray / torch.linalg.vector_norm(ray)
-        K = cameras.K[view]
-        corners = torch.tensor([[u, v, 1.0] for u in (x1, x2) for v in (y1, y2)]).to(K)
-        slant = float(torch.linalg.vector_norm(corners @ torch.linalg.inv(K).T, dim=1).max())
-        focal = float(K.diagonal()[:2].max())
-        return _ViewMask(
-            mask=crop.pixels,
-            corner=(x1, y1),
-            px_from_world=cameras.px_from_world[view],
-            focal=focal,
-            slant=slant,
-            center=cameras.centers[view],
-            ray=ray,
-        )
-
-    @cached_property
-    def integral(self) -> Tensor:
-        """((h + 1) * (w + 1),) int: pixels of the mask above and to the left of each pixel corner, row by row."""
-        return torch.nn.functional.pad(self.mask.int().cumsum(0).cumsum(1), (1, 0, 1, 0)).flatten()
-
-    def contains(self, axes: list[Tensor]) -> Tensor:
-        """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask?"""
-        return self.look_up(axes, self.mask, self.corner)
-
-    def look_up(self, axes: list[Tensor], mask: Tensor, corner: tuple[int, int]) -> Tensor:
-        """(X, Y, Z) bool: the same for any mask (h, w) of this view whose top-left pixel is `corner` (x, y).
-
-        Computed relative to the first point, so that float32 is exact to a thousandth of a pixel wherever the world's
-        origin is.
-        """
-        first = torch.stack([axis[0] for axis in axes])
-        offset = (self.px_from_world[:, :3] @ first + self.px_from_world[:, 3]).float()
-        x, y, z = ((axis - axis[0]).float() for axis in axes)
-        x, y, z = x[:, None, None], y[None, :, None], z[None, None, :]
-        rows = self.px_from_world.float()
-        u, v, depth = (row[0] * x + row[1] * y + (row[2] * z + start) for row, start in zip(rows, offset, strict=True))
-        scale = 1 / depth.clamp(min=1e-12)
-        height, width = mask.shape
-        # A border of one False pixel receives everything that falls outside.
-        framed = torch.nn.functional.pad(mask, (1, 1, 1, 1)).flatten()
-        column = (u * scale - (corner[0] - 1)).clamp(0, width + 1).long()
-        row = (v * scale - (corner[1] - 1)).clamp(0, height + 1).long()
-        return framed[row * (width + 2) + column] & (depth > 0)
-
-    def may_meet(self, points: Tensor, reach: float) -> Tensor:
-        """(P,) bool: can the mask meet the projection of a ball of radius `reach` about each (P, 3) point?
-
-        The projection is replaced by a square of pixels that contains it, so the answer errs only towards True.
-        """
-        u, v, depth = (points @ self.px_from_world[:, :3].T + self.px_from_world[:, 3]).unbind(1)
-        distance = torch.linalg.vector_norm(points - self.center, dim=1)
-        scale = 1 / depth.clamp(min=1e-12)
-        u, v = u * scale - self.corner[0], v * scale - self.corner[1]
-        # |u' - u| <= f reach sqrt(1 + (X/Z)^2) / (Z - reach), and distance / depth bounds the root.
-        margin = reach * self.focal / (depth - reach).clamp(min=1e-12) * distance * scale
-        height, width = self.mask.shape
-        integral = self.integral
-        x1, y1 = ((c - margin).floor().clamp(0, side).long() for c, side in ((u, width), (v, height)))
-        x2, y2 = (((c + margin).floor() + 1).clamp(0, side).long() for c, side in ((u, width), (v, height)))
-        top, bottom = y1 * (width + 1), y2 * (width + 1)
-        count = integral[bottom + x2] - integral[top + x2] - integral[bottom + x1] + integral[top + x1]
-        # A ball that reaches behind the camera has no bounded projection. A mask point in it has a depth below
-        # 2 reach, thus lies within 2 reach * slant of the camera, and the ball's centre within reach of that.
-        beside = (depth > -reach) & (distance <= reach * (1 + 2 * self.slant))
-        return torch.where(depth > reach, count > 0, beside)
-
-
 def _share_of_masks(
-    masks: list[_ViewMask], axes: list[Tensor], *, free: list[Tensor] | None, seen_share: float
+    silhouettes: Silhouettes, axes: list[Tensor], *, free: Silhouettes | None, seen_share: float
 ) -> Tensor:
     """(X, Y, Z) float32: I_k (Eq. 6) on a grid, a slab at a time to bound the memory.
 
-    With `free`, one map (H, W) bool per mask, it is 0 where not more than `seen_share` of the views whose pixel is in
-    the mask or free have it in the mask.
+    With `free`, what shows nothing in the same views, it is 0 where not more than `seen_share` of the views whose pixel
+    is in the mask or free have it in the mask.
     """
     slab = max(1, 2_000_000 // (len(axes[1]) * len(axes[2])))
     parts = []
     for planes in axes[0].split(slab):
         part = [planes, axes[1], axes[2]]
-        votes = torch.zeros([len(axis) for axis in part], device=planes.device)
-        for mask in masks:
-            votes += mask.contains(part)
-        share = votes / len(masks)
+        votes = _count_masks(silhouettes, part)
+        share = votes / len(silhouettes)
         if free is not None:
-            empty = torch.zeros_like(votes)
-            for mask, free_map in zip(masks, free, strict=True):
-                empty += mask.look_up(part, free_map, (0, 0))
-            share = share.where(votes > seen_share * (votes + empty) + 1e-6, 0)
+            share = share.where(votes > seen_share * (votes + _count_masks(free, part)) + 1e-6, 0)
         parts.append(share)
     return torch.cat(parts)
 
 
-def _bounding_box(masks: list[_ViewMask], middle: Tensor, threshold: float) -> tuple[Tensor, Tensor] | None:
+def _count_masks(silhouettes: Silhouettes, axes: list[Tensor]) -> Tensor:
+    """(X, Y, Z) float32: how many masks the points of a grid are in, L of Eq. 6 summed over the views."""
+    count = torch.zeros([len(axis) for axis in axes], device=axes[0].device)
+    for mask, px_from_world in zip(silhouettes.masks, silhouettes.px_from_world, strict=True):
+        count += _is_in(mask, px_from_world, axes)
+    return count
+
+
+def _is_in(mask: Tensor, px_from_world: Tensor, axes: list[Tensor]) -> Tensor:
+    """(X, Y, Z) bool: L of Eq. 6 on a grid: is the point in front of the camera, and its pixel in the mask (h, w)?
+
+    Computed relative to the first point, so that float32 is exact to a thousandth of a pixel wherever the world's
+    origin is.
+    """
+    first = torch.stack([axis[0] for axis in axes])
+    offset = (px_from_world[:, :3] @ first + px_from_world[:, 3]).float()
+    x, y, z = ((axis - axis[0]).float() for axis in axes)
+    x, y, z = x[:, None, None], y[None, :, None], z[None, None, :]
+    rows = px_from_world.float()
+    u, v, depth = (row[0] * x + row[1] * y + (row[2] * z + start) for row, start in zip(rows, offset, strict=True))
+    scale = 1 / depth.clamp(min=1e-12)
+    height, width = mask.shape
+    # A border of one False pixel receives everything that falls outside.
+    framed = torch.nn.functional.pad(mask, (1, 1, 1, 1)).flatten()
+    column, row = (u * scale + 1).clamp(0, width + 1).long(), (v * scale + 1).clamp(0, height + 1).long()
+    return framed[row * (width + 2) + column] & (depth > 0)
+
+
+def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, Tensor] | None:
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
-    A cube about `middle` (3,), the point nearest to all centroid rays, twice as far as the farthest camera, is halved
-    again and again; cells in which no point can exceed the threshold are discarded, until the box of the rest is
-    `SEARCH_CELLS` cells long and hardly shrinks any more. Cells are judged by the balls around them, so nothing is
-    lost, however thin. None when no cell is left. Masks of nearly parallel views may have no bounded common part: it is
-    cut off at the cube.
+    Cells are halved until the box of those that are left is `SEARCH_CELLS` cells long and hardly shrinks any more. None
+    when no cell is left.
     """
-    centers = torch.stack([mask.center for mask in masks])
-    half = 2 * float(torch.linalg.vector_norm(centers - middle, dim=1).max().clamp(min=1e-9))
-    root_low, root_high = middle - half, middle + half
-    cells, split = middle[None], torch.cartesian_prod(*[torch.tensor([-0.5, 0.5])] * 3).to(middle)
-    low, high, shrinks = root_low, root_high, True
-    while (shrinks or (high - low).max() < 2 * half * SEARCH_CELLS) and len(cells) < MAX_CELLS:
-        before = (high - low).prod()
-        cells = (cells[:, None] + half * split).flatten(0, 1)
-        half /= 2
-        votes = torch.stack([mask.may_meet(cells, half * 3**0.5) for mask in masks]).sum(0)
-        cells = cells[votes > threshold * len(masks) + 1e-6]
+    before = torch.inf
+    for cells in halve_cells(silhouettes, threshold):
         if not len(cells):
             return None
-        low, high = cells.amin(0) - half, cells.amax(0) + half
-        shrinks = bool((high - low).prod() < 0.8 * before)
-    if (low - half < root_low).any() or (high + half > root_high).any():
-        message = f"the {len(masks)} masks of an instance have no bounded common part (the views are too similar)"
+        low, high = cells.box
+        volume = float((high - low).prod())
+        is_fine = float((high - low).max()) >= SEARCH_CELLS * cells.size and volume >= 0.8 * before
+        if is_fine or len(cells) >= MAX_CELLS:
+            break
+        before = volume
+    root_low, root_high = silhouettes.cube.box
+    if (low - cells.size / 2 < root_low).any() or (high + cells.size / 2 > root_high).any():
+        message = f"the {len(silhouettes)} masks of an instance have no bounded common part (the views are too similar)"
         warnings.warn(f"{message}: its shape is cut off", InputWarning, stacklevel=4)
     return low, high
