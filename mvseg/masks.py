@@ -21,7 +21,15 @@ T = TypeVar("T")
 
 SURE = 0.5  # match score from which a mask counts for its instance's support
 VERY_SURE = 0.9  # match score from which an id is hardly ever wrong
-COLUMNS = ("instance_ids", "match_scores", "detection_scores", "classes", "origin", "second_ids")  # that are tensors
+COLUMNS = (  # that are tensors
+    "instance_ids",
+    "match_scores",
+    "detection_scores",
+    "classes",
+    "origin",
+    "is_linked",
+    "second_ids",
+)
 
 
 class Origin(IntEnum):
@@ -64,6 +72,7 @@ class Masks:
         detection_scores: (D,) float32, the detector's; NaN for masks that no detector scored.
         classes: (D,) int64; masks of different classes are never matched.
         origin: (D,) int64, of `Origin`.
+        is_linked: (D,) bool, a person says which other masks show its instance, or do not.
         second_ids: (D,) int64, id of the second instance that a mask seems to show; -1 for none.
         second_parts: D times (h, w) bool on the CPU, the pixels of the mask's box that show it; None for none.
 
@@ -77,6 +86,7 @@ class Masks:
     detection_scores: Tensor
     classes: Tensor
     origin: Tensor
+    is_linked: Tensor
     second_ids: Tensor
     second_parts: tuple[Tensor | None, ...]
 
@@ -105,6 +115,7 @@ class Masks:
             detection_scores=integer * torch.nan if detection_scores is None else detection_scores,
             classes=integer if classes is None else classes,
             origin=int(origin) * integer,
+            is_linked=integer < 0,
             second_ids=-integer,
             second_parts=(None,) * count,
         )

@@ -232,7 +232,7 @@ def choose_corrected(state: State) -> State:
     assert known is not None
     assert shown is not None
     masks = state.masks.to("cpu")
-    leaves = _choose_leaves(state, known.matched, linked=_is_linked(state), gone=_taken_away(shown, masks))
+    leaves = _choose_leaves(state, known.matched, gone=_taken_away(shown, masks))
     return _with_leaves(state, leaves)
 
 
@@ -278,13 +278,6 @@ def say_what_is_missing(state: State) -> State:
     return state
 
 
-def _is_linked(state: State) -> torch.Tensor:
-    """(D,) bool, the masks that a person linked; those that followed from drawn ones come after all others."""
-    assert state.corrected is not None
-    is_linked = state.corrected.is_linked
-    return torch.nn.functional.pad(is_linked, (0, len(state.masks) - len(is_linked)))
-
-
 def _taken_away(before: Masks, after: Masks) -> Masks:
     """The detected masks of a table that are not in it any more, after a person's edits."""
     is_left = torch.isin(after.origin.cpu(), torch.tensor([Origin.DETECTED, Origin.CONFIRMED]))
@@ -304,10 +297,8 @@ def check_ids(state: State) -> State:
     from mvseg.verification import checked_ids
 
     state = reconstruct(state, with_voxels=False)
-    held = None if state.corrected is None else _is_linked(state)
-    checked = checked_ids.check_ids(
-        state.masks, state.surfaces or {}, cameras=state.scene.cameras, held=held, config=state.config.match
-    )
+    surfaces, cameras = state.surfaces or {}, state.scene.cameras
+    checked = checked_ids.check_ids(state.masks, surfaces, cameras=cameras, config=state.config.match)
     num_moved = int((state.masks.instance_ids != checked.instance_ids).sum())
     return replace(state.with_masks(checked), num_moved=num_moved)
 

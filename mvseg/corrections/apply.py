@@ -56,9 +56,7 @@ class Corrected:
 
     Attributes:
         masks: D masks on the CPU, by view, matched to nothing.
-        links: of their rows.
-        is_linked: (D,) bool, masks that a person linked; other links keep outlines apart from what else their photos
-            show. After `apply_everywhere`, of the masks that are left.
+        links: of their rows; those that no edit names keep outlines apart from what else their photos show.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
         everywhere: (edit number, row, whether its instance is rejected) of each edit about a whole instance.
         refused: (edit number, view, x, y, whether in all photos) of each pixel where a person says that no leaf is,
@@ -68,7 +66,6 @@ class Corrected:
 
     masks: Masks
     links: Links
-    is_linked: Tensor
     last_edits: Tensor
     everywhere: tuple[tuple[int, int, bool], ...]
     refused: tuple[tuple[int, int, int, int, bool], ...]
@@ -132,7 +129,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     place = {mask: n for n, mask in enumerate(order)}
     links = _agreeing_links(work, place)
     is_linked, links = links.named(len(order)), _keep_outlines_apart(links, order)
-    table = as_table(masks, order)
+    table = replace(as_table(masks, order), is_linked=is_linked)
     if len(links.must):
         component = links.components(len(order))
         _tell_of_parts(work, place, component)
@@ -143,7 +140,6 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     return Corrected(
         masks=table,
         links=links,
-        is_linked=is_linked,
         last_edits=last_edits,
         everywhere=everywhere,
         refused=tuple(work.refused),
@@ -185,7 +181,7 @@ def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corre
     )
     origin = matched.origin.where(~confirmed | matched.is_corrected, int(Origin.CONFIRMED))
     masks = replace(matched, origin=origin).select(goes == 0).close_gaps()
-    return masks, replace(corrected, is_linked=corrected.is_linked[goes == 0], fates=fates)
+    return masks, replace(corrected, fates=fates)
 
 
 def _apply_one(work: _Work, number: int, edit: Edit) -> None:

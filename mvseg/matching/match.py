@@ -26,6 +26,7 @@ from mvseg.matching.view_graph import ViewGraph, first_without_links
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
+MATCHED = "instance_ids", "match_scores", "second_ids", "second_parts"  # columns of `Masks` that matching fills
 # They decide what is warned of, and no id. Of 80 development scenes with exact poses and right ids one is
 # warned of: its detector finds a third of the leaves (`benchmarks/confidence.py`).
 TRUSTED = 0.75  # ids are taken for right if their mean match score is at least this
@@ -123,7 +124,7 @@ def match_masks(
         parts.append(part)
         rows.append(members)
     joined = Masks.concatenate([part.masks for part in parts]).select(torch.cat(rows).argsort())
-    kept = replace(joined, detection_scores=masks.detection_scores, classes=masks.classes, origin=masks.origin)
+    kept = replace(masks, **{name: getattr(joined, name) for name in MATCHED})
     report = MatchReport.join([part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts])
     if any(part.method != report.method for part in parts):
         report = replace(report, method=config.resolved_method)

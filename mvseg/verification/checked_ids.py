@@ -17,7 +17,6 @@ from scipy.ndimage import distance_transform_edt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
-from torch import Tensor
 
 from mvseg.masks import SURE, Masks, MergedMask
 from mvseg.matching.config import MatchConfig
@@ -42,7 +41,6 @@ def check_ids(
     surfaces: Surfaces,
     *,
     cameras: Cameras,
-    held: Tensor | None = None,
     config: MatchConfig = MatchConfig(),
 ) -> Masks:
     """Move masks to the instances whose surfaces they show.
@@ -54,11 +52,10 @@ def check_ids(
     surfaces are marked as merged (`find_shared`).
 
     Args:
-        masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces.
+        masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces. Those that
+            a person corrected or linked keep their ids, and their instances are joined with none.
         surfaces: {instance id: surface} fitted to them, of every instance that has one.
         cameras: V cameras.
-        held: (D,) bool, masks that keep their ids, and whose instances are joined with none: a person knows them.
-            Those that a person corrected do so in any case.
         config: that the masks were matched with.
 
     Returns:
@@ -67,9 +64,9 @@ def check_ids(
     """
     on_cpu, cameras = masks.regions.to("cpu"), cameras.to("cpu")
     old, shown = masks.instance_ids.cpu().numpy(), Shown.of(on_cpu, surfaces, cameras)
-    is_held = _is_held(masks, held)
+    is_held: Bools = (masks.is_corrected | masks.is_linked).cpu().numpy()
     if masks.regions.num_views < VIEWS_TO_CHECK:
-        is_held |= (masks.match_scores >= SURE).cpu().numpy()
+        is_held = is_held | (masks.match_scores >= SURE).cpu().numpy()
     ids = np.where(is_held, old, move_pieces(on_cpu, old, shown))
     left = {instance: surface for instance, surface in surfaces.items() if (ids == instance).any()}
     ids = np.where(is_held, old, move_misfits(on_cpu, ids, shown))
@@ -85,11 +82,6 @@ def check_ids(
     shared = find_shared(on_cpu, ids, left, shown=shown, cameras=cameras, named=list(merged.values()))
     merged |= {each.region: each for each in shared}
     return checked.with_merged(merged.values())
-
-
-def _is_held(masks: Masks, held: Tensor | None) -> Bools:
-    is_held: Bools = (masks.is_corrected if held is None else masks.is_corrected | held).cpu().numpy()
-    return is_held
 
 
 def _with_ids(masks: Masks, ids: Ints) -> Masks:

@@ -75,7 +75,6 @@ def choose_leaves(
     *,
     cameras: Cameras,
     more: Sequence[Masks] = (),
-    linked: Tensor | None = None,
     gone: Masks | None = None,
     min_probability: float | None = None,
 ) -> Leaves:
@@ -90,9 +89,8 @@ def choose_leaves(
         proposals: R masks with detection scores, the excessive set; their ids do not matter.
         cameras: V cameras.
         more: masks of other matchings, of more of the proposals, with such labels, too.
-        linked: (D,) bool, masks that a person linked; None: nobody edited the masks. Otherwise only the instances of a
-            person's masks are candidates here, and `more` has the others.
-        gone: masks that a person took away; None: none.
+        gone: masks that a person took away; None: nobody edited the masks. Otherwise only the instances of a person's
+            masks are candidates here, and `more` has the others.
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
 
     Returns:
@@ -101,8 +99,8 @@ def choose_leaves(
     """
     matched, proposals, cameras = matched.to("cpu"), proposals.to("cpu"), cameras.to("cpu")
     proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(proposals))))
-    is_held = matched.is_corrected | (matched.origin == Origin.OTHER_VIEWS) | (matched.origin == Origin.GIVEN)
-    is_held = is_held if linked is None else is_held | linked.cpu()
+    is_held = matched.is_corrected | matched.is_linked
+    is_held |= (matched.origin == Origin.OTHER_VIEWS) | (matched.origin == Origin.GIVEN)
     left = _without(proposals, gone)
     is_added = is_held | ~_are_proposals(matched, proposals)  # what a person made, and what was cut since
     added = matched.select(is_added)
@@ -112,7 +110,7 @@ def choose_leaves(
     held = np.zeros(len(table), bool)
     held[row_of[is_held].numpy()] = True
     has_shapes, ids = _is_seen_around(matched, cameras), matched.instance_ids
-    if linked is not None:
+    if gone is not None:
         matched = replace(matched, instance_ids=ids.where(torch.isin(ids, ids[is_held]), -1))
     found = [(matched, row_of), *((each.to("cpu"), each.regions.labels.cpu()) for each in more)]
     candidates = gather_candidates(found, cameras if has_shapes else None, table=table, is_held=is_held)

@@ -151,6 +151,7 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         match_scores=torch.where(is_new, masks.match_scores[ids == leaf].mean(), more.match_scores),
         detection_scores=torch.where(is_new, torch.nan, more.detection_scores),
         origin=torch.where(is_new, int(Origin.OTHER_VIEWS), more.origin),
+        is_linked=more.is_linked & ~is_new,
     )
 
 

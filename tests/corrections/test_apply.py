@@ -231,10 +231,10 @@ def test_an_outline_is_a_leaf_of_its_own_unless_links_say_otherwise() -> None:
     row = apart.masks.origin.tolist().index(Origin.CORRECTED)
     others = {other for pair in apart.links.cannot.tolist() for other in pair if row in pair} - {row}
     assert others == {0, 1}  # the two masks of its photo
-    assert not apart.is_linked.any()
+    assert not apart.masks.is_linked.any()
     joined = correct(drawn, link("same", ("a", 25, 15), ("a", 15, 15)))
     assert [sorted(pair) for pair in joined.links.cannot.tolist()] == [[1, 2]]
-    assert joined.is_linked.tolist() == [True, False, True, False, False]
+    assert joined.masks.is_linked.tolist() == [True, False, True, False, False]
 
 
 def test_an_outline_over_everything_says_what_it_replaces() -> None:
@@ -262,8 +262,8 @@ def test_saying_no_where_no_mask_is_answers_a_question() -> None:
 
 def test_links_stay_with_their_masks_when_an_instance_goes() -> None:
     corrected = correct(at("reject", 15, 15, everywhere=True), link("same", ("a", 35, 15), ("b", 35, 15)))
-    assert corrected.is_linked.tolist() == [False, True, False, True]
+    assert corrected.masks.is_linked.tolist() == [False, True, False, True]
     matched = replace(corrected.masks, instance_ids=torch.tensor([1, 2, 1, 2]))
-    masks, after = apply_everywhere(corrected, matched)
+    masks, _ = apply_everywhere(corrected, matched)
     assert masks.regions.boxes.tolist() == [[*RIGHT], [*RIGHT]]
-    assert after.is_linked.tolist() == [True, True]
+    assert masks.is_linked.tolist() == [True, True]

@@ -129,7 +129,8 @@ def test_a_person_is_right() -> None:
     assert int(partners.sum()) >= 5
     rest = torch.arange(len(IDS)) != row
     gone = PROPOSALS.select(~rest)
-    without = choose(matched_of(PROPOSALS, IDS[rest], rest.nonzero()[:, 0]), gone=gone)
+    matched = matched_of(PROPOSALS, IDS[rest], rest.nonzero()[:, 0])
+    without = choose(matched, gone=gone, more=(matched,))
     assert len(without.masks) == len(REGIONS) - 1
     boxes = without.masks.regions.boxes[without.masks.view_index == 2]
     assert not (boxes == REGIONS.boxes[row]).all(1).any()
@@ -140,7 +141,7 @@ def test_an_edit_that_touches_nothing_changes_nothing() -> None:
     matched = matched_of(PROPOSALS, IDS)
     plain = choose(matched)
     moved = replace(matched, instance_ids=IDS % 3 + 1)  # what the edited masks are matched to does not matter
-    edited = choose(moved, linked=torch.zeros(len(IDS), dtype=torch.bool), more=(matched,))
+    edited = choose(moved, gone=PROPOSALS.select(IDS < 0), more=(matched,))
     assert plain.probabilities == edited.probabilities
     assert torch.equal(plain.masks.instance_ids, edited.masks.instance_ids)
     assert torch.equal(plain.masks.match_scores, edited.masks.match_scores)
