@@ -85,4 +85,5 @@ def score_method(cell: Cell, masks: Masks, method: str, *, cache: Path) -> Recor
     purity = {"s_match": metrics.s_match, "s_together": together.s_match}
     measures = {"e_k": metrics.e_k, "ari": metrics.ari, "f1": metrics.pair_f1}
     counts = {"masks": len(ids), "untied": int((ids < 0).sum()), "no_leaf": int((~judged).sum())}
-    return {**purity, **measures, **counts, "missed": masks.num_missed, "by": matching.method, "seconds": seconds}
+    counts |= {"missed": masks.num_missed}
+    return {**purity, **measures, **counts, "by": matching.report.method, "seconds": seconds}

@@ -58,7 +58,7 @@ def match_proposals(
             cameras=cameras,
             config=match,
             num_instances=_count_instances(matching.masks) if match.resolved_method == "symnmf" else {},
-            residual_px=matching.residual_px,  # of the poses, which stay the same
+            residual_px=matching.report.residual_px,  # of the poses, which stay the same
         )
         for _ in range(num_iterations):
             matched = matching.masks

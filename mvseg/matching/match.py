@@ -52,7 +52,7 @@ def match_regions(
         cameras: V >= 2 cameras.
         config: method and options.
         residual_px: the reprojection error, one of 1, 2, 4 and 8 pixels, where an earlier matching of these views has
-            found it (`Matching.residual_px`); None: it is estimated. Only "nview" makes use of it.
+            found it (`MatchReport.residual_px`); None: it is estimated. Only "nview" makes use of it.
         links: regions that show one instance, or different ones; these ids hold, and links that the views agree with
             change nothing.
 
@@ -126,7 +126,7 @@ def match_masks(
     joined = Masks.concatenate([part.masks for part in parts]).select(torch.cat(rows).argsort())
     kept = replace(masks, **{name: getattr(joined, name) for name in MATCHED})
     report = MatchReport.join([part.report for part in parts], [int((part.instance_ids > 0).sum()) for part in parts])
-    if any(part.method != report.method for part in parts):
+    if any(part.report.method != report.method for part in parts):
         report = replace(report, method=config.resolved_method)
     return Matching(kept, report)
 
@@ -145,7 +145,7 @@ def match_graph(affinity: Affinity, regions: Regions, config: MatchConfig, *, me
         affinity: the graph of D regions.
         regions: whose numbers per view set the default range for the number of instances.
         config: num_instances, search_range, num_restarts and seed are used; the rest concerns the epipolar weights.
-        method: the `Matching.method` of the result.
+        method: the `MatchReport.method` of the result.
     """
     clustering = cluster_weights(affinity.to_dense(), regions.num_per_view, config)
     return matching_of_ids(clustering.instance_ids, regions, affinity, method=method)
@@ -207,20 +207,20 @@ def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
 def _warn_of_disagreement(matching: Matching) -> None:
     """Poses are wrong where ids are likely to be wrong, where no reprojection error that is tried is large enough, or
     where some views explain far less than the others (`benchmarks/confidence.py` counts how often this is so)."""
-    assert matching.explained is not None
-    assert matching.view_explained is not None
+    assert matching.report.explained is not None
+    assert matching.report.view_explained is not None
     is_matched = matching.instance_ids > 0
     sure = float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
-    is_capped, odd = matching.residual_px == DILATIONS[-1], odd_views(matching.view_explained)
+    is_capped, odd = matching.report.residual_px == DILATIONS[-1], odd_views(matching.report.view_explained)
     if sure >= TRUSTED and not is_capped and not odd:
         return
-    facts = f"{sure:.0%} of the ids are expected to be right, rays explain {matching.explained:.0%} of the masks"
+    facts = f"{sure:.0%} of the ids are expected to be right, rays explain {matching.report.explained:.0%} of the masks"
     if odd:
         facts += f", least in view{'s' if len(odd) > 1 else ''} {', '.join(map(str, odd))}"
     if is_capped:
-        facts += f", at a reprojection error of {matching.residual_px} pixels or more"
-    if matching.method != "nview":
-        facts += f"; '{matching.method}' matched them"
+        facts += f", at a reprojection error of {matching.report.residual_px} pixels or more"
+    if matching.report.method != "nview":
+        facts += f"; '{matching.report.method}' matched them"
     question = "do R and t map world points to the camera, and does each mask belong to its photo?"
     num_per_view = matching.masks.regions.num_per_view
     richest, sparse = int(num_per_view.max()), num_per_view <= num_per_view.max() / 2

@@ -94,26 +94,6 @@ class Matching:
         0.5; None where the match scores are not probabilities."""
         return self.masks.count_sure_views() if self.report.has_probabilities else None
 
-    @property
-    def method(self) -> str:
-        """See `MatchReport`."""
-        return self.report.method
-
-    @property
-    def residual_px(self) -> int | None:
-        """See `MatchReport`."""
-        return self.report.residual_px
-
-    @property
-    def explained(self) -> float | None:
-        """See `MatchReport`."""
-        return self.report.explained
-
-    @property
-    def view_explained(self) -> Tensor | None:
-        """See `MatchReport`."""
-        return self.report.view_explained
-
     def with_masks(self, masks: Masks) -> Matching:
         """The same report with another state of the table."""
         return replace(self, masks=masks)

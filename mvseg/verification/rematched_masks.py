@@ -58,7 +58,7 @@ def rematch_misfits(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)  # the first matching has said it
         matching = match_masks(masks, cameras, config, links=_links(masks.instance_ids.cpu(), is_misfit.cpu()))
-    if matching.method != "nview":
+    if matching.report.method != "nview":
         return masks
     return _with_found(masks, matching.masks, is_free=is_misfit | (masks.instance_ids < 0))
 

@@ -58,7 +58,7 @@ def test_sgbm_finds_surfaces_and_matches_the_leaves(leafy: LeafyScene) -> None:
     metrics = matching_metrics(matching.instance_ids, leafy.regions.labels)
     assert metrics.s_match >= 0.95
     assert metrics.ari >= 0.9
-    assert matching.method == "mvs (sgbm)"
+    assert matching.report.method == "mvs (sgbm)"
 
 
 def test_true_depths_are_fused_to_the_surface_wherever_the_world_is(

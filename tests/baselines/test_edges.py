@@ -34,7 +34,7 @@ def test_scores_are_the_share_of_partners_that_a_region_has_an_edge_to() -> None
     matching = match_graph(edge_graph(pairs, 6), three_views(), MatchConfig(), method="here")
     assert clusters(matching) == [[0, 2, 4], [1, 3, 5]]
     assert matching.match_scores.tolist() == [1, 0.5, 1, 1, 1, 0.5]
-    assert (matching.num_instances, matching.method) == (2, "here")
+    assert (matching.num_instances, matching.report.method) == (2, "here")
 
 
 def test_regions_without_an_edge_are_unmatched() -> None:

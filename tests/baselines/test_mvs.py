@@ -40,10 +40,10 @@ def points(balls: BallScene) -> torch.Tensor:
 def test_good_points_give_the_balls(balls: BallScene, points: torch.Tensor) -> None:
     found = match_mvs(balls.regions, scene_of(balls.cameras), DensePoints(points, "file"))
     assert adjusted_rand_score(balls.regions.labels, found.instance_ids) == 1
-    assert (found.num_instances, found.method) == (4, "mvs (file)")
+    assert (found.num_instances, found.report.method) == (4, "mvs (file)")
     config = MatchConfig(num_instances=3)
     fewer = match_mvs(balls.regions, scene_of(balls.cameras), DensePoints(points, "sgbm"), config=config)
-    assert (fewer.num_instances, fewer.method) == (3, "mvs (sgbm)")
+    assert (fewer.num_instances, fewer.report.method) == (3, "mvs (sgbm)")
 
 
 def test_points_of_regions_are_those_of_the_slow_twin(balls: BallScene) -> None:

@@ -33,7 +33,7 @@ def edge_set(graph: Affinity) -> set[tuple[int, int]]:
 def test_finds_the_balls_of_an_easy_scene(balls: BallScene) -> None:
     found = match_points(balls.regions, scene_of(balls.cameras))
     assert adjusted_rand_score(balls.regions.labels, found.instance_ids) == 1
-    assert (found.num_instances, found.method) == (4, "points")
+    assert (found.num_instances, found.report.method) == (4, "points")
     assert found.match_scores.dtype == torch.float32
     assert found.match_scores.min() > 0.8
     assert found.match_scores.max() <= 1

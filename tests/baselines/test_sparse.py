@@ -33,7 +33,7 @@ def test_finds_the_leaves_of_an_easy_scene(leafy: LeafyScene) -> None:
     metrics = matching_metrics(found.instance_ids, leafy.regions.labels)
     assert metrics.s_match >= 0.9
     assert metrics.ari >= 0.8
-    assert found.method in ("sparse (akaze)", "sparse (sift)")
+    assert found.report.method in ("sparse (akaze)", "sparse (sift)")
 
 
 def test_the_papers_detector_is_used_where_opencv_has_it(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -43,7 +43,7 @@ def test_the_papers_detector_is_used_where_opencv_has_it(leafy: LeafyScene, monk
     assert sparse.keypoint_detector()[1] == "sift"
     monkeypatch.setattr(cv2, "xfeatures2d", SimpleNamespace(AKAZE_create=lambda: cv2.ORB.create(1000)), raising=False)
     found = match_sparse(leafy.regions, leafy.scene, MatchConfig(num_instances=4))
-    assert found.method == "sparse (akaze)"
+    assert found.report.method == "sparse (akaze)"
     assert found.num_instances <= 4
     assert matching_metrics(found.instance_ids, leafy.regions.labels).s_match >= 0.7
 

@@ -287,7 +287,7 @@ def test_classes_are_matched_apart_and_their_matchings_joined() -> None:
     labels = matching.masks.regions.labels
     assert matching.support is not None
     assert len(matching.support) == matching.num_instances == 6
-    assert matching.residual_px == 1
+    assert matching.report.residual_px == 1
     for instance in range(1, 7):
         assert len(matching.masks.classes[matching.instance_ids == instance].unique()) == 1
     (merged,) = matching.merged

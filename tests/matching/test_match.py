@@ -23,7 +23,7 @@ def test_shipped_scene_is_solved(
     method: str, demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor
 ) -> None:
     matching = match_regions(demo_regions, demo_scene.cameras, MatchConfig(method=method))
-    assert matching.method == ("nview" if method == "auto" else method)
+    assert matching.report.method == ("nview" if method == "auto" else method)
     metrics = matching_metrics(matching.instance_ids, demo_truth)
     assert (metrics.s_match, metrics.e_k, metrics.ari) == (1.0, 0, 1.0)
     assert matching.num_instances == 12
@@ -34,10 +34,10 @@ def test_shipped_scene_is_solved(
         assert matching.support is not None
         assert matching.support.shape == (12,)
         assert matching.support.min() >= 2
-        assert matching.residual_px == 1
+        assert matching.report.residual_px == 1
     else:
         assert matching.support is None
-        assert matching.residual_px is None
+        assert matching.report.residual_px is None
 
 
 def test_the_papers_random_points_solve_it_too(
@@ -76,8 +76,8 @@ def test_scores_are_the_mean_affinity_to_the_cluster() -> None:
 
 def test_a_given_number_of_instances_is_for_symnmf() -> None:
     scene = ball_scene(5, 4, seed=2)
-    assert match_regions(scene.regions, scene.cameras, MatchConfig(num_instances=4)).method == "symnmf"
-    assert match_regions(scene.regions, scene.cameras, MatchConfig(search_range=(4, 6))).method == "symnmf"
+    assert match_regions(scene.regions, scene.cameras, MatchConfig(num_instances=4)).report.method == "symnmf"
+    assert match_regions(scene.regions, scene.cameras, MatchConfig(search_range=(4, 6))).report.method == "symnmf"
     with pytest.raises(InputError, match="are for symnmf, not for nview"):
         MatchConfig(method="nview", num_instances=4)
 
@@ -132,7 +132,7 @@ def test_views_that_agree_on_nothing_are_warned_of() -> None:
     order = [2, 0, 3, 1]  # every photo has the pose of another
     cameras = Cameras(scene.cameras.K, scene.cameras.R[order], scene.cameras.t[order], scene.cameras.sizes)
     with pytest.warns(InputWarning, match="the views hardly agree .* 'one-per-view' matched them"):
-        assert match_regions(scene.regions, cameras).method == "one-per-view"
+        assert match_regions(scene.regions, cameras).report.method == "one-per-view"
 
 
 @pytest.mark.parametrize(

@@ -273,10 +273,10 @@ def test_label_maps_that_grow_step_by_step_give_the_sweep_of_each_step(balls: Ba
 def test_balls_are_solved_and_scored(balls: BallScene) -> None:
     matching = solve(balls.regions, balls.cameras)
     assert same_partition(matching.instance_ids, balls.regions.labels)
-    assert matching.method == "nview"
-    assert matching.residual_px == 1
-    assert matching.explained is not None
-    assert matching.explained > 0.7
+    assert matching.report.method == "nview"
+    assert matching.report.residual_px == 1
+    assert matching.report.explained is not None
+    assert matching.report.explained > 0.7
     assert matching.match_scores.median() > 0.9
     sure = matching.match_scores >= 0.5
     seen = [len(set(balls.regions.view_index[sure & (matching.instance_ids == k)].tolist())) for k in range(1, 8)]
@@ -451,7 +451,7 @@ def test_epipoles_inside_the_images() -> None:
 def test_two_views_fall_back_on_the_pairs() -> None:
     scene = ball_scene(3, 2, seed=1)
     matching = solve(scene.regions, scene.cameras)
-    assert matching.method == "one-per-view"
+    assert matching.report.method == "one-per-view"
     assert same_partition(matching.instance_ids, scene.regions.labels)
 
 
@@ -480,14 +480,14 @@ def test_wrong_poses_are_noticed() -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.25)
     matching = solve(scene.regions, turned_a_little(scene.cameras, 0.004))
     assert same_partition(matching.instance_ids, scene.regions.labels)
-    assert matching.explained < solve(scene.regions, scene.cameras).explained
+    assert matching.report.explained < solve(scene.regions, scene.cameras).report.explained
 
 
 def test_large_pose_errors_are_measured_and_tolerated() -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.1)
     matching = solve(scene.regions, turned_a_little(scene.cameras, 0.008))
-    assert matching.residual_px > 1
-    assert matching.method == "nview"
+    assert matching.report.residual_px > 1
+    assert matching.report.method == "nview"
     assert same_partition(matching.instance_ids, scene.regions.labels)
 
 
@@ -497,9 +497,9 @@ def test_the_reprojection_error_may_be_known_from_an_earlier_matching(monkeypatc
     first = solve(scene.regions, cameras)
     graph = ViewGraph.of(region_affinity(scene.regions, cameras), scene.regions)
     monkeypatch.setattr("mvseg.matching.nview.match_nview.sweep_dilated", None)  # nothing is tried
-    again = match_nview(scene.regions, cameras, graph, residual_px=first.residual_px)
+    again = match_nview(scene.regions, cameras, graph, residual_px=first.report.residual_px)
     assert torch.equal(again.instance_ids, first.instance_ids)
-    assert again.residual_px == first.residual_px
+    assert again.report.residual_px == first.report.residual_px
     with pytest.raises(InputError, match="residual_px is 3, expected one of 1, 2, 4, 8"):
         match_regions(scene.regions, cameras, residual_px=3)
 
@@ -512,7 +512,7 @@ def test_a_few_rays_tell_the_reprojection_error(angle: float, monkeypatch: pytes
     everything = solve(scene.regions, cameras)
     monkeypatch.setattr("mvseg.matching.nview.match_nview.PROBE_RAYS", 5 * len(scene.regions))
     few = solve(scene.regions, cameras)
-    assert few.residual_px == everything.residual_px
+    assert few.report.residual_px == everything.report.residual_px
     assert torch.equal(few.instance_ids, everything.instance_ids)
 
 
@@ -520,8 +520,8 @@ def test_where_the_views_agree_on_nothing_the_pairs_answer() -> None:
     scene = ball_scene(6, 4, seed=7, radius=0.1)
     cameras = turned_a_little(scene.cameras, 0.3)
     matching = solve(scene.regions, cameras)
-    assert matching.method == "one-per-view"
-    assert matching.explained < 0.3
+    assert matching.report.method == "one-per-view"
+    assert matching.report.explained < 0.3
     graph = ViewGraph.of(region_affinity(scene.regions, cameras), scene.regions)
     pairwise = one_per_view_clusters(graph).drop_singletons()
     assert same_partition(matching.instance_ids, pairwise.instance_ids())
