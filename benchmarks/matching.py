@@ -58,8 +58,7 @@ ABLATIONS = {
     "no coverage": NViewConfig(gains=Gains(coverage=0)),
     "missed=absent": NViewConfig(costs=HypothesisCosts(absent=HypothesisCosts.missing)),
     "hidden is free": NViewConfig(costs=HypothesisCosts(hidden=0)),
-    "pieces alone": NViewConfig(thresholds=Thresholds(fragment_coverage=math.inf)),
-    "few views kept": NViewConfig(thresholds=Thresholds(few_coverage=math.inf)),
+    "pieces alone": NViewConfig(thresholds=Thresholds(covered=math.inf)),
 }
 METHODS |= {name: partial(nview_ids, config=config) for name, config in ABLATIONS.items()}
 

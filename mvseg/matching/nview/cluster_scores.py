@@ -61,7 +61,7 @@ class ClusterScores:
     Attributes:
         sweep: hypotheses of D regions, ordered by view.
         graph: their epipolar weights.
-        config: costs, gains and thresholds for this number of views.
+        config: costs, gains and thresholds.
     """
 
     sweep: PlaneSweep

@@ -8,7 +8,7 @@ changes no id of degraded masks of 8 leaves in 10 and 20 views and of 16 in 3 (`
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
@@ -47,21 +47,19 @@ class Gains:
 
 @dataclass(frozen=True)
 class Thresholds:
-    """When regions join a cluster that has a region in their view already, and when a mask covers two instances.
+    """When a mask shows a part of an instance, or two of them: segmenters split leaves, and merge them.
 
     Attributes:
-        fragment_coverage: least coverage of such a cluster on a left-over region that joins it.
-        fragment_score: least score of the left-over region, as a share of the score of the region already there.
-        few: clusters that at most this share of the views show are doubted.
-        few_coverage: least coverage of a cluster on a region that it takes over from a doubted one.
-        merged_coverage: least coverage of a cluster on a region that it may share with another cluster.
-        merged_share: least share of the pixels of such a region that only the second cluster explains.
+        covered: a cluster may show more of a view than one region if it covers at least this share of another one.
+        as_good: a cluster explains a region or pixel if that scores at least this share of what its own regions do.
+        few: a cluster is doubted if at most this share of the views show it.
+        merged_coverage: a cluster may share the region of another one if it covers at least this share of it.
+        merged_share: a mask shows two instances if each explains at least this share of its pixels: a definition.
     """
 
-    fragment_coverage: float = 0.05
-    fragment_score: float = 0.5
+    covered: float = 0.05
+    as_good: float = 0.5
     few: float = 0.25
-    few_coverage: float = 0.02
     merged_coverage: float = 0.25
     merged_share: float = 0.2
 
@@ -73,11 +71,3 @@ class NViewConfig:
     costs: HypothesisCosts = field(default_factory=HypothesisCosts)
     gains: Gains = field(default_factory=Gains)
     thresholds: Thresholds = field(default_factory=Thresholds)
-
-    def for_views(self, num_views: int) -> NViewConfig:
-        """The parameters for V views: stricter about fragments up to three, too few to tell a fragment from a
-        neighbour."""
-        if num_views > 3:
-            return self
-        coverage, score = max(self.thresholds.fragment_coverage, 0.1), max(self.thresholds.fragment_score, 0.8)
-        return replace(self, thresholds=replace(self.thresholds, fragment_coverage=coverage, fragment_score=score))

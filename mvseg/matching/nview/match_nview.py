@@ -151,7 +151,6 @@ def select_dilation(
     The error is the least dilation with which the hypotheses explain the pairwise clusters nearly as well as with any;
     a few rays of each region tell that of all but the first. A `residual_px` that is known is not estimated.
     """
-    config = config.for_views(len(cameras))
 
     def score(sweep: PlaneSweep) -> ClusterScores:
         return ClusterScores(sweep, graph, config)

@@ -13,17 +13,17 @@ from mvseg.matching.partition import Clusters
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]
-# They decide which masks are listed as merged, and where they are cut; a third more or less changes no id.
+# It decides where merged masks are cut; a third more or less changes no id.
 NEIGHBOURS = 3  # a pixel goes to the cluster that explains so many of its nearest sampled pixels better
-HALF_AS_GOOD = 0.5  # a cluster explains a pixel if that scores at least this share of the median score of its regions
 
 
 def find_merged(scores: ClusterScores, clusters: Clusters, regions: Regions) -> tuple[MergedMask, ...]:
     """Masks that cover two instances: two clusters explain disjoint parts of them.
 
     A cluster that has no region in a view, but covers one that belongs to another cluster, may share it. A pixel is
-    explained by a cluster when it scores at least half of the median score of the cluster's regions. Of several such
-    clusters, the one that explains most of the pixels that the region's own cluster does not is its second.
+    explained by a cluster when it scores nearly as well as the cluster's regions do in the median, see `Thresholds`. Of
+    several such clusters, the one that explains most of the pixels that the region's own cluster does not is its
+    second.
 
     Args:
         scores: of D regions, ordered by view.
@@ -66,7 +66,8 @@ def _shared_in_view(
     column[asked] = np.arange(len(asked))
     own = scores.own(clusters)
     median_score = np.array([np.median(own[clusters.members[number]]) for number in asked])
-    is_explained = scores.pixel_scores(view, column[clusters.ids]) >= HALF_AS_GOOD * median_score[:, None]
+    least = scores.config.thresholds.as_good * median_score[:, None]
+    is_explained = scores.pixel_scores(view, column[clusters.ids]) >= least
     pixel_region = scores.sweep.pixel_region[scores.sweep.bounds.pixels(view)]
     pairs = []
     for region in shared.tolist():

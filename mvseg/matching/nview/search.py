@@ -103,7 +103,7 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
     for view in np.unique(sweep.view_index[is_few[clusters.ids]]).tolist():
         here = sweep.bounds.regions(view)
         gains = scores.gains(view, clusters.ids, coverages)
-        fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.few_coverage) & (gains.score > 0)
+        fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.covered) & (gains.score > 0)
         moves = is_few[clusters.ids[here]] & fits.any(1) & ~is_linked[here]
         if moves.any():
             joined[here][moves] = gains.clusters[np.where(fits, gains.coverage, -1)[moves].argmax(1)]
@@ -135,8 +135,8 @@ def _join_fragments(chosen: Ints, gains: ViewGains, config: NViewConfig, *, is_f
     is_assigned = chosen < len(gains.clusters)
     holder_score = np.full(len(gains.clusters), np.inf)
     holder_score[chosen[is_assigned]] = gains.score[is_assigned, chosen[is_assigned]]
-    fits = (gains.coverage >= config.thresholds.fragment_coverage) & (gains.score > 0)
-    fits &= gains.score >= config.thresholds.fragment_score * holder_score
+    fits = (gains.coverage >= config.thresholds.covered) & (gains.score > 0)
+    fits &= gains.score >= config.thresholds.as_good * holder_score
     value = np.where(fits, gains.score + config.gains.coverage * gains.coverage, -np.inf)
     joins = ~is_assigned & is_free & fits.any(1)
     chosen = chosen.copy()
