@@ -6,7 +6,32 @@ import os
 import signal
 import sys
 import time
+import warnings
+from multiprocessing.connection import Connection
 from pathlib import Path
+from unittest.mock import MagicMock
+
+from mvseg.errors import InputError, InputWarning
+from mvseg.system import worker_pool
+
+start_worker = worker_pool._start_worker
+
+
+def start_lightly(parent: Connection) -> None:
+    """Stands in for the start of a worker: all of it, but for libraries that take a second to load."""
+    sys.modules.update(dict.fromkeys(("cv2", "torch", "pycolmap"), MagicMock()))
+    start_worker(parent)
+
+
+def square(number: int) -> tuple[int, int, str | None]:
+    """The square, the process, and how many threads its libraries were told to use; some numbers misbehave."""
+    if number == 13:
+        raise InputError("13 brings bad luck")
+    if number == 7:
+        warnings.warn("7 is odd", InputWarning, stacklevel=1)
+    if number < 0:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number**2, os.getpid(), os.environ.get("OMP_NUM_THREADS")
 
 
 class Unpicklable:

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from batch_work import Unpicklable, do_as_told
+from batch_work import Unpicklable, do_as_told, start_lightly
 from mvseg.batch.workers import Lost, run_locally
 from mvseg.errors import InputError
 
@@ -27,7 +27,14 @@ def run(items: list[str], num_workers: int) -> tuple[dict[int, Any], list[int]]:
     return dict(found), begun
 
 
+@pytest.fixture
+def light(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Workers that load no libraries."""
+    monkeypatch.setattr("mvseg.system.worker_pool._start_worker", start_lightly)
+
+
 def test_every_item_has_its_answer_and_workers_are_used_again() -> None:
+    """With workers as they are; those of the other tests load no libraries."""
     environment = dict(os.environ)
     answers, begun = run(["a", "b", "c", "threads", "d"], 2)
     assert [answers[key][0] for key in range(5)] == ["A", "B", "C", "1", "D"]
@@ -36,14 +43,14 @@ def test_every_item_has_its_answer_and_workers_are_used_again() -> None:
     assert dict(os.environ) == environment
 
 
-def test_a_process_that_dies_loses_its_own_item_only() -> None:
+def test_a_process_that_dies_loses_its_own_item_only(light: None) -> None:
     answers, _ = run(["kill", "a", "exit", "b", "raise", "c"], 2)
     assert [answers[key][0] for key in (1, 3, 5)] == ["A", "B", "C"]
     assert answers[0] == answers[2] == Lost("died, most likely because memory ran out")
     assert answers[4] == Lost("stopped with ValueError: it is broken")
 
 
-def test_the_last_item_may_kill_its_process() -> None:
+def test_the_last_item_may_kill_its_process(light: None) -> None:
     answers, _ = run(["a", "kill"], 1)
     assert (answers[0][0], type(answers[1])) == ("A", Lost)
 
@@ -52,13 +59,13 @@ def test_nothing_to_do() -> None:
     assert run([], 2) == ({}, [])
 
 
-def test_workers_that_cannot_start_are_an_error() -> None:
+def test_workers_that_cannot_start_are_an_error(light: None) -> None:
     work = partial(do_as_told, Unpicklable())  # type: ignore[arg-type]
     with pytest.raises(InputError, match=r"^no worker can be started: the process dies before"):
         list(run_locally(work, {0: "a", 1: "b"}, int, num_workers=2))
 
 
-def test_workers_end_when_the_caller_has_enough(tmp_path: Path) -> None:
+def test_workers_end_when_the_caller_has_enough(light: None, tmp_path: Path) -> None:
     items = {0: f"wait:{tmp_path}", 1: "a"}
     with closing(run_locally(do_as_told, items, int, num_workers=2)) as answers:
         assert next(answers)[1][0] == "A"  # type: ignore[index]

@@ -5,14 +5,15 @@ from __future__ import annotations
 import os
 import signal
 import time
-import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from multiprocessing import active_children
 
 import pytest
 import torch
 
+from batch_work import square, start_lightly
 from blade_scene import EllipticBlade, as_regions, blade_masks, ring_cameras
 from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -22,37 +23,29 @@ from mvseg.system.worker_pool import default_workers, map_in_order, run_all, sta
 pytestmark = pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="processes are killed")
 
 
-def work(number: int) -> tuple[int, int, str | None]:
-    """The square, the process, and how many threads its libraries were told to use; some numbers misbehave."""
-    if number == 13:
-        raise InputError("13 brings bad luck")
-    if number == 7:
-        warnings.warn("7 is odd", InputWarning, stacklevel=1)
-    if number < 0:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return number**2, os.getpid(), os.environ.get("OMP_NUM_THREADS")
-
-
 @pytest.fixture(scope="module")
 def workers() -> Iterator[ProcessPoolExecutor | None]:
-    with start_workers(2) as workers:
+    with ExitStack() as stack:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("mvseg.system.worker_pool._start_worker", start_lightly)
+            workers = stack.enter_context(start_workers(2))
         yield workers
 
 
 def test_answers_come_in_order_from_other_processes(workers: ProcessPoolExecutor) -> None:
-    answers = list(map_in_order(work, range(40, 80), workers))
+    answers = list(map_in_order(square, range(40, 80), workers))
     assert [square for square, _, _ in answers] == [number**2 for number in range(40, 80)]
     assert os.getpid() not in {process for _, process, _ in answers}
     assert {threads for _, _, threads in answers} == {"1"}
-    assert [square for square, _, _ in map_in_order(work, range(3), None)] == [0, 1, 4]
+    assert [square for square, _, _ in map_in_order(square, range(3), None)] == [0, 1, 4]
 
 
 def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor) -> None:
     with pytest.warns(InputWarning, match=r"^7 is odd$"):
-        assert next(map_in_order(work, [7], workers))[0] == 49
+        assert next(map_in_order(square, [7], workers))[0] == 49
     with pytest.raises(InputError, match=r"^13 brings bad luck$"):
-        list(map_in_order(work, [1, 13, 2], workers))
-    assert next(map_in_order(work, [3], workers))[0] == 9  # the workers are still there
+        list(map_in_order(square, [1, 13, 2], workers))
+    assert next(map_in_order(square, [3], workers))[0] == 9  # the workers are still there
 
 
 def test_surfaces_are_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -89,7 +82,7 @@ def test_an_interruption_ends_them_at_once() -> None:
 def test_a_killed_worker_is_said_and_none_is_left() -> None:
     before = set(active_children())
     with pytest.raises(InputError, match=r"^a worker process was killed, .* expected fewer workers$"):
-        list(run_all(work, [1, -1, 2], 2))
+        list(run_all(square, [1, -1, 2], 2))
     for process in set(active_children()) - before:
         process.join(20)
         assert not process.is_alive()
