@@ -5,10 +5,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from torchvision.models.detection import MaskRCNN, fasterrcnn_mobilenet_v3_large_320_fpn, maskrcnn_resnet50_fpn
+from torchvision.models.detection import MaskRCNN, fasterrcnn_mobilenet_v3_large_320_fpn
 from torchvision.models.detection.anchor_utils import AnchorGenerator
+from torchvision.models.detection.faster_rcnn import FastRCNNPredictor, TwoMLPHead
+from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredictor
 from torchvision.models.detection.roi_heads import paste_masks_in_image
-from torchvision.ops import box_iou
+from torchvision.ops import MultiScaleRoIAlign, box_iou
 
 import mvseg.detection.mask_rcnn
 from leafy_scene import write_leafy_scene
@@ -43,23 +45,20 @@ def tiny_detector() -> MaskRCNN:
     torch.manual_seed(0)
     detector = MaskRCNN(
         TinyBackbone(),
-        num_classes=3,
         min_size=96,
         max_size=128,
         rpn_anchor_generator=AnchorGenerator(((24, 48),), ((0.5, 1.0, 2.0),)),
         box_score_thresh=0.05,
         box_detections_per_img=12,
         rpn_post_nms_top_n_test=25,
-        box_roi_pool=_align(7),
-        mask_roi_pool=_align(14),
+        box_roi_pool=MultiScaleRoIAlign(["0"], 7, 2),
+        box_head=TwoMLPHead(8 * 7**2, 32),
+        box_predictor=FastRCNNPredictor(32, 3),
+        mask_roi_pool=MultiScaleRoIAlign(["0"], 14, 2),
+        mask_head=MaskRCNNHeads(8, (8,), 1),
+        mask_predictor=MaskRCNNPredictor(8, 8, 3),
     )
     return detector.eval()
-
-
-def _align(size: int) -> torch.nn.Module:
-    from torchvision.ops import MultiScaleRoIAlign
-
-    return MultiScaleRoIAlign(["0"], size, 2)
 
 
 def some_images(count: int = 3, width: int = 160, height: int = 120) -> list[torch.Tensor]:
@@ -81,8 +80,7 @@ def test_without_cameras_it_is_the_detector_it_wraps() -> None:
     for plain, ours in zip(expected, results, strict=True):
         assert plain.keys() == ours.keys()
         assert all(torch.equal(plain[key], ours[key]) for key in plain)
-    fresh = MultiViewMaskRCNN(maskrcnn_resnet50_fpn(weights=None, weights_backbone=None))
-    fresh.load_state_dict(maskrcnn_resnet50_fpn(weights=None, weights_backbone=None).state_dict())
+    MultiViewMaskRCNN(tiny_detector()).load_state_dict(detector.state_dict())
 
 
 def test_losses_in_train_mode_are_untouched_even_with_cameras() -> None:
