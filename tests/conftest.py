@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from pathlib import Path
 
@@ -18,6 +19,12 @@ from mvseg.scene import Scene
 ROOT = Path(__file__).parent.parent
 if "OMP_NUM_THREADS" not in os.environ:
     torch.set_num_threads(1)  # deterministic sums, and no spinning beside other tests
+gc.disable()  # until all modules are there: a search among what they keep takes a third of a second, and finds nothing
+
+
+def pytest_collection_finish() -> None:
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

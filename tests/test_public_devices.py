@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ import torch
 import mvseg
 from mvseg import (
     Cameras,
+    LeafSurface,
     Masks,
     Matching,
     MatchReport,
@@ -68,7 +70,9 @@ def scene_there(cameras: Cameras) -> Scene:
 
 
 
-SURFACES = fit_surfaces(SCENE.regions, IDS, SCENE.cameras)
+@cache
+def surfaces() -> dict[int, LeafSurface]:
+    return fit_surfaces(SCENE.regions, IDS, SCENE.cameras)
 
 
 def masks_of(regions: Regions, ids: torch.Tensor) -> Masks:
@@ -94,20 +98,20 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
     "cluster_affinity": (lambda r, c, i: cluster_affinity(region_affinity(r, c), r.num_per_view).instance_ids, True),
     "split_merged": (lambda r, c, i: split_merged(match_regions(r, c).masks).instance_ids, True),
     "Masks": (lambda r, c, i: Masks.concatenate([masks_of(r, i)] * 2).close_gaps().count_sure_views(), True),
-    "LeafSurface": (lambda r, c, i: SURFACES[1].project(c)[0], True),
+    "LeafSurface": (lambda r, c, i: surfaces()[1].project(c)[0], True),
     "fit_surfaces": (lambda r, c, i: fit_surfaces(r, i, c)[1].coefficients, False),
-    "check_ids": (lambda r, c, i: check_ids(masks_of(r, i), SURFACES, cameras=c).instance_ids, True),
+    "check_ids": (lambda r, c, i: check_ids(masks_of(r, i), surfaces(), cameras=c).instance_ids, True),
     "choose_leaves": (
         lambda r, c, i: choose_leaves(found := detected(r, i), found, cameras=c).masks.instance_ids, False
     ),
     "snap_masks": (lambda r, c, i: snap_masks(detected(r, i), grey_photos(c)).instance_ids, False),
-    "list_doubts": (lambda r, c, i: len(list_doubts(masks_of(r, i), SURFACES, cameras=c)), False),
+    "list_doubts": (lambda r, c, i: len(list_doubts(masks_of(r, i), surfaces(), cameras=c)), False),
     "matching_metrics": (lambda r, c, i: matching_metrics(i, i).ari, False),
     "shape_distance": (lambda r, c, i: shape_distance(c.t, c.t), False),
     "check_scene": (lambda r, c, i: len(check_scene(scene_there(c), r, features=False).findings), False),
     "measure_plant": (
         lambda r, c, i: measure_plant(
-            scene_there(c), Matching(masks_of(r, i), MatchReport("none")), surfaces=SURFACES, voxels={},
+            scene_there(c), Matching(masks_of(r, i), MatchReport("none")), surfaces=surfaces(), voxels={},
             photos=Photos(scene_there(c)),
         ).whole["total_leaf_area"].value,
         False,
@@ -117,6 +121,7 @@ STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the d
 
 @pytest.fixture
 def device() -> Iterator[torch.device]:
+    surfaces()  # fitted here
     with other_device() as device:
         yield device
 

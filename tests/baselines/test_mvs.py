@@ -4,11 +4,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from sklearn.metrics import adjusted_rand_score
 
 from benchmarks.baselines.dense_points import DensePoints
 from benchmarks.baselines.mvs import match_mvs, projection_graph, region_points
 from mvseg.errors import InputError
+from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.config import MatchConfig
 from mvseg.regions import regions_from_label_maps
 from mvseg.scene import Cameras, Scene, View
@@ -39,7 +39,7 @@ def points(balls: BallScene) -> torch.Tensor:
 
 def test_good_points_give_the_balls(balls: BallScene, points: torch.Tensor) -> None:
     found = match_mvs(balls.regions, scene_of(balls.cameras), DensePoints(points, "file"))
-    assert adjusted_rand_score(balls.regions.labels, found.instance_ids) == 1
+    assert matching_metrics(found.instance_ids, balls.regions.labels).ari == 1
     assert (found.num_instances, found.report.method) == (4, "mvs (file)")
     config = MatchConfig(num_instances=3)
     fewer = match_mvs(balls.regions, scene_of(balls.cameras), DensePoints(points, "sgbm"), config=config)

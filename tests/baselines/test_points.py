@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from sklearn.metrics import adjusted_rand_score
 
 from benchmarks.baselines.points import centroid_rays, match_points, nearest_ray_graph, pairwise_ray_distance
 from mvseg.errors import InputError
+from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.regions import regions_from_label_maps
@@ -32,7 +32,7 @@ def edge_set(graph: Affinity) -> set[tuple[int, int]]:
 
 def test_finds_the_balls_of_an_easy_scene(balls: BallScene) -> None:
     found = match_points(balls.regions, scene_of(balls.cameras))
-    assert adjusted_rand_score(balls.regions.labels, found.instance_ids) == 1
+    assert matching_metrics(found.instance_ids, balls.regions.labels).ari == 1
     assert (found.num_instances, found.report.method) == (4, "points")
     assert found.match_scores.dtype == torch.float32
     assert found.match_scores.min() > 0.8
@@ -105,10 +105,10 @@ def test_order_of_regions_and_views_changes_nothing(balls: BallScene) -> None:
     there = {(min(a, b), max(a, b)) for a, b in order[nearest_ray_graph(shuffled, balls.cameras).edges].tolist()}
     assert there == edge_set(nearest_ray_graph(balls.regions, balls.cameras))
     ids = match_points(shuffled, scene_of(balls.cameras)).instance_ids
-    assert adjusted_rand_score(balls.regions.labels[order], ids) == 1
+    assert matching_metrics(ids, balls.regions.labels[order]).ari == 1
     turned = permute_views(balls, [9, 3, 1, 0, 2, 8, 7, 6, 5, 4])
     ids = match_points(turned.regions, scene_of(turned.cameras)).instance_ids
-    assert adjusted_rand_score(turned.regions.labels, ids) == 1
+    assert matching_metrics(ids, turned.regions.labels).ari == 1
 
 
 def test_views_at_one_place_share_no_edge(balls: BallScene) -> None:

@@ -3,8 +3,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from sklearn.metrics import adjusted_rand_score
-from sklearn.metrics.cluster import contingency_matrix
 
 from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import contingency_table, matching_metrics
@@ -35,6 +33,9 @@ def test_pairs_agree_with_a_loop() -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_ari_and_contingencies_are_scikit_learns(seed: int) -> None:
+    from sklearn.metrics import adjusted_rand_score  # here, as it takes a second to load
+    from sklearn.metrics.cluster import contingency_matrix
+
     generator = np.random.default_rng(seed)
     estimated, true = generator.integers(0, 1 + seed, 30), generator.integers(3, 7, 30)
     metrics = matching_metrics(torch.from_numpy(estimated), torch.from_numpy(true))

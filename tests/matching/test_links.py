@@ -9,10 +9,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from sklearn.metrics import adjusted_rand_score
 
 from benchmarks.label_maps import render_maps
 from mvseg.errors import InputError, InputWarning
+from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links
@@ -22,7 +22,7 @@ from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.plane_sweep import sweep_planes
 from mvseg.matching.nview.search import search
 from mvseg.matching.one_per_view import link_average, one_per_view_clusters
-from mvseg.matching.partition import Clusters, separate_unmatched
+from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.simulation.dataset import SceneSpec
 from synthetic import ball_scene
@@ -233,7 +233,7 @@ def test_impossible_links_are_refused(links: Links, message: str) -> None:
 
 def scored(truth: torch.Tensor, ids: torch.Tensor) -> float:
     """ARI; each mask that is matched to nothing is by itself."""
-    return float(adjusted_rand_score(truth.numpy(), separate_unmatched(ids.numpy())))
+    return matching_metrics(ids, truth).ari
 
 
 def test_a_link_sets_other_masks_right_too() -> None:

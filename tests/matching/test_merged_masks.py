@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import torch
-from sklearn.metrics import adjusted_rand_score
 
+from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.nview.config import NViewConfig
@@ -22,7 +22,7 @@ def test_a_mask_that_covers_two_instances_is_found_and_no_other() -> None:
     regions, numbers, region = merged_balls(scene)
     rest = torch.arange(len(regions)) != region
     matching = match_nview(regions, scene.cameras, ViewGraph.of(region_affinity(regions, scene.cameras), regions))
-    assert adjusted_rand_score(matching.instance_ids[rest], regions.labels[rest]) == 1
+    assert matching_metrics(regions.labels[rest], matching.instance_ids[rest]).ari == 1
     assert matching.num_instances == 6
     instances = [int(matching.instance_ids[rest][regions.labels[rest] == number][0]) for number in numbers]
     (merged,) = matching.merged
