@@ -43,7 +43,7 @@ from mvseg.verification.snap_edges import snap_masks
 from other_device import other_device
 from synthetic import ball_scene
 
-SCENE = ball_scene(4, 5, seed=1)
+SCENE = ball_scene(2, 4, seed=1)
 IDS = SCENE.regions.labels
 CPU = torch.device("cpu")
 # Names whose answers are tried on another device in other files, and names that take and give no tensors.
@@ -93,7 +93,7 @@ def grey_photos(cameras: Cameras) -> Callable[[int], np.ndarray]:
 
 Step = Callable[[Regions, Cameras, torch.Tensor], Any]
 STEPS: dict[str, tuple[Step, bool]] = {  # and whether the answer stays on the device
-    "match_regions": (lambda r, c, i: match_regions(r, c, links=Links.of([(0, 5)], [(0, 1)])).instance_ids, True),
+    "match_regions": (lambda r, c, i: match_regions(r, c, links=Links.of([(0, 3)], [(0, 1)])).instance_ids, True),
     "match_masks": (lambda r, c, i: match_masks(masks_of(r, i), c, links=Links.of()).match_scores, True),
     "cluster_affinity": (lambda r, c, i: cluster_affinity(region_affinity(r, c), r.num_per_view).instance_ids, True),
     "split_merged": (lambda r, c, i: split_merged(match_regions(r, c).masks).instance_ids, True),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -28,9 +28,19 @@ from two_worlds import every_second_farther, half_turned
 NAMES = tuple(f"{view:03d}" for view in range(9))
 
 
+Look = Callable[[Cameras], list[PhotoMatches]]
+
+
+@pytest.fixture(scope="module")
+def look(demo_scene: Scene) -> Look:
+    """What the photos of the shipped plant share where these cameras say what is near; each pair is matched once."""
+    features = {view: find_features(read_photo(demo_scene, view)) for view in range(9)}
+    match = cache(lambda i, j, unit_px: _match((i, j), features[i], features[j], unit_px=unit_px))
+    return lambda cameras: [match(*pair, cameras.unit_px) for pair in neighbours(cameras)]
+
+
 @pytest.fixture(scope="module")
 def shared(demo_scene: Scene) -> list[PhotoMatches]:
-    """What the photos of the shipped plant share."""
     return match_photos(partial(read_photo, demo_scene), demo_scene.cameras)
 
 
@@ -44,7 +54,8 @@ def one_turned(cameras: Cameras) -> Cameras:
     return replace(cameras, R=R)
 
 
-def test_right_cameras_have_no_finding(shared: list[PhotoMatches], demo_scene: Scene) -> None:
+def test_right_cameras_have_no_finding(shared: list[PhotoMatches], look: Look, demo_scene: Scene) -> None:
+    assert [pair.views for pair in look(demo_scene.cameras)] == [pair.views for pair in shared]
     assert sum(pair.is_significant for pair in shared) >= 8
     assert focal_factor(shared, demo_scene.cameras) == 1
     assert say(shared, demo_scene.cameras) == []
@@ -63,23 +74,23 @@ def test_a_wrong_focal_length_is_measured(factor: float, shared: list[PhotoMatch
 @pytest.mark.parametrize(
     ("fault", "views", "named"),
     [
-        (partial(every_second_farther, factor=1.2), (1, 3, 5, 7), "5 views (000, 002, 004, 006, 008)"),
         (partial(every_second_farther, factor=1.1), (1, 3, 5, 7), "5 views (000, 002, 004, 006, 008)"),
         (partial(half_turned, degrees=10), (0, 1, 2, 3), "5 views (004, 005, 006, 007, 008)"),
         (partial(half_turned, degrees=-10), (0, 1, 2, 3), "5 views (004, 005, 006, 007, 008)"),
         (one_turned, (2,), "view 2 (002)"),
         (lambda cameras: cameras[[8, *range(8)]], (), "features of the photos contradict the cameras"),
     ],
-    ids=["t x 1.2", "t x 1.1", "half turned", "turned the other way", "one turned", "cameras of the previous photo"],
+    ids=["t x 1.1", "half turned", "turned the other way", "one turned", "cameras of the previous photo"],
 )
 def test_wrong_poses_are_named(
     fault: Callable[[Cameras], Cameras],
     views: tuple[int, ...],
     named: str,
+    look: Look,
     demo_scene: Scene,
 ) -> None:
     cameras = fault(demo_scene.cameras)
-    shared = match_photos(partial(read_photo, demo_scene), cameras)  # wrong about what is near, too
+    shared = look(cameras)  # wrong about what is near, too
     ((what, found),) = say(shared, cameras)
     assert named in what
     assert found == views
@@ -95,7 +106,7 @@ def test_what_stands_still_tells_nothing(shared: list[PhotoMatches], demo_scene:
     still = [replace(pair, num_still=2 * pair.xy.shape[1]) for pair in shared]
     assert say(still, scale_focal(demo_scene.cameras, 0.5)) == []
     photo = read_photo(demo_scene, 3)
-    same = match_photos(lambda _: photo, demo_scene.cameras)
+    same = match_photos(lambda _: photo, demo_scene.cameras[:3])
     assert all(pair.xy.shape[1] == 0 for pair in same)
     assert all(pair.num_still > 50 for pair in same)
 
@@ -114,8 +125,8 @@ def test_photos_that_cannot_be_read_are_left_out(demo_scene: Scene) -> None:
             raise InputError("broken")
         return read_photo(demo_scene, view)
 
-    shared = match_photos(read, demo_scene.cameras)
-    assert {view for pair in shared for view in pair.views} == {0, 1, 2, 4, 5, 6, 7, 8}
+    shared = match_photos(read, demo_scene.cameras[:5])
+    assert {view for pair in shared for view in pair.views} == {0, 1, 2, 4}
 
 
 def test_features_that_fit_nothing_are_no_evidence() -> None:
