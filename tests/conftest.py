@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import gc
 import os
+from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
 import torch
 
 from mvseg import demo
+from mvseg.cli import command
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
@@ -25,6 +28,14 @@ gc.disable()  # until all modules are there: a search among what they keep takes
 def pytest_collection_finish() -> None:
     gc.freeze()
     gc.enable()
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_parser() -> Iterator[None]:
+    """The parser of the command line is built once: that takes longer than most commands of the tests."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(command, "build_parser", cache(command.build_parser))
+        yield
 
 
 @pytest.fixture(scope="session")

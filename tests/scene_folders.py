@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -50,12 +51,17 @@ def rig_content(num_views: int = 4) -> dict[str, Any]:
     return {"format": "mvseg-rig/1", "unit": "mm", "views": views}
 
 
+@cache
+def drawn_labels(view: int, num_views: int) -> np.ndarray:
+    return draw_labels(*arc_pose(view, num_views))
+
+
 def write_scene(folder: Path, num_views: int = 4, *, images: bool = True) -> Path:
     """A whole scene: cameras.json, images/, masks/ (numbers mean nothing across views) and truth/."""
     folder.mkdir(parents=True)
     (folder / "cameras.json").write_text(json.dumps(rig_content(num_views)))
     for view in range(num_views):
-        truth = draw_labels(*arc_pose(view, num_views))
+        truth = drawn_labels(view, num_views)
         numbers = np.array([0, *(np.roll((1, 2, 3), view) + 10 * view)], np.uint16)
         write_image(folder / "masks" / f"{view:03d}.png", numbers[truth])
         write_image(folder / "truth" / f"{view:03d}.png", truth)

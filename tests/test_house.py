@@ -24,7 +24,7 @@ import mvseg
 import mvseg.matching
 from benchmarks.demo_plant import write_demo_plant, write_demo_plant_later
 from mvseg._version import code_hash, made_by
-from mvseg.cli.command import build_parser
+from mvseg.cli import command
 from mvseg.training.config import TrainConfig
 
 ROOT = Path(__file__).parent.parent
@@ -335,7 +335,7 @@ def test_shipped_masks_are_what_the_script_makes(name: str, write: Callable[[Pat
 def test_published_configs_are_understood(config: Path) -> None:
     """Unknown keys, wrong types and values out of range are errors."""
     verb = "train" if config.parent.name == "train" else "infer"
-    args = build_parser().parse_args([verb, "--config", str(config)])[verb]
+    args = command.build_parser().parse_args([verb, "--config", str(config)])[verb]
     if verb == "train":
         TrainConfig(**{field.name: args[field.name] for field in fields(TrainConfig)})
         return

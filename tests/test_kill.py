@@ -109,15 +109,14 @@ def earlier(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out" / "plant"
 
 
-@pytest.mark.parametrize("verb", ["match", "infer", "detect"])
+@pytest.mark.parametrize("verb", ["infer", "detect"])
 def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: Path) -> None:
     """"detect" is `mvseg infer` without masks, whose detections are kept until it is done."""
-    plant, out = write_scene(tmp_path / "plant", 3), tmp_path / "out"
+    plant, out = write_scene(tmp_path / "plant", 3 if verb == "infer" else 2), tmp_path / "out"
     place = out / "plant"
     coarse = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--out", str(place), "--quiet"]
     coarse += ["--overwrite", "true"]  # the earlier result is of another folder
     run = {
-        "match": ["match", str(plant), "--out", str(out), "--quiet", "--overwrite", "true"],
         "infer": ["infer", str(plant), "--masks", "masks", *coarse],
         "detect": ["infer", str(plant), *coarse],
     }[verb]

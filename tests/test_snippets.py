@@ -22,8 +22,7 @@ import pytest
 
 import mvseg
 from mvseg import demo_scene, load_scene
-from mvseg.cli import main
-from mvseg.cli.command import build_parser
+from mvseg.cli import command, main
 from mvseg.cli.options import join_up
 from mvseg.corrections.file import FORMAT, parse_corrections
 from mvseg.formats.label_png import read_labels, write_label_png
@@ -142,7 +141,7 @@ def test_commands_are_understood(block: Block) -> None:
     targets = re.findall(r"^(\w+)[\w ]*:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
     for program, *words in block.commands:
         if program == "mvseg":
-            build_parser().parse_args(join_up(words))
+            command.build_parser().parse_args(join_up(words))
         else:
             assert program in ("make", "python"), block
             assert program == "python" or words[0] in targets, block
