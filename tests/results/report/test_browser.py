@@ -211,11 +211,8 @@ def test_ids_alone_have_a_page_without_leaves_in_3d(browser: sync_api.Browser, f
     opened.close()
 
 
-@pytest.mark.parametrize("size", [(390, 800), (800, 1000), (1280, 800)])
-def test_nothing_is_wider_than_the_screen(
-    size: tuple[int, int], browser: sync_api.Browser, files: dict[str, Path]
-) -> None:
-    opened = Viewer(browser, files["hostile"], size)
+def test_nothing_is_wider_than_the_screen(opened: Viewer) -> None:
     opened.page.evaluate("selection.select(1)")
-    assert opened.page.evaluate("document.documentElement.scrollWidth") <= size[0]
-    opened.close()
+    for width in (390, 800, 1280):
+        opened.page.set_viewport_size({"width": width, "height": 800})
+        assert opened.page.evaluate("document.documentElement.scrollWidth") <= width
