@@ -16,13 +16,15 @@ from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, write_structure
 from mvseg.scene import Cameras, Scene
 from room_scene import room_cameras, write_room
+from watched_stages import watch_stages
 
 
 @dataclass(frozen=True)
 class MappedRoom:
-    """Photos of the room, their true cameras (mm, z up), and what structure from motion made of them."""
+    """Photos of the room, their true cameras (mm, z up), and what structure from motion made of them by these steps."""
 
     folder: Path
+    steps: tuple[str, ...]
     truth: Cameras
     files: list[PhotoFile]
     structure: Structure
@@ -36,6 +38,8 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> MappedRoom:
     truth = room_cameras()
     source, names = list_photos(write_room(folder / "my photos", truth))
     files = copy_photos(source, names, folder / IMAGES)
-    structure = find_structure(folder / IMAGES, files, config=PoseConfig(), work=folder)
+    with pytest.MonkeyPatch.context() as patch:
+        steps = watch_stages(patch)
+        structure = find_structure(folder / IMAGES, files, config=PoseConfig(), work=folder)
     scene = write_structure(structure, folder)
-    return MappedRoom(folder, truth, files, structure, scene, find_scene_markers(Photos(scene)))
+    return MappedRoom(folder, tuple(steps), truth, files, structure, scene, find_scene_markers(Photos(scene)))

@@ -25,9 +25,9 @@ def test_features_move_with_the_picture() -> None:
 
 def test_pixels_are_of_the_photo_whatever_the_size() -> None:
     """A photo that is scaled down gives the same features, but for the finest: no shift and no scale."""
-    large = cv2.resize(grey(), None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
-    one = find_sift(large, image_size=2000, most=4000)
-    small = find_sift(large, image_size=500, most=4000)
+    large = cv2.resize(grey()[:260, :320], None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    one = find_sift(large, image_size=640, most=4000)
+    small = find_sift(large, image_size=320, most=4000)
     gaps = one.px[None] - small.px[:, None]
     nearest = np.take_along_axis(gaps, np.linalg.norm(gaps, axis=2).argmin(1)[:, None, None], axis=1)[:, 0]
     is_same = np.linalg.norm(nearest, axis=1) < 1
