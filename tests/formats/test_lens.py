@@ -211,14 +211,14 @@ def test_a_fisheye_is_none_of_opencvs() -> None:
     assert opencv_distortion(lens) is None
 
 
-def test_positions_are_computed_part_by_part(monkeypatch: pytest.MonkeyPatch, coefficients: list[float]) -> None:
+def test_positions_are_computed_part_by_part(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whole rows at a time; the last part may have fewer."""
-    K_large = K * [[8], [8], [1]]
-    lens = opencv_lens(K_large, coefficients, width=8 * WIDTH, height=8 * HEIGHT)
-    labels = np.arange(64 * WIDTH * HEIGHT).reshape(8 * HEIGHT, -1) % 60_000
+    K_large = K * [[4], [4], [1]]
+    lens = opencv_lens(K_large, COEFFICIENTS["rational"], width=4 * WIDTH, height=4 * HEIGHT)
+    labels = np.arange(16 * WIDTH * HEIGHT).reshape(4 * HEIGHT, -1) % 60_000
     _positions.cache_clear()
     whole = undistort(labels.astype(np.uint16), lens, K_large)
-    for chunk in (1, 7 * 8 * WIDTH + 5):
+    for chunk in (1, 7 * 4 * WIDTH + 5):
         monkeypatch.setattr("mvseg.formats.lens.CHUNK", chunk)
         _positions.cache_clear()
         tracemalloc.start()

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 import pytest
 
 from mvseg.errors import InputError
+from mvseg.formats.markers import find_board
+from mvseg.poses import board_calibration
 from mvseg.poses.board_calibration import calibrate_turntable
 from room_scene import BOARD
 from turntable_board import ANGLES, HEIGHT, SIDE_R, SIDE_T, WIDTH, K, R, T, draw_board
@@ -16,6 +20,19 @@ NOTHING = np.full((HEIGHT, WIDTH), 90, np.uint8)  # a photo without the board
 @pytest.fixture(scope="module")
 def top() -> list[np.ndarray]:
     return [draw_board(angle) for angle in ANGLES]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def once(top: list[np.ndarray]) -> Iterator[None]:
+    """The board is looked for once in each of these photos."""
+    seen = {id(photo): find_board(photo, BOARD) for photo in (*top, NOTHING)}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(
+            board_calibration,
+            "find_board",
+            lambda photo, board: seen[id(photo)] if id(photo) in seen else find_board(photo, board),
+        )
+        yield
 
 
 def test_camera_axis_and_angles_come_back(top: list[np.ndarray]) -> None:

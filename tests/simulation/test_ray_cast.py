@@ -162,9 +162,9 @@ def test_views_share_the_light_but_not_the_noise() -> None:
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_photos_are_exposed_and_leaves_are_green(family: str) -> None:
-    for seed in range(3):
-        shot = shoot(grow_plant(family, 10, seed), seed=seed, size=80)
-        assert shot.rgb.shape == (80, 80, 3)
+    for seed in range(2):
+        shot = shoot(grow_plant(family, 6, seed), seed=seed, size=64)
+        assert shot.rgb.shape == (64, 64, 3)
         assert shot.rgb.dtype == np.uint8
         assert shot.ids.dtype == np.uint16
         assert shot.depth.dtype == np.float32
