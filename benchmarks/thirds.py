@@ -8,10 +8,10 @@ much their pair F1, and how far match scores move. Of verification: how many mas
 pixels, and by how much pair F1 and MV-PQ change, where surfaces check the ids of degraded masks and of straps in pieces
 and masks are cut; where the views choose what the shipped detector found, also in the folders of `--scenes`; and where
 up to `MOST_DRAWN` of these leaves were missed, and a person drew them in two photos, or in three (half of their other
-masks are still there, matched to nothing). Of reconstruction, with degraded masks: of all leaves together, how far area
-and its standard deviation move (median and largest change in percent), of how many it changes whether they are
-credible, doubted or oriented, and how far the volume of voxels moves; ids are true but for one scene, where they are
-those of "nview".
+masks are still there, matched to nothing). Of reconstruction, with the masks of `--masks`: of all leaves together, how
+far area and its standard deviation move (median and largest change in percent), of how many it changes whether they
+are credible, doubted or oriented, and how far the volume of voxels moves; ids are true but for one scene, where they
+are those of "nview".
 """
 
 from __future__ import annotations
@@ -19,11 +19,12 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
+import inspect
 import pkgutil
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
@@ -42,7 +43,7 @@ import mvseg.reconstruction.shapes
 import mvseg.verification
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
-from benchmarks.label_maps import LabelledScene, load_maps, visible_ids
+from benchmarks.label_maps import KINDS, LabelledScene, load_maps, visible_ids
 from benchmarks.simulated_person import Look
 from benchmarks.straps import FIRST_SEED, cut_pieces, strap_cameras
 from mvseg.config import RunConfig
@@ -89,7 +90,7 @@ def list_numbers(package: ModuleType) -> Iterator[tuple[ModuleType, str]]:
     """The numbers at the head of the modules of a package."""
     for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
         module = importlib.import_module(found.name)
-        for statement in ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8")).body:
+        for statement in parse(module).body:
             for target in statement.targets if isinstance(statement, ast.Assign) else ():
                 for name in target.elts if isinstance(target, ast.Tuple) else [target]:
                     if isinstance(name, ast.Name) and is_number(getattr(module, name.id)):
@@ -103,24 +104,77 @@ def is_number(value: Any) -> bool:
 
 @contextmanager
 def changed(module: ModuleType, name: str, value: Any) -> Iterator[None]:
-    """A number with another value, wherever it was imported, or is a default."""
+    """A number with another value: wherever it was imported, in defaults, and in the numbers that are computed from it.
+
+    What functions remember is forgotten.
+    """
     before = getattr(module, name)
     holders = [each for key, each in sys.modules.items() if key.startswith("mvseg.") and vars(each).get(name) is before]
-    functions = [each for each in vars(module).values() if isinstance(each, FunctionType)]
-    defaults = [(each, each.__defaults__, each.__kwdefaults__) for each in functions]
-    try:
-        for holder in holders:
-            setattr(holder, name, value)
-        for function, positional, named in defaults:
-            if name.lower() in function.__code__.co_varnames:
-                function.__defaults__ = positional and tuple(value if each is before else each for each in positional)
-                function.__kwdefaults__ = named and {k: value if v is before else v for k, v in named.items()}
-        yield
-    finally:
-        for holder in holders:
-            setattr(holder, name, before)
-        for function, positional, named in defaults:
-            function.__defaults__, function.__kwdefaults__ = positional, named
+    functions = [each for holder in holders for each in list_defaults(holder, name)]
+    kept = [(function, function.__defaults__, function.__kwdefaults__) for function, _ in functions]
+    with ExitStack() as derived:
+        try:
+            for holder in holders:
+                setattr(holder, name, value)
+            for function, node in functions:
+                set_defaults(function, node.args)
+            for other, again in list_derived(module, name):
+                derived.enter_context(changed(module, other, again))
+            forget(holders)
+            yield
+        finally:
+            for holder in holders:
+                setattr(holder, name, before)
+            for function, positional, named in kept:
+                function.__defaults__, function.__kwdefaults__ = positional, named
+            forget(holders)
+
+
+def list_defaults(module: ModuleType, name: str) -> Iterator[tuple[FunctionType, ast.FunctionDef]]:
+    """Functions and methods of a module whose defaults name a number."""
+    body = parse(module).body
+    classes = [each for each in body if isinstance(each, ast.ClassDef)]
+    for owner, statements in [(module, body), *((vars(module)[each.name], each.body) for each in classes)]:
+        for node in statements:
+            if isinstance(node, ast.FunctionDef):
+                function = inspect.unwrap(getattr(vars(owner)[node.name], "__func__", vars(owner)[node.name]))
+                defaults = [each for each in (*node.args.defaults, *node.args.kw_defaults) if each is not None]
+                if isinstance(function, FunctionType) and any(names(each, name) for each in defaults):
+                    yield function, node
+
+
+def set_defaults(function: FunctionType, args: ast.arguments) -> None:
+    function.__defaults__ = tuple(evaluate(each, function.__globals__) for each in args.defaults)
+    pairs = zip(args.kwonlyargs, args.kw_defaults, strict=True)
+    function.__kwdefaults__ = {k.arg: evaluate(v, function.__globals__) for k, v in pairs if v is not None}
+
+
+def list_derived(module: ModuleType, name: str) -> Iterator[tuple[str, Any]]:
+    """What else the head of a module computes from a number, and its value now."""
+    for statement in parse(module).body:
+        if isinstance(statement, ast.Assign) and names(statement.value, name):
+            (target,), value = statement.targets, evaluate(statement.value, vars(module))
+            several = isinstance(target, ast.Tuple)
+            for each, part in zip(target.elts, value, strict=True) if several else [(target, value)]:
+                yield each.id, part
+
+
+def forget(modules: list[ModuleType]) -> None:
+    for each in [each for module in modules for each in vars(module).values()]:
+        if hasattr(each, "cache_clear"):
+            each.cache_clear()
+
+
+def parse(module: ModuleType) -> ast.Module:
+    return ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
+
+
+def names(expression: ast.expr, name: str) -> bool:
+    return any(isinstance(each, ast.Name) and each.id == name for each in ast.walk(expression))
+
+
+def evaluate(expression: ast.expr, where: dict[str, Any]) -> Any:
+    return eval(compile(ast.Expression(expression), "default", "eval"), where)
 
 
 def match_all(scenes: list[LabelledScene], config: NViewConfig = NViewConfig()) -> list[tuple[np.ndarray, ...]]:
@@ -323,22 +377,22 @@ def thirds_of_reconstruction(args: argparse.Namespace) -> None:
     for num_views, num_leaves, family in (*SHAPES, MATCHED):
         fits = (each for each in specs if (each.num_views, each.num_leaves) == (num_views, num_leaves))
         scenes.append(load_maps(next(each for each in fits if family in (None, each.family)), args.cache))
-    before = fit_all(scenes)
-    try_numbers(mvseg.reconstruction, args.numbers, lambda: compare_leaves(before, fit_all(scenes)))
+    before = fit_all(scenes, args.masks)
+    try_numbers(mvseg.reconstruction, args.numbers, lambda: compare_leaves(before, fit_all(scenes, args.masks)))
 
 
-def fit_all(scenes: list[LabelledScene]) -> np.ndarray:
+def fit_all(scenes: list[LabelledScene], kind: str) -> np.ndarray:
     """(N, 6) of all leaves that have two masks: area, its standard deviation, credible, reasons, oriented, volume."""
     rows = []
     for index, scene in enumerate(scenes):
-        regions, ids = scene.masks("degraded")
+        regions, ids = scene.masks(kind)
         ids = torch.where(ids > 0, ids, -1)
         if index == len(SHAPES):
             graph = ViewGraph.of(region_affinity(regions, scene.cameras), regions)
             ids = match_nview(regions, scene.cameras, graph).instance_ids
         voxels = reconstruct_instances(regions, ids, scene.cameras)
         for instance, leaf in fit_surfaces(regions, ids, scene.cameras).items():
-            volume = voxels[instance].volume if instance in voxels else np.nan
+            volume = voxels[instance].without_crumbs().volume if instance in voxels else np.nan
             rows.append((*describe_leaf(leaf), volume))
     return np.array(rows)
 
@@ -364,6 +418,7 @@ def main() -> None:
     parser.add_argument("--cache", type=Path, required=True, help="folder for rendered scenes and detections")
     parser.add_argument("--room", choices=ROOMS, default="matching")
     parser.add_argument("--numbers", nargs="+", help="only these")
+    parser.add_argument("--masks", choices=KINDS, default="degraded", help="that leaves are reconstructed from")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], help="more to verify, with photos and truth/")
     args = parser.parse_args()
     torch.set_num_threads(1)
