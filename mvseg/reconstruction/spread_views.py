@@ -14,7 +14,7 @@ from torch import Tensor
 from mvseg.scene import Cameras
 
 SAME = np.radians(1.0)  # directions that differ by less than this crowd each other no more (a technical limit)
-# Axes meet in no point if the root mean square of their angles to the mean axis is less than this.
+# Axes meet in no point, as on a gantry, if the root mean square of their angles to the mean axis is less than this.
 PARALLEL = np.radians(2.0)
 TIE = 1e-6  # sums that differ by less than this share are equal, and the first one is taken (a technical limit)
 

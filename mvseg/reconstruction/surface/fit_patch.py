@@ -12,28 +12,31 @@ from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
-# Rows and columns at which a patch is drawn, the second where it is still far from the masks.
+# A patch is drawn at so many rows and columns; at the second where it is still far from the masks.
 FIT_GRID, FAR_GRID = (36, 9), (20, 5)
 # Steps from a rough start, in two halves, and from a start that is nearly right (technical limits).
 FIRST_HALF, SECOND_HALF, NUM_STEPS = range(5), range(5, 10), 7
-FAR_REACH, NEAR_REACH = 14.0, 6.0  # pixels within which a sample looks for an edge, at first and in the end
-# Damping of a step, and half-widths that no point moves farther than; at first and in the end.
+FAR_REACH, NEAR_REACH = 14.0, 6.0  # a sample looks for an edge within so many pixels, at first and in the end
+# A step is damped by the first, and moves no point by more than the second, in half-widths; at first and in the end.
 FAR_STEP, NEAR_STEP = (0.05, 0.25), (0.005, 0.12)
-SAMPLE_WEIGHT = 0.35  # weight of one sample, since neighbouring samples are alike
-FAR_SCALE_PX, LEAST_SCALE_PX = 4.0, 0.7  # scale of the Cauchy weights of distances, at first, and the least in the end
-SCALE_FACTOR = 4.0  # the scale is at least so many median distances: masks may contradict each other
+SAMPLE_WEIGHT = 0.35  # a sample has this weight: neighbouring samples are alike
+# A distance of so many pixels has half the weight of none, at first; of at least so many, in the end.
+FAR_SCALE_PX, LEAST_SCALE_PX = 4.0, 0.7
+SCALE_FACTOR = 4.0  # or of at least so many median distances: masks may contradict each other
 # Masks may be too large or small from this step on, and this share of what is measured is believed.
 OFFSET_FROM, OFFSET_SHARE = 6, 0.8
 CLEAN_PX = 1.0  # masks are clean if the deviation of the distances is less; beyond it fold and curl stay nearer to none
-NARROW = 0.15  # a leaf counts as so wide at least, as a share of its length, where steps are limited by its width
+NARROW = 0.15  # steps are limited as if half a leaf were at least so wide, as a share of its length
 NOISY_VIEW = 1.5  # a view counts less if its distances deviate by more than this times what is usual
 
-# Of the covariance.
+# Of the covariance; fitted (`python benchmarks/traits.py --cache DIR`, column "inside").
 # Deviations are multiplied by the first, and by more where the root mean square distance is above the second.
 FIT_FACTOR, QUIET_PX = 2.0, 0.3
-# Deviation of what all masks may be too large by: so many times the measured one, and at least so many pixels.
+# Deviation of what all masks may be too large by: so many times the measured one, and at least so many pixels:
+# where masks are clean, little is measured.
 CENTRE_FACTOR, LEAST_CENTRE_SD = 1.5, 0.1
-# Of the scaled normal matrix. Leaves have 1e-4 and more; where nothing holds a patch in its place, rounding makes 1e-15
+# A normal matrix, scaled, is singular if its least eigenvalue is less (a technical limit). Leaves have 1e-4 and more;
+# where nothing holds a patch in its place, rounding makes 1e-15.
 LEAST_EIGENVALUE = 1e-10
 
 

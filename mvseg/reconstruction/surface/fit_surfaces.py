@@ -45,11 +45,12 @@ LEAST_GAIN = 0.03  # another start is better if its score is more by this, in Io
 AREA_COST = 0.1
 # A start shows how the blade lies if its median IoU is at least this; else other starts are looked at, too.
 CLEAR_IOU = 0.75
-WIDE_COST = 0.1  # a patch that is wider than long scores less by this, in IoU
+WIDE_COST = 0.1  # a patch that is wider than long scores less by this, in IoU: some would run from edge to edge
 MOST_STARTS = 3  # so many starts are tried of each hull
 HOPELESS = 0.1  # a patch goes no farther than half way if it scores less than the best by more than this
 SEARCHED_VIEWS = 12  # starts are compared in so many views of a leaf, evenly spread (a technical limit)
-WRONG_SHARE = 0.25  # a mask is another leaf's if its share of the hull's voxels is less than this share of the median
+# A mask is another leaf's, with a wrong id, if its share of the hull's voxels is less than this share of the median.
+WRONG_SHARE = 0.25
 BEHIND = 0.03  # a neighbour lies behind if it is farther away by more than this share of the leaf's length
 
 # A surface is doubted if its median IoU is less, or the deviation of its area more than this share of it.

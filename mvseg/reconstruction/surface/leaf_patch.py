@@ -19,19 +19,20 @@ from scipy.interpolate import BSpline
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-COUNTS = (7, 12, 4, 3)  # coefficients of m, Q, R, S; fewer for Q cannot follow lobes
+COUNTS = (7, 12, 4, 3)  # m, Q, R, S have so many coefficients (a definition); fewer for Q cannot follow lobes
 NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
 
-# Standard deviations of the prior, in leaf lengths (SPEED, BEND, SWAY) or half-widths.
-BEND_SD = 0.06  # of the third differences of m
-SWAY_SD = 0.1  # times length / width: of the turns of the midrib within the blade, from each of ten pieces to the next
-SPEED_SD = 0.05  # of the speed along the midrib about its mean
-SIDE_SD = 1.0  # of the second differences of Q
-FOLD_SD, FOLD_STEP_SD = 0.35, 0.2  # of R along the normal, and of its differences
-CURL_SD = 0.35  # of S along the normal
-SHEAR_SD = 0.15  # of Q along the midrib, and of R and S within the blade
-NUM_PIECES = 10  # SPEED and SWAY are those of so many pieces of the midrib
+# The prior: each of these is expected to be none, with this standard deviation in leaf lengths (BEND, SWAY, SPEED) or
+# half-widths.
+BEND_SD = 0.06  # third differences of m
+SWAY_SD = 0.1  # times length / width: turns of the midrib within the blade, from each piece to the next
+SPEED_SD = 0.05  # differences of the speed along a piece of the midrib from one length in all
+SIDE_SD = 1.0  # second differences of Q
+FOLD_SD, FOLD_STEP_SD = 0.35, 0.2  # R along the normal, and its differences
+CURL_SD = 0.35  # S along the normal
+SHEAR_SD = 0.15  # Q along the midrib, and R and S within the blade
+NUM_PIECES = 10  # the midrib has so many pieces, for SWAY and SPEED
 
 
 def place_stations(num_rows: int) -> Floats:

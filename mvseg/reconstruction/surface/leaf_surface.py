@@ -23,9 +23,9 @@ from mvseg.reconstruction.surface.leaf_patch import (
 from mvseg.reconstruction.surface.patch_image import draw_polygons, grid_quads
 from mvseg.scene import Cameras
 
-MESH_SHAPE = (64, 17)  # rows and columns of vertices of a mesh
+MESH_SHAPE = (64, 17)  # a mesh has so many rows and columns of vertices (a definition)
 LEAST_CREDIBLE_IOU = 0.7  # a surface is credible if its median IoU is at least this
-BESIDE = 2  # pixels around a drawn surface: OpenCV draws polygons a little too large
+BESIDE = 2  # a surface is drawn on a crop that reaches so many pixels beyond it (a technical limit)
 STEP = 1e-4  # a coefficient is moved by this share of the spread of all, for differences (a technical limit)
 
 

@@ -17,12 +17,12 @@ from skimage.measure import find_contours
 
 from mvseg.reconstruction.surface.leaf_patch import Floats
 
-BLUR_PX = 0.8  # masks are blurred by this, so that their edges are smooth functions of the position
+BLUR_PX = 0.8  # masks are blurred by a Gaussian of this, so that their edges are smooth functions of the position
 MARGIN = 24  # a crop has so many pixels around its mask (a technical limit)
 LARGE_PX = 60.0  # masks are made smaller by the whole number nearest to the root of their median area over this
 LONG_PX = 400  # or by more, so that no side is longer than this (a technical limit)
-EDGE_SAMPLES = 40  # samples of each mask's edge (a technical limit)
-FRAME = -1  # label of what lies outside the image
+EDGE_SAMPLES = 40  # the edge of a mask has about so many samples (a technical limit)
+FRAME = -1  # what lies outside the image has this label (a definition)
 Labels = NDArray[np.int32]
 
 

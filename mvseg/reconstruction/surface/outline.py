@@ -29,7 +29,7 @@ BEYOND_PX = (1.0, 2.0)  # another instance begins beyond an edge if it is seen s
 # A sample lies on the outline if the patch does not cover the pixel so far outside of it: filled quads are half a pixel
 # too wide.
 OUTSIDE_PX = 1.6
-REVERSE_WEIGHT = 0.5  # weight of the samples of the masks' edges, beside those of the patch
+REVERSE_WEIGHT = 0.5  # samples of the masks' edges have this weight, those of the patch 1
 PULL_FROM_PX = 4.0  # an edge pulls at its nearest sample if it is farther than this outside the patch
 SIMILAR = 0.5  # two samples match if the cosine between their normals is at least this
 MOST_SHIFT_PX = 5.0  # outline of a patch and edge of its image may be apart by at most this

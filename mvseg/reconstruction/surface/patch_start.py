@@ -19,8 +19,8 @@ from mvseg.reconstruction.surface.leaf_patch import (
 )
 
 MOST_POINTS = 1000  # so many voxels are used at most, which is enough for nine windows (a technical limit)
-NUM_WINDOWS = 9  # windows along a leaf, through whose middles the midrib of a start goes
-NEIGHBOURS = 8  # voxels that a voxel is joined to where the way along a leaf is looked for
+NUM_WINDOWS = 9  # the midrib of a start goes through the middles of so many windows along the leaf
+NEIGHBOURS = 8  # a voxel is joined to so many others where the way along a leaf is looked for
 # A leaf may be so bent that its axis is a curve if the ratio of its two largest deviations is at least this.
 ELONGATED = 2.0
 BENT = 1.35  # or if the way along it is so many times the straight one: graphs make detours of a tenth
