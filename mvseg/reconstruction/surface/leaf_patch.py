@@ -29,8 +29,8 @@ BEND_SD = 0.06  # third differences of m
 SWAY_SD = 0.1  # times length / width: turns of the midrib within the blade, from each piece to the next
 SPEED_SD = 0.05  # differences of the speed along a piece of the midrib from one length in all
 SIDE_SD = 1.0  # second differences of Q
-FOLD_SD, FOLD_STEP_SD = 0.35, 0.2  # R along the normal, and its differences
-CURL_SD = 0.35  # S along the normal
+NORMAL_SD = 0.35  # R and S along the normal
+FOLD_STEP_SD = 0.2  # differences of R
 SHEAR_SD = 0.15  # Q along the midrib, and R and S within the blade
 NUM_PIECES = 10  # the midrib has so many pieces, for SWAY and SPEED
 
@@ -155,12 +155,12 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
     frames = [_frames(coefficients, count) for count in COUNTS[1:]]
     tangents = _unit(_speed_rows() @ coefficients)
     equations = [bend / (BEND_SD * length), side / (SIDE_SD * half), fold * (noise / (FOLD_STEP_SD * half))]
-    shear = noise / (SHEAR_SD * half)
+    shear, upright = noise / (SHEAR_SD * half), noise / (NORMAL_SD * half)
     rows = np.eye(NUM_COEFFICIENTS)
-    for place, (along, across, normal), sd in zip((SIDE, FOLD, CURL), frames, (None, FOLD_SD, CURL_SD), strict=True):
+    for place, (along, across, normal) in zip((SIDE, FOLD, CURL), frames, strict=True):
         equations.append(_along(rows[place], along) * shear)
-        if sd is not None:
-            equations += [_along(rows[place], across) * shear, _along(rows[place], normal) * (noise / (sd * half))]
+        if place != SIDE:
+            equations += [_along(rows[place], across) * shear, _along(rows[place], normal) * upright]
     # The outline of a round blade does not tell where its midrib runs, which would wind and come out too long. That of
     # a narrow one does.
     turns, sideways = np.diff(_speed_rows(), axis=0), _frames(coefficients, NUM_PIECES + 1)[1][1:-1]
