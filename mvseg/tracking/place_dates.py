@@ -97,11 +97,12 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
 def _search(
     poses: Floats, roots: np.ndarray, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness
 ) -> Floats:
-    """One date after the other takes the pose that agrees best with the others, of those that its pairs suggest."""
+    """One date after the other takes the pose that agrees best with the others, of those that its pairs suggest; the
+    first one, too: where it is the odd one, all others would have to move."""
     poses = poses.copy()
     for _ in range(ROUNDS):
         before = poses.copy()
-        for date in np.flatnonzero(roots != np.arange(len(roots))).tolist():
+        for date in range(len(poses)):
             pairs = [pair for pair in alignments if date in pair]
             options = [poses[date], *(
                 poses[earlier] @ np.linalg.inv(alignments[earlier, later].pose) if date == later
@@ -116,7 +117,7 @@ def _search(
             poses[date] = options[int(np.argmax(np.round(totals, DIGITS)))]
         if np.array_equal(poses, before):
             break
-    return poses
+    return np.linalg.inv(poses[roots]) @ poses
 
 
 def _remembered(looked: Looked, habit: Habit) -> Likeliness:

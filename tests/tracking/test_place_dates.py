@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from itertools import combinations
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from mvseg.tracking.place_dates import place_dates
 from tests.plants_over_days import grow_blades, grown, see
 
 BLADES = grow_blades(7, 3)
+HALF_TURN = Rotation.from_euler("z", 180, degrees=True).as_matrix()
 TURNS = (0.0, 80.0, 200.0, 200.0)
 
 
@@ -25,7 +27,7 @@ def look_at(turns: tuple[float, ...]) -> dict[tuple[int, int], Poses]:
 
 def turns_of(poses: np.ndarray) -> np.ndarray:
     """How far the pot is turned on each date, degrees."""
-    return np.degrees(np.arctan2(poses[:, 0, 1], poses[:, 0, 0])) % 360
+    return np.degrees(np.arctan2(poses[:, 0, 1], poses[:, 0, 0])).round(6) % 360
 
 
 def test_all_dates_are_placed_and_sure_of_it() -> None:
@@ -50,6 +52,16 @@ def test_two_dates_that_look_alike_in_a_wrong_way_are_settled_by_the_others(wron
     assert np.allclose(judge(likelier, Habit(0.3)).pose, away)
     poses, _, _ = place_dates(4, {**looked, wrong: likelier}, Habit(0.3))
     np.testing.assert_allclose(turns_of(poses), TURNS, atol=5)
+
+
+@pytest.mark.parametrize("date", range(4))
+def test_one_date_that_stands_wrong_to_all_others_is_moved_the_first_one_too(date: int) -> None:
+    looked, start = look_at(TURNS), place_dates(4, look_at(TURNS), Habit(0.3))[0]
+    start[date] = start[date] @ make_poses(HALF_TURN, np.zeros(3))
+    with patch("mvseg.tracking.place_dates.chain_dates", return_value=(start, np.zeros(4, int))):
+        poses, _, _ = place_dates(4, looked, Habit(0.3))
+    np.testing.assert_allclose(turns_of(poses), TURNS, atol=5)
+    np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-9)
 
 
 def test_pots_that_are_said_to_be_fixed_stand_as_they_stood() -> None:
