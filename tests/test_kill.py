@@ -19,6 +19,7 @@ from typing import Any
 
 import pytest
 
+from batch_work import run_here
 from mvseg.cli import main
 from mvseg.detectors.weights_file import read_weights
 from mvseg.results.read import read_instances
@@ -152,7 +153,7 @@ def test_a_batch_goes_on_where_it_was_killed(
     plants = [write_scene(tmp_path / "plants" / name, 2 + number % 2) for number, name in enumerate(names)]
     run = ["batch", str(plants[0].parent), "--masks", "masks", "--out", str(out), "--quiet", "--num_workers", "2"]
     run += ["--resume", "true", "--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
-    monkeypatch.setattr("mvseg.batch.workers.run_locally", work_here)
+    monkeypatch.setattr("mvseg.batch.workers.run_locally", run_here)
     monkeypatch.chdir(tmp_path)  # where no masks/ lies
     assert main([*run, "--match.seed", "7", "--unit", "cm", "--scale", "0.1"]) == 0
     shutil.copytree(out, earlier)
@@ -178,13 +179,6 @@ def test_a_batch_goes_on_where_it_was_killed(
         assert {name: read_result(out / name) for name in names} == new
         read_result(out / "tables")
         assert {name: (out / "tables" / name).read_bytes() for name in tables} == tables
-
-
-def work_here(work: Any, items: Any, started: Any, *, num_workers: int) -> Iterator[tuple[int, Any]]:
-    """Without processes that take seconds to start."""
-    for key, item in items.items():
-        started(key)
-        yield key, work(item)
 
 
 @pytest.mark.slow

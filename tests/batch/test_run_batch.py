@@ -7,7 +7,7 @@ import json
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import fields
 from pathlib import Path
@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 
+from batch_work import run_here
 from mvseg.batch import run_batch as batch
 from mvseg.batch import workers
 from mvseg.batch.run_batch import BatchCounts, run_batch
@@ -30,7 +31,7 @@ from mvseg.results.read import read_instances
 from mvseg.system.atomic import lock_folder
 from scene_folders import write_scene
 
-COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
+COARSE = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500", "--report", "false"]
 
 
 @pytest.fixture
@@ -45,17 +46,8 @@ def plants(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def here(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Work in this process: others take seconds to start."""
-
-    def run(
-        work: Callable[[Any], Any], items: Mapping[int, Any], started: Callable[[int], object], *, num_workers: int
-    ) -> Iterator[tuple[int, Any]]:
-        assert num_workers >= 1
-        for key, item in items.items():
-            started(key)
-            yield key, work(item)
-
-    monkeypatch.setattr(workers, "run_locally", run)
+    """Work in this process."""
+    monkeypatch.setattr(workers, "run_locally", run_here)
 
 
 def arguments(scenes: Path, out: Path, *more: str) -> list[str]:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from batch_work import run_here
 from benchmarks.tracking import true_ids
 from mvseg import demo_scene
 from mvseg.batch.track_plants import list_plants, track_plants
@@ -83,7 +84,10 @@ def test_each_result_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert len(re.findall(r'"crop": ?"/9j/', page)) == 2 * len(BLADES)  # a JPEG of each leaf
 
 
-def test_all_plants_of_a_batch(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_all_plants_of_a_batch(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mvseg.batch.workers.run_locally", run_here)
     rows = [("a0", "a", "0"), ("b0", "b", "0"), ("a1", "a", "1"), ("b1", "b", ""), ("c0", "c", "0")]
     batch = write_batch(tmp_path / "batch", rows)
     assert main(["track", str(batch), "--out", str(tmp_path / "out"), "--quiet", "--num_workers", "2"]) == 3
@@ -144,6 +148,18 @@ def test_the_two_dates_that_ship(tmp_path: Path) -> None:
     assert sorted(tracks.values()) == [[1, 1], [2], [3, 3], [5, 5], [7, 7], [9, 9], [11, 11], [13]]
 
 
+@pytest.fixture(scope="module")
+def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two whole results, and one without shapes."""
+    folder = tmp_path_factory.mktemp("results")
+    for name in ("a", "b", "ids"):
+        write_result(folder / name, BLADES)
+    for name in ("traits.csv", "surfaces.npz"):
+        (folder / "ids" / name).unlink()
+    (folder / "ids" / "run.json").write_text('{"format": 2}')
+    return folder
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -156,20 +172,14 @@ def test_the_two_dates_that_ship(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_gets_one_sentence(
-    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    arguments: list[str], said: str, results: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    for name in ("a", "b"):
-        write_result(tmp_path / name, BLADES)
-    write_result(tmp_path / "ids", BLADES)
-    for name in ("traits.csv", "surfaces.npz"):
-        (tmp_path / "ids" / name).unlink()
-    (tmp_path / "ids" / "run.json").write_text('{"format": 2}')
+    monkeypatch.chdir(results)
     assert main(["track", *arguments, "--out", "out", "--quiet"]) == 2
     error = capsys.readouterr().err.strip()
     assert re.search(said, error)
     assert len(error.splitlines()) == 1
-    assert not (tmp_path / "out").exists()
+    assert not (results / "out").exists()
 
 
 def test_a_batch_without_two_dates_is_refused(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.system.atomic import lock_folder
 from scene_folders import edit_rig, write_scene
 
-CONFIG = RunConfig(reconstruct=None)  # ids only: these tests look at no shape
+CONFIG = RunConfig(reconstruct=None, report=False)  # ids only: these tests look at no shape and no page
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_what_has_changed_is_done_again(
 
 def test_other_options_are_done_again(scene: BatchScene, tmp_path: Path) -> None:
     done = [work_on_scene(tmp_path / "out", CONFIG, scene)]
-    for config in (RunConfig(reconstruct=None, match=MatchConfig(seed=3)), RunConfig(reconstruct=None, unit="cm")):
+    for config in (replace(CONFIG, match=MatchConfig(seed=3)), replace(CONFIG, unit="cm")):
         done.append(work_on_scene(tmp_path / "out", config, scene))
     assert [each.is_kept for each in done] == [False, False, False]
     assert len({each.status.key for each in done}) == 3
