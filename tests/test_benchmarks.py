@@ -5,8 +5,6 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
-import pytest
-
 ROOT = Path(__file__).parents[1]
 SCRIPTS = sorted(
     ".".join(path.relative_to(ROOT).with_suffix("").parts)
@@ -15,6 +13,6 @@ SCRIPTS = sorted(
 )
 
 
-@pytest.mark.parametrize("name", SCRIPTS)
-def test_it_is_imported(name: str) -> None:
-    assert importlib.import_module(name).__doc__
+def test_they_are_imported() -> None:
+    assert len(SCRIPTS) > 50
+    assert [name for name in SCRIPTS if not importlib.import_module(name).__doc__] == []

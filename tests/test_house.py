@@ -89,10 +89,10 @@ def test_contributors_read_the_floors_as_they_are() -> None:
     assert "\n".join("  ".join(rooms) for rooms in FLOORS) in page
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_imports_go_one_way(module: str) -> None:
-    assert room_of(module) in FLOOR_OF
-    assert forbidden_rooms(MODULES[module], module) == set()
+def test_imports_go_one_way() -> None:
+    assert {room_of(module) for module in MODULES} <= FLOOR_OF.keys()
+    forbidden = {module: forbidden_rooms(source, module) for module, source in MODULES.items()}
+    assert {module: rooms for module, rooms in forbidden.items() if rooms} == {}
 
 
 @pytest.mark.parametrize(
@@ -227,13 +227,13 @@ PATHS = re.compile(r"\]\(([^)#]+)|\b((?:mvseg|benchmarks|configs|docs|models|tes
 PAGES = [*ROOT.glob("*.md"), *ROOT.glob("docs/*.md"), *ROOT.glob("docs/notes/*.md"), *ROOT.glob("models/**/*.md")]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.relative_to(ROOT).as_posix())
-def test_files_that_the_documents_name_are_there(page: Path) -> None:
+def test_files_that_the_documents_name_are_there() -> None:
     absent = []
-    for link, path in PATHS.findall(page.read_text(encoding="utf-8")):
-        target = page.parent / link if link else ROOT / path
-        if not link.startswith("http") and not target.exists():
-            absent.append(link or path)
+    for page in PAGES:
+        for link, path in PATHS.findall(page.read_text(encoding="utf-8")):
+            target = page.parent / link if link else ROOT / path
+            if not link.startswith("http") and not target.exists():
+                absent.append((page.relative_to(ROOT).as_posix(), link or path))
     assert absent == []
 
 
@@ -244,8 +244,8 @@ def test_every_promise_names_tests_that_exist() -> None:
     named = [re.findall(r"`(tests/[\w/]+\.py)::(\w+)`", row) for row in rows]
     assert [row for row, tests in zip(rows, named, strict=True) if not tests] == []
     for file, name in [test for tests in named for test in tests]:
-        tree = ast.parse((ROOT / file).read_text(encoding="utf-8"))
-        assert name in {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}, (file, name)
+        text = (ROOT / file).read_text(encoding="utf-8")
+        assert re.search(rf"^ *def {name}\(", text, re.MULTILINE), (file, name)
 
 
 def test_every_format_names_a_test() -> None:

@@ -13,7 +13,7 @@ import torch
 
 from blade_scene import as_regions
 from found_masks import FoundMasks
-from leafy_scene import write_leafy_scene
+from leafy_scene import LeafyScene, write_leafy_scene
 from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.few_views import select_by_views
@@ -81,9 +81,13 @@ def test_more_views_can_be_asked_for() -> None:
         DetectConfig(min_views=0)
 
 
+@pytest.fixture(scope="module")
+def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
+    return write_leafy_scene(tmp_path_factory.mktemp("leafy"), num_leaves=3, num_views=4, size=160, span_deg=180)
+
+
 @pytest.mark.parametrize("min_views", [1, 2])
-def test_a_leaf_in_one_photo_comes_out_marked(tmp_path: Path, min_views: int) -> None:
-    leafy = write_leafy_scene(tmp_path, num_leaves=3, num_views=4, size=160, span_deg=180)
+def test_a_leaf_in_one_photo_comes_out_marked(leafy: LeafyScene, tmp_path: Path, min_views: int) -> None:
     regions = leafy.regions.select((leafy.regions.labels != 3) | (leafy.regions.view_index == 0))
     ids = torch.where(regions.labels == 3, -1, regions.labels)
     scores = torch.full((len(regions),), 0.7)

@@ -43,7 +43,7 @@ def test_thinned_masks_give_nearly_the_same_similarity() -> None:
 
 def test_thinned_masks_take_the_clusters_of_whole_ones() -> None:
     """Counted by runs in place of pixels, 5 in 100 proposals of crowded plants took another one."""
-    scene = ball_scene(14, 4, seed=3, radius=0.5, spread=1.3, focal=900.0, width=800, height=600)
+    scene = ball_scene(10, 3, seed=3, radius=0.5, spread=1.3, focal=900.0, width=800, height=600)
     ids, cameras = scene.regions.labels, scene.cameras
     assert scene.regions.areas.median() > 2 * MAX_PIXELS
     clusters, _ = EpipolarAssignment()(scene.regions, scene.regions, ids, cameras=cameras)
