@@ -7,15 +7,17 @@ PYTHON := $(VENV)/bin/python
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
 
-# two processes, one thread each: libraries that start more get in each other's way
+# two processes, one thread each: libraries that start more get in each other's way; a file goes to one of them, so that
+# what its tests share is made once
 test slow: export OMP_NUM_THREADS := 1
+test slow: PYTEST := $(PYTHON) -m pytest -n 2 --dist loadfile
 
 test: $(VENV)/installed
-	$(PYTHON) -m pytest -n 2
+	$(PYTEST)
 
 # whole commands, killed workers, notebooks: about three minutes
 slow: $(VENV)/installed
-	$(PYTHON) -m pytest -n 2 -m slow
+	$(PYTEST) -m slow
 
 # the numeric tests in the arithmetic of other processors; ARITHMETICS="sse avx2" tries two of them
 processors: $(VENV)/installed

@@ -67,9 +67,9 @@ def test_drawing_in_the_box_of_a_mask_is_drawing_in_the_whole_picture() -> None:
 
 
 def test_a_mask_that_is_too_small_for_the_picture_is_not_drawn() -> None:
-    labels = np.zeros((4000, 6000), np.uint16)
+    labels = np.zeros((2400, 3200), np.uint16)
     labels[12, 13] = 1  # between the pixels that the overlay takes
-    photo = np.full((4000, 6000, 3), 90, np.uint8)
+    photo = np.full((2400, 3200, 3), 90, np.uint8)
     assert (draw_overlay(photo, masks(regions_from_label_maps([labels]), [1]), view=0) == 90).all()
 
 
