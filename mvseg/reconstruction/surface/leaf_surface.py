@@ -25,7 +25,6 @@ from mvseg.scene import Cameras
 
 MESH_SHAPE = (64, 17)  # a mesh has so many rows and columns of vertices (a definition)
 LEAST_CREDIBLE_IOU = 0.7  # a surface is credible if its median IoU is at least this
-BESIDE = 2  # a surface is drawn on a crop that reaches so many pixels beyond it (a technical limit)
 STEP = 1e-4  # a coefficient is moved by this share of the spread of all, for differences (a technical limit)
 
 
@@ -201,8 +200,8 @@ class LeafSurface:
             if not len(quads):
                 parts.append(nothing)
                 continue
-            low = np.clip(np.floor(quads.min((0, 1))) - BESIDE, 0, size).astype(int)
-            high = np.clip(np.ceil(quads.max((0, 1))) + BESIDE, 0, size).astype(int)
+            low = np.clip(np.floor(quads.min((0, 1))), 0, size).astype(int)
+            high = np.clip(np.ceil(quads.max((0, 1))), 0, size).astype(int)
             (width, height), corner = (high - low).tolist(), low.astype(float)
             if width == 0 or height == 0:
                 parts.append(nothing)
