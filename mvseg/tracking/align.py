@@ -24,14 +24,11 @@ from mvseg.tracking.leaves import Pair
 
 NUM_REFINED = 20  # poses of two dates that are refined at most, those that look best
 UPRIGHT = 2.0  # "up stays up" weighs as much as this many leaves where a pose is fitted
-COARSE = 0.5  # scale of log lengths while poses are looked for, between leaves of any age
 ROUNDS = 5  # of pairing leaves and fitting a pose to them, at most
-PARTS = (0.7, 0.7, 0.3)  # weights of base, middle and tip where a pose is fitted: petioles carry bases, and tips sway
-LEAST_PAIRS = 3  # a pose other than "as it stood" needs this many leaves: two fit many plants
+TIP = 0.43  # weight of tips where a pose is fitted, in that of bases and middles: tips sway
 TURNS = 30  # turns of a pot that leaves can tell apart, of 12 degrees (a definition)
 TEMPER = 0.45  # of a gain, that counts as log odds; `python benchmarks/fit_chances.py` fits it
 GUESS = (-1.18, 0.55, 1.23)  # see `guess_chance`; `python benchmarks/fit_chances.py` fits them
-NEAR_SHIFT = 0.3  # two poses that move the plant's middle by less than this apart are one, in `Pair.scale`
 DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
 LARGE_NEW = 3.0  # a pose is less likely by this log odds for each large leaf that it lets appear from nowhere
 
@@ -126,8 +123,7 @@ def list_poses(pair: Pair) -> Poses:
     found: list[Alignment] = [_as_it_stood(pair)]
     left = np.argsort(-scores, kind="stable")
     while len(left) and len(found) < NUM_REFINED:
-        if left[0] or pair.fewer >= LEAST_PAIRS:
-            found.append(refine(pair, poses[left[0]]))
+        found.append(refine(pair, poses[left[0]]))
         left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]
     every = np.stack([each.pose for each in found])
     gains = np.array([each.gain - large_new(pair, each.pairs) for each in found])
@@ -185,12 +181,12 @@ def near_world(pair: Pair, poses: Floats) -> Floats:
 
 
 def pose_distances(pair: Pair, pose: Floats, others: Floats) -> Floats:
-    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of one of the TURNS and, for the plant's middle, of
-    NEAR_SHIFT: below 1, they are one."""
+    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of one of the TURNS and, for the plant's middle,
+    of how far the base of a leaf moves: below 1, they are one."""
     middle = np.append(pair.first.midribs.mean((0, 1)), 1.0)
     turned = np.arccos(np.clip((np.einsum("ij,hij->h", pose[:3, :3], others[:, :3, :3]) - 1) / 2, -1, 1))
     moved = np.linalg.norm((others - pose)[:, :3] @ middle, axis=1)
-    return np.hypot(turned / (2 * np.pi / TURNS), moved / (NEAR_SHIFT * pair.scale))
+    return np.hypot(turned / (2 * np.pi / TURNS), moved / (POSES.across * pair.scale))
 
 
 def draw_poses(pair: Pair) -> Floats:
@@ -234,14 +230,13 @@ def make_poses(rotations: Floats, shifts: Floats) -> Floats:
 def alikeness(pair: Pair, poses: Floats) -> Floats:
     """(H, N + M) in [0, 1] how alike the most alike leaf of the other date is under each of the poses (H, 4, 4)."""
     first, second = pair.first, pair.second
-    size = np.square(np.log(second.lengths[None] / first.lengths[:, None]) / COARSE)
     found = []
     for part in np.array_split(poses, 1 + len(poses) // 200):  # bounds the memory
         bases = np.einsum("hij,nj->hni", part[:, :3, :3], first.bases) + part[:, None, :3, 3]
         chords = np.einsum("hij,nj->hni", part[:, :3, :3], first.chords)
         away = np.square(bases[:, :, None] - second.bases).sum(-1) / (POSES.across * pair.scale) ** 2
         turn = 2 * (1 - np.einsum("hni,mi->hnm", chords, second.chords)) / POSES.turn**2
-        alike = np.exp(-0.25 * (away + turn + size))
+        alike = np.exp(-0.25 * (away + turn))
         found.append(np.concatenate([alike.max(2), alike.max(1)], 1))
     return np.concatenate(found)
 
@@ -279,7 +274,7 @@ def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Fl
     other = other[:, :1] + (other - other[:, :1]) * np.clip(share, 0.5, 2)[:, None, None]  # as long as it was
     places = [0, one.shape[1] // 2, -1]
     source, target = one[:, places].reshape(-1, 3), other[:, places].reshape(-1, 3)
-    mass = (weights[:, None] * PARTS).ravel()
+    mass = (weights[:, None] * (1.0, 1.0, TIP)).ravel()
     mass /= mass.sum()
     middle, aim = mass @ source, mass @ target
     source, target = source - middle, target - aim

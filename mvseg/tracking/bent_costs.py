@@ -13,12 +13,11 @@ import numpy as np
 
 from mvseg.tracking.align import Alignment
 from mvseg.tracking.dates import STATIONS, Floats
-from mvseg.tracking.fitted_costs import FLIPPED, LINKS, length_costs, student_tail
+from mvseg.tracking.fitted_costs import FLIPPED, LINKS, POSES, length_costs, student_tail
 from mvseg.tracking.leaves import Leaves, Pair
 
 PLACE = 0.07  # scale by which bases, and points of leaves, of two sights of one leaf are apart, in `Pair.scale`
 RISE = 0.02  # PLACE grows by this per day for heights and points: internodes stretch
-TURN = 0.30  # scale by which directions of two sights of one leaf differ, in radians
 BEND = 0.10  # scale by which midribs of two sights of one leaf differ, in lengths of the leaf
 PARTING = 9.0  # midribs of one leaf that agree in all are likelier than those of strangers by this log odds
 APART = 3.0  # points of one leaf that agree are likelier than those of strangers by this log odds
@@ -82,7 +81,7 @@ def _directed_costs(pair: Pair, widening: float) -> Floats:
     across = np.linalg.norm(apart[..., :2], axis=-1) / np.hypot(PLACE * widening, noise)
     along = apart[..., 2] / np.hypot(PLACE * widening + RISE * pair.days, noise)
     turn_noise = np.hypot(first.turn_sd[:, None], second.turn_sd[None])
-    turn = np.arccos(np.clip(first.chords @ second.chords.T, -1, 1)) / np.hypot(TURN * widening, turn_noise)
+    turn = np.arccos(np.clip(first.chords @ second.chords.T, -1, 1)) / np.hypot(POSES.turn * widening, turn_noise)
     bend = _bends(first, second) / BEND
     return 0.5 * (
         student_tail(across, 2) + student_tail(along, 1) + student_tail(turn, 2) + student_tail(bend, 2)

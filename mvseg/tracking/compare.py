@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvseg.tracking.align import (
+    DIGITS,
     Alignment,
     Habit,
     Poses,
@@ -29,7 +30,6 @@ from mvseg.tracking.place_dates import place_dates
 MOST_GAP = 3  # dates from one sight to another that it is compared with, at most: two dates may hide a leaf
 UNLINKED = 2.0  # a pair of leaves may cost this much in a track before two tracks are cheaper than one
 ENOUGH = 6  # a plant is bent as its leaves moved if at least this many are paired: fewer do not tell
-RARE = 1e-4  # a pose that is less likely than this says nothing of a link
 MOST_ODDS = 40.0  # of log odds, whose exponentials are numbers then (a technical limit)
 
 
@@ -44,7 +44,7 @@ class Comparison:
         roots: (T,) index of that date.
         trust: (T, T) probability that two dates stand to each other as `poses` says.
         otherwise: {(earlier, later): (N, M) probability that their leaves are the same, over the other poses that were
-            looked at}, each as likely as it is among them; not there where there are none.
+            looked at}, each as likely as it is among them; 0 where there are none.
         motions: {(earlier, later): of leaves that moved otherwise than the rest}, where there are any.
     """
 
@@ -81,9 +81,7 @@ def compare_dates(
         if not len(alignment.pairs):
             continue
         costs[earlier, later] = _link_costs(pair, alignment)
-        left = _under_others(looked[earlier, later], pose, habit)
-        if left is not None:
-            otherwise[earlier, later] = left
+        otherwise[earlier, later] = _under_others(looked[earlier, later], pose, habit)
         is_step = roots[later] not in roots[earlier + 1 : later]
         if is_step or any(earlier <= a and b <= later for a, b in motions):  # a leaf that grew is no motion over weeks
             motion = find_motion(pair, alignment.pose)
@@ -101,16 +99,14 @@ def compare_dates(
     )  # fmt: skip
 
 
-def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats | None:
-    """(N, M) probability that leaves of two dates are the same if not this pose (4, 4) but another one is right."""
+def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats:
+    """(N, M) probability that leaves of two dates are the same if not this pose (4, 4) but another one is right; 0 if
+    there is none."""
     every = np.stack([each.pose for each in looked.refined])
-    weights = looked.weights(habit) * (pose_distances(looked.pair, pose, every) >= 1)
-    total = float(weights.sum())
-    if total < RARE:
-        return None
+    weights = np.round(looked.weights(habit), DIGITS) * (pose_distances(looked.pair, pose, every) >= 1)
     chances = np.zeros((len(looked.pair.first), len(looked.pair.second)))
-    for weight, other in zip(weights / total, every, strict=True):
-        if weight >= RARE:
+    for weight, other in zip(weights / (weights.sum() or 1.0), every, strict=True):
+        if weight:
             odds = np.exp(np.clip(-fitted_costs(looked.pair.moved(other), LINKS), -MOST_ODDS, MOST_ODDS))
             rivals = odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds
             chances += weight * odds / (1 + rivals)

@@ -11,19 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mvseg.tracking.align import (
-    LEAST_PAIRS,
-    alikeness,
-    best_pairs,
-    draw_poses,
-    pose_distances,
-    refine,
-)
+from mvseg.tracking.align import NUM_REFINED, alikeness, best_pairs, draw_poses, pose_distances, refine
 from mvseg.tracking.bent_costs import pair_costs
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
 
-TRIED = 8  # poses that are tried as a second motion at most, those that explain most of what the alignment does not
 LEAST_GAIN = 20.0  # a second motion is believed from this log odds on; where leaves only grew, about 15 are reached
 SURE_MARGIN = 7.0  # a second motion is sure if its log odds exceed those of every other one by this
 
@@ -51,7 +43,7 @@ class Motion:
 
 def find_motion(pair: Pair, pose: Floats) -> Motion | None:
     """The best second motion of dates that are aligned by a pose (4, 4); None where one is enough."""
-    if pair.fewer < LEAST_PAIRS:
+    if not pair.fewer:
         return None
     poses = np.concatenate([pose[None], draw_poses(pair)])
     alike = alikeness(pair, poses)[:, : len(pair.first)]
@@ -60,21 +52,20 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
     costs = pair_costs(pair.moved(pose))
     alone, found = _total(costs), []
     left = np.argsort(-better, kind="stable")
-    for _ in range(TRIED):
+    for _ in range(NUM_REFINED):
         if not len(left) or not better[left[0]]:
             break
         at, own = poses[left[0]], np.flatnonzero(alike[left[0]] > alike[0])
         left = left[pose_distances(pair, at, poses[left]) >= 1]
         refined = refine(pair.take(own, np.arange(len(pair.second))), at)
-        is_other = pose_distances(pair, pose, refined.pose[None])[0] >= 1
-        if len(refined.pairs) >= LEAST_PAIRS and is_other:
+        if pose_distances(pair, pose, refined.pose[None])[0] >= 1:
             others = pair_costs(pair.moved(refined.pose))
             rows, columns = best_pairs(np.minimum(costs, others)).T
             keep = others[rows, columns] < costs[rows, columns]
             pairs = np.stack([rows[keep], columns[keep]], 1)
             found.append(Motion(refined.pose, pairs, alone - _total(np.minimum(costs, others)), margin=0.0))
     best = max(found, key=lambda motion: motion.gain, default=None)
-    if best is None or best.gain < LEAST_GAIN or len(best.pairs) < LEAST_PAIRS:
+    if best is None or best.gain < LEAST_GAIN:
         return None
     rivals = (motion.gain for motion in found if _contradicts(motion.pairs, best.pairs))
     return Motion(best.pose, best.pairs, best.gain, margin=best.gain - max(rivals, default=0.0))
