@@ -38,12 +38,13 @@ class Cells:
     @property
     def centers(self) -> Tensor:
         """(P, 3) float64."""
-        return self.corner + self.size * (self.indices + 0.5)
+        return self.corner + self.size * (self.indices.double() + 0.5)
 
     @property
     def box(self) -> tuple[Tensor, Tensor]:
         """Lowest and highest corner (3,) of at least one cell."""
-        return self.corner + self.size * self.indices.amin(0), self.corner + self.size * (self.indices.amax(0) + 1)
+        low, high = self.indices.amin(0).double(), self.indices.amax(0).double() + 1
+        return self.corner + self.size * low, self.corner + self.size * high
 
     def divide(self, parts: int) -> Cells:
         """Each side in so many parts."""

@@ -45,8 +45,9 @@ def assert_same_result(
         _check_numbers(f"cameras.{name}", *pair, relative=relative)
     _check("kind of masks", first.mask_kind, second.mask_kind)
     numbers = _compare_masks(first.masks.to("cpu"), second.masks.to("cpu"), ids, absolute)
-    for name in ("method", "residual_px", "num_instances"):
-        _check(name, getattr(first.matching, name), getattr(second.matching, name))
+    for name in ("method", "residual_px"):
+        _check(name, getattr(first.matching.report, name), getattr(second.matching.report, name))
+    _check("num_instances", first.matching.num_instances, second.matching.num_instances)
     of_leaf = _pair_up("probability", first.instances.probabilities, second.instances.probabilities, numbers)
     for leaf, pair in of_leaf.items():
         _check_numbers(f"probability of leaf {leaf}", *pair, absolute=absolute)
