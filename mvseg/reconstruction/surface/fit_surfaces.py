@@ -43,7 +43,7 @@ FORGIVEN = 0.5
 LEAST_GAIN = 0.03  # another start is better if its score is more by this, in IoU
 # A surface e times as large scores less by this, in IoU: bulges can hide behind the outlines of a level leaf.
 AREA_COST = 0.1
-# A start shows how the blade lies if its median IoU is at least this; else other starts are looked at, too.
+# The likely start shows how the blade lies if its median IoU is at least this; else the others are looked at, too.
 CLEAR_IOU = 0.75
 WIDE_COST = 0.1  # a patch that is wider than long scores less by this, in IoU: some would run from edge to edge
 MOST_STARTS = 3  # so many starts are tried of each hull
@@ -229,20 +229,19 @@ def _start_groups(masks: MaskStack, hull: Hull) -> list[list[Floats]]:
 
     How well a start explains the masks, before any fit, tells how likely it is.
     """
-    starts, others = start_in(hull)
-    ranks = [_rank(masks, start) for start in starts]
-    if ranks and max(ranks) < CLEAR_IOU:
-        starts += others
-        ranks += [_rank(masks, start) for start in others]
-    order = sorted(range(len(starts)), key=lambda index: -ranks[index])[:MOST_STARTS]
+    starts = start_in(hull)
+    ranks = [_rank(masks, start) for start in starts[:1]]
+    if ranks and ranks[0] < CLEAR_IOU:
+        ranks += [_rank(masks, start) for start in starts[1:]]
+    order = sorted(range(len(ranks)), key=lambda index: -ranks[index])[:MOST_STARTS]
     return [[starts[index] for index in group] for group in (order[:1], order[1:]) if group]
 
 
-def start_in(hull: Hull) -> tuple[list[Floats], list[Floats]]:
+def start_in(hull: Hull) -> list[Floats]:
     """`start_patches` in whole numbers of voxels: many of these are equally far from each other, and in world units
     rounding, and with it the world's scale, would choose between them."""
     starts = start_patches(hull.voxels.astype(float))
-    for start in (*starts[0], *starts[1]):
+    for start in starts:
         start *= hull.size
         start[MIDRIB] += hull.corner + 0.5 * hull.size
     return starts

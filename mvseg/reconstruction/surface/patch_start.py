@@ -24,14 +24,12 @@ NEIGHBOURS = 8  # a voxel is joined to so many others where the way along a leaf
 # A leaf may be so bent that its axis is a curve if the ratio of its two largest deviations is at least this.
 ELONGATED = 2.0
 BENT = 1.35  # or if the way along it is so many times the straight one: graphs make detours of a tenth
-ROUND = 1.6  # the midrib may as well run along the shorter axis if that ratio is less than this
 TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # starts have their side at these angles about the midrib
-LEAST_POINTS = 12  # a start needs so many voxels
 TIE = 1e-6  # distances on a lattice are equal if they differ by less than this share, by rounding
 
 
-def start_patches(points: Floats) -> tuple[list[Floats], list[Floats]]:
-    """Rough patches through a cloud of points: the likely ones, and others.
+def start_patches(points: Floats) -> list[Floats]:
+    """Rough patches through a cloud of points, the likely one first.
 
     The long axis is straight (PCA), or a geodesic one for elongated clouds, so that strongly bent blades keep their
     two ends. Windowed centroids along it are the midrib, spreads across it the sides. Cameras that all look down at
@@ -41,24 +39,20 @@ def start_patches(points: Floats) -> tuple[list[Floats], list[Floats]]:
         points: (P, 3) float64, centres of occupied voxels.
 
     Returns:
-        (26, 3) coefficients each, fold and curl 0. The likely ones run along the longest axis, and for round leaves
-        also across it; the others, too, and have sides in other directions. None with fewer than 12 points, or without
-        any spread.
+        (26, 3) coefficients each, fold and curl 0. The likely one runs along the longest axis; the others have sides in
+        other directions, or run across it. None where all points are on one line.
     """
     points = _thin(points)
-    if len(points) < LEAST_POINTS:
-        return [], []
+    if len(points) < 2:
+        return []
     centred = points - points.mean(0)
     _, spreads, axes = np.linalg.svd(centred, full_matrices=False)
     if spreads[1] <= 1e-9 * spreads[0] or spreads[0] == 0:
-        return [], []
+        return []
     straight, along = centred @ axes[0], _geodesic_places(points)
     is_bent = spreads[0] > ELONGATED * spreads[1] or along.max() > BENT * np.ptp(straight)
     first = _patches_along(points, along if is_bent else straight, axes[1])
-    second = _patches_along(points, centred @ axes[1], axes[0])
-    if is_bent or spreads[0] >= ROUND * spreads[1]:
-        return first[:1], first[1:] + second
-    return [first[0], second[0]], first[1:] + second[1:]
+    return first + _patches_along(points, centred @ axes[1], axes[0])
 
 
 def _patches_along(points: Floats, place: Floats, side: Floats) -> list[Floats]:
