@@ -7,10 +7,10 @@ PYTHON := $(VENV)/bin/python
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
 
-# two processes, one thread each: libraries that start more get in each other's way; a file goes to one of them, so that
-# what its tests share is made once
+# two processes, one thread each: libraries that start more get in each other's way; each begins with one half of the tests, so that
+# what the tests of a file share is made once, as a rule
 test slow: export OMP_NUM_THREADS := 1
-test slow: PYTEST := $(PYTHON) -m pytest -n 2 --dist loadfile
+test slow: PYTEST := $(PYTHON) -m pytest -n 2 --dist worksteal
 
 test: $(VENV)/installed
 	$(PYTEST)
