@@ -44,7 +44,7 @@ from fuzz.readers import (
 )
 from mvseg.errors import InputError, InputWarning
 
-EXAMPLES = int(os.environ.get("MVSEG_FUZZ_EXAMPLES", "20"))
+EXAMPLES = int(os.environ.get("MVSEG_FUZZ_EXAMPLES", "10"))
 IS_LONG = "MVSEG_FUZZ_EXAMPLES" in os.environ
 NAMES = [
     "rig", "transforms", "turntable", "bop", "metashape", "calibration", "colmap text", "colmap binary", "label png",
