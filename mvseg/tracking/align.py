@@ -22,15 +22,15 @@ from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, POSES, fitted_costs
 from mvseg.tracking.leaves import Pair
 
-NUM_REFINED = 20  # poses of two dates that are refined at most, those that look best
-UPRIGHT = 2.0  # "up stays up" weighs as much as this many leaves where a pose is fitted
-ROUNDS = 5  # of pairing leaves and fitting a pose to them, at most
-TIP = 0.43  # weight of tips where a pose is fitted, in that of bases and middles: tips sway
-TURNS = 30  # turns of a pot that leaves can tell apart, of 12 degrees (a definition)
-TEMPER = 0.45  # of a gain, that counts as log odds; `python benchmarks/fit_chances.py` fits it
+NUM_REFINED = 20  # poses of two dates: this many of those that look best are refined
+UPRIGHT = 2.0  # the direction of up, where a pose is fitted: it weighs as much as this many leaves
+ROUNDS = 5  # rounds of pairing leaves and fitting a pose to them: at most this many (a technical limit)
+TIP = 0.43  # the tip of a leaf, where a pose is fitted: it weighs this much of what base and middle do, for tips sway
+TURNS = 30  # turns of a pot that leaves can tell apart: this many, of 12 degrees (a definition)
+TEMPER = 0.45  # a gain of a pose: this share counts as log odds; `python benchmarks/fit_chances.py` fits it
 GUESS = (-1.18, 0.55, 1.23)  # see `guess_chance`; `python benchmarks/fit_chances.py` fits them
-DIGITS = 6  # of logarithms and probabilities that count: what differs less is a tie, on every processor
-LARGE_NEW = 3.0  # a pose is less likely by this log odds for each large leaf that it lets appear from nowhere
+DIGITS = 6  # decimals of logarithms and probabilities: what differs in later ones is a tie (a technical limit)
+LARGE_NEW = 3.0  # large leaves that a pose lets appear from nowhere: each costs it this log odds
 
 
 @dataclass(frozen=True, eq=False)

@@ -20,9 +20,9 @@ from mvseg.tracking.compare import MOST_ODDS, UNLINKED, Comparison
 from mvseg.tracking.dates import Floats
 
 Sight = tuple[int, int]  # index of the date, row of its `Leaves`
-ASKED = 1e4  # gain of what a person says, above all that leaves can say (a technical limit)
+ASKED = 1e4  # gain of what a person says: above all that leaves can say (a technical limit)
 CALIBRATION = (0.33, 4.08)  # slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them
-ROUNDS = 10  # of joining anew, at most; two or three are enough (a technical limit)
+ROUNDS = 10  # rounds of joining anew: at most this many, two or three are enough (a technical limit)
 
 
 @dataclass(frozen=True)

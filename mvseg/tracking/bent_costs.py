@@ -16,14 +16,14 @@ from mvseg.tracking.dates import STATIONS, Floats
 from mvseg.tracking.fitted_costs import FLIPPED, LINKS, POSES, length_costs, student_tail
 from mvseg.tracking.leaves import Leaves, Pair
 
-PLACE = 0.07  # scale by which bases, and points of leaves, of two sights of one leaf are apart, in `Pair.scale`
-RISE = 0.02  # PLACE grows by this per day for heights and points: internodes stretch
-BEND = 0.10  # scale by which midribs of two sights of one leaf differ, in lengths of the leaf
-PARTING = 9.0  # midribs of one leaf that agree in all are likelier than those of strangers by this log odds
-APART = 3.0  # points of one leaf that agree are likelier than those of strangers by this log odds
-CLOUD_COUNTS = 0.3  # of the costs of midribs and of points, the one that says less of a pair counts by this factor
-IN_PART = 0.3  # a surface may show a part of the leaf only where log lengths differ by more than this
-LIKE_RIGID = 0.3  # "all leaves moved by the same" weighs as much as this many leaves where a plant is bent
+PLACE = 0.07  # distance of bases, or of points, of two sights of one leaf: its scale, in `Pair.scale`
+RISE = 0.02  # days between two dates: PLACE grows by this for each, for heights and points, as internodes stretch
+BEND = 0.10  # distance of midribs of two sights of one leaf, laid base on base: its scale, in lengths of the leaf
+PARTING = 9.0  # log odds of a leaf against a stranger where midribs agree in all: this much
+APART = 3.0  # log odds of a leaf against a stranger where points lie on each other: this much
+CLOUD_COUNTS = 0.3  # costs of midribs and of points: the one that says less of a pair counts by this factor
+IN_PART = 0.3  # difference of log lengths: above this, a surface may show a part of the leaf only
+LIKE_RIGID = 0.3  # one motion of all leaves, where a plant is bent: it weighs as much as this many leaves
 
 
 def bent_costs(pair: Pair, alignment: Alignment) -> Floats:

@@ -27,10 +27,10 @@ from mvseg.tracking.leaves import Leaves, Pair
 from mvseg.tracking.motions import Motion, find_motion
 from mvseg.tracking.place_dates import place_dates
 
-MOST_GAP = 3  # dates from one sight to another that it is compared with, at most: two dates may hide a leaf
-UNLINKED = 2.0  # a pair of leaves may cost this much in a track before two tracks are cheaper than one
-ENOUGH = 6  # a plant is bent as its leaves moved if at least this many are paired: fewer do not tell
-MOST_ODDS = 40.0  # of log odds, whose exponentials are numbers then (a technical limit)
+MOST_GAP = 3  # dates from one sight to another: they are compared up to this many, so that two may hide a leaf
+UNLINKED = 2.0  # cost of a pair of leaves: up to this, one track is cheaper than two
+ENOUGH = 6  # leaves that are paired: from this many on they tell how a plant bent
+MOST_ODDS = 40.0  # log odds: cut off here, so that their exponentials are numbers (a technical limit)
 
 
 @dataclass(frozen=True, eq=False)

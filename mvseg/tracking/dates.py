@@ -27,11 +27,11 @@ from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
 
 Floats = NDArray[np.float64]
-STATIONS = 9  # points of a midrib, base and tip included
-ROWS = 12  # of points from base to tip, three in each: edge, midrib, edge
-CLOUD = 3 * ROWS  # points that stand for a leaf
-UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}  # in millimetres
-MOST_PARTS = 256  # of a path, at most (a technical limit)
+STATIONS = 9  # points of a midrib, base and tip included (a definition)
+ROWS = 12  # rows of points from base to tip, of edge, midrib and edge (a definition)
+CLOUD = 3 * ROWS  # points that stand for a leaf (a definition)
+UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}  # in millimetres (a definition)
+MOST_PARTS = 256  # parts of a path: at most this many (a technical limit)
 
 
 @dataclass(frozen=True)

@@ -16,8 +16,8 @@ import numpy as np
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
 
-TAIL = 3.0  # degrees of freedom of Student's t, which the differences follow
-FLIPPED = 0.5  # a midrib that runs the other way on the other date costs this much more
+TAIL = 3.0  # degrees of freedom of Student's t, which differences follow
+FLIPPED = 0.5  # a midrib that runs the other way on the other date: it costs this much more
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from mvseg.tracking.track import Tracks
 
 TRAITS = ("area", "length", "width", "inclination", "curvature", "insertion_height", "greenness_index")
 SIZES = ("area", "length", "width")  # get a curve, too
-LEAST_SD = 0.01  # standard deviation of a size, at least, as a share of it: no leaf is measured better
-LEAST_DATES = 5  # a leaf gets a curve if it is measured on at least this many dates: curves have three parameters
+LEAST_SD = 0.01  # standard deviation of a size: at least this share of the size, no leaf is measured better
+LEAST_DATES = 5  # dates on which a leaf is measured: from this many on it gets a curve, which has three parameters
 NOTHING = Number(math.nan, math.nan, "")
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from mvseg.tracking.dates import CLOUD, STATIONS, Floats, PlantOnDate, SeenLeaf
 
-SPREAD = 0.6  # places are measured in this share of how far bases are spread where leaves are shorter than that
+SPREAD = 0.6  # spread of bases: places are measured in this share of it where leaves are shorter than that
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,8 +16,8 @@ from mvseg.tracking.bent_costs import pair_costs
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
 
-LEAST_GAIN = 20.0  # a second motion is believed from this log odds on; where leaves only grew, about 15 are reached
-SURE_MARGIN = 7.0  # a second motion is sure if its log odds exceed those of every other one by this
+LEAST_GAIN = 20.0  # log odds of a second motion: from this on it is believed; leaves that only grow reach about 15
+SURE_MARGIN = 7.0  # log odds of a second motion over each other one: from this on it is sure
 
 
 @dataclass(frozen=True, eq=False)

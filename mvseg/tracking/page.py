@@ -20,7 +20,7 @@ from mvseg.tracking.growth import SIZES, Growth
 from mvseg.tracking.track import Tracks
 
 PAGE_FILE = "tracks.html"
-CURVE_STEPS = 40  # points of a drawn curve
+CURVE_STEPS = 40  # points of a drawn curve (a definition)
 ASSETS = files("mvseg.tracking") / "assets"
 
 

@@ -13,8 +13,8 @@ from mvseg.formats.image_file import encode_jpeg
 from mvseg.results.photo_masks import labels_in_photo
 from mvseg.results.result import Result
 
-SIDE, QUALITY = 72, 70  # pixels and JPEG quality of a picture
-LIT, DARK = np.uint8(200), np.uint8(24)  # greys of a mask and of what is around it, where the photo is gone
+SIDE, QUALITY = 72, 70  # pixels and JPEG quality of a picture (a definition)
+LIT, DARK = np.uint8(200), np.uint8(24)  # greys of a mask and around it without a photo (a definition)
 
 
 def picture_leaves(result: Result, leaves: Collection[int]) -> dict[int, bytes]:

@@ -29,7 +29,7 @@ from mvseg.tracking.align import (
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import fitted_costs
 
-ROUNDS = 6  # of placing all dates anew, at most; two or three are enough (a technical limit)
+ROUNDS = 6  # rounds of placing all dates anew: at most this many, two or three are enough (a technical limit)
 Looked = Mapping[tuple[int, int], Poses]
 Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
 

@@ -22,7 +22,7 @@ from mvseg.tracking.leaves import leaves_of
 if TYPE_CHECKING:
     from mvseg.results.result import Result
 
-TOLD = 0.9  # a person is told of an alignment that is less likely than this
+TOLD = 0.9  # probability of an alignment: below this, a person is told
 State = Literal["born", "seen", "hidden", "gone"]
 
 
