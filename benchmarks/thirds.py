@@ -154,9 +154,10 @@ def list_derived(module: ModuleType, name: str) -> Iterator[tuple[str, Any]]:
     for statement in parse(module).body:
         if isinstance(statement, ast.Assign) and names(statement.value, name):
             (target,), value = statement.targets, evaluate(statement.value, vars(module))
-            several = isinstance(target, ast.Tuple)
-            for each, part in zip(target.elts, value, strict=True) if several else [(target, value)]:
-                yield each.id, part
+            pairs = zip(target.elts, value, strict=True) if isinstance(target, ast.Tuple) else [(target, value)]
+            for each, part in pairs:
+                if isinstance(each, ast.Name):
+                    yield each.id, part
 
 
 def forget(modules: list[ModuleType]) -> None:
