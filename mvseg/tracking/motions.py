@@ -17,7 +17,7 @@ from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
 
 LEAST_GAIN = 20.0  # log odds of a second motion: from this on it is believed; leaves that only grow reach about 15
-SURE_MARGIN = 7.0  # log odds of a second motion over each other one: from this on it is sure
+SURE_MARGIN = 7.0  # log odds of a second motion over each other one: from this on it is sure, where two turns fit
 
 
 @dataclass(frozen=True, eq=False)
