@@ -7,8 +7,8 @@ PYTHON := $(VENV)/bin/python
 demo: $(VENV)/installed
 	$(PYTHON) infer.py
 
-# two processes, one thread each: libraries that start more get in each other's way; each begins with one half of the tests, so that
-# what the tests of a file share is made once, as a rule
+# two processes, one thread each: libraries that start more get in each other's way; each begins with one half of the
+# tests, so that what the tests of a file share is made once, as a rule
 test slow: export OMP_NUM_THREADS := 1
 test slow: PYTEST := $(PYTHON) -m pytest -n 2 --dist worksteal
 

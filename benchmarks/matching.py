@@ -59,6 +59,7 @@ ABLATIONS = {
     "missed=absent": NViewConfig(costs=HypothesisCosts(absent=HypothesisCosts.missing)),
     "hidden is free": NViewConfig(costs=HypothesisCosts(hidden=0)),
     "pieces alone": NViewConfig(thresholds=Thresholds(covered=math.inf)),
+    "few views kept": NViewConfig(thresholds=Thresholds(few_covered=math.inf)),
 }
 METHODS |= {name: partial(nview_ids, config=config) for name, config in ABLATIONS.items()}
 

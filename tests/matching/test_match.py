@@ -138,8 +138,9 @@ def test_views_that_agree_on_nothing_are_warned_of() -> None:
     ("shift", "facts"),
     [
         (1, "5.% of the ids are expected to be right, .*, at a reprojection error of 8 pixels or more; 'one-per-view'"),
-        (-1, "4.% of the ids are expected to be right, rays explain 3.% of the masks, at a reprojection error of 8"),
-        (2, "rays explain 5.% of the masks, least in views 7, 8"),
+        (-1, "(39|40|41)% of the ids are expected to be right, rays explain 32% of the masks, "
+             "at a reprojection error of 8"),
+        (2, "rays explain 59% of the masks, least in views 7, 8"),
     ],
 )
 def test_cameras_of_other_photos_are_warned_of(

@@ -50,9 +50,10 @@ class Thresholds:
     """When a mask shows a part of an instance, or two of them: segmenters split leaves, and merge them.
 
     Attributes:
-        covered: a cluster may show more of a view than one region if it covers at least this share of another one.
+        covered: a cluster may have a second region in a view if it covers at least this share of it.
         as_good: a cluster explains a region or pixel if that scores at least this share of what its own regions do.
         few: a cluster is doubted if at most this share of the views show it.
+        few_covered: another one takes a region over from a doubted one if it covers at least this share of it.
         merged_coverage: a cluster may share the region of another one if it covers at least this share of it.
         merged_share: a mask shows two instances if each explains at least this share of its pixels: a definition.
     """
@@ -60,6 +61,7 @@ class Thresholds:
     covered: float = 0.05
     as_good: float = 0.5
     few: float = 0.25
+    few_covered: float = 0.02
     merged_coverage: float = 0.25
     merged_share: float = 0.2
 

@@ -103,7 +103,7 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
     for view in np.unique(sweep.view_index[is_few[clusters.ids]]).tolist():
         here = sweep.bounds.regions(view)
         gains = scores.gains(view, clusters.ids, coverages)
-        fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.covered) & (gains.score > 0)
+        fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.few_covered) & (gains.score > 0)
         moves = is_few[clusters.ids[here]] & fits.any(1) & ~is_linked[here]
         if moves.any():
             joined[here][moves] = gains.clusters[np.where(fits, gains.coverage, -1)[moves].argmax(1)]
