@@ -14,7 +14,7 @@ from mvseg.reconstruction.surface.leaf_patch import Floats
 from mvseg.reconstruction.surface.mask_stack import BLUR_PX, MaskStack
 
 SUPERSAMPLED = 3  # a pixel is drawn as so many small ones along each side (a technical limit)
-DRAWN_TOO_FAR = 0.48  # OpenCV draws polygons so many small pixels too wide on every side (fitted: test_outline.py)
+DRAWN_TOO_FAR = 0.48  # OpenCV draws polygons so many small pixels too wide on every side (measured: test_outline.py)
 SUB_PIXEL_BITS = 4  # corners of OpenCV's polygons are whole numbers of 1 / 2^4 pixels (a technical limit)
 LEAST_GROWTH_PX = 0.15  # a patch is drawn with an offset if that is at least this: less is not worth the time
 DRAWN_BESIDE = 4  # the blurred image of a patch reaches so many pixels beyond it
