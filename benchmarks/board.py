@@ -45,9 +45,10 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
+from mvseg.open_scene import Opened
 from mvseg.results.overlay import draw_overlay
+from mvseg.run import find_leaves, shape_leaves
 from mvseg.scene import Scene
-from mvseg.stages import State, choose, detect, match, snap
 from mvseg.training.data import list_samples
 from mvseg.training.validation import detect_and_label
 
@@ -57,7 +58,7 @@ SLENDER = 4.0  # length over width of what is no leaf of the rosette
 ROSETTE = 0.85  # of the photo's height: the rosette lies below
 
 Figures = dict[str, float]
-Draw = Callable[[DetectConfig, Scene, str], tuple[Masks, Masks]]  # `find_leaves` with some weights
+Draw = Callable[[DetectConfig, Scene, str], tuple[Masks, Masks]]  # `find_masks` with some weights
 
 
 def mirror_scene(scene: Scene, folder: Path) -> Scene:
@@ -77,12 +78,12 @@ def mirror_scene(scene: Scene, folder: Path) -> Scene:
     return Scene(f"{scene.name}-mirrored", tuple(views), cameras)
 
 
-def find_leaves(scene: Scene, options: DetectConfig, cache: Path | None) -> tuple[Masks, Masks]:
+def find_masks(scene: Scene, options: DetectConfig, cache: Path | None) -> tuple[Masks, Masks]:
     """Masks as they are found and matched, and as they leave the whole job."""
-    state = State(config=RunConfig(reconstruct=None, detect=options), scene=scene, photos=Photos(scene), cache=cache)
-    state = match(detect(state))
-    found = state.masks
-    return found, (snap(choose(state)) if options.verify else state).masks
+    config = RunConfig(reconstruct=None, detect=options)
+    opened = Opened(scene, Photos(scene), None, mask_kind="", views_left_out=(), config=config)
+    known = find_leaves(opened, cache=cache)
+    return known.matched[0], shape_leaves(known).masks
 
 
 def judge(masks: Masks, truth: list[np.ndarray]) -> Figures:
@@ -203,9 +204,9 @@ SCENES: Mapping[str, Callable] = {
 def draw_found(
     weights: str, args: argparse.Namespace, options: DetectConfig, scene: Scene, name: str
 ) -> tuple[Masks, Masks]:
-    """`find_leaves` with some weights; with `--pictures`, what comes out is drawn, four photos of each scene."""
+    """`find_masks` with some weights; with `--pictures`, what comes out is drawn, four photos of each scene."""
     keep = args.keep / "detections" / f"{Path(weights).parent.name or weights}-{name}"
-    masks = find_leaves(scene, replace(options, weights=weights), keep)
+    masks = find_masks(scene, replace(options, weights=weights), keep)
     if args.pictures is not None and options.image_size is None:
         views = range(0, len(scene.views), max(1, len(scene.views) // 4))
         photos = Photos(scene)

@@ -27,6 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from mvseg.detection.config import LEAST_SCORE, MORE_SCORE, SURE_SCORE
 from mvseg.detection.detect_scene import detect_scene
+from mvseg.detection.find_leaves import find_leaves
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.formats.label_png import read_label_png
@@ -69,9 +70,8 @@ def study(folder: Path, step: int = 1) -> Study | None:
         return None
     scene = replace(scene, views=scene.views[::step], cameras=scene.cameras[list(range(0, len(scene.views), step))])
     truth = true_maps(folder, scene)
-    found = detect_scene(Photos(scene))
-    table = found.proposals(scene.cameras)
-    matched = [found.match(scene.cameras).masks, *found.match_more(scene.cameras)]
+    found = find_leaves(detect_scene(Photos(scene)), scene.cameras)
+    table, matched = found.proposals, found.matched
     candidates = gather_candidates(
         [(masks, masks.regions.labels) for masks in matched],
         scene.cameras,

@@ -21,7 +21,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -52,20 +52,19 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
-from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import BEFORE_EDITS, list_stages
+from mvseg.open_scene import Opened, open_scene
 from mvseg.regions import IGNORE_LABEL
+from mvseg.results.result import Result
+from mvseg.run import Known, apply_edits, find_leaves, match_given, shape_leaves
 from mvseg.scene import Scene, View
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.simulation.scene_writer import write_scene
-from mvseg.stages import State, load
 from mvseg.system.atomic import write_text_whole
 from mvseg.system.running import running
 
 Record = dict[str, Any]
 
-NOT_SHOWN = ("say_what_is_missing", "check", "measure")
 MOST, ROUNDS = 2.0, 8  # edits' worth per leaf, and in how many rounds, as a rule
 ORDERS: tuple[Order, ...] = ("repair", "ask")
 CURVES = (
@@ -88,13 +87,13 @@ class Case:
 
     Attributes:
         name: of its files.
-        found: what is known before edits.
+        known: what is known before edits.
         truth: V label maps.
         has_masks: they were given.
     """
 
     name: str
-    found: State
+    known: Known
     truth: Sequence[Labels]
     has_masks: bool
 
@@ -113,10 +112,8 @@ def list_cases(args: argparse.Namespace) -> Iterator[Case]:
 
 def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -> Case:
     """A scene whose leaves the detector finds."""
-    state = load(folder, None, config, cache=cache)
-    for name, stage in list_stages(config, has_masks=False).items():
-        state = stage(state) if name in BEFORE_EDITS else state
-    return Case(f"detected_{folder.name}", state, true_maps(folder, state.scene), has_masks=False)
+    known = find_leaves(open_scene(folder, None, config), cache=cache)
+    return Case(f"detected_{folder.name}", known, true_maps(folder, known.scene), has_masks=False)
 
 
 def degraded_case(spec: SceneSpec, cache: Path) -> Case:
@@ -125,14 +122,9 @@ def degraded_case(spec: SceneSpec, cache: Path) -> Case:
     name = Path(spec.folder).name
     views = tuple(View(f"{view:03d}", Path(f"{name}/{view:03d}.png")) for view in range(len(maps.cameras)))
     scene = Scene(name=name, views=views, cameras=maps.cameras, unit="mm", up=(0.0, 0.0, 1.0))
-    state = State(
-        config=config,
-        scene=scene,
-        photos=Photos(scene),
-        matching=Matching(Masks.of(regions), MatchReport("none")),
-        mask_kind="label images",
-    )
-    return Case(f"degraded_{name}", state, list(maps.true), has_masks=True)
+    given = Masks.of(regions)
+    opened = Opened(scene, Photos(scene), given, mask_kind="label images", views_left_out=(), config=config)
+    return Case(f"degraded_{name}", match_given(opened, given), list(maps.true), has_masks=True)
 
 
 def render(spec: SceneSpec, cache: Path) -> Path:
@@ -147,14 +139,9 @@ def render(spec: SceneSpec, cache: Path) -> Path:
 # --- rounds
 
 
-def compute(case: Case, corrections: Corrections) -> State:
+def compute(case: Case, corrections: Corrections) -> Result:
     """What a run makes of the scene with these corrections, without traits."""
-    state = replace(case.found, corrections=corrections)
-    stages = list_stages(state.config, has_masks=case.has_masks, has_edits=len(corrections.edits) > 0)
-    for name, stage in stages.items():
-        is_done = name in BEFORE_EDITS and not case.has_masks
-        state = state if is_done or name in NOT_SHOWN else stage(state)
-    return state
+    return shape_leaves(apply_edits(case.known, corrections) if corrections.edits else case.known)
 
 
 def judge(masks: Masks, truth: Sequence[Labels]) -> dict[str, float]:
@@ -182,12 +169,12 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
     right, touched = frozenset[int](), frozenset[int]()  # leaves, after the round before, and that its edits are about
     while True:
         begun = time.process_time()
-        state = compute(case, Corrections(edits))
+        result = compute(case, Corrections(edits))
         seconds = time.process_time() - begun
-        masks = state.masks.to("cpu")
+        masks = result.masks.to("cpu")
         first = masks if first is None else first
-        doubts = list_doubts(masks, state.surfaces, cameras=state.scene.cameras, left=state.left)
-        look = Look(masks, case.truth, state.scene, doubts, ids_only=case.has_masks)
+        doubts = list_doubts(masks, result.surfaces, cameras=result.scene.cameras, left=result.left)
+        look = Look(masks, case.truth, result.scene, doubts, ids_only=case.has_masks)
         listed = list_answers(look, edits) if order == "ask" else list_repairs(look)
         done = {str(edit.by) for edit in edits}
         most = math.ceil(MOST * case.num_leaves)
@@ -195,12 +182,12 @@ def correct(case: Case, order: Order, out: Path) -> list[Record]:
         step = min(left, math.ceil(most / ROUNDS))
         chosen = choose_repairs(listed, order=order, worth=(step, left), done=done)
         about = {"scene": case.name, "order": order, "leaves": case.num_leaves}
-        alone = judge(change_masks_alone(first, edits, state.scene), case.truth)
+        alone = judge(change_masks_alone(first, edits, result.scene), case.truth)
         record = about | {"edits": len(edits), "worth": count_worth(edits)} | judge(masks, case.truth)
         record |= {f"alone_{name}": value for name, value in alone.items()}
         record["harmed"] = len(right - look.right - touched)
         right, touched = look.right, frozenset[int]().union(*(each.leaves for each in chosen))
-        record |= {"idle": sum(fate.fate != APPLIED for fate in state.result().fates), "seconds": round(seconds, 1)}
+        record |= {"idle": sum(fate.fate != APPLIED for fate in result.fates), "seconds": round(seconds, 1)}
         records.append(record | {"is_last": int(not chosen)})
         for each in chosen:
             edits += tuple(edit.model_copy(update={"by": each.name}) for edit in each.edits)

@@ -40,7 +40,7 @@ def open_views(visible: np.ndarray) -> list[int]:
 
 def draw_from(case: Case, views: list[int], number: int) -> list[int]:
     """The first view, and then those from the most different sides."""
-    centers = case.found.scene.cameras.centers.numpy()
+    centers = case.known.scene.cameras.centers.numpy()
     sights = centers - centers.mean(0)
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
     chosen = [views[0]]
@@ -76,7 +76,7 @@ def main() -> None:
     for folder in args.scenes:
         case, begun = detect_case(folder, RunConfig(reconstruct=None)), time.process_time()
         first = compute(case, Corrections()).masks.to("cpu")
-        before = Look(first, case.truth, case.found.scene, ())
+        before = Look(first, case.truth, case.known.scene, ())
         views_of = {leaf: open_views(before.visible[:, leaf]) for leaf in range(1, len(before.size))}
         leaves = [leaf for leaf, views in views_of.items() if len(views) >= FEWEST]
         here = np.zeros_like(total)
@@ -92,7 +92,7 @@ def main() -> None:
                     here[number - 2, 0] += found, len(others)
                     if leaf not in before.right:
                         here[number - 2, 1] += found, len(others)
-                after = Look(masks, case.truth, case.found.scene, ()).right
+                after = Look(masks, case.truth, case.known.scene, ()).right
                 harmed += len(before.right - after - set(chosen))
                 drawn_leaves += len(chosen)
         total, harm = total + here, harm + harmed

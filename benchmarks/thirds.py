@@ -23,7 +23,7 @@ import inspect
 import pkgutil
 import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -51,24 +51,29 @@ from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import LeafMetrics, leaf_metrics
-from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.affinity import region_affinity
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.match import match_masks
 from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
-from mvseg.matching.result import Matching, MatchReport
+from mvseg.matching.split import split_merged
 from mvseg.matching.view_graph import ViewGraph
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.scene import Cameras, Scene, View
+from mvseg.run import Known
+from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
 from mvseg.simulation.growth import grow_plant
-from mvseg.stages import State, check_ids, choose, follow, match, reconstruct, snap, split
 from mvseg.system.running import running
+from mvseg.verification.checked_ids import check_ids
+from mvseg.verification.choose import choose_leaves
+from mvseg.verification.drawn_leaves import follow_drawn
+from mvseg.verification.snap_edges import snap_masks
 
 FACTOR = 1.33
 SCENES = ((3, 16), (5, 32), (10, 8), (20, 8))  # views and leaves
@@ -271,39 +276,38 @@ def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
     for folder in (demo_scene(), *(render(spec_of(*cell), args.cache) for cell in FOUND), *args.scenes):
         config = RunConfig(reconstruct=None)
         case = detect_case(folder, config, cache=args.cache / "kept" / folder.name)
-        matched = match(replace(case.found, unedited=None))
-        first = choose_anew(matched).to("cpu")
-        yield Trial(f"choose {folder.name}", CHOOSING, partial(choose_anew, matched), case.truth)
+        first = choose_anew(case.known).to("cpu")
+        yield Trial(f"choose {folder.name}", CHOOSING, partial(choose_anew, case.known), case.truth)
         for number in (2, 3):
             drawn = draw(case, first, number)
-            yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, drawn), case.truth)
+            yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, case.known, drawn), case.truth)
 
 
 def check_trial(name: str, regions: Regions, cameras: Cameras, truth: np.ndarray) -> Trial:
     """Surfaces check the ids of given masks, and those that show two leaves are cut."""
-    views = tuple(View(f"{view:03d}", Path(f"{view:03d}.png")) for view in range(len(cameras)))
-    scene = Scene(name=name, views=views, cameras=cameras)
-    matching = Matching(Masks.of(regions), MatchReport("none"))
-    given = State(config=RunConfig(), scene=scene, photos=Photos(scene), matching=matching, mask_kind="label images")
-    state = reconstruct(match(given), with_voxels=False)
-    return Trial(f"check {name}", CHECKING, partial(check_anew, state), list(truth))
+    masks = match_masks(Masks.of(regions), cameras).masks
+    surfaces = fit_surfaces(masks.regions, masks.instance_ids, cameras)
+    return Trial(f"check {name}", CHECKING, partial(check_anew, masks, surfaces, cameras), list(truth))
 
 
-def check_anew(state: State) -> Masks:
-    return split(check_ids(state)).masks
+def check_anew(masks: Masks, surfaces: Mapping[int, LeafSurface], cameras: Cameras) -> Masks:
+    checked = check_ids(masks, surfaces, cameras=cameras, config=MatchConfig())
+    return split_merged(checked.close_gaps()).close_gaps()
 
 
-def choose_anew(state: State) -> Masks:
-    return snap(choose(state)).masks
+def choose_anew(known: Known) -> Masks:
+    sure, *more = known.matched
+    leaves = choose_leaves(sure, known.proposals, cameras=known.scene.cameras, more=more)
+    return snap_masks(leaves.masks, known.opened.photos)
 
 
-def follow_anew(state: State) -> Masks:
-    return follow(state).masks
+def follow_anew(known: Known, masks: Masks) -> Masks:
+    return follow_drawn(masks, cameras=known.scene.cameras, photos=known.opened.photos)[0]
 
 
-def draw(case: Case, first: Masks, number: int) -> State:
+def draw(case: Case, first: Masks, number: int) -> Masks:
     """Every third leaf that enough photos show, up to `MOST_DRAWN`, was missed, and is drawn in so many of them."""
-    look, ids = Look(first, case.truth, case.found.scene, ()), first.instance_ids.clone()
+    look, ids = Look(first, case.truth, case.known.scene, ()), first.instance_ids.clone()
     views = [(leaf, open_views(look.visible[:, leaf])) for leaf in range(1, len(look.size))]
     chosen = [(leaf, shown) for leaf, shown in views if len(shown) > number][number - 2 :: 3][:MOST_DRAWN]
     maps = [np.zeros_like(labels) for labels in case.truth]
@@ -314,8 +318,7 @@ def draw(case: Case, first: Masks, number: int) -> State:
     outlines = regions_from_label_maps(maps)
     drawn = Masks.of(outlines, outlines.labels, torch.ones(len(outlines)), origin=Origin.CORRECTED)
     left = replace(first, instance_ids=ids).select((ids > 0) | (first.view_index % 2 == 0))
-    masks = Masks.concatenate((left.with_merged(()), drawn)).close_gaps()
-    return replace(case.found, matching=Matching(masks, MatchReport("none")))
+    return Masks.concatenate((left.with_merged(()), drawn)).close_gaps()
 
 
 def count_changed(before: Masks, after: Masks) -> int:

@@ -36,7 +36,8 @@ from mvseg.masks import Masks
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.shapes import reconstruct_shapes
+from mvseg.reconstruction.shapes import reconstruct_voxels
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.folder import save_result
 from mvseg.results.read import read_instances
@@ -265,7 +266,8 @@ def prepare(table: Path, results: Path, *, masks: str = "true") -> None:
             ids = torch.tensor([number.get(label, -1) for label in regions.labels.tolist()])
             matching = Matching(Masks.of(regions, ids, (ids > 0).float()), MatchReport(method="truth"))
         ids = matching.instance_ids
-        surfaces, voxels = reconstruct_shapes(regions, ids, scene.cameras, config=ReconstructConfig())
+        surfaces = fit_surfaces(regions, ids, scene.cameras)
+        voxels = reconstruct_voxels(regions, ids, scene.cameras, config=ReconstructConfig(), surfaces=surfaces)
         traits = measure_plant(scene, matching, surfaces=surfaces, voxels=voxels)
         instances = Instances(surfaces=surfaces, voxels=voxels, traits=traits)
         result = Result(scene=scene, matching=matching, instances=instances)

@@ -1,4 +1,4 @@
-"""Stands in for what a detector finds: masks that are matched whatever is asked, and the excessive set."""
+"""Stands in for what a detector sees: masks that are matched whatever is asked, and the excessive set."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from typing import Any
 
 import torch
 
+from mvseg.config import RunConfig
+from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching
-from mvseg.scene import Cameras
+from mvseg.open_scene import Opened
+from mvseg.scene import Cameras, Scene
 
 
 @dataclass(frozen=True, eq=False)
 class FoundMasks:
-    """As `mvseg.detection.detect_scene.Found`."""
+    """As `mvseg.detection.find_leaves.Look`."""
 
-    matching: Matching
+    sure: Matching
     excessive: Masks
+    more: Masks | None = None
 
     @staticmethod
     def of(matching: Matching) -> Any:
@@ -27,11 +31,18 @@ class FoundMasks:
         numbered = replace(numbered, origin=torch.full_like(masks.origin, Origin.DETECTED))
         return FoundMasks(matching.with_masks(numbered), numbered)
 
-    def match(self, cameras: Cameras) -> Matching:
-        return self.matching
-
-    def match_more(self, cameras: Cameras) -> tuple[Masks, ...]:
-        return (self.matching.masks,)
+    def match(self, cameras: Cameras, min_score: float) -> Matching:
+        return self.sure.with_masks(self.more or self.sure.masks)
 
     def proposals(self, cameras: Cameras) -> Masks:
         return self.excessive
+
+
+def open_photos(scene: Scene, config: RunConfig = RunConfig(), given: Masks | None = None) -> Opened:
+    """A scene in memory, as `open_scene` opens one."""
+    return Opened(scene, Photos(scene), given, mask_kind="", views_left_out=(), config=config)
+
+
+def see_masks(monkeypatch: Any, look: Any) -> None:
+    """The detector sees this look in every scene."""
+    monkeypatch.setattr("mvseg.detection.detect_scene.detect_scene", lambda *_, **__: [look])

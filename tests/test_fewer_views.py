@@ -11,10 +11,10 @@ from typing import Any
 import pytest
 import torch
 
-import mvseg.stages
 from mvseg import Corrections, InputError, InputWarning, ReconstructConfig, RunConfig, run_scene
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, parse_corrections
+from mvseg.open_scene import open_scene
 from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
 from scene_folders import write_scene
 
@@ -29,9 +29,9 @@ def plant(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def taken(folder: Path, views: Any, **how: Any) -> list[str]:
     """Names of the views that a run from photos takes."""
-    state = mvseg.stages.load(folder, None, replace(IDS_ONLY, views=views), **how)
-    names = [view.name for view in state.scene.views]
-    assert sorted([*names, *state.views_left_out]) == [f"{view:03d}" for view in range(9)]
+    opened = open_scene(folder, None, replace(IDS_ONLY, views=views), **how)
+    names = [view.name for view in opened.scene.views]
+    assert sorted([*names, *opened.views_left_out]) == [f"{view:03d}" for view in range(9)]
     return names
 
 
@@ -74,7 +74,7 @@ def test_photos_alone_are_as_many_as_are_enough_and_given_masks_are_all(
     plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert len(taken(plant, None)) == 9
-    monkeypatch.setattr(mvseg.stages, "ENOUGH_VIEWS", 5)
+    monkeypatch.setattr("mvseg.open_scene.ENOUGH_VIEWS", 5)
     assert taken(plant, None) == taken(plant, 5)
     assert len(taken(plant, "all")) == len(taken(plant, 9)) == len(taken(plant, 500)) == 9
     assert len(run_scene(plant, plant / "masks", IDS_ONLY).regions) == 27
@@ -121,12 +121,12 @@ def test_a_result_is_corrected_in_its_own_views_and_in_those_that_were_corrected
     assert main(["infer", str(plant), *words]) == 0
     few = taken(plant, 4)
     with pytest.warns(InputWarning, match="15 of 27 masks are left out"):
-        assert [view.name for view in OpenResult(out).found.scene.views] == few
+        assert [view.name for view in OpenResult(out).scene.views] == few
     other = next(f"{view:03d}" for view in range(9) if f"{view:03d}" not in few)
     edits = [{"op": "reject", "view": other, "at": [1, 1]}]
     (out / CORRECTIONS_FILE).write_text(json.dumps({"format": FORMAT, "edits": edits}))
     with pytest.warns(InputWarning, match="12 of 27 masks are left out"):
-        assert [view.name for view in OpenResult(out).found.scene.views] == sorted([*few, other])
+        assert [view.name for view in OpenResult(out).scene.views] == sorted([*few, other])
 
 
 @pytest.mark.parametrize("views", [1, 0, -3])

@@ -31,8 +31,7 @@ from mvseg.masks import Masks
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
 from mvseg.matching.result import Matching
-from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.shapes import reconstruct_shapes
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.results.overlay import draw_overlay
 from mvseg.scene import Cameras
@@ -68,9 +67,8 @@ def draw_pictures(masks: Masks, cameras: Cameras) -> None:
 
 
 def fit_shapes(regions: Regions, instance_ids: Tensor, cameras: Cameras, *, num_workers: int) -> None:
-    config = ReconstructConfig()
     with running(num_workers=num_workers):
-        reconstruct_shapes(regions, instance_ids, cameras, config=config)
+        fit_surfaces(regions, instance_ids, cameras)
 
 
 def propose(maps: np.ndarray, count: int, seed: int) -> list[dict[str, Tensor]]:

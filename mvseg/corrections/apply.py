@@ -50,6 +50,33 @@ class Fate:
         return f"correction {self.edit} ({self.op}): {': '.join(filter(None, (self.fate, self.problem)))}"
 
 
+@dataclass(frozen=True)
+class Refused:
+    """A pixel where a person says that no leaf is, and where no mask is: it may be the answer to a question, see
+    `settle`.
+
+    Attributes:
+        edit: its number.
+        view, column, row: of the undistorted photo.
+        everywhere: no leaf in any photo.
+    """
+
+    edit: int
+    view: int
+    column: int
+    row: int
+    everywhere: bool
+
+
+@dataclass(frozen=True)
+class Whole:
+    """An edit about a whole instance: its number, the row of a mask of it, and whether it is rejected, or confirmed."""
+
+    edit: int
+    row: int
+    rejects: bool
+
+
 @dataclass(frozen=True, eq=False)
 class Corrected:
     """Masks as edits leave them.
@@ -58,17 +85,16 @@ class Corrected:
         masks: D masks on the CPU, by view, matched to nothing.
         links: of their rows; those that no edit names keep outlines apart from what else their photos show.
         last_edits: (D,) int64, number of the last edit that drew, cut or confirmed each; 0 = none.
-        everywhere: (edit number, row, whether its instance is rejected) of each edit about a whole instance.
-        refused: (edit number, view, x, y, whether in all photos) of each pixel where a person says that no leaf is,
-            and where no mask is: it may be the answer to a question, see `settle`.
+        everywhere: the edits about whole instances.
+        refused: the pixels where a person says that no leaf is, and where no mask is.
         fates: of the edits, in their order.
     """
 
     masks: Masks
     links: Links
     last_edits: Tensor
-    everywhere: tuple[tuple[int, int, bool], ...]
-    refused: tuple[tuple[int, int, int, int, bool], ...]
+    everywhere: tuple[Whole, ...]
+    refused: tuple[Refused, ...]
     fates: tuple[Fate, ...]
 
     @property
@@ -88,7 +114,7 @@ class _Work:
     everywhere: list[tuple[int, EditedMask, bool]] = field(default_factory=list)
     words: dict[str, list[tuple[int, EditedMask]]] = field(default_factory=dict)
     rejected: list[tuple[int, EditedMask]] = field(default_factory=list)  # in one photo, by which edit
-    refused: list[tuple[int, int, int, int, bool]] = field(default_factory=list)
+    refused: list[Refused] = field(default_factory=list)
 
     def is_rejected(self, mask: EditedMask) -> bool:
         """Whether it only stays to tell which instance is rejected."""
@@ -135,7 +161,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         _tell_of_parts(work, place, component)
         first = np.unique(component, return_index=True)[1]
         table = replace(table, classes=table.classes[first[component]])  # those of different classes are never matched
-    everywhere = tuple((n, place[mask], rejects) for n, mask, rejects in work.everywhere if mask in place)
+    everywhere = tuple(Whole(n, place[mask], rejects) for n, mask, rejects in work.everywhere if mask in place)
     last_edits = torch.tensor([max(mask.edits, default=0) for mask in order], dtype=torch.int64)
     return Corrected(
         masks=table,
@@ -162,10 +188,11 @@ def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corre
     ids, goes = matched.instance_ids, torch.zeros(len(matched), dtype=torch.int64)  # the edit by which each mask goes
     confirmed, last_edits = torch.zeros(len(matched), dtype=torch.bool), corrected.last_edits
     overridden: dict[int, int] = {}
-    for number, row, rejects in corrected.everywhere:
+    for each in corrected.everywhere:
+        number, row = each.edit, each.row
         own = (ids == ids[row]) if ids[row] > 0 else torch.zeros_like(confirmed)
         own[row] = True
-        if rejects:
+        if each.rejects:
             goes[own & (last_edits < number)] = number
         else:
             overridden |= dict.fromkeys(goes[own & (goes > 0)].tolist(), number)
@@ -191,7 +218,7 @@ def _apply_one(work: _Work, number: int, edit: Edit) -> None:
         place = edit.view, *edit.at
         pixel = _pixel_at(work, place)
         if not _masks_at(work, place, work.masks):
-            work.refused.append((number, *pixel, edit.everywhere))
+            work.refused.append(Refused(number, *pixel, edit.everywhere))
         mask = _mask_at(work, place)
         if edit.everywhere:
             _contradict(work, number, mask.edits)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
-from mvseg.corrections.apply import APPLIED, Corrected
+from mvseg.corrections.apply import APPLIED, Fate, Refused
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.choose import LeftOut
@@ -13,33 +13,35 @@ from mvseg.verification.evidence import paint_view
 
 
 def settle(
-    corrected: Corrected, left: Sequence[LeftOut], surfaces: Mapping[int, LeafSurface], *, cameras: Cameras
-) -> tuple[tuple[LeftOut, ...], Corrected]:
+    edits: Sequence[Fate],
+    refused: Sequence[Refused],
+    left: Sequence[LeftOut],
+    surfaces: Mapping[int, LeafSurface],
+    *,
+    cameras: Cameras,
+) -> tuple[tuple[LeftOut, ...], tuple[Fate, ...]]:
     """The edits that say "no leaf" where no mask is, once all is known that a person may be asked about.
 
     They are applied where they answer a question: a candidate that was not chosen is shown there, which goes if the
     edit is about all photos, or a surface, of which no mask is there.
 
     Args:
-        corrected: what came of all edits.
+        edits: what came of all edits.
+        refused: where no leaf is.
         left: candidates that were not chosen.
         surfaces: {instance id: surface}.
         cameras: V cameras.
 
     Returns:
-        The candidates that are left, and the same with the final fates.
+        The candidates that are left, and the final fates.
     """
-    gone: set[int] = set()
-    answers: set[int] = set()
-    for number, view, column, row, is_about_all in corrected.refused:
-        shown = [each for each in left if each.masks.regions.at(view, column, row)]
-        gone |= {id(each) for each in shown if is_about_all}
-        width, height = cameras.sizes[view].tolist()
-        is_in_photo = 0 <= column < width and 0 <= row < height
-        if shown or (is_in_photo and paint_view(surfaces, cameras, view)[row, column] > 0):
-            answers.add(number)
-    fates = tuple(
-        replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in corrected.fates
-    )
-    return tuple(each for each in left if id(each) not in gone), replace(corrected, fates=fates)
-
+    gone, answers = set[int](), set[int]()
+    for each in refused:
+        shown = {n for n, other in enumerate(left) if other.masks.regions.at(each.view, each.column, each.row)}
+        gone |= shown if each.everywhere else set()
+        width, height = cameras.sizes[each.view].tolist()
+        is_in_photo = 0 <= each.column < width and 0 <= each.row < height
+        if shown or (is_in_photo and paint_view(surfaces, cameras, each.view)[each.row, each.column] > 0):
+            answers.add(each.edit)
+    fates = tuple(replace(each, fate=APPLIED, problem="") if each.edit in answers else each for each in edits)
+    return tuple(other for n, other in enumerate(left) if n not in gone), fates

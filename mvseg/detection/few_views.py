@@ -5,13 +5,12 @@ Not in the paper.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import torch
 from torch import Tensor
 
-from mvseg.errors import InputWarning
+from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.verification.evidence import SHARED
 
@@ -26,22 +25,25 @@ def select_by_views(masks: Masks, detected: Masks, *, min_views: int) -> Masks:
         detected: the D' masks that they come from, matched.
         min_views: in so many photos a leaf has a mask, at least. 2 leaves the masks as they are, since verification
             itself drops what one photo shows. With more, leaves in fewer photos go, and masks that are matched to
-            nothing. 1 adds detected masks that are matched to nothing, or to an instance that one or two photos show,
-            unless other masks of their photo cover most of them (the better detection score first).
+            nothing, but for the leaves and masks of a person. 1 adds detected masks that are matched to nothing, or to
+            an instance that one or two photos show, unless other masks of their photo cover most of them (the better
+            detection score first).
 
     Returns:
         The masks, ids as before, with gaps where instances went. Added ones follow, with `Origin.FEW_VIEWS`; their ids
         come after the others, one for each mask that was matched to nothing. Warns (InputWarning) of how many came.
     """
     if min_views > 2:
-        return masks.select(_count_views(masks) >= min_views)
+        leaves_of_a_person = masks.instance_ids[masks.is_corrected & (masks.instance_ids > 0)]
+        is_his = masks.is_corrected | torch.isin(masks.instance_ids, leaves_of_a_person)
+        return masks.select(is_his | (_count_views(masks) >= min_views))
     if min_views == 2:
         return masks
     added = _few(masks, detected.to("cpu"))
     if not len(added):
         return masks
     message = f"masks that one or two photos show and no other view verifies: {len(added)} (from_few_views)"
-    warnings.warn(message, InputWarning, stacklevel=2)
+    warn(message)
     return Masks.concatenate((masks, added))
 
 

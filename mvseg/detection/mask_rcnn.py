@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from functools import partial
+from collections.abc import Iterable, Sequence
 
 import torch
 from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
-from mvseg.detection.config import MORE_SCORE, SURE_SCORE
+from mvseg.detection.config import SURE_SCORE, DetectConfig
+from mvseg.detection.find_leaves import Look, find_leaves
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.proposals import gather_proposals
 from mvseg.detectors.run import run_heads
@@ -19,7 +19,6 @@ from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
-from mvseg.verification.choose import choose_leaves
 from mvseg.verification.snap_edges import snap_masks
 
 
@@ -144,13 +143,10 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         _check_cameras(cameras, sizes)
         if not self.verify:
             return self.match_detections(detections, cameras)
-        posed = cameras.to("cpu")
-        match = partial(self.match_detections, detections, posed)
-        matching = match(min_score=max(SURE_SCORE, self.roi_heads.score_thresh))
-        leaves = choose_leaves(
-            matching.masks, list_proposals(detections, posed), cameras=posed, more=(match(min_score=MORE_SCORE).masks,)
-        )
-        return matching.with_masks(snap_masks(leaves.masks, photos.__getitem__))
+        config, posed = DetectConfig(min_score=max(SURE_SCORE, self.roi_heads.score_thresh)), cameras.to("cpu")
+        look = Look.of(self, detections, posed, min_score=config.min_score)
+        leaves = find_leaves([look], posed, config=config).leaves
+        return look.sure.with_masks(snap_masks(leaves.masks, photos.__getitem__))
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:
@@ -165,17 +161,17 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
     @torch.no_grad()
     def match_detections(
         self,
-        detections: list[dict[str, Tensor]],
+        detections: Sequence[dict[str, Tensor]],
         cameras: Cameras,
         *,
         min_score: float = 0.0,
     ) -> Matching:
         """The second half of `find_regions`: what is kept of what `detect` gives for V images, matched, of proposals
-        that score `min_score` or more. `labels` of its regions are rows of `list_proposals`."""
+        that score `min_score` or more. `labels` of its regions are rows of the excessive set, view after view."""
         matching = self._match(detections, cameras.to("cpu"), min_score=min_score)
         return matching.with_masks(matching.masks.select(matching.masks.view_index.argsort(stable=True)))
 
-    def _match(self, detections: list[dict[str, Tensor]], cameras: Cameras, *, min_score: float = 0.0) -> Matching:
+    def _match(self, detections: Sequence[dict[str, Tensor]], cameras: Cameras, *, min_score: float = 0.0) -> Matching:
         """The proposals that are kept, of those whose mask is not empty, matched; `labels` say which they are."""
         with torch.autocast(cameras.K.device.type, enabled=False):  # pixel counts need single precision
             proposals, boxes = gather_proposals(detections, cameras.sizes.tolist())
@@ -210,12 +206,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             results.append(result | {"instance_ids": here.instance_ids, "match_scores": here.match_scores})
             start += len(proposals["boxes"])
         return results
-
-
-def list_proposals(detections: list[dict[str, Tensor]], cameras: Cameras) -> Masks:
-    """The excessive set of V images, as `MultiViewMaskRCNN.detect` gives it, as masks on the CPU that are matched to
-    nothing; those that are empty are in it, too."""
-    return gather_proposals(detections, cameras.sizes.tolist())[0]
 
 
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:

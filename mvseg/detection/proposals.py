@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 from torchvision.models.detection.roi_heads import expand_boxes, expand_masks, paste_mask_in_image
@@ -12,7 +14,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.regions import stack_regions
 
 
-def gather_proposals(detections: list[dict[str, Tensor]], sizes: list[list[int]]) -> tuple[Masks, Tensor]:
+def gather_proposals(detections: Sequence[dict[str, Tensor]], sizes: list[list[int]]) -> tuple[Masks, Tensor]:
     """Proposals of all views, moved to the frame of the images; masks become box crops, never full frames.
 
     Args:

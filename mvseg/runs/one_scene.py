@@ -20,10 +20,10 @@ from mvseg.detection.cached_detections import claim_cache, delete_cached
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.find_views import list_some
-from mvseg.pipeline import run_scene
 from mvseg.results.earlier import check_out, check_same_scene
 from mvseg.results.folder import save_result
 from mvseg.results.result import Result
+from mvseg.run import run_scene
 from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.file_hash import hash_files

@@ -32,7 +32,8 @@ from mvseg.errors import InputError, InputWarning
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.results.report.page import build_page, describe_update
 from mvseg.results.report.pictures import draw_picture
-from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult, Superseded
+from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
+from mvseg.system.running import Cancelled
 
 HOST = "127.0.0.1"
 WAIT_SECONDS = 20.0  # that a page's question for news stays open
@@ -61,11 +62,11 @@ class Corrector:
         """Raises InputError: the corrections saved in the folder, or a photo, cannot be read, or they are another
         scene's."""
         self.opened = opened
-        self.written, self.marks = self._stamp(), mark_photos(opened.found.photos)
+        self.written, self.marks = self._stamp(), mark_photos(opened.photos)
         self.corrections, self.notice = self._read_edits()
-        self.shown = opened.matched()
-        photos, views = opened.found.photos, range(len(opened.found.scene.views))
-        self.pictures = [draw_picture(photos(view), self.shown.masks, view=view) for view in views]
+        self.shown = opened.saved_result()
+        photos, views = opened.photos, range(len(opened.scene.views))
+        self.pictures = [draw_picture(photos(view), self.shown.masks, view=view, is_whole=True) for view in views]
         self.news = threading.Condition()
         self.wanted, self.computed = 1, 0
         self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
@@ -100,7 +101,7 @@ class Corrector:
                 raise Refused(HTTPStatus.CONFLICT, "Another page has changed the edits since this one was loaded.")
             if self._is_changed():
                 raise Refused(HTTPStatus.CONFLICT, CHANGED)
-            corrections = with_marks(corrections, self.opened.found.scene, self.marks)
+            corrections = with_marks(corrections, self.opened.scene, self.marks)
             write_corrections(self.opened.folder / CORRECTIONS_FILE, corrections)
             self.corrections, self.written = corrections, self._stamp()
             self.wanted += 1
@@ -112,7 +113,7 @@ class Corrector:
         found = self.opened.saved_corrections()
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always", InputWarning)
-            check_made_for(found, self.opened.found.photos)
+            check_made_for(found, self.opened.photos)
         return found, " ".join(filter(None, (self.opened.notice, *(f"{each.message}." for each in caught))))
 
     def _stamp(self) -> tuple[int, int] | None:
@@ -174,7 +175,7 @@ class Corrector:
             ]
             news = shown, pictures, describe_update(shown, pictures)
             problem = " ".join([self.notice, *messages]).strip()
-        except Superseded:
+        except Cancelled:
             return
         except InputError as error:
             problem = str(error)
@@ -210,7 +211,7 @@ class Corrector:
         Raises:
             InputError: a request of another form, no such view, or nothing to outline.
         """
-        scene = self.opened.found.scene
+        scene = self.opened.scene
         try:
             asked = _Rough.model_validate_json(text)
             view = [each.name for each in scene.views].index(asked.view)
@@ -222,7 +223,7 @@ class Corrector:
         straight = rough if lens is None else pinhole_from_photo(lens, K, rough)
         if not np.isfinite(straight).all():
             raise InputError("the rough outline leaves what the lens shows")
-        found = refine_outline(self.opened.found.photos(view), straight)
+        found = refine_outline(self.opened.photos(view), straight)
         placed = found if lens is None else photo_from_pinhole(lens, K, found)
         return {"polygon": np.round(placed, 2).tolist()}
 

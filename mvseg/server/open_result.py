@@ -1,54 +1,50 @@
-"""A result that a person corrects: the outcome of a run is cached, and each edit reruns only what it
-affects."""
+"""A result that a person corrects: what is known without him is found once, and each edit reruns only what follows."""
 
 from __future__ import annotations
 
 import os
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, InputWarning
-from mvseg.pipeline import BEFORE_EDITS, Stage, list_stages
+from mvseg.masks import Masks
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.open_scene import open_scene
 from mvseg.reconstruction.surface.kept_surfaces import name_each
+from mvseg.regions import stack_regions
+from mvseg.results.read import load_result
 from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Result
+from mvseg.run import Known, apply_edits, find_leaves, match_given, shape_leaves
 from mvseg.runs.recorded_run import read_recorded
-from mvseg.stages import State, detect, load, reconstruct
 from mvseg.system.atomic import lock_folder
-from mvseg.verification.leaf_color import colors_of_leaves
+from mvseg.system.running import running
 
 CORRECTIONS_FILE = "corrections.json"
-NOT_SHOWN = ("say_what_is_missing", "check", "measure")  # stages whose outcome the page does not show
-
-
-class Superseded(Exception):
-    """There are newer edits, so these results are not needed any more."""
 
 
 class OpenResult:
-    """A result folder with its scene, its masks (or what the detector finds), and the surfaces that are known already.
+    """A result folder with its scene.
 
     Attributes:
         folder: of the result.
         run: that made it.
         notice: what a person should know of it; "" for nothing.
-        found: the masks, not matched yet, or how to find them.
+        opened: its scene, and its masks if they were given.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Read the scene and its masks; where a detector made them, find them again.
+        """Read the scene, and its masks if they were given.
 
         Raises:
             InputError: this is no result, or one that this version does not understand; its scene, its masks or its
@@ -56,25 +52,31 @@ class OpenResult:
         """
         self.folder = folder
         self.run = read_recorded(folder)
-        self.config, masks = self.run.config, self.run.masks
         changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
         self.notice = " ".join(("What you see is computed anew.", *changes)) if changes else ""
         saved = self.saved_corrections()  # the views that they name are taken
-        state = replace(load(self.run.scene, masks, self.config, corrections=saved), corrections=None)
-        if not state.photos.exist:
-            raise InputError(f"{state.scene.views[0].path}: the photos of this result are gone, expected them there")
-        self.found = state if masks is not None else detect(state)
+        self.opened = open_scene(self.run.scene, self.run.masks, self.run.config, corrections=saved)
+        self.scene, self.photos = self.opened.scene, self.opened.photos
+        if not self.photos.exist:
+            raise InputError(f"{self.scene.views[0].path}: the photos of this result are gone, expected them there")
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
-        self.has_masks = masks is not None
 
     def saved_corrections(self) -> Corrections:
         """What was saved into the result folder before; none without the file."""
         path = self.folder / CORRECTIONS_FILE
         return load_corrections(path) if path.is_file() else Corrections()
 
-    def matched(self) -> Result:
-        """The masks with the ids that matching alone gives them, within a moment: for the page to begin with."""
-        return list_stages(self.config, has_masks=self.has_masks)["match"](self.found).result()
+    def saved_result(self) -> Result:
+        """The result as it lies in the folder, for the page to begin with; without masks where it shows other views, or
+        another version of mvseg wrote it in a way that this one cannot read."""
+        nothing = Masks.of(stack_regions([], [], [], labels=[], num_views=len(self.scene.views)))
+        try:
+            saved = load_result(self.folder)
+        except InputError:
+            return Result(self.scene, Matching(nothing, MatchReport("none")))
+        if [view.name for view in saved.scene.views] != [view.name for view in self.scene.views]:
+            return Result(self.scene, Matching(nothing, MatchReport("none")))
+        return keep_numbers(replace(saved, scene=self.scene, photos=self.photos), self._numbers)
 
     def recompute(self, corrections: Corrections, is_old: Callable[[], bool]) -> tuple[Result, list[str], list[str]]:
         """The result with these corrections, without traits and voxels; for each edit what hinders it, "" for nothing;
@@ -85,45 +87,38 @@ class OpenResult:
         on the masks that may hide it.)
 
         Raises:
-            Superseded: `is_old`, which is asked between the stages, said so.
+            Cancelled: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        state, messages = self._before_edits
-        state = replace(state, corrections=corrections, colors=self._colors)
-        stages = list_stages(self.config, has_masks=self.has_masks, has_edits=len(corrections.edits) > 0)
-        left = {name: stage for name, stage in stages.items() if self.has_masks or name not in BEFORE_EDITS}
-        state, more = _run(state, left, is_old)
-        told = () if state.corrected is None else state.corrected.messages
-        shown = keep_numbers(state.result(), self._numbers)
-        outcomes = [describe_fate(fate) for fate in shown.fates]
-        return shown, outcomes, [text for text in dict.fromkeys(messages + more) if text not in told]
+        known, messages = self._known
+        with running(is_cancelled=is_old), _collect_warnings() as more:
+            edited = apply_edits(known, corrections) if corrections.edits else known
+            result = shape_leaves(edited)
+        shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
+        told = {fate.message for fate in shown.fates}
+        return (
+            shown,
+            [describe_fate(fate) for fate in shown.fates],
+            [text for text in dict.fromkeys(messages + more) if text not in told],
+        )
 
     @cached_property
-    def _colors(self) -> NDArray[np.bool_]:
-        """The colours of leaves before all edits: they stay, so that an edit changes no mask of other leaves."""
-        return colors_of_leaves(self.matched().masks.to("cpu"), self.found.photos)
-
-    @cached_property
-    def _before_edits(self) -> tuple[State, list[str]]:
+    def _known(self) -> tuple[Known, list[str]]:
         """What is known without a person, and the warnings on the way; it stays."""
-        stages = list_stages(self.config, has_masks=self.has_masks)
-        names = () if self.has_masks else BEFORE_EDITS[1:]
-        return _run(self.found, {name: stages[name] for name in names if name in stages}, lambda: False)
+        with _collect_warnings() as messages:
+            given = self.opened.given
+            known = find_leaves(self.opened) if given is None else match_given(self.opened, given)
+        return known, messages
 
 
-def _run(state: State, stages: Mapping[str, Stage], is_old: Callable[[], bool]) -> tuple[State, list[str]]:
-    """Run stages, without traits and voxels; and the warnings on the way."""
+@contextmanager
+def _collect_warnings() -> Iterator[list[str]]:
+    """The sentences of InputWarnings inside the block."""
     messages: list[str] = []
-    for name, stage in stages.items():
-        if is_old():
-            raise Superseded
-        if name in NOT_SHOWN:
-            continue
-        with warnings.catch_warnings(record=True) as caught:
-            warnings.simplefilter("always", InputWarning)
-            state = reconstruct(state, with_voxels=False) if name == "reconstruct" else stage(state)
-        messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
-    return state, messages
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        yield messages
+    messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
 
 
 def keep_numbers(result: Result, known: dict[str, int]) -> Result:

@@ -5,11 +5,12 @@ Stages ask here, so that no signature hands it on (as with `decimal.localcontext
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import time
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from tqdm import tqdm
@@ -25,11 +26,19 @@ class Running:
         progress: show progress bars, and lines that say what was done.
         workers: processes that surfaces are fitted in, see `start_workers`; None: this one.
         kept: {name of what it was computed from: what was computed}; None: nothing is kept.
+        seconds: {stage: wall time}, see `timed`.
+        is_cancelled: asked before each stage, see `timed`.
     """
 
     progress: bool = False
     workers: ProcessPoolExecutor | None = None
     kept: dict[str, Any] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
+    is_cancelled: Callable[[], bool] = lambda: False
+
+
+class Cancelled(Exception):
+    """The run is not wanted any more."""
 
 
 SILENT = Running()
@@ -42,13 +51,20 @@ def now_running() -> Running:
 
 
 @contextmanager
-def running(*, progress: bool | None = None, num_workers: int | None = None, keep: bool = False) -> Iterator[None]:
+def running(
+    *,
+    progress: bool | None = None,
+    num_workers: int | None = None,
+    keep: bool = False,
+    is_cancelled: Callable[[], bool] | None = None,
+) -> Iterator[Running]:
     """Let all of mvseg that is called inside the block work so. A thread that is started there does not know of it.
 
     Args:
         progress: show progress bars; None: as outside.
         num_workers: processes that surfaces are fitted in, stopped at the end, see `start_workers`; None: as outside.
         keep: what was computed inside, or outside where that is kept, too, is not computed again, see `fit_kept`.
+        is_cancelled: asked before each stage; where it says so, that stage raises `Cancelled`. None: as outside.
 
     Raises:
         InputError: fewer than one process.
@@ -58,8 +74,25 @@ def running(*, progress: bool | None = None, num_workers: int | None = None, kee
         workers = outside.workers if num_workers is None else stack.enter_context(start_workers(num_workers))
         is_shown = outside.progress if progress is None else progress
         kept = {} if keep and outside.kept is None else outside.kept
-        stack.callback(_NOW.reset, _NOW.set(Running(progress=is_shown, workers=workers, kept=kept)))
-        yield
+        cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
+        now = Running(progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled)
+        stack.callback(_NOW.reset, _NOW.set(now))
+        yield now
+
+
+@contextmanager
+def timed(stage: str) -> Iterator[None]:
+    """A stage of a run: `Running.seconds` has its wall time, the sum if it comes more than once.
+
+    Raises:
+        Cancelled: the run is not wanted any more.
+    """
+    now = now_running()
+    if now.is_cancelled():
+        raise Cancelled
+    begun = time.perf_counter()
+    yield
+    now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
 
 
 def progress_bar(items: Iterable[Any] | None = None, name: str = "", total: int | None = None, **how: Any) -> Any:

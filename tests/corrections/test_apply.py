@@ -253,11 +253,12 @@ def test_saying_no_where_no_mask_is_answers_a_question() -> None:
         at("reject", 45, 30, everywhere=True), at("reject", 25, 30, everywhere=True), at("reject", 5, 30)
     )
     assert fates(corrected) == ["points at nothing"] * 3
-    left, answered = settle(corrected, (candidate, other), {}, cameras=SCENE.cameras)
+    left, final = settle(corrected.fates, corrected.refused, (candidate, other), {}, cameras=SCENE.cameras)
+    answered = replace(corrected, fates=final)
     assert left == (other,)
     assert fates(answered) == ["applied", "points at nothing", "applied"]
     assert len(answered.messages) == 1
-    assert settle(answered, left, {}, cameras=SCENE.cameras)[0] == (other,)
+    assert settle(final, answered.refused, left, {}, cameras=SCENE.cameras)[0] == (other,)
 
 
 def test_links_stay_with_their_masks_when_an_instance_goes() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,16 +10,14 @@ import pytest
 import torch
 
 from blade_scene import as_regions
-from mvseg.config import RunConfig
+from found_masks import FoundMasks, open_photos, see_masks
 from mvseg.corrections.apply import APPLIED
 from mvseg.corrections.file import Corrections, Edit, Reject
-from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.pipeline import list_stages
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+from mvseg.run import Known, apply_edits, find_leaves
 from mvseg.scene import Cameras, Scene, View
-from mvseg.stages import State
 from mvseg.verification import choose as choosing
 from three_leaves import CAMERAS, LEAVES, true_maps
 
@@ -32,22 +30,11 @@ PROPOSALS = Masks.of(
 )
 MATCHED = replace(PROPOSALS, instance_ids=IDS, match_scores=torch.full((len(IDS),), 0.9))
 VIEWS = tuple(View(f"v{view}", Path(f"v{view}.png")) for view in range(len(CAMERAS)))
-OTHERS = ("detect", "follow", "snap", "say_what_is_missing", "check", "reconstruct", "settle", "measure")
 SCENE = Scene(name="plant", views=VIEWS, cameras=CAMERAS, unit="mm", up=None)
 
 
-@dataclass(frozen=True)
-class Found:
-    """What a detector would have found: the sure masks are those of two leaves."""
-
-    def match(self, cameras: Cameras) -> Matching:
-        return Matching(MATCHED.select(IDS != WEAK), MatchReport("nview"))
-
-    def match_more(self, cameras: Cameras) -> tuple[Masks, ...]:
-        return (MATCHED,)
-
-    def proposals(self, cameras: Cameras) -> Masks:
-        return PROPOSALS
+# What a detector would have found: the sure masks are those of two leaves.
+FOUND = FoundMasks(Matching(MATCHED.select(IDS != WEAK), MatchReport("nview")), PROPOSALS, more=MATCHED)
 
 
 def fit(masks: Masks, _: Cameras) -> dict[int, LeafSurface]:
@@ -63,26 +50,19 @@ def at(leaf: int, view: int) -> tuple[float, float]:
     return float(x) + 0.5, float(y) + 0.5
 
 
-def run(*edits: Edit) -> State:
-    found = Found()
-    state = State(
-        config=RunConfig(),
-        scene=SCENE,
-        photos=Photos(SCENE),
-        found=found,  # type: ignore[arg-type]
-        corrections=Corrections(edits) if edits else None,
-    )
-    for name, stage in list_stages(state.config, has_masks=False, has_edits=len(edits) > 0).items():
-        state = state if name in OTHERS else stage(state)
-    return state
+def run(*edits: Edit) -> Known:
+    known = find_leaves(open_photos(SCENE))
+    return apply_edits(known, Corrections(edits)) if edits else known
 
 
 @pytest.fixture(autouse=True)
 def known_surfaces(monkeypatch: pytest.MonkeyPatch) -> None:
+    see_masks(monkeypatch, FOUND)
     monkeypatch.setattr(choosing, "fit_roughly", fit)
+    monkeypatch.setattr("mvseg.verification.leaf_color.count_colors", lambda *_: pytest.fail("no photo is needed"))
 
 
-def as_painted(state: State) -> list[np.ndarray]:
+def as_painted(state: Known) -> list[np.ndarray]:
     """V maps of which leaf every pixel shows: the true number."""
     masks = state.masks
     leaves = IDS[masks.regions.labels] * (masks.instance_ids > 0)
@@ -94,7 +74,7 @@ def test_an_edit_is_about_the_mask_that_is_seen_whatever_it_scores() -> None:
     before = run()
     assert set(np.unique(as_painted(before))) == {0, 1, 2, WEAK}
     state = run(Reject(view="v0", at=at(WEAK, 0), everywhere=True))
-    assert [each.fate for each in state.result().fates] == [APPLIED]
+    assert [each.fate for each in state.edits] == [APPLIED]
     assert set(np.unique(as_painted(state))) == {0, 1, 2}
     for one, other in zip(as_painted(before), as_painted(state), strict=True):
         assert np.array_equal(np.where(one == WEAK, 0, one), other)
@@ -109,7 +89,9 @@ def test_an_answer_that_changes_nothing_changes_nothing() -> None:
 
 
 def test_what_is_known_without_a_person_is_found_once() -> None:
-    known = run(Reject(view="v0", at=at(1, 0), everywhere=True)).unedited
-    assert known is not None
-    assert len(known.leaves.probabilities) == 3
+    known = find_leaves(open_photos(SCENE))
+    assert len(known.instances.probabilities) == 3
     assert [len(each) for each in known.matched] == [int((IDS != WEAK).sum()), len(IDS)]
+    once, twice = (apply_edits(known, Corrections((Reject(view="v0", at=at(1, 0), everywhere=True),))) for _ in (1, 2))
+    assert torch.equal(once.masks.instance_ids, twice.masks.instance_ids)
+    assert len(known.instances.probabilities) == 3

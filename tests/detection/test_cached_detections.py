@@ -133,7 +133,7 @@ def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, keep = load_scene(write_scene(tmp_path / "plant")), tmp_path / "kept"
     config = DetectConfig(min_score=0.05)
-    whole = detect_scene(Photos(scene), config).match(scene.cameras).masks
+    whole = detect_scene(Photos(scene), config)[0].sure.masks
     assert len(whole.regions)
     ran: list[tuple[int, ...]] = []
     run_heads = mask_rcnn.run_heads
@@ -148,7 +148,7 @@ def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monk
     with pytest.raises(KeyboardInterrupt):
         detect_scene(Photos(scene), config, cache=keep)
     assert len(list(keep.iterdir())) == 2
-    resumed = detect_scene(Photos(scene), config, cache=keep).match(scene.cameras).masks
+    resumed = detect_scene(Photos(scene), config, cache=keep)[0].sure.masks
     assert len(ran) == 3 + 2  # the first two photos were not looked at again
     assert torch.equal(resumed.regions.crops, whole.regions.crops)
     assert torch.equal(resumed.detection_scores, whole.detection_scores)

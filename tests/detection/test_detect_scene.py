@@ -10,11 +10,14 @@ import pytest
 import torch
 
 from blade_scene import as_regions
+from found_masks import FoundMasks
 from mvseg import demo_scene, load_scene
 from mvseg.detection import detect_scene as steps
 from mvseg.detection.config import DetectConfig
+from mvseg.detection.find_leaves import find_leaves
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
+from mvseg.matching.result import Matching, MatchReport
 
 
 def found(*, side: int, scores: list[float]) -> Masks:
@@ -25,6 +28,13 @@ def found(*, side: int, scores: list[float]) -> Masks:
     return Masks.of(regions, torch.ones(len(scores), dtype=torch.int64), torch.tensor(scores))
 
 
+def seen(masks: Masks, max_size: int) -> SimpleNamespace:
+    """A look of a detector that scales to so many pixels."""
+    look = FoundMasks(Matching(masks, MatchReport("none")), masks)
+    object.__setattr__(look, "model", SimpleNamespace(transform=SimpleNamespace(max_size=max_size)))
+    return SimpleNamespace(look=look, cached=None, names=set())
+
+
 def test_both_sizes_count_where_masks_are_large(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is proposed at half the size follows, and the labels of all matchings are rows of the whole set."""
     scene = load_scene(demo_scene())
@@ -32,27 +42,19 @@ def test_both_sizes_count_where_masks_are_large(monkeypatch: pytest.MonkeyPatch)
     tables = [found(side=side, scores=[0.1] * views) for side in sides]
     tables = [replace(each, regions=replace(each.regions, labels=torch.arange(views))) for each in tables]
 
-    def look(_: Photos, config: DetectConfig, **__: object) -> SimpleNamespace:
-        table = tables[config.image_size is not None]
-        model = SimpleNamespace(transform=SimpleNamespace(max_size=int(scene.cameras.sizes.max())))
-        model.match_detections = lambda found, _, min_score: SimpleNamespace(masks=found)
-        matching = SimpleNamespace(masks=table)
-        return SimpleNamespace(model=model, cached=None, names=set(), detections=table, match=lambda _: matching)
+    def see(_: Photos, config: DetectConfig, **__: object) -> SimpleNamespace:
+        return seen(tables[config.image_size is not None], int(scene.cameras.sizes.max()))
 
-    monkeypatch.setattr(steps, "_look", look)
-    monkeypatch.setattr(steps, "list_proposals", lambda detections, _: detections)
-    seen = steps.detect_scene(Photos(scene))
-    proposals = seen.proposals(scene.cameras)
-    assert len(proposals) == 2 * views
+    monkeypatch.setattr(steps, "_see", see)
+    both = find_leaves(steps.detect_scene(Photos(scene)), scene.cameras)
+    assert len(both.proposals) == 2 * views
     assert [*map(steps.median_side, tables)] == [*sides]
-    own, *others = seen.match_more(scene.cameras)
-    assert own.regions.labels.tolist() == [*range(views)]
-    assert [each.regions.labels.tolist() for each in others] == [[*range(views, 2 * views)]] * 2
-    for each in others:
-        assert torch.equal(each.regions.areas, proposals.regions.areas[each.regions.labels])
+    assert [each.regions.labels.min() for each in both.matched] == [0, 0, views, views]
+    for each in both.matched:
+        assert torch.equal(each.regions.areas, both.proposals.regions.areas[each.regions.labels])
+    assert len(steps.detect_scene(Photos(scene), DetectConfig(verify=False))) == 1
     monkeypatch.setattr(steps, "LARGE", 101.0)
-    assert len(steps.detect_scene(Photos(scene)).proposals(scene.cameras)) == views
-    assert steps.detect_scene(Photos(scene), DetectConfig(verify=False)).beside is None
+    assert len(steps.detect_scene(Photos(scene))) == 1
 
 
 def test_the_share_and_the_area_of_sure_masks() -> None:
@@ -84,15 +86,13 @@ def test_half_the_size_where_few_masks_are_sure(
     """Photos of 640 x 480 before a detector that scales to 480 pixels at most."""
     asked, answers = [], [found(side=10, scores=scores) for scores in (first, second) if scores is not None]
 
-    def look(_: Photos, config: DetectConfig, **__: object) -> SimpleNamespace:
+    def see(_: Photos, config: DetectConfig, **__: object) -> SimpleNamespace:
         asked.append(config.image_size)
-        matching = SimpleNamespace(masks=answers[len(asked) - 1])
-        model = SimpleNamespace(transform=SimpleNamespace(max_size=480))
-        return SimpleNamespace(model=model, cached=None, names=set(), detections=[], match=lambda _: matching)
+        return seen(answers[len(asked) - 1], 480)
 
-    monkeypatch.setattr(steps, "_look", look)
+    monkeypatch.setattr(steps, "_see", see)
     scene = load_scene(demo_scene())
     assert scene.cameras.sizes.max() >= 480
-    matching = steps.detect_scene(Photos(scene), config).match(scene.cameras)
+    (look,) = steps.detect_scene(Photos(scene), config)
     assert asked == sizes
-    assert matching.masks is answers[chosen]
+    assert look.sure.masks is answers[chosen]

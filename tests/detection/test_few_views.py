@@ -12,17 +12,16 @@ import pytest
 import torch
 
 from blade_scene import as_regions
-from found_masks import FoundMasks
+from found_masks import FoundMasks, open_photos, see_masks
 from leafy_scene import LeafyScene, write_leafy_scene
 from mvseg.config import RunConfig
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.few_views import select_by_views
 from mvseg.errors import InputError, InputWarning
-from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.results.folder import save_result
-from mvseg.stages import State, choose, measure, reconstruct
+from mvseg.run import find_leaves, finish
 
 SIZE = 40
 
@@ -77,6 +76,9 @@ def test_of_two_masks_on_each_other_the_better_one_stays() -> None:
 def test_more_views_can_be_asked_for() -> None:
     assert select_by_views(FOUND, FOUND, min_views=3).instance_ids.tolist() == [1] * 4
     assert len(select_by_views(FOUND, FOUND, min_views=5)) == 0
+    drawn = replace(FOUND, origin=torch.where(FOUND.view_index == 0, int(Origin.CORRECTED), FOUND.origin))
+    kept = select_by_views(drawn, FOUND, min_views=5)  # the leaves and masks of a person stay
+    assert kept.instance_ids.tolist() == [1, 2, -1, 1, 2, 1, 1]
     with pytest.raises(InputError, match="min_views is 0, expected 1 or more"):
         DetectConfig(min_views=0)
 
@@ -87,28 +89,26 @@ def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
 
 
 @pytest.mark.parametrize("min_views", [1, 2])
-def test_a_leaf_in_one_photo_comes_out_marked(leafy: LeafyScene, tmp_path: Path, min_views: int) -> None:
+def test_a_leaf_in_one_photo_comes_out_marked(
+    leafy: LeafyScene, tmp_path: Path, min_views: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     regions = leafy.regions.select((leafy.regions.labels != 3) | (leafy.regions.view_index == 0))
     ids = torch.where(regions.labels == 3, -1, regions.labels)
     scores = torch.full((len(regions),), 0.7)
     found = Masks.of(regions, ids, (ids > 0).float(), detection_scores=scores, origin=Origin.DETECTED)
     config = RunConfig(detect=DetectConfig(min_views=min_views))
     matching = Matching(found, MatchReport("nview", has_probabilities=True))
-    found_masks = FoundMasks.of(matching)
-    state = State(
-        config=config, scene=leafy.scene, photos=Photos(leafy.scene), matching=found_masks.matching, found=found_masks
-    )
+    see_masks(monkeypatch, FoundMasks.of(matching))
     with pytest.warns(InputWarning, match="no other view verifies: 1") if min_views == 1 else nullcontext():
-        state = choose(state)
-    state = measure(reconstruct(state))
-    assert state.surfaces is not None
-    assert state.traits is not None
-    save_result(state.result(), tmp_path / "out", {})
+        result = finish(find_leaves(open_photos(leafy.scene, config)))
+    assert result.surfaces is not None
+    assert result.traits is not None
+    save_result(result, tmp_path / "out", {})
     entries = json.loads((tmp_path / "out" / "instances.json").read_text())["annotations"]
     marked = [entry for entry in entries if entry.get("from_few_views")]
     assert len(marked) == (min_views == 1)
     for entry in marked:
-        assert (entry["image_id"], entry["instance_id"], entry["score"]) == (1, state.matching.num_instances, 0.7)
-        leaf = state.traits.leaves[-1]
+        assert (entry["image_id"], entry["instance_id"], entry["score"]) == (1, result.matching.num_instances, 0.7)
+        leaf = result.traits.leaves[-1]
         assert (leaf.leaf, leaf.method) == (entry["instance_id"], "none")
         assert "seen in one view only" in " ".join(leaf.reasons)

@@ -12,7 +12,6 @@ from torchvision.models.detection.mask_rcnn import MaskRCNNHeads, MaskRCNNPredic
 from torchvision.models.detection.roi_heads import paste_masks_in_image
 from torchvision.ops import MultiScaleRoIAlign, box_iou
 
-import mvseg.detection.mask_rcnn
 from leafy_scene import write_leafy_scene
 from matched import matched
 from mvseg.detection.loop import match_proposals
@@ -322,7 +321,7 @@ def test_the_views_choose_where_that_is_asked_for(tmp_path: Path, monkeypatch: p
     sure = replace(sure, instance_ids=found.instance_ids, match_scores=found.match_scores)
     wrapped = MultiViewMaskRCNN(tiny_detector(), verify=True)
     monkeypatch.setattr(wrapped, "match_detections", lambda *_, **__: found.with_masks(sure))
-    monkeypatch.setattr(mvseg.detection.mask_rcnn, "list_proposals", lambda *_: proposals)
+    monkeypatch.setattr("mvseg.detection.find_leaves.gather_proposals", lambda *_: (proposals, None))
     results = wrapped(load_photos(leafy.scene), cameras=leafy.scene.cameras)
     assert [len(result["instance_ids"]) for result in results] == [2] * 5
     assert all(result["instance_ids"].unique().numel() == 2 for result in results)

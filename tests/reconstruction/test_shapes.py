@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from blade_scene import EllipticBlade, as_regions, blade_masks, ring_cameras
-from mvseg.reconstruction import shapes
 from mvseg.reconstruction.config import ReconstructConfig
-from mvseg.reconstruction.shapes import best_shape, reconstruct_shapes
+from mvseg.reconstruction.shapes import best_shape, reconstruct_voxels
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid, reconstruct_instances
 from mvseg.regions import Regions
@@ -29,19 +29,13 @@ def two_blades() -> tuple[Regions, torch.Tensor]:
     return as_regions(maps)
 
 
-def test_instances_without_a_credible_surface_get_voxels(
-    two_blades: tuple[Regions, torch.Tensor], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_instances_without_a_credible_surface_get_voxels(two_blades: tuple[Regions, torch.Tensor]) -> None:
     """The voxels that voxels alone would give: other instances hide as before."""
-    monkeypatch.setattr(shapes, "fit_kept", lambda *_, **__: {
-        1: LeafSurface.none(torch.arange(4), "for the test"), 2: LeafSurface.none(torch.arange(2), "for the test")
-    })  # fmt: skip
+    surfaces = {n: LeafSurface.none(torch.arange(6 - 2 * n), "for the test") for n in (1, 2)}
     with pytest.warns(UserWarning, match="instance 2 has no shape"):
-        surfaces, voxels = reconstruct_shapes(*two_blades, CAMERAS, config=COARSE)
+        voxels = reconstruct_voxels(*two_blades, CAMERAS, config=COARSE, surfaces=surfaces)
     with pytest.warns(UserWarning, match="instance 2 has no shape"):
         expected = reconstruct_instances(*two_blades, CAMERAS, config=COARSE)
-    assert surfaces is not None
-    assert surfaces.keys() == {1, 2}
     assert voxels.keys() == expected.keys() == {1}
     assert torch.equal(voxels[1].votes, expected[1].votes)
     assert isinstance(best_shape(1, surfaces, voxels), VoxelGrid)
@@ -52,8 +46,8 @@ def test_instances_without_a_credible_surface_get_voxels(
 def test_what_is_made_is_what_was_asked_for(shape: str) -> None:
     masks = as_regions(blade_masks(EllipticBlade(), CAMERAS))
     config = ReconstructConfig(shape=shape, voxel_budget=2000)  # type: ignore[arg-type]
-    surfaces, voxels = reconstruct_shapes(*masks, CAMERAS, config=config)
-    assert (surfaces is None) == (shape == "voxels")
+    surfaces = None if shape == "voxels" else fit_surfaces(*masks, CAMERAS)
+    voxels = reconstruct_voxels(*masks, CAMERAS, config=config, surfaces=surfaces)
     assert voxels.keys() == (set() if shape == "surface" else {1})
     assert isinstance(best_shape(1, surfaces, voxels), VoxelGrid if shape == "voxels" else LeafSurface)
 
@@ -67,7 +61,7 @@ def test_results_have_no_crumbs_and_the_rule_of_the_paper_keeps_them() -> None:
     masks = as_regions(maps)
     config = ReconstructConfig(shape="voxels", voxel_budget=60_000)
     plain = reconstruct_instances(*masks, CAMERAS, config=config)[1]
-    _, voxels = reconstruct_shapes(*masks, CAMERAS, config=config)
+    voxels = reconstruct_voxels(*masks, CAMERAS, config=config)
     assert (plain.num_pieces, voxels[1].num_pieces) == (2, 1)
     assert 0 < plain.volume - voxels[1].volume < 0.02 * plain.volume
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,14 +11,14 @@ import pytest
 import torch
 
 from blade_scene import SIZE, as_regions
+from found_masks import FoundMasks, open_photos, see_masks
 from leafy_scene import write_leafy_scene
 from mvseg.config import RunConfig
-from mvseg.corrections.apply import apply
-from mvseg.corrections.file import Corrections
+from mvseg.corrections.apply import Fate
 from mvseg.errors import InputWarning
-from mvseg.formats.photos import Photos
-from mvseg.masks import Masks
-from mvseg.stages import State, say_what_is_missing
+from mvseg.masks import Masks, Origin
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.run import find_leaves, finish
 from mvseg.verification.unexplained import describe_missing, share_unexplained
 from three_leaves import true_maps
 
@@ -67,11 +68,16 @@ def test_what_is_missing_is_said_once() -> None:
     assert describe_missing(by_hand, photo, sure_score=0.3) == ""
 
 
-def test_a_run_that_finds_no_leaf_says_so(tmp_path: Path) -> None:
+def test_a_run_that_finds_no_leaf_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Unless a person has rejected them all."""
     leafy = write_leafy_scene(tmp_path, num_leaves=1, num_views=3, size=64, span_deg=120)
-    state = State(config=RunConfig(), scene=leafy.scene, photos=Photos(leafy.scene))
+    nothing = Masks.of(leafy.regions.select(torch.zeros(0, dtype=torch.int64)), origin=Origin.DETECTED)
+    see_masks(monkeypatch, FoundMasks.of(Matching(nothing, MatchReport("none"))))
+    with pytest.warns(InputWarning, match="the detector finds nothing that scores"):
+        known = find_leaves(open_photos(leafy.scene, RunConfig(reconstruct=None)))
     with pytest.warns(InputWarning, match="no leaf was found"):
-        say_what_is_missing(state)
-    rejected = apply(Corrections(), state.masks, state.scene)
-    assert say_what_is_missing(replace(state, corrected=rejected)).corrected is rejected
+        finish(known)
+    rejected = replace(known, edits=(Fate(1, "reject", "applied"),))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        finish(rejected)

@@ -56,7 +56,7 @@ class Picture:
     """One view.
 
     Attributes:
-        jpeg: the part of the photo with the plant.
+        jpeg: the part of the photo with the plant, or all of it.
         thumbnail: JPEG of the whole photo.
         box: xyxy of that part, in shares of the photo's width and height.
         proportion: its height / width.
@@ -84,11 +84,12 @@ class Picture:
         return replace(self, outlines=outline_masks(masks, view=view, box=(x1, y1, x2, y2)))
 
 
-def draw_picture(photo: np.ndarray, masks: Masks, *, view: int) -> Picture:
+def draw_picture(photo: np.ndarray, masks: Masks, *, view: int, is_whole: bool = False) -> Picture:
     """The picture of one view, from its photo (H, W, 3) uint8 RGB, undistorted; the more views there are, the smaller,
-    so that a page of 60 views can still be sent."""
+    so that a page of 60 views can still be sent. `is_whole`: of all of it, since leaves are looked for that no mask
+    shows."""
     height, width = photo.shape[:2]
-    box = x1, y1, x2, y2 = find_plant(masks, view=view, size=(width, height))
+    box = x1, y1, x2, y2 = (0, 0, width, height) if is_whole else find_plant(masks, view=view, size=(width, height))
     proportion = (y2 - y1) / (x2 - x1)
     wide = min(x2 - x1, picture_width(masks.regions.num_views, proportion))
     return Picture(

@@ -16,8 +16,7 @@ import pytest
 import torch
 
 import mvseg
-import mvseg.stages
-from found_masks import FoundMasks
+from found_masks import FoundMasks, open_photos, see_masks
 from mvseg import (
     InputError,
     InputWarning,
@@ -42,9 +41,9 @@ from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
+from mvseg.run import match_given
 from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Scene, View
-from mvseg.stages import State
 from mvseg.system.running import running
 from mvseg.verification.choose import Leaves
 from scene_folders import write_scene
@@ -71,7 +70,7 @@ def test_it_is_the_stages_one_after_another(plant: Path) -> None:
     assert result.voxels is not None
     assert result.voxels.keys() == shapes.keys() == {1, 2, 3}
     assert all(torch.equal(result.voxels[instance].votes, shapes[instance].votes) for instance in shapes)
-    assert [*result.seconds] == ["load", "match", "check", "reconstruct", "measure"]
+    assert [*result.seconds] == ["load", "match", "check", "voxels", "measure"]
 
 
 def test_ids_are_those_of_the_balls(plant: Path) -> None:
@@ -98,11 +97,13 @@ def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.M
     assert result.scene.cameras is better
     assert result.poses is poses
     fisheye = pycolmap.Camera(model="OPENCV_FISHEYE", width=128, height=96, params=[150, 150, 64, 48, 0, 0, 0, 0])
-    state = mvseg.stages.load(plant, plant / "masks", IDS_ONLY)
-    view, *others = state.scene.views
-    odd = replace(state.scene, views=(replace(view, lens=fisheye), *others))
+    scene = load_scene(plant)
+    view, *others = scene.views
+    odd = replace(scene, views=(replace(view, lens=fisheye), *others))
+    given = Masks.of(load_masks(scene, plant / "masks"))
+    opened = open_photos(odd, replace(IDS_ONLY, refine_poses=True), given)
     with pytest.warns(InputWarning, match="view 000 has a lens that no rig file can hold"):
-        assert mvseg.stages.match_refined(replace(state, scene=odd)).scene.cameras is better
+        assert match_given(opened, given).scene.cameras is better
 
 
 def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
@@ -281,7 +282,7 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
 
     monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
-    monkeypatch.setattr("mvseg.stages.match_masks", match)
+    monkeypatch.setattr("mvseg.run.match_masks", match)
     config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
     ids = result.matching.instance_ids.tolist()
@@ -301,17 +302,14 @@ def test_masks_that_a_detector_found_are_cut_where_they_show_two_leaves(
     regions = load_masks(load_scene(plant), plant / "masks")
     asked: list[Masks] = []
 
-    def detect(state: State) -> State:
-        matching = match_regions(regions, state.scene.cameras)
-        found = FoundMasks.of(matching.with_masks(show_two(matching.masks)))
-        return replace(state, found=found)
+    matching = match_regions(regions, load_scene(plant).cameras)
+    see_masks(monkeypatch, FoundMasks.of(matching.with_masks(show_two(matching.masks))))
 
     def choose(matched: Masks, proposals: Masks, **_: object) -> Leaves:
         asked.append(matched)
         return Leaves(matched, {}, {}, ())
 
-    monkeypatch.setattr("mvseg.pipeline.detect", detect)
-    monkeypatch.setattr("mvseg.verification.choose.choose_leaves", choose)
+    monkeypatch.setattr("mvseg.detection.find_leaves.choose_leaves", choose)
     config = replace(IDS_ONLY, split_merged=True, detect=DetectConfig(verify=verifies))
     result = run_scene(plant, None, config)
     assert len(result.masks) == len(regions) + 1
@@ -337,8 +335,8 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
         write_png(views[-1].path, photo)
     scene = Scene("far", tuple(views), cameras)
     kept = tmp_path / "kept"
-    first = detect_scene(Photos(scene), DetectConfig(crop="off")).match(cameras).masks
-    again = detect_scene(Photos(scene), cache=kept).match(cameras).masks
+    first = detect_scene(Photos(scene), DetectConfig(crop="off"))[0].sure.masks
+    again = detect_scene(Photos(scene), cache=kept)[0].sure.masks
     assert len(again) > len(first)
     assert len([*kept.iterdir()]) == 2 * len(chosen)
 
@@ -346,7 +344,7 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
     for view, (x1, y1, x2, y2) in zip(views, boxes.tolist(), strict=True):
         write_png(view.path, np.ascontiguousarray(read_rgb(view.path)[y1:y2, x1:x2]))
     cut = Scene("cut", tuple(views), crop_cameras(cameras, boxes))
-    expected = detect_scene(Photos(cut)).match(cut.cameras).masks
+    expected = detect_scene(Photos(cut))[0].sure.masks
     placed = place_crops(expected, boxes)
     assert torch.equal(again.regions.boxes, placed.regions.boxes)
     assert torch.equal(again.regions.crops, placed.regions.crops)

@@ -1,0 +1,129 @@
+"""From what a detector proposes in the photos to leaves: match what it is sure of, and more; the views choose."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+from torch import Tensor
+
+from mvseg.detection.config import MORE_SCORE, DetectConfig
+from mvseg.detection.crops import crop_cameras, place_crops
+from mvseg.detection.proposals import gather_proposals
+from mvseg.errors import InputWarning
+from mvseg.masks import Masks
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.matching.split import split_merged
+from mvseg.regions import stack_regions
+from mvseg.scene import Cameras
+from mvseg.system.running import timed
+from mvseg.verification.choose import Leaves, choose_leaves
+
+if TYPE_CHECKING:
+    from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What a detector proposes in V photos, or in parts of them, seen at one size.
+
+    Attributes:
+        model: that proposed it, and matches it.
+        detections: of each photo, as `MultiViewMaskRCNN.detect` gives them.
+        boxes: (V, 4) int64 xyxy, the parts of the photos that were looked at; None: all of them.
+        sure: the proposals that score enough to be matched at first, matched, see `match`.
+    """
+
+    model: MultiViewMaskRCNN
+    detections: Sequence[dict[str, Tensor]]
+    boxes: Tensor | None
+    sure: Matching
+
+    @staticmethod
+    def of(
+        model: MultiViewMaskRCNN,
+        detections: Sequence[dict[str, Tensor]],
+        cameras: Cameras,
+        *,
+        boxes: Tensor | None = None,
+        min_score: float,
+    ) -> Look:
+        """A look, matched from `min_score` on with the V cameras of the photos."""
+        nothing = Matching(Masks.of(stack_regions([], [], [], labels=[], num_views=len(cameras))), MatchReport("none"))
+        return Look(model, detections, boxes, nothing).with_cameras(cameras, min_score)
+
+    def with_cameras(self, cameras: Cameras, min_score: float) -> Look:
+        """The same, matched anew."""
+        return replace(self, sure=self.match(cameras, min_score))
+
+    def proposals(self, cameras: Cameras) -> Masks:
+        """The excessive set: R masks on the CPU, in the frames of the photos, matched to nothing."""
+        masks, _ = gather_proposals(self.detections, self._posed(cameras).sizes.tolist())
+        return masks if self.boxes is None else place_crops(masks, self.boxes)
+
+    def match(self, cameras: Cameras, min_score: float) -> Matching:
+        """Those that score `min_score` or more, matched with the V cameras of the photos, in their frames; `labels` are
+        rows of `proposals`."""
+        with timed("match"):
+            matching = self.model.match_detections(self.detections, self._posed(cameras), min_score=min_score)
+        return matching if self.boxes is None else matching.with_masks(place_crops(matching.masks, self.boxes))
+
+    def _posed(self, cameras: Cameras) -> Cameras:
+        return cameras if self.boxes is None else crop_cameras(cameras, self.boxes)
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The leaves that were found, and what they were chosen from.
+
+    Attributes:
+        leaves: that the views choose; without `DetectConfig.verify`, what was matched.
+        proposals: R masks, the excessive set.
+        matched: tables of masks that are matched, the sure ones first; their `labels` are rows of `proposals`.
+        report: of the sure ones.
+    """
+
+    leaves: Leaves
+    proposals: Masks
+    matched: tuple[Masks, ...]
+    report: MatchReport
+
+
+def find_leaves(
+    looks: Sequence[Look],
+    cameras: Cameras,
+    *,
+    config: DetectConfig = DetectConfig(),
+    splits: bool = False,
+) -> Found:
+    """The views choose leaves and masks from everything that one or more looks propose, see `choose_leaves`.
+
+    Args:
+        looks: at the same photos, matched with the same cameras.
+        cameras: V cameras.
+        config: `verify`, `min_score` and `min_probability`.
+        splits: cut masks that seem to show two leaves, before the views choose.
+    """
+    matched, proposals, offset = [], [], 0
+    for look in looks:
+        own = look.proposals(cameras)
+        tables = [look.sure.masks.to("cpu")]
+        if config.verify:
+            with warnings.catch_warnings(action="ignore", category=InputWarning):  # said of the sure ones already
+                tables.append(look.match(cameras, min(MORE_SCORE, config.min_score)).masks)
+        numbered = [replace(each.regions, labels=each.regions.labels + offset) for each in tables]
+        matched += [replace(each, regions=regions) for each, regions in zip(tables, numbered, strict=True)]
+        proposals.append(own)
+        offset += len(own)
+    everything = proposals[0] if len(proposals) == 1 else Masks.concatenate(proposals)
+    first = split_merged(matched[0]).close_gaps() if splits else matched[0]
+    matched[0] = first
+    leaves = Leaves(first, {}, {}, ())
+    if config.verify:
+        with timed("choose"):
+            leaves = choose_leaves(
+                first, everything, cameras=cameras, more=matched[1:], min_probability=config.min_probability
+            )
+    return Found(leaves, everything, tuple(matched), looks[0].sure.report)

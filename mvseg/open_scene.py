@@ -1,0 +1,103 @@
+"""A scene, opened for a run: which views are taken, how the world stands, and the masks if they are given."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import torch
+from torch import Tensor
+
+from mvseg.config import ENOUGH_VIEWS, RunConfig
+from mvseg.corrections.file import Corrections
+from mvseg.corrections.same_scene import named_views
+from mvseg.errors import warn
+from mvseg.formats.find_views import natural_order
+from mvseg.formats.masks.recognise import recognise_masks
+from mvseg.formats.photos import Photos, check_photos, require_photos
+from mvseg.formats.scene_folder import load_scene, read_masks
+from mvseg.masks import Masks
+from mvseg.matching.match import check_baselines
+from mvseg.reconstruction.spread_views import spread_views
+from mvseg.scene import Scene
+from mvseg.system.running import timed
+from mvseg.traits.up import place_scene
+
+
+@dataclass(frozen=True, eq=False)
+class Opened:
+    """A scene, opened for a run.
+
+    Attributes:
+        scene: with the views that are taken.
+        photos: of these.
+        given: their masks, matched to nothing; None: a detector is to find them.
+        mask_kind: what those were read from ("COCO", "label images", ...); "" without any.
+        views_left_out: names of the other views.
+        config: the options of all stages.
+    """
+
+    scene: Scene
+    photos: Photos
+    given: Masks | None
+    mask_kind: str
+    views_left_out: tuple[str, ...]
+    config: RunConfig
+
+    @property
+    def is_checked(self) -> bool:
+        """Whether surfaces check the ids: those of masks that the views do not choose."""
+        shapes = self.config.reconstruct
+        return shapes is not None and shapes.check_ids and shapes.shape != "voxels" and not self.is_chosen
+
+    @property
+    def is_chosen(self) -> bool:
+        """Whether the views choose the masks, of all that a detector proposes."""
+        return self.given is None and self.config.detect.verify
+
+
+def open_scene(
+    folder: Path | str,
+    masks: Path | str | None = None,
+    config: RunConfig = RunConfig(),
+    *,
+    corrections: Corrections | None = None,
+) -> Opened:
+    """Cameras of the views that are taken, those that corrections name among them, and their masks if there are any.
+
+    Warns (InputWarning) of given masks in views that are left out.
+    """
+    with timed("load"):
+        folder, masks = Path(folder), None if masks is None else Path(masks)
+        loaded = load_scene(folder)
+        photos = Photos(loaded)
+        whole = place_scene(loaded, photos, scale=config.scale, unit=config.unit, up=config.up)
+        taken = _take_views(whole, config.views or ("all" if masks else ENOUGH_VIEWS), corrections)
+        scene = whole.select(taken)
+        left_out = tuple(view.name for index, view in enumerate(whole.views) if index not in taken)
+        check_photos(scene)
+        check_baselines(scene.cameras)
+        photos = photos.select(scene, taken.tolist())
+        if masks is None:
+            require_photos(scene, folder)
+            return Opened(scene, photos, None, mask_kind="", views_left_out=left_out, config=config)
+        found = recognise_masks(whole, masks)
+        regions = read_masks(whole, found, crowd=config.coco_crowd, categories=config.category_names)
+        if left_out:
+            num_given, regions = len(regions), regions.of_views(taken)
+            message = f"{len(taken)} of {len(whole.views)} views are taken (views is {config.views})"
+            warn(f"{masks}: {num_given - len(regions)} of {num_given} masks are left out: {message}")
+        given = Masks.of(regions)
+        return Opened(scene, photos, given, mask_kind=found.kind, views_left_out=left_out, config=config)
+
+
+def _take_views(scene: Scene, most: int | Literal["all"], corrections: Corrections | None) -> Tensor:
+    """(S,) int64, ascending: the views that are taken, see `RunConfig.views`. Their names decide between equally good
+    choices, so that the order of the views does not matter."""
+    if most == "all":
+        return torch.arange(len(scene.views))
+    order = torch.tensor(sorted(range(len(scene.views)), key=lambda view: natural_order(scene.views[view].name)))
+    taken = order[spread_views(scene.cameras[order], most)].tolist()
+    named = [] if corrections is None else named_views(corrections, scene)
+    return torch.tensor(sorted({*taken, *named}))
