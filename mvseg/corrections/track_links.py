@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.corrections.file import TrackLink, load_corrections
+from mvseg.formats.find_views import base_name
 from mvseg.formats.label_png import read_labels
 
 
@@ -53,15 +54,25 @@ def find_links(edits: Sequence[TrackLink], folders: Mapping[str, Path]) -> tuple
 def leaf_at(folder: Path, view: str, x: float, y: float) -> int:
     """The id of the leaf at a point of a view of a result; 0 where there is none, or no such view.
 
-    The view is named with or without the suffix of its photo.
+    The view is named as in a single scene (`find_views`): with its folders, or without them if no other one is named
+    so; with or without the suffix of its photo.
     """
-    labels_of = {path.stem: path for path in (folder / "labels").glob("*.png")}
-    path = labels_of.get(view, labels_of.get(Path(view).stem))
+    path = _find_labels(folder / "labels", view)
     if path is None:
         return 0
     labels, column, row = read_labels(path), int(x // 1), int(y // 1)
     is_inside = 0 <= row < labels.shape[0] and 0 <= column < labels.shape[1]
     return int(labels[row, column]) if is_inside else 0
+
+
+def _find_labels(folder: Path, view: str) -> Path | None:
+    """The label image of a view; None where none is named so, or several are."""
+    labels_of = {path.relative_to(folder).as_posix().removesuffix(".png"): path for path in folder.rglob("*.png")}
+    name = view.replace("\\", "/").removeprefix("./")
+    if (exact := labels_of.get(name, labels_of.get(name.rsplit(".", 1)[0]))) is not None:
+        return exact
+    alike = [path for of, path in labels_of.items() if base_name(of) == base_name(name)]
+    return alike[0] if len(alike) == 1 else None
 
 
 def _with_full_names(edit: TrackLink, scenes: Sequence[str]) -> tuple[TrackLink, list[tuple[str, list[str]]]]:

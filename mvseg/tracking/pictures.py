@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
 import numpy as np
 from PIL import Image, ImageOps
 
-from mvseg.formats.image_file import encode_jpeg
+from mvseg.errors import InputError
+from mvseg.formats.image_file import encode_jpeg, read_rgb
 from mvseg.results.photo_masks import labels_in_photo
 from mvseg.results.result import Result
 
@@ -32,9 +34,11 @@ def picture_leaves(result: Result, leaves: Collection[int]) -> dict[int, bytes]:
 
 
 def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
-    """A photo, if it still is where the run found it and has its size."""
-    photo = cv2.imread(str(path)) if path.is_file() else None
-    return None if photo is None or photo.shape[:2] != shape else np.asarray(photo[..., ::-1])
+    """A photo as it is stored, if it still is where the run found it, can be read, and has its size."""
+    with suppress(InputError):
+        photo = read_rgb(path) if path.is_file() else None
+        return None if photo is None or photo.shape[:2] != shape else photo
+    return None
 
 
 def cut_picture(photo: np.ndarray | None, mask: np.ndarray) -> bytes:

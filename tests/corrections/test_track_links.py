@@ -6,10 +6,12 @@ import json
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mvseg.corrections.track_links import LeafLink, find_links, read_track_links
 from mvseg.errors import InputError
+from mvseg.formats.label_png import write_label_png
 from tests.plants_over_days import grow_blades, write_result
 
 
@@ -46,6 +48,20 @@ def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
     links, lost = find_links(read_track_links(path), folders)
     assert links == [LeafLink(True, (("mon/plant", 1), ("fri/plant", 2)))]
     assert lost == ["same_track: plant fits mon/plant and fri/plant, expected one of them"]
+
+
+def test_views_in_folders_are_found_by_any_name_that_fits_one(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        write_result(tmp_path / name, grow_blades(3, 1), view="left/000")
+    write_label_png(tmp_path / "b" / "labels" / "right" / "000.png", np.zeros((40, 60), np.uint16))  # two are named 000
+    folders = {name: tmp_path / name for name in ("a", "b")}
+    for view in ("left/000", "left/000.jpg", "left\\000.png"):
+        edit = {"op": "same_track", "at": [["a", "000", 5.5, 20], ["b", view, 30.2, 20]]}
+        links, lost = find_links(read_track_links(write(tmp_path / "corrections.json", edit)), folders)
+        assert (links, lost) == ([LeafLink(True, (("a", 1), ("b", 2)))], [])
+    edit = {"op": "same_track", "at": [["a", "000", 5.5, 20], ["b", "000", 30.2, 20]]}
+    links, lost = find_links(read_track_links(write(tmp_path / "corrections.json", edit)), folders)
+    assert (links, lost) == ([], ["same_track: there is no leaf at (30.2, 20) in view 000 of b"])
 
 
 @pytest.mark.parametrize("view", ["nothing", "../labels/000", "/etc/x"])

@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
+from mvseg.results.read import load_result
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import describe_tracks, write_page
-from mvseg.tracking.pictures import cut_picture
+from mvseg.tracking.pictures import cut_picture, picture_leaves
 from mvseg.tracking.track import TrackRow, Tracks
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
-from tests.plants_over_days import grow_blades, grown, see
+from tests.plants_over_days import grow_blades, grown, see, write_result
 
 
 def noisy_picture() -> bytes:
@@ -22,6 +25,20 @@ def noisy_picture() -> bytes:
     photo, mask = np.random.default_rng(0).integers(0, 256, (90, 90, 3), np.uint8), np.zeros((90, 90), bool)
     mask[5:85, 5:85] = True
     return cut_picture(photo, mask)
+
+
+@pytest.mark.parametrize("orientation", [1, 3])
+def test_pictures_follow_the_stored_rows(tmp_path: Path, orientation: int) -> None:
+    """Whatever EXIF says: masks and cameras refer to these."""
+    write_result(tmp_path / "a", grow_blades(2, 1))
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    photo = np.zeros((40, 40, 3), np.uint8)
+    photo[:, :20, 0], photo[:, 20:, 2] = 255, 255  # leaf 1 is red, leaf 2 is blue
+    Image.fromarray(photo).save(tmp_path / "000.png", exif=exif)
+    pictures = picture_leaves(load_result(tmp_path / "a"), [1, 2])
+    middles = [np.asarray(Image.open(BytesIO(pictures[leaf])))[36, 36] for leaf in (1, 2)]
+    assert [int(middle.argmax()) for middle in middles] == [0, 2]
 
 
 def many_dates(num_dates: int, num_leaves: int) -> Tracks:
