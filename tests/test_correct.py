@@ -416,7 +416,9 @@ def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> Non
     assert len(load_corrections(out / "corrections.json").edits) == 1
 
 
-def test_inputs_that_changed_or_moved_since(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_inputs_that_changed_or_moved_since(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     scene, elsewhere = write_scene(tmp_path / "here" / "balls"), tmp_path / "there"
     monkeypatch.chdir(tmp_path / "here")
     run_one_scene(Path("balls"), Path("masks"), Path("out"), config=RunConfig(reconstruct=None))
@@ -429,6 +431,14 @@ def test_inputs_that_changed_or_moved_since(tmp_path: Path, monkeypatch: pytest.
     first, second, *_ = sorted((elsewhere / "balls" / "masks").iterdir())
     first.write_bytes(second.read_bytes())
     assert f"{first.parent}: has changed since this result was made." in OpenResult(elsewhere / "out").notice
+    photos = elsewhere / "balls" / "images"
+    shutil.copy(photos / "002.png", photos / "001.png")
+    capsys.readouterr()
+    assert main(["infer", "--again", str(elsewhere / "out"), "--quiet"]) == 0  # in place
+    said = capsys.readouterr()
+    assert f"{photos}: 1 of 4 photos have changed since this result was made (001.png)." in said.err
+    assert said.out.endswith("(in place of an earlier result)\n")
+    assert OpenResult(elsewhere / "out").notice == ""
 
 
 def test_a_rough_box_becomes_the_outline_of_what_is_inside() -> None:

@@ -19,7 +19,7 @@ from mvseg.batch.work import Finished, work_on_scene
 from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
-from mvseg.results.earlier import check_out
+from mvseg.results.earlier import Output, check_out
 from mvseg.system.atomic import is_partial, lock_folder, resolve_place, sweep_abandoned
 from mvseg.system.running import progress_bar
 
@@ -71,7 +71,7 @@ def run_batch(
     with open_workers(partial(work_on_scene, place, config), num_workers, scheduler) as engine:
         _claim(out, resume=resume)
         with lock_folder(place):
-            check_out(place / TABLES)
+            check_out(place / TABLES, Output("tables"))
             if any(is_partial(path) for path in place.iterdir()):  # a run was killed
                 for scene in scenes:
                     sweep_abandoned(place / scene.name)

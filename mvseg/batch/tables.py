@@ -9,7 +9,7 @@ from typing import Any
 from mvseg.batch.scene_list import SUMMARY_COLUMNS, BatchScene
 from mvseg.batch.status import TABLES, Status
 from mvseg.errors import InputError
-from mvseg.results.earlier import replace_result
+from mvseg.results.earlier import Output, replace_result
 from mvseg.traits.table import COLUMNS, as_cells, read_csv, wide_columns, write_csv
 
 
@@ -29,7 +29,7 @@ def write_tables(
     failures = [as_cells(scene.name, str(scene.folder), status.sentence)
                 for scene, status in scenes if status.state == "failed"]  # fmt: skip
     counts = {"scenes": len(scenes), "done": len(done), "failed": len(failures)}
-    with replace_result(folder, {**run, "counts": counts}) as partial:
+    with replace_result(folder, {**run, "counts": counts}, Output("tables")) as partial:
         for name, columns in (("traits.csv", COLUMNS), ("traits_wide.csv", wide_columns())):
             _join(partial / name, columns, done, out, carried=carried)
         write_csv(partial / "summary.csv", ["scene", *carried, *SUMMARY_COLUMNS], summary)

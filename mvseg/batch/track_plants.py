@@ -16,7 +16,7 @@ from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import TrackLink
 from mvseg.corrections.track_links import find_links, read_track_links
 from mvseg.errors import InputError
-from mvseg.results.earlier import RUN_FILE, replace_result
+from mvseg.results.earlier import RUN_FILE, Output, replace_result
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import progress_bar
 from mvseg.tracking.config import Pots
@@ -92,13 +92,16 @@ def track_plants(
         report: write the pages, too.
 
     Raises:
-        InputError: `out` cannot be written, the corrections are broken, or every plant failed.
+        InputError: `out` cannot be written, or holds something else or tracks of other results; the corrections are
+            broken, or every plant failed.
     """
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
     edits = [] if corrections is None else read_track_links(corrections)
     said: dict[str, Any] = {}
-    with replace_result(out, said) as folder:
+    folders = tuple(folder for plant in plants for folder in plant.folders)
+    output = Output("tracks", of=folders, reads=() if corrections is None else (corrections,))
+    with replace_result(out, said, output) as folder:
         places = [folder / "plants" / f"{number:05d}" for number in range(1, len(plants) + 1)]
         places = places if len(plants) > 1 else [folder]
         work = partial(_track_plant, edits, pots=pots, report=report)

@@ -19,7 +19,7 @@ from mvseg.batch.status import Status, read_status, scene_state, write_status
 from mvseg.config import RunConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_scene
-from mvseg.results.earlier import RUN_FILE, check_out
+from mvseg.results.earlier import RUN_FILE, Output, check_out
 from mvseg.results.run_record import load_run
 from mvseg.runs.one_scene import find_masks, save_scene, solve_scene
 from mvseg.system.atomic import lock_folder, sweep_abandoned
@@ -78,9 +78,11 @@ def _finish(
     scene: BatchScene, masks: Path | None, out: Path, *, config: RunConfig, corrections: Path | None, cache: Path
 ) -> Status:
     sweep_abandoned(out)
-    check_out(out)
+    # the name in the batch says whose the result is: scenes may have moved
+    output = Output("result", reads=tuple(path for path in (scene.folder, masks, corrections) if path is not None))
+    check_out(out, output)
     result, messages = solve_scene(scene.folder, masks, config, corrections=corrections, cache=cache)
-    save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages)
+    save_scene(result, scene.folder, out, masks=masks, config=config, messages=messages, output=output)
     return Status(
         state="done",
         scene=str(scene.folder),

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mvseg.checks.finding import Finding
 
 WRONG = 1  # exit code
+CHECK_FILE, PLAN_FILE, TARGET_FILE = "check.json", "cameras.png", "target.json"
 NOTHING_TO_SEE = "there are neither photos nor masks"
 
 
@@ -46,8 +47,13 @@ def run(args: Namespace) -> int:
         raise InputError("--bar is of the page of mvseg target, expected --target with it")
     from mvseg.checks.check_scene import check_scene
     from mvseg.formats.scene_folder import load_masks, load_scene
+    from mvseg.results.earlier import check_file
     from mvseg.runs.one_scene import find_masks
 
+    if args.out is not None:
+        check_file(args.out / CHECK_FILE, b'"findings"')
+        if not (args.out / CHECK_FILE).exists():  # an earlier check wrote both
+            check_file(args.out / PLAN_FILE, None)
     wanted = () if args.categories is None else [name.strip() for name in args.categories.split(",")]
     found: list[Finding] = []
     regions, unread = None, None
@@ -77,11 +83,14 @@ def run(args: Namespace) -> int:
 
 def _run_target(args: Namespace) -> int:
     from mvseg.formats.target import BAR
+    from mvseg.results.earlier import check_file
     from mvseg.runs.check_target import check_target
     from mvseg.system.atomic import write_text_whole
 
     if args.masks is not None or args.categories is not None:
         raise InputError("--masks and --categories have no effect with --target: its shapes are found by their colour")
+    if args.out is not None:
+        check_file(args.out / TARGET_FILE, b'"shapes"')
     check = check_target(args.scene, bar=BAR if args.bar is None else args.bar)
     off = f"{check.residual:.2f} mm off; lengths {check.scale - 1:+.2%} by the tags"
     print(f"{args.scene}: {check.num_tags} tags, {off}")
@@ -94,8 +103,8 @@ def _run_target(args: Namespace) -> int:
     print(f"\n{check.verdict}")
     if args.out is not None:
         args.out.mkdir(parents=True, exist_ok=True)
-        write_text_whole(args.out / "target.json", json.dumps(check.describe(), indent=1) + "\n")
-        print(f"{args.out}: target.json", file=sys.stderr)
+        write_text_whole(args.out / TARGET_FILE, json.dumps(check.describe(), indent=1) + "\n")
+        print(f"{args.out}: {TARGET_FILE}", file=sys.stderr)
     return 0 if check.is_right else WRONG
 
 
@@ -182,7 +191,7 @@ def _write(out: Path, check: Check, findings: list[Finding]) -> None:
     off = {view for each in findings if each.where == "poses" and each.level == "error" for view in each.views}
     content = {"scene": check.scene.name, "findings": [asdict(each) for each in findings], "views": _rows(check)}
     out.mkdir(parents=True, exist_ok=True)
-    write_text_whole(out / "check.json", json.dumps(content, indent=1) + "\n")
+    write_text_whole(out / CHECK_FILE, json.dumps(content, indent=1) + "\n")
     picture = draw_cameras(check.scene, check.coverage, tuple(sorted(off)))
-    write_whole(out / "cameras.png", lambda partial: write_png(partial, picture))
-    print(f"{out}: check.json, cameras.png", file=sys.stderr)
+    write_whole(out / PLAN_FILE, lambda partial: write_png(partial, picture))
+    print(f"{out}: {CHECK_FILE}, {PLAN_FILE}", file=sys.stderr)

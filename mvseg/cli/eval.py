@@ -25,12 +25,14 @@ def run(args: Namespace) -> int:
     from mvseg.evaluation.panoptic import leaf_metrics
     from mvseg.evaluation.truth import shown_instances
     from mvseg.regions import IGNORE_LABEL
+    from mvseg.results.earlier import check_file
     from mvseg.results.read import find_result, read_instances
     from mvseg.system.atomic import write_text_whole
 
     result = find_result(args.result)
     if result != args.result:
         print(f"mvseg: {result}: the only result in {args.result}", file=sys.stderr)
+    check_file(result / "metrics.json", b'"s_match"')
     regions, truth = read_instances(result, args.truth)
     ids, true = regions.labels, shown_instances(regions, truth)
     is_scored = (true != 0) & (true != IGNORE_LABEL)

@@ -74,7 +74,7 @@ SHARED: dict[str, tuple[Any, Any, str]] = {
     "corrections": (Path | None, None, "file of a person's corrections, in the scene folder or anywhere; "
                     "docs/corrections.md"),
     "force_corrections": (bool, False, "apply --corrections even if they were made for other photos"),
-    "overwrite": (bool, False, "replace the result in --out even if it is another scene's"),
+    "overwrite": (bool, False, "replace what mvseg wrote to --out even if it is another scene's, or no result"),
     "num_workers": (int | None, None, "processes that fit surfaces (default: one per core, but at most 4)"),
     "scheduler": (str | None, None, "work on a Dask cluster instead: the scheduler's address, or its file"),
     "quiet": (None, False, "no progress bars"),

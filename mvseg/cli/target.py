@@ -16,8 +16,10 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    from mvseg.formats.target import tag_corners, tag_distance, write_target
+    from mvseg.formats.target import SIGN, tag_corners, tag_distance, write_target
+    from mvseg.results.earlier import check_file
 
+    check_file(args.page, SIGN)
     write_target(args.page)
     scale = f"--distance marker:0 marker:{len(tag_corners()) - 1} {tag_distance():.2f} --unit mm"
     print(f"{args.page}: print it at 100 %, in colour. Of photos of it, mvseg pose needs {scale}")

@@ -167,6 +167,8 @@ def _problem(photo: Photo, file: str) -> str | None:
         return problem
     if max(photo.width, photo.height, photo.width * photo.height) > MAX_PIXELS:
         return f"the image size is {photo.width} x {photo.height}, expected at most {MAX_PIXELS} pixels in all"
+    if photo.lens is not None and not np.isfinite(photo.lens.params).all():
+        return f"its lens has the parameters {photo.lens.params_to_string()}, expected finite numbers"
     size = torch.tensor([photo.width, photo.height])
     return camera_problem(torch.as_tensor(photo.K), torch.as_tensor(photo.R), torch.as_tensor(photo.t), size=size)
 

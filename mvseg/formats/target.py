@@ -27,6 +27,7 @@ BLACK, INK = (0, 0, 0), (213, 0, 120)  # sRGB; of the shapes: unlike wood, soil,
 PAPER = 4.0  # around each shape, nothing else is printed
 POINTS = 360  # of half an outline
 POINTS_PER_MM = 72 / 25.4  # of PDF
+SIGN = b"(mvseg target: AprilTags"  # by which the page is known
 
 
 @dataclass(frozen=True, eq=False)

@@ -25,7 +25,7 @@ from mvseg.formats.lens import opencv_distortion
 from mvseg.formats.photos import Photos
 from mvseg.formats.rig import write_rig
 from mvseg.masks import Origin
-from mvseg.results.earlier import replace_result
+from mvseg.results.earlier import RESULT, Output, replace_result
 from mvseg.results.overlay import draw_overlay
 from mvseg.results.photo_masks import labels_in_photo, mask_in_photo
 from mvseg.results.report.pictures import Picture, draw_picture
@@ -39,7 +39,14 @@ CAMERAS_FILE = "cameras.json"
 CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED: "confirm"}  # the edit that made a mask
 
 
-def save_result(result: Result, out: Path, run: Mapping[str, Any] | None = None, *, report: bool = True) -> None:
+def save_result(
+    result: Result,
+    out: Path,
+    run: Mapping[str, Any] | None = None,
+    *,
+    report: bool = True,
+    output: Output = RESULT,
+) -> None:
     """Write a result folder; an earlier result at the same path is replaced, and the user's files there stay.
 
     The folder appears complete or not at all. The overlays are drawn on the photos, or on grey when there are none.
@@ -50,6 +57,7 @@ def save_result(result: Result, out: Path, run: Mapping[str, Any] | None = None,
         run: what goes into run.json besides timings and counts: version, config, inputs, warnings; None: what a result
             that was loaded knows of its run.
         report: write report.html, too.
+        output: what may be replaced; by default any result.
 
     Raises:
         InputError: `out` cannot be written or holds something that is not a result (see `check_out`), or a photo is
@@ -58,7 +66,7 @@ def save_result(result: Result, out: Path, run: Mapping[str, Any] | None = None,
     if run is None:
         run = {} if result.run is None else result.run.as_json()
     said = {**run, **describe_result(result)}
-    with replace_result(out, said) as folder:
+    with replace_result(out, said, output) as folder:
         pictures = _write_images(result, folder)
         _write_instances(result, folder)
         if result.surfaces is not None or result.voxels is not None:
@@ -84,7 +92,7 @@ def describe_result(result: Result) -> dict[str, Any]:
         "scene": scene.name,
         "unit": scene.unit or None,
         "up": scene.up,
-        "photos": str(_photos_folder(scene.views[0]).resolve()) if scene.views else None,
+        "photos": str(photos_folder(scene.views[0]).resolve()) if scene.views else None,
         "views": {"taken": taken, "left_out": list(result.views_left_out)},
         "mask_kind": result.mask_kind or None,
         "matched_by": report.method,
@@ -114,7 +122,7 @@ def _or_none(number: float) -> float | None:
     return None if math.isnan(number) else number
 
 
-def _photos_folder(view: View) -> Path:
+def photos_folder(view: View) -> Path:
     """The folder that the names of all views start from."""
     parents = view.path.parents
     return parents[min(view.name.count("/"), len(parents) - 1)]

@@ -30,11 +30,13 @@ from mvseg.masks import Masks, MergedMask, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.regions import Regions, stack_regions
+from mvseg.results.earlier import RUN_FILE
 from mvseg.results.folder import CORRECTED
 from mvseg.results.photo_masks import regions_in_photos
 from mvseg.results.result import Instances, Result
 from mvseg.results.run_record import RunRecord, find_place, load_run
 from mvseg.scene import Cameras, Scene, View
+from mvseg.system.file_hash import hash_files
 
 if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -42,6 +44,7 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.traits.measure import Traits
 
 MOST_INSTANCES = 65534  # that 16 bits of a label image hold
+READ_FILES = ("instances.json", "traits.csv", "traits_wide.csv", "surfaces.npz", "voxels.npz")
 Box = tuple[int, int, int, int]
 
 
@@ -132,7 +135,8 @@ def load_result(folder: Path | str) -> Result:
         The result, on the CPU; `Result.run` is what its run.json says.
 
     Raises:
-        InputError: this is no result; it has a newer format than this version knows; a file is missing or broken.
+        InputError: this is no result; it has a newer format than this version knows; a file is missing, broken,
+            or another one than run.json lists.
     """
     folder = Path(folder)
     path = folder / "instances.json"
@@ -149,10 +153,12 @@ def load_result(folder: Path | str) -> Result:
         poses = RefinedPoses(cameras=scene.cameras, is_refined=run.poses.refined, residual_px=(before, after))
     source = run.config.get("corrections")
     edits = {"format": EDITS_FORMAT, "edits": run.edits}
+    instances = _instances_of(folder, run, content, masks=masks, traits=traits)
+    check_unchanged(folder, run)
     return Result(
         scene=scene,
         matching=Matching(masks, _report_of(run)),
-        instances=_instances_of(folder, run, content, masks=masks, traits=traits),
+        instances=instances,
         poses=poses,
         seconds=run.seconds,
         mask_kind=run.mask_kind or "",
@@ -162,6 +168,19 @@ def load_result(folder: Path | str) -> Result:
         fates=run.corrections,
         run=run,
     )
+
+
+def check_unchanged(folder: Path, run: RunRecord) -> None:
+    """Check that the files of a result that programs read are those that its run wrote.
+
+    Raises:
+        InputError: one is another result's, or was changed, or cut.
+    """
+    for name in READ_FILES:
+        path = folder / name
+        if name in run.files and path.is_file() and hash_files(path) != run.files[name]:
+            message = f"is not the file that {RUN_FILE} lists: changed since, or another result's"
+            raise InputError(f"{path}: {message}; expected it as mvseg wrote it, or the result made again")
 
 
 def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]]:

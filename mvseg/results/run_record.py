@@ -57,6 +57,7 @@ class RunRecord(_Part):
     unit: str | None = None
     up: Vector3 | None = None
     photos: Path | None = None
+    photo_sha256: dict[str, str] = {}
     views: dict[str, tuple[str, ...]] = {}
     matched_by: str = "none"
     residual_px: int | None = None

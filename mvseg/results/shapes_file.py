@@ -51,7 +51,7 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
     """{instance id: surface} of a file that `write_surfaces` wrote.
 
     Raises:
-        InputError: it is none.
+        InputError: it is none; or coefficients are no numbers, and no reason says why there is no surface.
     """
     arrays = _read(path)
     try:
@@ -60,7 +60,7 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
         coefficients = arrays["coefficients"].reshape(-1, NUM_COEFFICIENTS, 3)
         covariance = arrays["covariance"].reshape(-1, *(3 * NUM_COEFFICIENTS,) * 2)
         rows = arrays["leaf"], arrays["is_oriented"], coefficients, covariance, views, residuals, ious, reasons
-        return {
+        surfaces = {
             int(leaf): LeafSurface(
                 coefficients=torch.from_numpy(numbers.copy()),
                 covariance=torch.from_numpy(products.copy()),
@@ -72,6 +72,10 @@ def read_surfaces(path: Path) -> dict[int, LeafSurface]:
             )
             for leaf, is_oriented, numbers, products, seen, residual, iou, doubts in zip(*rows, strict=True)
         }
+        for leaf, each in surfaces.items():
+            if not each.exists and (each.coefficients.isfinite().any() or not each.quality.reasons):
+                raise ValueError(f"leaf {leaf} has coefficients that are not finite")
+        return surfaces
     except (IndexError, KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path}: holds no surfaces that mvseg wrote ({error})") from None
 
@@ -101,6 +105,8 @@ def read_voxels(path: Path) -> dict[int, VoxelGrid]:
     """
     arrays = _read(path)
     try:
+        if not (np.isfinite(arrays["origin"]).all() and np.isfinite(arrays["voxel_size"]).all()):
+            raise ValueError("a grid lies at no place")
         return {
             int(leaf): VoxelGrid(
                 origin=torch.from_numpy(arrays["origin"][row].copy()),

@@ -20,8 +20,9 @@ from mvseg.detection.cached_detections import claim_cache, delete_cached
 from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.find_views import list_some
-from mvseg.results.earlier import check_out, check_same_scene
-from mvseg.results.folder import save_result
+from mvseg.formats.photos import Photos
+from mvseg.results.earlier import Output, check_out
+from mvseg.results.folder import photos_folder, save_result
 from mvseg.results.result import Result
 from mvseg.run import run_scene
 from mvseg.runs.recorded_run import read_recorded, record_places
@@ -45,17 +46,17 @@ def run_one_scene(
 
     Raises:
         InputError: bad input; corrections of another scene, unless `force_corrections` is set; `out` holds a result of
-            another scene, or what a run found in its photos, and `overwrite` is not set; or another run detects for
-            `out` now.
+            another scene, what another command wrote, or what a run found in its photos, and `overwrite` is not set; it
+            is read by this run; or another run detects for `out` now.
     """
-    sweep_abandoned(out)
-    check_out(out)
-    if not overwrite:
-        check_same_scene(out, scene)
-    replaces = " (in place of an earlier result)" if out.is_dir() and any(out.iterdir()) else ""
+    place = resolve_place(out)
+    sweep_abandoned(place)
     masks = None if masks is None else find_masks(scene, masks)
     corrections = None if corrections is None else find_masks(scene, corrections, what="corrections")
-    place = resolve_place(out)
+    reads = tuple(path for path in (masks, corrections) if path is not None)
+    output = Output("result", of=(scene,), reads=reads, overwrite=overwrite)
+    check_out(out, output)
+    replaces = " (in place of an earlier result)" if place.is_dir() and any(place.iterdir()) else ""
     cache = place.with_name(f"{place.name}.detections")
     with ExitStack() as stack:
         if masks is None and stack.enter_context(claim_cache(cache, scene, overwrite=overwrite)):
@@ -74,7 +75,7 @@ def run_one_scene(
             print(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", file=sys.stderr)
         for message in messages:
             print(f"mvseg: warning: {message}", file=sys.stderr)
-        save_scene(result, scene, out, masks=masks, config=config, messages=messages)
+        save_scene(result, scene, out, masks=masks, config=config, messages=messages, output=output)
         if masks is None:
             delete_cached(cache)
     num_masks, num_views = len(result.regions), len(result.scene.views)
@@ -154,9 +155,10 @@ def save_scene(
     masks: Path | None,
     config: RunConfig,
     messages: Sequence[str],
+    output: Output,
 ) -> None:
     """Write the result folder, run.json included; with the report, the findings of the checks of the scene and its
-    masks."""
+    masks. `output`: what may be replaced."""
     run = describe_run(result, masks, config, messages=messages)
     corrections = None if result.corrections is None else result.corrections.source
     run["config"] |= record_places(scene, out, masks, corrections)
@@ -164,14 +166,14 @@ def save_scene(
         # of what features say the run has warned
         check = check_scene(result.scene, result.regions, photos=result.photos, features=False)
         run["checks"] = [asdict(finding) for finding in check.findings]
-    save_result(result, out, run, report=config.report)
+    save_result(result, out, run, report=config.report, output=output)
 
 
 def describe_run(
     result: Result, masks: Path | None, config: RunConfig, *, messages: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Where a result comes from, for run.json: version, inputs with their SHA-256 (of the detector's weights, where no
-    `masks` were given), the options of the stages that ran, and the `messages` of the run."""
+    """Where a result comes from, for run.json: version, inputs and photos with their SHA-256 (without `masks`, of the
+    detector's weights, too), the options of the stages that ran, and the `messages` of the run."""
     options = asdict(config)
     if masks is not None:
         del options["detect"]
@@ -190,9 +192,19 @@ def describe_run(
         "torch": torch.__version__,
         "python": platform.python_version(),
         "inputs": {str(path.resolve()): hash_files(path) for path in sources if path is not None},
+        "photo_sha256": _hash_photos(result),
         "config": options,
         "warnings": list(messages),
     }
+
+
+def _hash_photos(result: Result) -> dict[str, str]:
+    """{path of a photo in their folder: SHA-256}; nothing where there are no photos."""
+    views, photos = result.scene.views, result.photos or Photos(result.scene)
+    if not photos.exist:
+        return {}
+    folder = photos_folder(views[0])
+    return {view.path.relative_to(folder).as_posix(): photos.sha256(index) for index, view in enumerate(views)}
 
 
 def find_masks(scene: Path, masks: Path, beside: Path = Path(), *, what: str = "masks") -> Path:

@@ -24,14 +24,12 @@ from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
 from mvseg.poses.video import is_video, write_frames
-from mvseg.results.earlier import check_out, replace_result
+from mvseg.results.earlier import Output, check_out, replace_result
 from mvseg.scene import Scene
 from mvseg.system.atomic import sweep_abandoned
 from mvseg.system.running import now_running
 from mvseg.traits.config import Up
 from mvseg.traits.up import place_scene
-
-POSE_FILE = "pose.json"  # lists the files of mvseg in a scene folder
 
 
 def pose_photos(
@@ -56,17 +54,17 @@ def pose_photos(
 
     Raises:
         InputError: a photo or the video is broken, the video shows too little motion, too few photos register, what is
-            known does not fit them, or `out` holds something other than an earlier scene of this kind.
+            known does not fit them, or `out` holds something other than an earlier scene of these photos.
     """
-    is_clip = is_video(photos)
-    check_place(out)
-    source, names = (photos, []) if is_clip else check_folders(photos, out)
-    file = config.calibration
+    is_clip, file = is_video(photos), config.calibration
+    output = Output("scene", of=(photos,), reads=tuple(path for path in (file, known.positions) if path is not None))
+    check_place(out, output)
+    source, names = (photos, []) if is_clip else check_folders(photos, out, output)
     calibration = None if file is None else read_calibration(file.parent, file.name)
     if known.positions is not None:
         read_positions(known.positions)  # to find mistakes in it before the minutes that follow
     start, run = time.perf_counter(), dict[str, Any](made_by())
-    with warnings.catch_warnings(record=True) as caught, replace_result(out, run, POSE_FILE) as folder:
+    with warnings.catch_warnings(record=True) as caught, replace_result(out, run, output) as folder:
         warnings.simplefilter("always", InputWarning)
         files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, folder / IMAGES)
         structure = find_structure(folder / IMAGES, files, config=config, calibration=calibration, work=folder)
@@ -85,27 +83,27 @@ def pose_photos(
     return scene
 
 
-def check_folders(photos: Path, out: Path) -> tuple[Path, list[str]]:
+def check_folders(photos: Path, out: Path, output: Output) -> tuple[Path, list[str]]:
     """The folder of the photos and their names, as from `list_photos`, after checking that `out` may be written.
 
     Raises:
-        InputError: no photos, photos inside `out`, or `out` holds something other than an earlier scene of this kind.
+        InputError: no photos, photos inside `out`, or `out` holds something other than a scene of these photos.
     """
-    check_place(out)
+    check_place(out, output)
     source, names = list_photos(photos)
     if out.resolve() in (source.resolve(), *source.resolve().parents):
         raise InputError(f"{out}: the photos lie in it, expected a folder of its own for the scene")
     return source, names
 
 
-def check_place(out: Path) -> None:
+def check_place(out: Path, output: Output) -> None:
     """Check that a scene may be written to `out`, after taking away what a killed run left beside it.
 
     Raises:
-        InputError: `out` holds something other than an earlier scene of this kind.
+        InputError: `out` holds something other than an earlier scene of these photos.
     """
     sweep_abandoned(out)
-    check_out(out, POSE_FILE)
+    check_out(out, output)
 
 
 def _copy_frames(clip: Path, folder: Path, *, config: PoseConfig) -> list[PhotoFile]:

@@ -22,8 +22,8 @@ from mvseg.poses.board_calibration import calibrate_turntable
 from mvseg.poses.photo_files import PhotoFile, copy_photos
 from mvseg.poses.scene_files import IMAGES
 from mvseg.poses.table_fit import TableCamera
-from mvseg.results.earlier import replace_result
-from mvseg.runs.pose_photos import POSE_FILE, check_folders
+from mvseg.results.earlier import Output, replace_result
+from mvseg.runs.pose_photos import check_folders
 from mvseg.scene import Scene
 from mvseg.system.running import now_running, progress_bar
 
@@ -46,9 +46,10 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
     Raises:
         InputError: see `calibrate_turntable`; a photo is broken, or `out` holds something else.
     """
-    source, names = check_folders(photos, out)
+    output = Output("scene", of=(photos,))
+    source, names = check_folders(photos, out, output)
     run: dict[str, Any] = made_by() | {"board": asdict(board), "unit": unit}
-    with replace_result(out, run, POSE_FILE) as folder:
+    with replace_result(out, run, output) as folder:
         files = copy_photos(source, names, folder / IMAGES)
         by_camera: dict[str, list[PhotoFile]] = {}
         grey: dict[str, list[np.ndarray]] = {}
@@ -91,12 +92,14 @@ def pose_turntable_photos(photos: Path, out: Path, *, turntable: Path, angles: A
         InputError: photos of a camera that the file does not know, of another number or size than it says, or without
             an angle; a photo is broken, or `out` holds something else.
     """
-    source, names = check_folders(photos, out)
+    reads = (turntable, angles) if isinstance(angles, Path) else (turntable,)
+    output = Output("scene", of=(photos,), reads=reads)
+    source, names = check_folders(photos, out, output)
     cameras, known, unit = read_turntable_parts(turntable)
     camera_of = _camera_of(names, list(cameras), turntable)
     angle_of = _angles_of(names, camera_of, known, angles=angles, turntable=turntable)
     run: dict[str, Any] = made_by() | {"photos": len(names), "turntable": str(turntable), "unit": unit}
-    with replace_result(out, run, POSE_FILE) as folder:
+    with replace_result(out, run, output) as folder:
         files = copy_photos(source, names, folder / IMAGES)
         for file, camera in zip(files, camera_of, strict=True):
             size, expected = (file.width, file.height), (cameras[camera]["width"], cameras[camera]["height"])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import shlex
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +12,8 @@ from pydantic import TypeAdapter, ValidationError
 from mvseg._version import __version__, code_hash
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
-from mvseg.results.earlier import RUN_FILE
+from mvseg.formats.find_views import list_some
+from mvseg.results.earlier import RUN_FILE, path_from
 from mvseg.results.run_record import RunRecord, find_place, load_run
 from mvseg.system.file_hash import hash_files
 
@@ -81,19 +81,12 @@ def record_places(scene: Path, out: Path, masks: Path | None, corrections: Path 
     """What run.json says of the places of a run: absolute paths, and under "from_here" those from the result."""
     places = {"scene": scene, "out": out, "masks": masks, "corrections": corrections}
     absolute = {name: None if path is None else str(path.resolve()) for name, path in places.items()}
-    return absolute | {"from_here": {name: _from(out, path) for name, path in absolute.items() if path is not None}}
+    return absolute | {"from_here": {name: path_from(out, path) for name, path in absolute.items() if path is not None}}
 
 
 def repeat_command(folder: Path, corrections: Path) -> str:
     """The command that makes the whole result again, with its options and with corrections."""
     return shlex.join(["mvseg", "infer", "--again", str(folder), "--corrections", str(corrections)])
-
-
-def _from(out: Path, path: str) -> str | None:
-    try:
-        return Path(os.path.relpath(path, out.resolve())).as_posix()
-    except ValueError:  # another drive of Windows
-        return None
 
 
 def _list_changes(folder: Path, said: RunRecord) -> list[str]:
@@ -108,8 +101,25 @@ def _list_changes(folder: Path, said: RunRecord) -> list[str]:
             changes.append(f"{path}: is gone since this result was made.")
         elif hash_files(path) != sha256:
             changes.append(f"{path}: has changed since this result was made.")
+    changes += _list_other_photos(folder, said)
     changes += [f"{folder}: {change}" for name, change in GONE.items() if said.config.get(name) is not None]
     return changes
+
+
+def _list_other_photos(folder: Path, said: RunRecord) -> list[str]:
+    if said.photos is None:
+        return []
+    place, count = find_place(folder, said, said.photos), len(said.photo_sha256)
+    gone = [name for name in said.photo_sha256 if not (place / name).is_file()]
+    others = [
+        name for name, sha256 in said.photo_sha256.items() if name not in gone and hash_files(place / name) != sha256
+    ]
+    facts = {"have changed": others, "are gone": gone}
+    return [
+        f"{place}: {len(names)} of {count} photos {what} since this result was made ({list_some(names)})."
+        for what, names in facts.items()
+        if names
+    ]
 
 
 def _read_config(folder: Path, said: RunRecord) -> RunConfig:

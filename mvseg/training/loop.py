@@ -11,8 +11,9 @@ All randomness is a function of the seed and the step. A killed run therefore re
 the same number of threads) without the state of any generator or scheduler in its checkpoint. Only `precision: auto`
 measures time, once; the checkpoint keeps the decision.
 
-Files in `output`: config.yaml (resolved), log.jsonl (losses by step), metrics.json (by epoch), model.safetensors (the
-best epoch by mask AP; without validation samples the last), checkpoint.pt, broken_samples.txt if samples were skipped.
+Files in `output`: run.json (what the folder is), config.yaml (resolved), log.jsonl (losses by step), metrics.json (by
+epoch), model.safetensors (the best epoch by mask AP; without validation samples the last), checkpoint.pt,
+broken_samples.txt if samples were skipped.
 """
 
 from __future__ import annotations
@@ -40,7 +41,9 @@ from mvseg.detectors.mask_rcnn import count_parameters
 from mvseg.detectors.weights_file import Description, encode_weights
 from mvseg.errors import InputError
 from mvseg.evaluation.average_precision import average_precision
-from mvseg.system.atomic import is_partial, lock_folder, sweep_folder, write_text_whole, write_whole
+from mvseg.formats.text_file import read_yaml
+from mvseg.results.earlier import RUN_FILE, Output, check_out, claim_folder
+from mvseg.system.atomic import lock_folder, sweep_folder, write_text_whole, write_whole
 from mvseg.training.augmentation import AugmentedSamples, Target, mix_seed, order_epoch
 from mvseg.training.config import TrainConfig as TrainConfig
 from mvseg.training.config import config_values
@@ -52,6 +55,7 @@ from mvseg.training.state import TrainingState, apply_gradients, learning_rate, 
 from mvseg.training.validation import detect_and_label
 
 logger = logging.getLogger(__name__)
+OUTPUT = Output("training")
 Chunk = tuple[list[Tensor], list[Target], list[int]]
 
 
@@ -122,9 +126,8 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
     Raises:
         InputError: an output folder that holds something else, broken samples, nothing to train on.
     """
-    names = {path.name for path in config.output.glob("*") if not is_partial(path)}
-    if names and not names & {"config.yaml", "broken_samples.txt"}:
-        raise InputError(f"{config.output}: holds files that no training run wrote, expected a new or empty folder")
+    if not is_earlier_run(config.output):
+        check_out(config.output, OUTPUT)
     parts = [] if config.photos is None or config.labels is None else [list_samples(config.photos, config.labels)]
     parts += [] if config.from_results is None else [list_results(config.from_results)]
     if len({part.categories for part in parts}) > 1:
@@ -148,7 +151,7 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
     num_held_out = len(held_out) if held_out is not None else 0
     logger.info("%d samples to train on, %d to validate, %d skipped", len(samples), num_held_out, len(problems))
     if problems:
-        config.output.mkdir(parents=True, exist_ok=True)
+        claim_folder(config.output, OUTPUT)
         write_text_whole(config.output / "broken_samples.txt", "\n".join(problems) + "\n")
     return samples, held_out
 
@@ -294,9 +297,21 @@ def evaluate(run: Run, state: TrainingState) -> dict[str, float | None]:
 def open_files(run: Run, state: TrainingState) -> None:
     """Write the config, and cut the log to the state's step."""
     output = run.config.output
+    claim_folder(output, OUTPUT)
     sweep_folder(output)
     write_text_whole(output / "config.yaml", yaml.safe_dump(config_values(run.config), sort_keys=False))
     cut_log(output / "log.jsonl", state.step)
+
+
+def is_earlier_run(output: Path) -> bool:
+    """Whether a folder is one of a run of an earlier version, whose run.json did not say so yet."""
+    if (output / RUN_FILE).exists() or not (output / "config.yaml").is_file():
+        return False
+    try:
+        options = read_yaml(output / "config.yaml", "the options of a run")
+    except InputError:
+        return False
+    return isinstance(options, dict) and {"arch", "images_per_forward", "output"} <= options.keys()
 
 
 def cut_log(path: Path, step: int) -> None:

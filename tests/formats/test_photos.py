@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 import pytest
 import torch
 from PIL import Image
@@ -47,6 +48,10 @@ def test_view_names_are_paths_below_the_shared_folder(files: list[str], names: l
     assert view_names(files) == names
 
 
+def make_lens(k1: float) -> pycolmap.Camera:
+    return pycolmap.Camera(model="SIMPLE_RADIAL", width=WIDTH, height=HEIGHT, params=[150, 64, 48, k1])
+
+
 def test_views_have_the_same_names_on_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(os, "path", ntpath)
@@ -76,6 +81,8 @@ def test_scene_keeps_order_names_paths_and_cameras() -> None:
         ({"K": np.diag([0.0, 100.0, 1.0])}, "focal length is 0, 100"),
         ({"t": np.array([0, np.nan, 0])}, "t holds a number that is not finite"),
         ({"R": np.diag([1.0, 1.0, -1.0])}, "reflection"),
+        ({"lens": make_lens(np.nan)}, "its lens has the parameters 150, 64, 48, nan, expected finite numbers"),
+        ({"lens": make_lens(np.inf)}, "its lens has the parameters"),
     ],
 )
 def test_a_bad_photo_is_named(change: dict[str, object], message: str) -> None:

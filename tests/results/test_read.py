@@ -35,6 +35,7 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
 from mvseg.regions import mask_box
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
+from mvseg.results.shapes_file import write_surfaces
 from mvseg.run import run_scene
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.measure import measure_plant
@@ -171,6 +172,7 @@ def test_masks_of_large_photos_load_in_little_memory(balls: Result, tmp_path: Pa
     content["images"] = [straight | size | {"id": n, "name": f"{n}", "file_name": f"{n}.png"} for n in range(5)]
     content["annotations"] = [mask | {"image_id": n % 5} for n in range(50)]
     path.write_text(json.dumps(content))
+    change_run(tmp_path, files={})
     tracemalloc.start()
     result = load_result(tmp_path)
     peak = tracemalloc.get_traced_memory()[1]
@@ -288,6 +290,9 @@ def test_a_file_that_is_missing_or_cut_is_named(saved: Path, name: str) -> None:
         ("surfaces.npz", {"leaf": np.array([1, 2])}),
         ("voxels.npz", {"origin": np.zeros((0, 3))}),
         ("voxels.npz", {"leaf": np.array([4])}),
+        ("surfaces.npz", {"coefficients": np.full((3, 26, 3), np.nan)}),  # and no reason why
+        ("surfaces.npz", {"coefficients": np.full((3, 26, 3), np.inf)}),
+        ("voxels.npz", {"voxel_size": np.array([np.nan])}),
     ],
 )
 def test_arrays_that_do_not_fit_are_refused(saved: Path, name: str, change: dict[str, Any]) -> None:
@@ -295,6 +300,31 @@ def test_arrays_that_do_not_fit_are_refused(saved: Path, name: str, change: dict
         arrays = dict(file)
     np.savez(saved / name, **(arrays | change))
     with pytest.raises(InputError, match=f"{name}: holds no"):
+        load_result(saved)
+
+
+def drop_last_row(path: Path) -> None:
+    path.write_text("".join(path.read_text().splitlines(keepends=True)[:-1]))
+
+
+def write_other_surfaces(path: Path) -> None:
+    write_surfaces(path, {1: bent_blade(), 2: bent_blade()})
+
+
+def move_mask(path: Path) -> None:
+    path.write_text(path.read_text().replace('"instance_id": 1', '"instance_id": 2', 1))
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [("surfaces.npz", write_other_surfaces), ("traits_wide.csv", drop_last_row), ("instances.json", move_mask)],
+)
+def test_files_that_run_json_does_not_list_are_refused(
+    saved: Path, name: str, change: Callable[[Path], None]
+) -> None:
+    """Each of them can be read: of another result, or cut between two rows."""
+    change(saved / name)
+    with pytest.raises(InputError, match=f"{name}: is not the file that run.json lists: changed since, or another"):
         load_result(saved)
 
 

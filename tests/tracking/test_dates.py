@@ -131,7 +131,7 @@ def test_what_is_no_result_with_surfaces_is_refused(tmp_path: Path) -> None:
     (tmp_path / "day" / "traits.csv").write_text("no,table\n1,2\n")
     with pytest.raises(InputError, match="expected a table that mvseg wrote"):
         read_date(tmp_path / "day", 0)
-    del said["traits"]
+    del said["traits"], said["files"]
     run.write_text(json.dumps(said))
     with pytest.raises(InputError, match="has ids but no surfaces, run mvseg infer"):
         read_date(tmp_path / "day", 0)

@@ -231,7 +231,7 @@ def test_a_finished_run_can_be_prolonged(leaves: Path, tmp_path: Path) -> None:
 def test_a_folder_of_other_things_is_left_alone_and_a_failed_start_leaves_none(leaves: Path, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("precious")
-    with pytest.raises(InputError, match="holds files that no training run wrote"):
+    with pytest.raises(InputError, match="holds files that are not a run of mvseg train"):
         train(make_config(leaves, tmp_path / "mine"), build_tiny())
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
     with pytest.raises(InputError, match="leaf-litee"):
