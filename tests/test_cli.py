@@ -375,6 +375,7 @@ def test_scripts_of_the_checkout_are_verbs(
         ("", ["--match.num_pionts", "3"], "--match.num_pionts"),
         ("", ["--match.num_points", "many"], "match.num_points"),
         ("", ["--config", "absent.yaml"], "absent.yaml"),
+        ('out: "a\\0b"', [], "out is 'a\\x00b', expected text without null characters"),
         ("", ["surplus"], "surplus"),
     ],
 )

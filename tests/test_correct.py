@@ -7,10 +7,11 @@ import json
 import os
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -221,6 +222,9 @@ def test_only_its_own_page_is_answered(served: CorrectionServer) -> None:
         assert served.token not in answer["problem"]
     assert ask(served, "PUT", "edits", text_of([]), Origin="http://127.0.0.1:1")[0] == 403
     assert ask(served, "GET", "../run.json")[0] == 404
+    with socket.create_connection(served.server_address) as raw:
+        raw.sendall(f"GET http://[ HTTP/1.1\r\nHost: {host}\r\n\r\n".encode())
+        assert raw.recv(12) == b"HTTP/1.1 400"
     assert served.server_address[0] == "127.0.0.1"
 
 
@@ -286,6 +290,12 @@ def test_a_second_process_is_told(folder: Path) -> None:
     message = "another mvseg correct has this result open"
     with open_alone(folder), pytest.raises(InputError, match=message), open_alone(folder):
         pass
+    with open_alone(folder):
+        copy = shutil.copytree(folder, folder.with_name("copy"))
+        shutil.rmtree(folder)
+        copy.rename(folder)  # as a run in its place does
+        with pytest.raises(InputError, match=message), open_alone(folder):
+            pass
     with open_alone(folder):
         pass
 
@@ -414,6 +424,38 @@ def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> Non
     after = run["config"]
     assert {name: each for name, each in after.items() if before[name] != each}.keys() == {"corrections", "from_here"}
     assert len(load_corrections(out / "corrections.json").edits) == 1
+
+
+def test_edits_that_come_while_the_whole_result_is_made_are_kept(
+    served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Those of the page and those of another program; and one run is made at a time. The run is imitated: it replaces
+    the folder by one with the edits that it found at its start."""
+    path, (view, at) = folder / "corrections.json", middle(served.corrector.opened, 0)
+    first, second = ([{"op": op, "view": view, "at": at}] for op in ("confirm", "reject"))
+    theirs = first + second
+
+    def run_while(happens: Callable[[], object]) -> tuple[int, Any]:
+        def run(*_: object, **__: object) -> subprocess.CompletedProcess[str]:
+            happens()
+            status, answer = ask(served, "POST", "whole")
+            assert (status, answer["problem"]) == (409, "The whole result is being made already.")
+            return subprocess.CompletedProcess([], 0, "done\n", "")
+
+        monkeypatch.setattr("mvseg.server.correction_server.subprocess.run", run)
+        return ask(served, "POST", "whole")
+
+    def save_into_the_old_folder() -> None:
+        found = path.read_bytes()
+        save(served, second)
+        path.write_bytes(found)
+
+    save(served, first)
+    assert run_while(save_into_the_old_folder) == (200, {"said": "done"})
+    assert json.loads(path.read_text())["edits"] == second
+    assert run_while(lambda: path.write_bytes(text_of(theirs))) == (200, {"said": "done"})
+    assert json.loads(path.read_text())["edits"] == theirs
+    assert ask(served, "GET", "state")[1]["isChanged"]
 
 
 def test_inputs_that_changed_or_moved_since(

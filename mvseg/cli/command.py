@@ -118,6 +118,9 @@ def _parse(arguments: Sequence[str]) -> Namespace:
         for name in ("quiet", "report", "split_merged", "coco_crowd", "overwrite"):
             if args.verb and name in args[args.verb] and args[args.verb][name] is None:
                 raise InputError(f"{name} is null, expected a value")
+        for name, value in args[args.verb].items() if args.verb else ():
+            if "\0" in str(value):  # a YAML file can hold one
+                raise InputError(f"{name} is {str(value)!r}, expected text without null characters")
         return args
     except (UnicodeDecodeError, RecursionError) as error:  # of a file that an option names
         raise InputError(f"the options cannot be read ({error})") from None

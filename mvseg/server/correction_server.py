@@ -72,6 +72,7 @@ class Corrector:
         self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
         self.is_closing = False
+        self.making_whole = threading.Lock()
 
     def page(self) -> bytes:
         """The page with the newest result, and with all edits that were saved: a reload must not lose any; nor those
@@ -231,22 +232,40 @@ class Corrector:
         """Make the whole result with the saved edits, in its place, by a process of its own, and say where it is.
 
         Raises:
+            Refused: it is being made already.
             InputError: the run ended with an error; its sentence.
         """
-        folder = self.opened.folder.resolve()
-        path = folder / CORRECTIONS_FILE
-        with self.news:
-            if self._is_changed():
-                raise InputError(CHANGED)
-            write_corrections(path, self.corrections)
-        words = ["infer", "--again", str(folder), "--corrections", str(path), "--quiet"]
-        run = subprocess.run([sys.executable, "-m", "mvseg.cli", *words], capture_output=True, text=True, check=False)
-        with self.news:  # edits that were saved meanwhile lay in the folder that was replaced
-            write_corrections(path, self.corrections)
-            self.written = self._stamp()
+        if not self.making_whole.acquire(blocking=False):
+            raise Refused(HTTPStatus.CONFLICT, "The whole result is being made already.")
+        try:
+            folder = self.opened.folder.resolve()
+            path = folder / CORRECTIONS_FILE
+            with self.news:
+                if self._is_changed():
+                    raise InputError(CHANGED)
+                write_corrections(path, self.corrections)
+                self.written, before = self._stamp(), self.corrections
+            words = ["infer", "--again", str(folder), "--corrections", str(path), "--quiet"]
+            command = [sys.executable, "-m", "mvseg.cli", *words]
+            run = subprocess.run(command, capture_output=True, text=True, check=False)
+            with self.news:
+                self._keep_newer(before)
+        finally:
+            self.making_whole.release()
         if run.returncode:
             raise InputError((run.stderr.strip().splitlines() or ["the run was stopped"])[-1])
         return {"said": run.stdout.strip()}
+
+    def _keep_newer(self, before: Corrections) -> None:
+        """After the folder was replaced: edits that were saved meanwhile may have lain in the one before, and are
+        written again; but over `before` only, not over those of another program."""
+        try:
+            names = {name_edits(each.edits) for each in (before, self.opened.saved_corrections())}
+        except InputError:  # theirs, and broken: `_is_changed` says so
+            return
+        if len(names) == 1:
+            write_corrections(self.opened.folder / CORRECTIONS_FILE, self.corrections)
+            self.written = self._stamp()
 
     def close(self) -> None:
         """Let everybody who waits go."""
@@ -320,13 +339,17 @@ class _Handler(BaseHTTPRequestHandler):
         """The requested path, below the token.
 
         Raises:
-            Refused: by another name of this machine, from another page, or without the token.
+            Refused: by another name of this machine, from another page, without the token, or no address at all.
         """
         own = f"{HOST}:{self.server.server_port}"
         origin = self.headers.get("Origin")
         if self.headers.get("Host") != own or (origin is not None and origin != f"http://{own}"):
             raise Refused(HTTPStatus.FORBIDDEN, "This address is only for the page that mvseg correct opens.")
-        token, _, place = urlsplit(self.path).path.lstrip("/").partition("/")
+        try:
+            path = urlsplit(self.path).path
+        except ValueError:  # http://[
+            raise Refused(HTTPStatus.BAD_REQUEST, "The address cannot be read.") from None
+        token, _, place = path.lstrip("/").partition("/")
         if not hmac.compare_digest(token.encode(), self.server.token.encode()):
             raise Refused(HTTPStatus.FORBIDDEN, "The token is missing or old: open what mvseg correct prints.")
         return place

@@ -27,7 +27,7 @@ from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Result
 from mvseg.run import Known, apply_edits, find_leaves, match_given, shape_leaves
 from mvseg.runs.recorded_run import read_recorded
-from mvseg.system.atomic import lock_folder
+from mvseg.system.atomic import lock_place
 from mvseg.system.running import running
 
 CORRECTIONS_FILE = "corrections.json"
@@ -158,7 +158,7 @@ def open_alone(folder: Path) -> Iterator[None]:
     """
     with ExitStack() as stack:
         try:
-            stack.enter_context(lock_folder(folder))
+            stack.enter_context(lock_place(folder))
         except InputError:
             raise InputError(f"{folder}: another mvseg correct has this result open, expected one at a time") from None
         yield

@@ -1,6 +1,7 @@
 """Replace on finish: a file or folder appears complete under its name, or not at all.
 
-What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile.
+What is being written to NAME is called `.NAME.partial` until it is complete, and `.NAME.lock` is locked meanwhile;
+`.NAME.open.lock` is, while a program shows a NAME that may be replaced.
 Locks end with their process: files without one were left by a killed process, and are deleted by the next write to
 NAME. On a disk without locks, two processes must not write to one NAME at the same time.
 """
@@ -21,7 +22,7 @@ from filelock import FileLock, Timeout
 
 from mvseg.errors import InputError
 
-PARTIAL, EARLIER, LOCK = ".partial", ".earlier", ".lock"
+PARTIAL, EARLIER, OPEN, LOCK = ".partial", ".earlier", ".open", ".lock"
 NO_LOCKS = (errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EINVAL)  # errors of disks without locks
 WAITS = (0.05, 0.2, 0.5)  # seconds between attempts to rename what another program has open
 
@@ -30,10 +31,12 @@ def resolve_place(place: Path) -> Path:
     """The absolute path of a place that need not exist, without links.
 
     Raises:
-        InputError: its links form a loop.
+        InputError: its links form a loop, or its name cannot be one.
     """
     try:
         place.stat()
+    except ValueError:  # a null character
+        raise InputError(f"{str(place)!r}: cannot be the name of a folder") from None
     except OSError as error:
         if error.errno == errno.ELOOP:
             raise InputError(f"{place}: its links form a loop, expected a folder or a new name") from None
@@ -74,6 +77,16 @@ def lock_folder(folder: Path, *, wait: bool = False) -> Iterator[None]:
         InputError: another process works in it, and `wait` is not set.
     """
     with _locked(folder / LOCK, wait=wait):
+        yield
+
+
+@contextmanager
+def lock_place(folder: Path) -> Iterator[None]:
+    """As `lock_folder`, but the lock outlives a folder that is replaced meanwhile: it lies beside it. (Where nothing
+    can be written there, nobody can replace the folder, and the lock lies in it.)"""
+    place = resolve_place(folder)
+    is_fixed = not os.access(place.parent, os.W_OK | os.X_OK)
+    with _locked(place / LOCK if is_fixed else _beside(place, OPEN + LOCK)):
         yield
 
 

@@ -21,6 +21,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import signal
 import sys
 import time
 from collections.abc import Iterator
@@ -263,14 +264,16 @@ def load_chunks(run: Run, first_step: int) -> Iterator[Chunk]:
         num_workers=config.num_workers,
         collate_fn=collate,
         pin_memory=run.processes.device.type == "cuda",
-        worker_init_fn=_end_quietly,
+        worker_init_fn=_leave_signals,
     )
     return iter(loader)
 
 
-def _end_quietly(_: int) -> None:
-    """A worker that is stopped with its parent prints no traceback of the broken connection. Errors of samples are not
+def _leave_signals(_: int) -> None:
+    """A worker ends with its parent. A SIGTERM that a scheduler sends to all processes is left to the parent, which
+    would report a dead worker with a traceback; and so is what breaks when the parent goes. Errors of samples are not
     affected: they reach the parent."""
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
     sys.excepthook = lambda *_: None
 
 

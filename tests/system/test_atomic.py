@@ -179,6 +179,12 @@ def test_another_process_keeps_what_it_writes_until_it_dies(
     assert [path.name for path in tmp_path.iterdir()] == ([] if is_killed else ["out"])
 
 
+def test_a_name_that_no_place_has(tmp_path: Path) -> None:
+    for path in (tmp_path / "a\0b", tmp_path / "a\0b" / "out"):
+        with pytest.raises(InputError, match=r"'.*a\\x00b.*': cannot be the name of a folder"), folder_whole(path):
+            pass
+
+
 def test_links_that_lead_in_a_circle(tmp_path: Path) -> None:
     (tmp_path / "self").symlink_to("self")
     for place in (tmp_path / "self", tmp_path / "self" / "out"):

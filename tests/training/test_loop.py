@@ -7,6 +7,7 @@ import json
 import logging
 import math
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -23,8 +24,8 @@ import mvseg.training.loop
 from mvseg.detectors.mask_rcnn import build_detector
 from mvseg.errors import InputError
 from mvseg.system.atomic import is_partial
-from mvseg.training.loop import TrainConfig, best_epoch, train
-from mvseg.training.processes import Processes
+from mvseg.training.loop import Run, TrainConfig, best_epoch, find_samples, load_chunks, train
+from mvseg.training.processes import Processes, join_processes
 from tiny_training import build_tiny, load_weights, make_config, parse_config, write_photos
 
 TESTS = Path(__file__).parent.parent
@@ -237,6 +238,19 @@ def test_a_folder_of_other_things_is_left_alone_and_a_failed_start_leaves_none(l
     with pytest.raises(InputError, match="leaf-litee"):
         train(make_config(leaves, tmp_path / "out", weights="leaf-litee"))
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="signals of POSIX systems")
+def test_a_signal_to_all_processes_is_left_to_the_run(leaves: Path, tmp_path: Path) -> None:
+    """Schedulers send SIGTERM to the workers, too, whose death would end the run with a traceback."""
+    config = make_config(leaves, tmp_path, num_workers=1)
+    with join_processes("cpu") as processes:
+        run = Run(config=config, processes=processes, samples=find_samples(config)[0], held_out=None)
+        chunks: Any = load_chunks(run, 0)
+        for number in range(6):  # more than are loaded ahead
+            next(chunks)
+            if number == 0:
+                os.kill(chunks._workers[0].pid, signal.SIGTERM)
 
 
 def test_what_a_killed_run_left_half_written_is_deleted(leaves: Path, tmp_path: Path) -> None:
