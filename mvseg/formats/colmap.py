@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import mmap
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -70,6 +70,9 @@ def read_colmap(model: Path, folder: Path) -> Scene:
     _check_binary_model(model)
     try:
         reconstruction = pycolmap.Reconstruction(model)
+        for image_id, name in _list_names(model / "images.txt"):
+            if image_id in reconstruction.images:
+                reconstruction.images[image_id].name = name
         images = sorted(reconstruction.images.values(), key=lambda image: image.name)  # which may be no UTF-8
     except (RuntimeError, ValueError, IndexError, OSError, MemoryError) as error:
         reason = " ".join(str(error).split())
@@ -83,6 +86,19 @@ def read_colmap(model: Path, folder: Path) -> Scene:
         what = f"{len(left_out)} photos in images/ have no pose in the model and are left out"
         warn(f"{model}: {what}, the first is {left_out[0]}")
     return scene
+
+
+def _list_names(path: Path) -> Iterator[tuple[int, str]]:
+    """The id and the name of each image of a text model, two lines each, after pycolmap has read the other fields: it
+    cuts names at a space. Nothing of a binary model, which pycolmap prefers."""
+    if path.with_suffix(".bin").is_file() or not path.is_file():
+        return
+    with path.open(encoding="utf-8") as file:
+        for line in file:
+            if line.strip() and not line.startswith("#"):
+                image_id, *_, name = line.strip().split(maxsplit=9)
+                yield int(image_id), name
+                next(file, "")  # its points, of which there may be none
 
 
 def _photo(model: Path, image: pycolmap.Image, lens: pycolmap.Camera) -> Photo:

@@ -14,14 +14,15 @@ from mvseg.scene import Scene
 SHOWN = 3  # names in a message
 # Roboflow calls the export of 000.jpg "000_jpg.rf.<hash>.jpg".
 ROBOFLOW = re.compile(r"_(jpe?g|png|tiff?|bmp|webp|heic)\.rf\.\w+$", re.IGNORECASE)
+LABEL_STUDIO = re.compile(r"^[0-9a-f]{8}-", re.IGNORECASE)  # its upload of 000.jpg is "5f1c0e7a-000.jpg"
 
 
 def find_views(names: Sequence[str], scene: Scene, *, source: Path, warn_of_loose: bool = False) -> list[int | None]:
     """The view that each file name refers to, None for a photo that is not in the scene.
 
-    A name refers to a view if it is the path of the view's photo, the last part of that path, or the view's name with
-    or without suffix. Views without such a name may be matched by the base name alone (without folders, suffix and
-    Roboflow's ending; case is ignored), if only one view and one of the names have it.
+    A name refers to a view if it is the path of the view's photo, the last part of that path, either of them with one
+    more suffix (COLMAP's masks: 000.jpg.png), or the view's name with or without suffix. Views without such a name may
+    be matched by the base name alone, see `base_name`, if only one view and one of the names have it.
 
     Args:
         names: paths with "/" or "\\" between folders, with or without suffix; of any machine.
@@ -53,12 +54,12 @@ def find_views(names: Sequence[str], scene: Scene, *, source: Path, warn_of_loos
 
 
 def base_name(name: str) -> str:
-    """A file name without folders, the suffix of an image and Roboflow's ending, in small letters."""
+    """A file name without folders, the suffixes of images, Roboflow's ending and Label Studio's prefix, in small
+    letters."""
     last = name.replace("\\", "/").rsplit("/", 1)[-1]
-    stem, dot, suffix = last.rpartition(".")
-    if dot and f".{suffix.lower()}" in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES):
-        last = stem
-    return ROBOFLOW.sub("", last).lower()
+    while "." in last and f".{last.rsplit('.', 1)[1].lower()}" in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES):
+        last = last.rsplit(".", 1)[0]
+    return LABEL_STUDIO.sub("", ROBOFLOW.sub("", last)).lower()
 
 
 def list_some(names: Sequence[str]) -> str:
@@ -85,8 +86,9 @@ def _exact_views(names: Sequence[str], scene: Scene, source: Path) -> list[int |
     found: list[int | None] = []
     for file_name in names:
         name = file_name.replace("\\", "/").removeprefix("./")
-        same_name = by_name.get(name, by_name.get(name.rsplit(".", 1)[0]))
-        fitting = by_path[name] if same_name is None and name in by_path else []
+        stem = name.rsplit(".", 1)[0]
+        same_name = by_name.get(name, by_name.get(stem))
+        fitting = [] if same_name is not None else by_path.get(name) or by_path.get(stem, [])
         if len(fitting) > 1:
             views = " or ".join(f"{i} ({scene.views[i].name})" for i in fitting)
             raise InputError(f"{source}: image {file_name} could be view {views}, expected its path")

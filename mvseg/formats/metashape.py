@@ -8,6 +8,9 @@
     u = w / 2 + cx + x' (f + b1) + y' b2,    v = h / 2 + cy + y' f
 
 with the corner of the top-left pixel at (0, 0). p1 and p2 are OpenCV's p2 and p1.
+
+A slave of a rig has no `transform`: it is that of its master times the offset of its sensor, `rotation` and `location`
+(master_from_slave; photogrammetrycommunity.github.io, "slave-sensor transform"; not tried in Metashape itself).
 """
 
 from __future__ import annotations
@@ -18,11 +21,12 @@ from xml.etree import ElementTree
 import numpy as np
 
 from mvseg.errors import InputError, faults_of, warn
+from mvseg.formats.find_views import list_some
 from mvseg.formats.image_file import MAX_SIDE
 from mvseg.formats.lens import opencv_lens
 from mvseg.formats.photos import Photo, build_scene, find_photo
 from mvseg.formats.text_file import read_bytes
-from mvseg.scene import Scene
+from mvseg.scene import ROTATION_TOLERANCE, Scene
 
 MAX_BYTES = 1 << 26
 GEOCENTRIC = 1e5  # metres from the origin, beyond which float32 does not resolve millimetres
@@ -48,7 +52,8 @@ def read_metashape(path: Path) -> Scene:
     """The scene of the cameras of a Metashape chunk, in the order of the file; photos are found by their labels.
 
     The unit is "m" where the chunk has a transform (markers, scale bars or positions), else unknown. A geocentric
-    transform loses its translation. Warns (InputWarning) of that, and of cameras that are not aligned.
+    transform loses its translation. Warns (InputWarning) of that, of cameras that are not aligned, and of slaves of a
+    rig that are left out: there, whether the offset is in metres or in units of the chunk is not known.
 
     Raises:
         InputError: the file is not a complete XML file of Metashape, holds several chunks or components, or a camera
@@ -58,18 +63,27 @@ def read_metashape(path: Path) -> Scene:
     sensors = {sensor.get("id"): sensor for sensor in chunk.iterfind("sensors/sensor")}
     with faults_of(path):
         world_from_chunk = _find_transform(path, chunk)
-    photos, num_left_out = [], 0
+    cameras = {camera.get("id"): camera for camera in chunk.iterfind(CAMERAS)}
+    photos, num_left_out, slaves = [], 0, []
     for index, camera in enumerate(chunk.iterfind(CAMERAS)):
-        text = camera.findtext("transform")
-        if text is None or camera.get("enabled") in ("0", "false"):
-            num_left_out += 1
-            continue
         label = camera.get("label") or str(index)
         with faults_of(f"{path}: camera {label}"):
             sensor = sensors.get(camera.get("sensor_id"))
-            photos.append(_photo(path.parent, label, sensor, transform=text, world_from_chunk=world_from_chunk))
+            is_slave = camera.get("master_id") in cameras and camera.find("transform") is None
+            chunk_from_master = _read_pose(cameras[camera.get("master_id")] if is_slave else camera)
+            offset = _read_offset(sensor) if is_slave else np.eye(4)
+            if chunk_from_master is None or camera.get("enabled") in ("0", "false"):
+                num_left_out += 1
+            elif world_from_chunk is not None and offset[:3, 3].any():
+                slaves.append(label)
+            else:
+                poses = {"chunk_from_cam": chunk_from_master @ offset, "world_from_chunk": world_from_chunk}
+                photos.append(_photo(path.parent, label, sensor, **poses))
     if num_left_out:
         warn(f"{path}: {num_left_out} cameras are not aligned or not enabled and are left out")
+    if slaves:
+        what = f"{len(slaves)} slaves of a rig ({list_some(slaves)}) are left out"
+        warn(f"{path}: {what}: the unit of their offset is not known; export the cameras for COLMAP instead")
     unit = "" if world_from_chunk is None else "m"
     return build_scene(path.parent, photos, unit=unit, source=path)
 
@@ -110,12 +124,32 @@ def _find_transform(path: Path, chunk: ElementTree.Element) -> tuple[np.ndarray,
     return R, T, scale
 
 
+def _read_pose(camera: ElementTree.Element) -> np.ndarray | None:
+    """(4, 4) chunk_from_cam; None of a camera that is not aligned, or a slave."""
+    text = camera.findtext("transform")
+    if text is None:
+        return None
+    chunk_from_cam = _numbers(text, 16).reshape(4, 4)
+    if np.abs(chunk_from_cam[3] - [0, 0, 0, 1]).max() > ROTATION_TOLERANCE:
+        raise InputError("the last row of its transform is not 0, 0, 0, 1")
+    return chunk_from_cam
+
+
+def _read_offset(sensor: ElementTree.Element | None) -> np.ndarray:
+    """(4, 4) master_from_slave of the sensor of a slave."""
+    master_from_slave = np.eye(4)
+    if sensor is not None:
+        master_from_slave[:3, :3] = _numbers(sensor.findtext("rotation", "1 0 0 0 1 0 0 0 1"), 9).reshape(3, 3)
+        master_from_slave[:3, 3] = _numbers(sensor.findtext("location", "0 0 0"), 3)
+    return master_from_slave
+
+
 def _photo(
     folder: Path,
     label: str,
     sensor: ElementTree.Element | None,
     *,
-    transform: str,
+    chunk_from_cam: np.ndarray,
     world_from_chunk: tuple[np.ndarray, np.ndarray, float] | None,
 ) -> Photo:
     if sensor is None:
@@ -124,9 +158,6 @@ def _photo(
     f, cx, cy, b1, b2, k1, k2, k3, p1, p2 = (values[name] for name in NAMES)
     K = np.array([[f + b1, b2, width / 2 + cx], [0, f, height / 2 + cy], [0, 0, 1]])
     lens = opencv_lens(K, [k1, k2, p2, p1, k3], width=width, height=height)
-    chunk_from_cam = _numbers(transform, 16).reshape(4, 4)
-    if chunk_from_cam[3].tolist() != [0, 0, 0, 1]:
-        raise InputError("the last row of its transform is not 0, 0, 0, 1")
     R, center = chunk_from_cam[:3, :3], chunk_from_cam[:3, 3]
     if world_from_chunk is not None:
         turn, shift, scale = world_from_chunk

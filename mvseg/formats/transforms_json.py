@@ -110,7 +110,7 @@ def _photo(folder: Path, frame: _Frame, given: dict[str, Any], *, undo: tuple[np
     fy = intrinsics.get("fl_y", fx)
     K = np.array([[fx, 0, intrinsics["cx"]], [0, fy, intrinsics["cy"]], [0, 0, 1.0]])
     world_from_cam = np.array(frame.transform_matrix)
-    if world_from_cam[3:].tolist() not in ([], [[0.0, 0.0, 0.0, 1.0]]):
+    if (np.abs(world_from_cam[3:] - [0, 0, 0, 1]) > ROTATION_TOLERANCE).any():
         raise InputError("the last row of transform_matrix is not 0, 0, 0, 1")
     undo_applied, scale = undo
     R = (undo_applied[:3, :3] @ world_from_cam[:3, :3] @ OPENGL_FROM_OPENCV).T

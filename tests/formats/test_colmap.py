@@ -275,3 +275,17 @@ def test_a_name_that_is_no_utf_8_is_refused(small: Path, tmp_path: Path) -> None
     images.write_bytes(images.read_bytes().replace(b".png", b"\xff.png").replace(b".jpg", b"\xff.jpg"))
     with pytest.raises(InputError, match="cannot be read as a COLMAP model"):
         read_colmap(tmp_path, tmp_path)
+
+
+def test_names_with_spaces(tmp_path: Path) -> None:
+    """pycolmap cuts names at a space; here one camera has no points, and one name two spaces and a suffix."""
+    model = build_model({"PINHOLE": PINHOLES["PINHOLE"], "SIMPLE_PINHOLE": PINHOLES["SIMPLE_PINHOLE"]})
+    model.images[1].name, model.images[2].name = "A plant (1).jpg", "A plant  (2).jpg"
+    (tmp_path / "sparse").mkdir()
+    model.write_text(tmp_path / "sparse")
+    lines = (tmp_path / "sparse" / "images.txt").read_text().splitlines()
+    lines[lines.index(next(line for line in lines if line.endswith("(1).jpg"))) + 1] = ""
+    (tmp_path / "sparse" / "images.txt").write_text("\n".join(lines) + "\n")
+    (tmp_path / "sparse" / "points3D.txt").write_text("")
+    scene = load_scene(tmp_path)
+    assert sorted(view.path.name for view in scene.views) == ["A plant  (2).jpg", "A plant (1).jpg"]

@@ -24,7 +24,7 @@ def scene_of(*files: str) -> Scene:
     [
         ("000.jpg", "000"), ("a/b/000.PNG", "000"), ("C:\\x\\Leaf 1.TIF", "leaf 1"), ("day.1", "day.1"),
         ("day.1.plant.jpg", "day.1.plant"), ("000_jpg.rf.0f3a9.jpg", "000"), ("000_png.rf.0f3a9", "000"),
-        ("IMG_1.heic", "img_1"), ("", ""), (".jpg", ""),
+        ("IMG_1.heic", "img_1"), ("", ""), (".jpg", ""), ("000.jpg.png", "000"), ("5f1c0e7a-000.jpg", "000"),
     ],
 )  # fmt: skip
 def test_base_names(name: str, base: str) -> None:
@@ -50,6 +50,8 @@ def test_names_find_their_views(names: list[str], views: list[int | None]) -> No
 def test_a_name_that_fits_by_itself_beats_base_names() -> None:
     scene = scene_of("images/day.jpg", "images/day.1.jpg")
     assert find_views(["day.1", "x/day.jpg", "day.jpg"], scene, source=Path("masks")) == [1, None, 0]
+    assert find_views(["day.1.jpg.png", "images/day.jpg.png"], scene, source=Path("masks")) == [1, 0]
+    assert find_views(["5f1c0e7a-day.jpg", "day.1.JPG.png"], scene, source=Path("masks")) == [0, 1]
 
 
 def test_names_that_fit_several_views() -> None:

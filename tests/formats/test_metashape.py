@@ -114,6 +114,29 @@ def test_worlds(tmp_path: Path) -> None:
     assert torch.equal(read_metashape(tmp_path / "cameras.xml").cameras.t, with_component.t)
 
 
+@pytest.mark.filterwarnings("ignore:.*not aligned:mvseg.errors.InputWarning")
+def test_a_slave_of_a_rig_stands_where_its_master_and_its_offset_say(tmp_path: Path) -> None:
+    (R_master, t_master), (R, t) = arc_pose(0, 4), arc_pose(1, 4)
+    rotation, location = R_master @ R.T, R_master @ (R_master.T @ t_master - R.T @ t)  # master_from_slave
+    offset = f"<rotation>{text(rotation)}</rotation><location>{text(location)}</location>"
+    whole = TRANSFORM.format(text(WORLD_R), text(WORLD_T), SCALE)
+    path = write(tmp_path)
+    expected = read_metashape(write(tmp_path, replace=(whole, ""))).cameras
+    content = path.read_text()
+    slave = content[content.index('<sensor id="0"') : content.index("</sensor>")] + "</sensor>"
+    slave = slave.replace('id="0"', 'id="1" master_id="0"').replace("<property", f"{offset}<property")
+    content = content.replace("</sensors>", f"{slave}</sensors>")
+    camera = r'<camera id="1" sensor_id="1" master_id="0"\1/>'
+    content = re.sub(r'<camera id="1" sensor_id="0"([^>]*)>.*', camera, content)
+    path.write_text(content)
+    found = read_metashape(path).cameras
+    np.testing.assert_allclose(found.R, expected.R, atol=1e-9)
+    np.testing.assert_allclose(found.t, expected.t, atol=1e-6)
+    path.write_text(content.replace('label="Component 1"></component>', f'label="Component 1">{whole}</component>'))
+    with pytest.warns(InputWarning, match=r"1 slaves of a rig \(IMG_1\) are left out: the unit of their offset is not"):
+        assert [view.name for view in read_metashape(path).views] == ["IMG_0", "IMG_2", "IMG_3"]
+
+
 BAD = [
     (("<f>150.0</f>", "<f>zero</f>"), "camera IMG_0: 'zero' is not 1 finite numbers"),
     (("<f>150.0</f>", "<f>nan</f>"), "camera IMG_0: 'nan' is not 1 finite numbers"),

@@ -158,6 +158,7 @@ BAD: list[tuple[dict[str, Any], dict[str, Any], str]] = [
     ({}, {"transform_matrix": np.diag([1, 1, -1, 1]).tolist()}, "view 1 .*: R is a reflection"),
     ({}, {"transform_matrix": np.diag([2, 2, 2, 1]).tolist()}, "view 1 .*: R is not a rotation"),
     ({}, {"transform_matrix": np.diag([1, 1, 1, 2]).tolist()}, "frame 1 .*: the last row of transform_matrix is not"),
+    ({}, {"transform_matrix": np.diag([1, 1, 1, 0]).tolist()}, "frame 1 .*: the last row of transform_matrix is not"),
 ]
 
 
