@@ -1,23 +1,18 @@
 """Results as training samples: masks that `mvseg infer` found and the other views verified, or that a person corrected.
 
-A mask is a label when it was matched with a score of at least 0.5 and its edges come from the photo, or when a person
-made or confirmed it. All others are ignored, not background: a mask that only the other views show, or one or two
-views, one that matches nothing, one that matches badly.
+What is a label, `are_labels` says. All other masks are ignored, not background.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-import torch
-from torch import Tensor
-
 from mvseg.errors import InputError
 from mvseg.formats.coco import CocoAnnotation, encode_mask
-from mvseg.masks import SURE, Masks, Origin
 from mvseg.results.photo_masks import mask_in_photo
 from mvseg.results.read import load_result
 from mvseg.training.data import Sample, SampleList
+from mvseg.training.view_labels import are_labels
 
 
 def list_results(folder: Path) -> SampleList:
@@ -39,7 +34,7 @@ def list_results(folder: Path) -> SampleList:
 
 def _list_photos(folder: Path) -> list[Sample]:
     result = load_result(folder)
-    is_label = are_labels(result.masks)
+    is_label = are_labels(result.masks, result.instances.probabilities)
     if not is_label.any():
         raise InputError(f"{folder}: holds no mask that is sure enough to learn from, expected a result with leaves")
     samples, sizes = [], result.scene.cameras.sizes.tolist()
@@ -61,9 +56,3 @@ def _list_photos(folder: Path) -> list[Sample]:
         name = f"{folder.name}/{result.scene.views[view].name}{photo.suffix}"
         samples.append(Sample(name=name, photo=photo, annotations=masks, size=(width, height), class_of={1: 1}))
     return sorted(samples, key=lambda sample: sample.name)
-
-
-def are_labels(masks: Masks) -> Tensor:
-    """(D,) bool: the masks to learn from."""
-    is_seen = ~torch.isin(masks.origin, torch.tensor([Origin.OTHER_VIEWS, Origin.FEW_VIEWS]))
-    return masks.is_corrected | ((masks.instance_ids > 0) & (masks.match_scores >= SURE) & is_seen)

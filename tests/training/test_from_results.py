@@ -20,7 +20,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.regions import stack_regions
 from mvseg.results.folder import save_result
-from mvseg.results.result import Result
+from mvseg.results.result import Instances, Result
 from mvseg.training.data import read_sample
 from mvseg.training.from_results import list_results
 from scene_folders import edit_rig
@@ -33,7 +33,9 @@ KINDS = (  # instance id, match score, origin
     (-1, 0.9, Origin.DETECTED),
     (3, 0.9, Origin.OTHER_VIEWS),
     (3, 0.1, Origin.CORRECTED),
+    (4, 0.9, Origin.DETECTED),
 )
+PROBABILITIES = {1: 0.9, 2: 0.9, 3: 0.2, 4: 0.3}
 
 
 @pytest.fixture
@@ -43,7 +45,7 @@ def scene(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def result(scene: Path, tmp_path: Path) -> Path:
-    return write_squares(tmp_path / "out", scene, lefts=range(0, 200, 40))
+    return write_squares(tmp_path / "out", scene, lefts=range(0, 240, 40))
 
 
 def write_squares(folder: Path, scene: Path, *, lefts: Sequence[int], kinds: Sequence[Any] = KINDS) -> Path:
@@ -54,7 +56,8 @@ def write_squares(folder: Path, scene: Path, *, lefts: Sequence[int], kinds: Seq
     ids, scores, origins = (torch.tensor([kind[column] for kind in kinds]) for column in range(3))
     masks = replace(Masks.of(regions, ids, scores), origin=origins)
     matching = Matching(masks, MatchReport("nview", has_probabilities=True))
-    save_result(Result(scene=load_scene(scene), matching=matching), folder, report=False)
+    known = Instances(probabilities={each: PROBABILITIES[each] for each in ids[ids > 0].tolist()})
+    save_result(Result(scene=load_scene(scene), matching=matching, instances=known), folder, report=False)
     return folder
 
 
@@ -64,8 +67,8 @@ def test_sure_and_corrected_masks_are_labels_and_others_are_ignored(result: Path
     labelled = read_sample(samples.samples[0])
     assert labelled.classes.tolist() == [1, 1]
     is_label = (labelled.layers > 0).any(0)[20]
-    assert [bool(is_label[40 * n + 5]) for n in range(5)] == [True, False, False, False, True]
-    assert [bool(labelled.ignore[20, 40 * n + 5]) for n in range(5)] == [False, True, True, True, False]
+    assert [bool(is_label[40 * n + 5]) for n in range(6)] == [True, False, False, False, True, False]
+    assert [bool(labelled.ignore[20, 40 * n + 5]) for n in range(6)] == [False, True, True, True, False, True]
     assert len(read_sample(samples.samples[1]).classes) == 0
     assert len(list_results(result.parent)) == 9  # of a folder that holds results
 
