@@ -9,13 +9,14 @@ import math
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.special import expit
 
 from mvseg.tracking.dates import Floats, Number, PlantOnDate
+from mvseg.tracking.heights import level_heights
 from mvseg.tracking.track import Tracks
 
 TRAITS = ("area", "length", "width", "inclination", "curvature", "insertion_height", "greenness_index")
@@ -27,7 +28,8 @@ NOTHING = Number(math.nan, math.nan, "")
 
 @dataclass(frozen=True)
 class GrowthPoint:
-    """One trait of one leaf on one date; `rate` per day is the slope through this date and its neighbours."""
+    """One trait of one leaf on one date; `rate` per day is the slope through this date and its neighbours. `reference`
+    is the track that heights are counted by, see `level_heights`."""
 
     track: int
     trait: str
@@ -35,6 +37,7 @@ class GrowthPoint:
     number: Number
     rate: float
     rate_sd: float
+    reference: int | None = None
 
 
 @dataclass(frozen=True)
@@ -110,19 +113,28 @@ def measure_growth(tracks: Tracks) -> Growth:
     for row in tracks.rows:
         if row.leaf is not None:
             dates_of.setdefault(row.track, []).append((row.date, row.leaf))
+    found: dict[str, dict[int, dict[int, Number]]] = {
+        trait: {
+            track: {date: numbers[date][leaf][trait] for date, leaf in sights if trait in numbers[date][leaf]}
+            for track, sights in sorted(dates_of.items())
+        }
+        for trait in TRAITS
+    }
+    found["insertion_height"], references = level_heights(found["insertion_height"])
     points: list[GrowthPoint] = []
     curves = []
-    for track, sights in sorted(dates_of.items()):
-        for trait in TRAITS:
-            seen = {date: numbers[date][leaf][trait] for date, leaf in sights if trait in numbers[date][leaf]}
-            times = np.array([tracks.dates[date].time for date in seen])
-            values = np.array([number.value for number in seen.values()])
-            sds = np.array([number.sd for number in seen.values()])
-            for place, (date, number) in enumerate(seen.items()):
-                near = slice(max(place - 1, 0), place + 2)
-                points.append(GrowthPoint(track, trait, date, number, *slope(times[near], values[near], sds[near])))
-            if trait in SIZES and len(seen) >= LEAST_DATES:
-                curves.append(fit_curve(track, trait, (times, values, sds)))
+    for track, trait in product(sorted(dates_of), TRAITS):
+        seen = found[trait][track]
+        times = np.array([tracks.dates[date].time for date in seen])
+        values = np.array([number.value for number in seen.values()])
+        sds = np.array([number.sd for number in seen.values()])
+        for place, (date, number) in enumerate(seen.items()):
+            near = slice(max(place - 1, 0), place + 2)
+            rates = slope(times[near], values[near], sds[near])
+            reference = references[date] if trait == "insertion_height" else None
+            points.append(GrowthPoint(track, trait, date, number, *rates, reference=reference))
+        if trait in SIZES and len(seen) >= LEAST_DATES:
+            curves.append(fit_curve(track, trait, (times, values, sds)))
     return Growth(tuple(points), tuple(curves), tuple(_plant_rows(tracks, points)))
 
 

@@ -12,7 +12,7 @@ from mvseg.traits.table import as_cells, write_csv
 
 COLUMNS = {
     "tracks.csv": ("plant", "time", "scene", "leaf", "track", "probability", "state"),
-    "growth.csv": ("plant", "track", "trait", "time", "value", "sd", "unit", "rate", "rate_sd"),
+    "growth.csv": ("plant", "track", "trait", "time", "value", "sd", "unit", "rate", "rate_sd", "reference"),
     "plants.csv": (
         "plant", "time", "scene", "leaves", "born", "gone", "phyllochron", "total_area", "total_area_sd", "unit",
         "relative_growth_rate", "relative_growth_rate_sd", "divergence_angles",
@@ -36,7 +36,7 @@ def write_tables(folder: Path, tracks: Tracks, growth: Growth) -> None:
     for point in growth.points:
         number, time = point.number, tracks.dates[point.date].written
         measured = number.value, number.sd, number.unit, point.rate, point.rate_sd
-        add("growth.csv", point.track, point.trait, time, *measured)
+        add("growth.csv", point.track, point.trait, time, *measured, point.reference)
     for each in growth.plant:
         date, area, rate = tracks.dates[each.date], each.total_area, each.relative_growth_rate
         numbers = each.phyllochron, area.value, area.sd, area.unit, rate.value, rate.sd
