@@ -226,7 +226,7 @@ def find_shared(
     arguments see `move_pieces`.
     """
     inside, every = shown.compare(surfaces).inside, np.arange(len(ids))
-    own = np.where(np.isin(ids, list(surfaces)), ids, 0)
+    own = np.where(np.isin(ids, shown.instances), ids, 0)  # others have no surface, and no column
     by_own = inside[every, own]
     inside[every, own] = 0
     second, by_second = inside.argmax(1), inside.max(1)

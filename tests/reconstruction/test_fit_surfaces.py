@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -230,6 +231,25 @@ def test_masks_without_a_common_point_give_no_surface() -> None:
     masks[0][:20, :20], masks[1][-20:, -20:] = True, True
     surface = fit(masks, CAMERAS[[0, 1]])
     assert surface.quality.reasons == ("its masks agree on no point",)
+
+
+@pytest.mark.parametrize("num_views", [3, 6])
+@pytest.mark.parametrize("kind", ["line", "level line", "ring", "salt"])
+def test_masks_of_a_pixel_give_no_surface_that_is_trusted(kind: str, num_views: int) -> None:
+    """Their hulls are flat, or of a few voxels: no start of such a one may divide by its width or length."""
+    cameras, rng = ring_cameras(num_views), np.random.default_rng(0)
+    masks = np.zeros((num_views, SIZE, SIZE), np.uint8)
+    ends = cameras.project(torch.tensor([[-0.5, 0.2, 0.1], [0.6, -0.3, 0.2]], dtype=torch.float64))[0].int().tolist()
+    for mask, ((x, y), end) in zip(masks, ends, strict=True):
+        if kind == "ring":
+            cv2.circle(mask, (x, y), 12, 1)
+        elif kind == "salt":
+            mask[y - 15 : y + 15, x - 15 : x + 15] = rng.random((30, 30)) < 0.2
+        else:
+            cv2.line(mask, (x, y), (end[0], y) if kind == "level line" else tuple(end), 1)
+    surface = fit(list(masks), cameras)
+    assert not surface.is_credible
+    assert not surface.quality.is_good
 
 
 def test_a_start_that_no_mask_is_near_gives_no_surface() -> None:

@@ -154,6 +154,15 @@ def test_no_mask_shows_the_surface_of_an_instance_that_has_no_masks_left() -> No
     assert torch.equal(checked.close_gaps().instance_ids, leaves)
 
 
+def test_an_instance_without_a_surface_keeps_its_masks(scene: tuple[Regions, Tensor]) -> None:
+    """A line of one pixel, say, with the highest id of all."""
+    regions, ids = scene
+    surfaces = {**LEAVES, 3: LeafSurface.none(torch.arange(6), "its masks do not tell its shape")}
+    checked = check(regions, ids, surfaces)
+    assert torch.equal(checked.instance_ids, ids)
+    assert checked.merged == ()
+
+
 def test_what_no_surface_explains_goes_to_the_nearest_part() -> None:
     """A merged mask that is drawn three pixels too large; and what the matcher alone calls merged stays on the list."""
     maps = merged_maps(3, 1)

@@ -15,6 +15,7 @@ from mvseg.reconstruction.surface.leaf_patch import (
     NUM_COEFFICIENTS,
     SIDE,
     Floats,
+    measure_patch,
     spline_basis,
 )
 
@@ -25,6 +26,9 @@ NEIGHBOURS = 8  # a voxel is joined to so many others where the way along a leaf
 ELONGATED = 2.0
 BENT = 1.35  # or if the way along it is so many times the straight one: graphs make detours of a tenth
 TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # starts have their side at these angles about the midrib
+# A start is at least so wide, as a share of its length, and so long, as a share of the cloud's deviation: masks of a
+# pixel have flat hulls, or hulls of a few voxels.
+THINNEST = 0.01
 TIE = 1e-6  # distances on a lattice are equal if they differ by less than this share, by rounding
 
 
@@ -40,7 +44,7 @@ def start_patches(points: Floats) -> list[Floats]:
 
     Returns:
         (26, 3) coefficients each, fold and curl 0. The likely one runs along the longest axis; the others have sides in
-        other directions, or run across it. None where all points are on one line.
+        other directions, or run across it. None where all points are on one line, and none without a length.
     """
     points = _thin(points)
     if len(points) < 2:
@@ -52,7 +56,9 @@ def start_patches(points: Floats) -> list[Floats]:
     straight, along = centred @ axes[0], _geodesic_places(points)
     is_bent = spreads[0] > ELONGATED * spreads[1] or along.max() > BENT * np.ptp(straight)
     first = _patches_along(points, along if is_bent else straight, axes[1])
-    return first + _patches_along(points, centred @ axes[1], axes[0])
+    starts = first + _patches_along(points, centred @ axes[1], axes[0])
+    shortest = THINNEST * spreads[0] / np.sqrt(len(points))
+    return [start for start in starts if measure_patch(start).length > shortest]
 
 
 def _patches_along(points: Floats, place: Floats, side: Floats) -> list[Floats]:
@@ -112,6 +118,7 @@ def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
     along = np.gradient(middles, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
     turns = np.radians(TURNS_DEG)[:, None]
+    thinnest = THINNEST / 2 * float(np.linalg.norm(np.diff(middles, axis=0), axis=1).sum())
     directions, sides = np.zeros((NUM_WINDOWS, 3)), np.zeros((len(turns), NUM_WINDOWS, 3))
     for index in np.argsort(np.abs(centres - 0.5), kind="stable"):
         near = np.abs(t - centres[index]) < 0.75 / NUM_WINDOWS
@@ -123,7 +130,8 @@ def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
         before = directions[done[np.abs(done - index).argmin()]] if len(done) else side
         directions[index] = widest * (1.0 if widest @ before >= 0 else -1.0)
         turned = np.cos(turns) * directions[index] + np.sin(turns) * np.cross(along[index], directions[index])
-        sides[:, index] = np.quantile(np.abs(flat @ turned.T), 0.93, axis=0)[:, None] * turned
+        half_widths = np.maximum(np.quantile(np.abs(flat @ turned.T), 0.93, axis=0), thinnest)
+        sides[:, index] = half_widths[:, None] * turned
     return middles, sides
 
 
