@@ -20,12 +20,12 @@ class InputWarning(UserWarning):
     """The input is odd but usable; the message says what was done about it. Kept in a result's `run.json`."""
 
 
-def warn(sentence: str) -> None:
-    """Warn (InputWarning), as of the line outside of this package that led here."""
+def warn(said: str | Warning) -> None:
+    """Warn (InputWarning) as of the line outside of this package that led here; one that was caught is repeated."""
     frame, level = sys._getframe(1), 2
     while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith("mvseg."):
         frame, level = frame.f_back, level + 1
-    warnings.warn(sentence, InputWarning, stacklevel=level)
+    warnings.warn(said, InputWarning, stacklevel=level)
 
 
 @contextmanager

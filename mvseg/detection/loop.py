@@ -10,6 +10,7 @@ from torch import Tensor
 
 from mvseg.detection.assignment import EpipolarAssignment
 from mvseg.detection.nms import backed_by_views, cluster_aware_nms
+from mvseg.errors import warn
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_masks
@@ -79,7 +80,7 @@ def match_proposals(
                 caught.clear()
                 matching = rematch(proposals.select(keep[stays]))
     for each in caught:
-        warnings.warn(each.message, stacklevel=2)
+        warn(each.message)
     return matching
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
@@ -11,7 +10,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
@@ -196,12 +195,12 @@ def _check_sizes(regions: Regions, cameras: Cameras) -> None:
 
 def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
     if not len(regions):
-        warnings.warn("the masks of all views are empty: there are no instances", InputWarning, stacklevel=3)
+        warn("the masks of all views are empty: there are no instances")
     pairs = torch.triu(is_coincident(cameras), diagonal=1).nonzero().tolist()
     if pairs:
         first = "views {} and {} share a camera centre".format(*pairs[0])
         skipped = "this pair is skipped" if len(pairs) == 1 else f"so do {len(pairs) - 1} more pairs; all are skipped"
-        warnings.warn(f"{first}: {skipped}", InputWarning, stacklevel=3)
+        warn(f"{first}: {skipped}")
 
 
 def _warn_of_disagreement(matching: Matching) -> None:
@@ -232,7 +231,7 @@ def _warn_of_disagreement(matching: Matching) -> None:
         view = few[0]
         count = f"{num_per_view[view]} against {num_per_view.median()} as a rule"
         question = f"view {view} has few masks ({count}): are some missing, or does one cover several instances?"
-    warnings.warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}", InputWarning, stacklevel=3)
+    warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}")
 
 
 def odd_views(view_explained: Tensor) -> list[int]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -13,7 +12,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells
 from mvseg.regions import Regions
@@ -139,7 +138,7 @@ def reconstruct_instances(
             shapes[instance] = grid
         elif len(members.view_index.unique()) > 1:
             message = f"instance {instance} has no shape: its {len(members)} masks agree on no point"
-            warnings.warn(message, InputWarning, stacklevel=2)
+            warn(message)
     return shapes
 
 
@@ -268,5 +267,5 @@ def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, T
     root_low, root_high = silhouettes.cube.box
     if (low - cells.size / 2 < root_low).any() or (high + cells.size / 2 > root_high).any():
         message = f"the {len(silhouettes)} masks of an instance have no bounded common part (the views are too similar)"
-        warnings.warn(f"{message}: its shape is cut off", InputWarning, stacklevel=4)
+        warn(f"{message}: its shape is cut off")
     return low, high

@@ -18,7 +18,7 @@ from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import claim_cache, delete_cached
 from mvseg.detection.config import DetectConfig
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.photos import Photos
 from mvseg.results.earlier import Output, check_out
@@ -131,7 +131,7 @@ def solve_scene(
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
         if masks is not None and config.detect != DetectConfig():
-            warnings.warn("the detect options have no effect: masks are given", InputWarning, stacklevel=1)
+            warn("the detect options have no effect: masks are given")
         result = run_scene(
             scene,
             masks,

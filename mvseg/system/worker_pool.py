@@ -19,7 +19,7 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, warn
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
@@ -166,5 +166,5 @@ def _receive(asked: Future[tuple[Answer, list[Warning]]]) -> Answer:
     """The answer; the warnings of the worker are repeated here."""
     answer, said = asked.result()
     for each in said:
-        warnings.warn(each, stacklevel=4)
+        warn(each)
     return answer

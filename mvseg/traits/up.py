@@ -4,13 +4,12 @@ cameras or markers that lie flat show.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, warn
 from mvseg.formats.markers import find_scene_markers
 from mvseg.formats.photos import Photos
 from mvseg.reconstruction.triangulate import triangulate_points
@@ -57,12 +56,12 @@ def place_scene(
     if unit is not None:
         if scene.unit not in ("", unit) and scale is None:
             message = f"the cameras are in {scene.unit}: unit {unit} without a scale only renames it"
-            warnings.warn(message, InputWarning, stacklevel=4)
+            warn(message)
         scene = replace(scene, unit=unit)
     scene = find_up(scene, up, photos)
     if scene.seems_upside_down:
         message = "up may be upside down: the cameras look up at the plant, or hang upside down; if not, reverse it"
-        warnings.warn(message, InputWarning, stacklevel=4)
+        warn(message)
     return scene
 
 

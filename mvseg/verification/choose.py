@@ -9,7 +9,6 @@ leaves fall by themselves. The paper's idea of an excessive set from which the v
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -18,7 +17,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
-from mvseg.errors import InputWarning
+from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
@@ -147,7 +146,7 @@ def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
     parallax = median_parallax(matched, cameras)
     if parallax < LEAST_PARALLAX:
         message = f"the cameras see the leaves from one side only ({parallax:.0f} degrees apart, as a rule)"
-        warnings.warn(f"{message}: their surfaces cannot verify their masks", InputWarning, stacklevel=3)
+        warn(f"{message}: their surfaces cannot verify their masks")
     return parallax >= LEAST_PARALLAX
 
 
