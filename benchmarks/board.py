@@ -35,6 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.best_dice import count_and_dice
 from mvseg.config import RunConfig
+from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.config import DetectConfig
 from mvseg.detectors.run import detect as detect_in_photo
 from mvseg.detectors.zoo import load_detector
@@ -82,7 +83,7 @@ def find_masks(scene: Scene, options: DetectConfig, cache: Path | None) -> tuple
     """Masks as they are found and matched, and as they leave the whole job."""
     config = RunConfig(reconstruct=None, detect=options)
     opened = Opened(scene, Photos(scene), None, mask_kind="", views_left_out=(), config=config)
-    known = find_leaves(opened, cache=cache)
+    known = find_leaves(opened, cache=None if cache is None else CachedDetections(cache))
     return known.matched[0], shape_leaves(known).masks
 
 

@@ -70,7 +70,7 @@ def study(folder: Path, step: int = 1) -> Study | None:
         return None
     scene = replace(scene, views=scene.views[::step], cameras=scene.cameras[list(range(0, len(scene.views), step))])
     truth = true_maps(folder, scene)
-    found = find_leaves(detect_scene(Photos(scene)), scene.cameras)
+    found = find_leaves([detect_scene(Photos(scene))], scene.cameras)
     table, matched = found.proposals, found.matched
     candidates = gather_candidates(
         [(masks, masks.regions.labels) for masks in matched],

@@ -46,6 +46,7 @@ from mvseg.config import RunConfig
 from mvseg.corrections.apply import APPLIED
 from mvseg.corrections.doubtful import list_doubts
 from mvseg.corrections.file import Corrections, Edit, load_corrections, write_corrections
+from mvseg.detection.cached_detections import CachedDetections
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import leaf_metrics
@@ -112,7 +113,8 @@ def list_cases(args: argparse.Namespace) -> Iterator[Case]:
 
 def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -> Case:
     """A scene whose leaves the detector finds."""
-    known = find_leaves(open_scene(folder, None, config), cache=cache)
+    kept = None if cache is None else CachedDetections(cache)
+    known = find_leaves(open_scene(folder, None, config), cache=kept)
     return Case(f"detected_{folder.name}", known, true_maps(folder, known.scene), has_masks=False)
 
 

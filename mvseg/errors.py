@@ -29,6 +29,20 @@ def warn(said: str | Warning) -> None:
 
 
 @contextmanager
+def collect_warnings() -> Iterator[list[str]]:
+    """The sentences of InputWarnings inside the block, each once, when it ends; they are not given. Other warnings
+    are."""
+    sentences: list[str] = []
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", InputWarning)
+        yield sentences
+    ours = (str(each.message) for each in caught if issubclass(each.category, InputWarning))
+    sentences += dict.fromkeys(ours)
+    for other in (each for each in caught if not issubclass(each.category, InputWarning)):
+        warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
+
+
+@contextmanager
 def faults_of(where: object) -> Iterator[None]:
     """Put the place, as a file or a view, in front of the reason of any InputError that is raised inside."""
     try:

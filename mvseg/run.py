@@ -22,7 +22,8 @@ from mvseg.corrections.apply import Fate, Refused, apply, apply_everywhere
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.corrections.settle import settle
-from mvseg.errors import warn
+from mvseg.detection.cached_detections import CachedDetections
+from mvseg.errors import collect_warnings, warn
 from mvseg.masks import Masks, Origin
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
@@ -78,10 +79,13 @@ def run_scene(
         opened = open_scene(folder, masks, config, corrections=corrections)
         if corrections is not None and not force_corrections:
             check_made_for(corrections, opened.photos)
-        known = find_leaves(opened, cache=cache) if opened.given is None else match_given(opened, opened.given)
+        kept = None if cache is None else CachedDetections(Path(cache))
+        known = find_leaves(opened, cache=kept) if opened.given is None else match_given(opened, opened.given)
         if corrections is not None and corrections.edits:
             known = apply_edits(known, corrections)
         result = finish(known)
+        if kept is not None:
+            kept.delete_others()
     return replace(result, corrections=corrections, seconds=now.seconds)
 
 
@@ -145,21 +149,36 @@ def match_given(opened: Opened, given: Masks) -> Known:
     return _cut_merged(known)
 
 
-def find_leaves(opened: Opened, *, cache: Path | str | None = None) -> Known:
-    """Look for leaves in the photos, see `detect_scene`; the views choose, see `mvseg.detection.find_leaves`."""
+def find_leaves(opened: Opened, *, cache: CachedDetections | None = None) -> Known:
+    """Look for leaves in the photos, at the size at which the views agree best; the views choose leaves and masks."""
+    from mvseg.detection.choose_size import choose_size
     from mvseg.detection.detect_scene import detect_scene
-    from mvseg.detection.find_leaves import find_leaves
+    from mvseg.detection.find_leaves import Found, find_leaves
 
-    config, scene, poses = opened.config, opened.scene, None
-    cache = None if cache is None else Path(cache)
-    looks = detect_scene(opened.photos, config.detect, match=config.match, cache=cache)
-    if config.refine_poses:
-        scene, poses = refine_scene(scene, partial(looks[0].match, min_score=config.detect.min_score))
-        looks = [each.with_cameras(scene.cameras, config.detect.min_score) for each in looks]
-    if not len(looks[0].sure):
-        warn(f"the detector finds nothing that scores {config.detect.min_score:g} or more")
+    config, detect, scene, poses = opened.config, opened.config.detect, opened.scene, None
     splits = config.split_merged and not opened.is_checked
-    found = find_leaves(looks, scene.cameras, config=config.detect, splits=splits)
+    with collect_warnings() as said:
+        look = detect_scene(opened.photos, detect, match=config.match, cache=cache)
+        if config.refine_poses:
+            scene, poses = refine_scene(scene, partial(look.match, min_score=detect.min_score))
+            look = look.with_cameras(scene.cameras, detect.min_score)
+        found = find_leaves([look], scene.cameras, config=detect, splits=splits)
+    found = replace(found, said=tuple(said))
+
+    def see(size: int) -> Found:
+        with collect_warnings() as said:
+            at_size = replace(detect, image_size=size)
+            other = detect_scene(opened.photos, at_size, match=config.match, cache=cache, boxes=look.boxes)
+            posed = other if poses is None else other.with_cameras(scene.cameras, detect.min_score)
+            found = find_leaves([posed], scene.cameras, config=detect, splits=splits)
+        return replace(found, said=tuple(said))
+
+    if detect.image_size is None and opened.is_chosen and (look.boxes is None or not found.is_familiar):
+        found = choose_size(see, found)
+    for sentence in found.said:
+        warn(sentence)
+    if not len(found.looks[0].sure):
+        warn(f"the detector finds nothing that scores {detect.min_score:g} or more")
     matching = Matching(found.matched[0], found.report)
     known = Known(opened, scene, matching, Instances(), found.proposals, found.matched, left=(), poses=poses)
     return _choose(known, found.leaves) if opened.is_chosen else known

@@ -29,6 +29,7 @@ from mvseg import (
     match_regions,
     run_scene,
 )
+from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
 from mvseg.detection.detect_scene import detect_scene
@@ -335,8 +336,8 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
         write_png(views[-1].path, photo)
     scene = Scene("far", tuple(views), cameras)
     kept = tmp_path / "kept"
-    first = detect_scene(Photos(scene), DetectConfig(crop="off"))[0].sure.masks
-    again = detect_scene(Photos(scene), cache=kept)[0].sure.masks
+    first = detect_scene(Photos(scene), DetectConfig(crop="off")).sure.masks
+    again = detect_scene(Photos(scene), cache=CachedDetections(kept)).sure.masks
     assert len(again) > len(first)
     assert len([*kept.iterdir()]) == 2 * len(chosen)
 
@@ -344,7 +345,7 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
     for view, (x1, y1, x2, y2) in zip(views, boxes.tolist(), strict=True):
         write_png(view.path, np.ascontiguousarray(read_rgb(view.path)[y1:y2, x1:x2]))
     cut = Scene("cut", tuple(views), crop_cameras(cameras, boxes))
-    expected = detect_scene(Photos(cut))[0].sure.masks
+    expected = detect_scene(Photos(cut)).sure.masks
     placed = place_crops(expected, boxes)
     assert torch.equal(again.regions.boxes, placed.regions.boxes)
     assert torch.equal(again.regions.crops, placed.regions.crops)

@@ -14,7 +14,7 @@ import os
 import re
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import safetensors.torch
@@ -24,31 +24,46 @@ from mvseg.errors import InputError
 from mvseg.formats.photos import Photos, photo_bits
 from mvseg.system.atomic import is_partial, lock_folder, write_whole
 
-CACHED_NAME = re.compile(r"[0-9a-f]{64}\.safetensors")
+CACHED_NAME = re.compile(r"(learned-)?[0-9a-f]{64}\.safetensors")
 SCENE_FILE = ".scene"
 FIELDS = {"boxes", "labels", "scores", "masks", "frame"}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class CachedDetections:
     """Where the detections of a run are cached.
 
     Attributes:
         folder: of the files; made with the first of them.
-        made_by: the detector and its options, in words that differ when any of them does.
+        used: names of the files that this run has asked for; the others are of other photos, detectors or options.
     """
 
     folder: Path
-    made_by: str
+    used: set[str] = field(default_factory=set)
 
-    def path(self, photos: Photos, view: int, box: Sequence[int] | None = None) -> Path:
-        """The file for the detections in the photo of a view, or in a box (xyxy) of it; the photo must exist."""
+    def path(self, photos: Photos, view: int, box: Sequence[int] | None = None, *, made_by: str) -> Path:
+        """The file for the detections in the photo of a view, or in a box (xyxy) of it; the photo must exist.
+
+        `made_by`: the detector and its options, in words that differ when any of them does.
+        """
         scene = photos.scene
         lens, K = scene.views[view].lens, scene.cameras.K[view].tolist()
         size = scene.cameras.sizes[view].tolist()
         camera = [None if lens is None else [lens.model_name, list(lens.params)], K, size]
-        text = json.dumps([photos.sha256(view), photo_bits(scene, view), camera, self.made_by, box])
-        return self.folder / f"{hashlib.sha256(text.encode()).hexdigest()}.safetensors"
+        text = json.dumps([photos.sha256(view), photo_bits(scene, view), camera, made_by, box])
+        return self._use(f"{hashlib.sha256(text.encode()).hexdigest()}.safetensors")
+
+    def learned(self, made_from: str) -> Path:
+        """The file for a detector that has learned, by a text that says all that it depends on."""
+        return self._use(f"learned-{hashlib.sha256(made_from.encode()).hexdigest()}.safetensors")
+
+    def delete_others(self) -> None:
+        """Delete what this run did not ask for, and the folder if nothing else is in it."""
+        delete_cached(self.folder, but=self.used)
+
+    def _use(self, name: str) -> Path:
+        self.used.add(name)
+        return self.folder / name
 
 
 def write_detections(path: Path, detections: dict[str, Tensor]) -> None:
@@ -68,7 +83,7 @@ def read_detections(path: Path) -> dict[str, Tensor] | None:
 
 
 def delete_cached(folder: Path, *, but: Collection[str] = ()) -> None:
-    """Delete the cached detections but those of the given names, and the folder if nothing else is in it."""
+    """Delete what is cached but the files of the given names, and the folder if nothing else is in it."""
     if not folder.is_dir():
         return
     for path in [*folder.iterdir()]:

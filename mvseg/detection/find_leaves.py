@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+import torch
 from torch import Tensor
 
-from mvseg.detection.config import MORE_SCORE, DetectConfig
+from mvseg.detection.config import MORE_SCORE, SURE_SCORE, DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops
 from mvseg.detection.proposals import gather_proposals
 from mvseg.errors import InputWarning
@@ -19,7 +20,8 @@ from mvseg.matching.split import split_merged
 from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
 from mvseg.system.running import timed
-from mvseg.verification.choose import Leaves, choose_leaves
+from mvseg.verification.choose import DIGITS, Leaves, choose_leaves
+from mvseg.verification.unexplained import is_familiar
 
 if TYPE_CHECKING:
     from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
@@ -58,6 +60,11 @@ class Look:
         """The same, matched anew."""
         return replace(self, sure=self.match(cameras, min_score))
 
+    @property
+    def longest(self) -> int:
+        """Pixels: the longer side of the largest photo, or part, as the detector sees it."""
+        return max(int(each["frame"].max()) for each in self.detections)
+
     def proposals(self, cameras: Cameras) -> Masks:
         """The excessive set: R masks on the CPU, in the frames of the photos, matched to nothing."""
         masks, _ = gather_proposals(self.detections, self._posed(cameras).sizes.tolist())
@@ -79,16 +86,40 @@ class Found:
     """The leaves that were found, and what they were chosen from.
 
     Attributes:
+        looks: at the photos, that the proposals come from.
         leaves: that the views choose; without `DetectConfig.verify`, what was matched.
         proposals: R masks, the excessive set.
         matched: tables of masks that are matched, the sure ones first; their `labels` are rows of `proposals`.
         report: of the sure ones.
+        said: what there is to warn of, should it stay.
     """
 
+    looks: tuple[Look, ...]
     leaves: Leaves
     proposals: Masks
     matched: tuple[Masks, ...]
     report: MatchReport
+    said: tuple[str, ...] = ()
+
+    @property
+    def is_familiar(self) -> bool:
+        """Whether the detector knows the species, see `mvseg.verification.unexplained.is_familiar`."""
+        return is_familiar(self.leaves.masks, sure_score=SURE_SCORE)
+
+    @property
+    def expected_right(self) -> float:
+        """E, the expected number of right masks: the sum over leaves of P times the sum of q of their masks. It orders
+        detectors and sizes, for one plant, as the truth does (docs/notes/detector.md)."""
+        return expect_right(self.leaves.masks, self.leaves.probabilities)
+
+
+def expect_right(masks: Masks, probabilities: Mapping[int, float]) -> float:
+    """The expected number of right masks among D masks whose match scores are q, for `probabilities` {id: P}."""
+    chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)
+    for instance, chance in probabilities.items():
+        chances[instance] = chance
+    ids = masks.instance_ids.clamp(min=0).cpu()
+    return round(float((chances[ids] * masks.match_scores.cpu().double()).sum()), DIGITS)
 
 
 def find_leaves(
@@ -126,4 +157,4 @@ def find_leaves(
             leaves = choose_leaves(
                 first, everything, cameras=cameras, more=matched[1:], min_probability=config.min_probability
             )
-    return Found(leaves, everything, tuple(matched), looks[0].sure.report)
+    return Found(tuple(looks), leaves, everything, tuple(matched), looks[0].sure.report)

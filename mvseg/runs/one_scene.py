@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import platform
 import sys
-import warnings
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
@@ -18,7 +17,7 @@ from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import claim_cache, delete_cached
 from mvseg.detection.config import DetectConfig
-from mvseg.errors import InputError, InputWarning, warn
+from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.photos import Photos
 from mvseg.results.earlier import Output, check_out
@@ -128,8 +127,7 @@ def solve_scene(
     cache: Path,
 ) -> tuple[Result, list[str]]:
     """The result of one scene and the InputWarnings on the way, each once; other warnings are passed on."""
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
+    with collect_warnings() as messages:
         if masks is not None and config.detect != DetectConfig():
             warn("the detect options have no effect: masks are given")
         result = run_scene(
@@ -140,11 +138,7 @@ def solve_scene(
             force_corrections=force_corrections,
             cache=cache,
         )
-    for other in (each for each in caught if not issubclass(each.category, InputWarning)):
-        warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
-    # each matching of a detector's loop may repeat a warning
-    messages = dict.fromkeys(str(each.message) for each in caught if issubclass(each.category, InputWarning))
-    return result, list(messages)
+    return result, messages  # each once: each matching of a detector's loop may repeat a warning
 
 
 def save_scene(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -16,7 +15,7 @@ import torch
 from torch import Tensor
 
 from mvseg.corrections.file import Corrections, load_corrections
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, collect_warnings
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.open_scene import open_scene
@@ -91,7 +90,7 @@ class OpenResult:
             InputError: see the stages.
         """
         known, messages = self._known
-        with running(is_cancelled=is_old), _collect_warnings() as more:
+        with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(known, corrections) if corrections.edits else known
             result = shape_leaves(edited)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
@@ -105,20 +104,10 @@ class OpenResult:
     @cached_property
     def _known(self) -> tuple[Known, list[str]]:
         """What is known without a person, and the warnings on the way; it stays."""
-        with _collect_warnings() as messages:
+        with collect_warnings() as messages:
             given = self.opened.given
             known = find_leaves(self.opened) if given is None else match_given(self.opened, given)
         return known, messages
-
-
-@contextmanager
-def _collect_warnings() -> Iterator[list[str]]:
-    """The sentences of InputWarnings inside the block."""
-    messages: list[str] = []
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
-        yield messages
-    messages += [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
 
 
 def keep_numbers(result: Result, known: dict[str, int]) -> Result:

@@ -38,6 +38,15 @@ def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
     return beside / max(total, 1)
 
 
+def is_familiar(masks: Masks, *, sure_score: float) -> bool:
+    """Whether a detector knows the species: it is sure (a detection score of `sure_score` or more) of at least half of
+    the masks of leaves that it found. Without any, it does not; masks that no detector scored are familiar."""
+    found = masks.instance_ids > 0
+    scores = masks.detection_scores[found]
+    scores = scores[~scores.isnan()]
+    return bool(found.any()) and (not len(scores) or float(scores.median()) >= sure_score)
+
+
 def describe_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float) -> str:
     """A sentence where leaves were probably missed, "" elsewhere.
 
@@ -48,9 +57,7 @@ def describe_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float) -> s
     found = masks.instance_ids > 0
     if not found.any():
         return f"no leaf was found that two photos agree on; {HELP}"
-    scores = masks.detection_scores[found]
-    scores = scores[~scores.isnan()]
-    if len(scores) and float(scores.median()) < sure_score:
+    if not is_familiar(masks, sure_score=sure_score):
         return (
             f"most leaves score less than {sure_score:g}: the detector does not know this species well, and has "
             f"probably missed others; {HELP}"

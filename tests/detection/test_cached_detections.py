@@ -55,7 +55,7 @@ def test_another_photo_camera_or_detector_has_another_name(tmp_path: Path) -> No
     names = []
 
     def note(made_by: str = "leaf-lite") -> None:
-        names.append(CachedDetections(tmp_path / "kept", made_by).path(Photos(load_scene(folder)), 1))
+        names.append(CachedDetections(tmp_path / "kept").path(Photos(load_scene(folder)), 1, made_by=made_by))
 
     note()
     note("another")
@@ -124,7 +124,9 @@ def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     scene, names = load_scene(write_scene(tmp_path / "plant", 2)), []
     for code in ("one", "other"):
         monkeypatch.setattr("mvseg.detection.detect_scene.code_hash", lambda code=code: code)
-        detect_scene(Photos(scene), DetectConfig(min_score=0.05), cache=tmp_path / "kept")
+        cache = CachedDetections(tmp_path / "kept")
+        detect_scene(Photos(scene), DetectConfig(min_score=0.05), cache=cache)
+        cache.delete_others()
         names.append({path.name for path in (tmp_path / "kept").iterdir()})
     assert [len(each) for each in names] == [2, 2]
     assert not names[0] & names[1]
@@ -133,7 +135,7 @@ def test_other_code_detects_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, keep = load_scene(write_scene(tmp_path / "plant")), tmp_path / "kept"
     config = DetectConfig(min_score=0.05)
-    whole = detect_scene(Photos(scene), config)[0].sure.masks
+    whole = detect_scene(Photos(scene), config).sure.masks
     assert len(whole.regions)
     ran: list[tuple[int, ...]] = []
     run_heads = mask_rcnn.run_heads
@@ -146,13 +148,15 @@ def test_a_run_that_was_cut_off_goes_on_from_its_detections(tmp_path: Path, monk
 
     monkeypatch.setattr(mask_rcnn, "run_heads", count)
     with pytest.raises(KeyboardInterrupt):
-        detect_scene(Photos(scene), config, cache=keep)
+        detect_scene(Photos(scene), config, cache=CachedDetections(keep))
     assert len(list(keep.iterdir())) == 2
-    resumed = detect_scene(Photos(scene), config, cache=keep)[0].sure.masks
+    resumed = detect_scene(Photos(scene), config, cache=CachedDetections(keep)).sure.masks
     assert len(ran) == 3 + 2  # the first two photos were not looked at again
     assert torch.equal(resumed.regions.crops, whole.regions.crops)
     assert torch.equal(resumed.detection_scores, whole.detection_scores)
     assert torch.equal(resumed.instance_ids, whole.instance_ids)
-    detect_scene(Photos(scene), DetectConfig(min_score=0.04), cache=keep)
+    other = CachedDetections(keep)
+    detect_scene(Photos(scene), DetectConfig(min_score=0.04), cache=other)
     assert len(ran) == 3 + 2 + 4
+    other.delete_others()
     assert len(list(keep.iterdir())) == 4  # those of other options are gone
