@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+import yaml
 from scipy.spatial.transform import Rotation
 
 from mvseg.cli import main
@@ -18,7 +20,7 @@ from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
 from mvseg.reconstruction.triangulate import triangulate_points
 from room_scene import BOARD
-from turntable_board import ANGLES, HEIGHT, SIDE_R, SIDE_T, WIDTH, draw_board
+from turntable_board import ANGLES, HEIGHT, SIDE_R, SIDE_T, WIDTH, K, draw_board
 
 OPTIONS = ["--board.columns", "5", "--board.rows", "4", "--board.square", "40", "--board.marker", "30", "--quiet"]
 
@@ -72,6 +74,31 @@ def test_a_table_is_calibrated_once_and_serves_other_photos(
     assert "7.png has 30 x 20 pixels, the turntable's camera 640 x 480" in capsys.readouterr().err
     assert len(load_scene(plant).views) == 8  # the earlier scene is still there
     assert sorted(path.name for path in tmp_path.iterdir()) == ["photos", "plant", "table"]
+
+
+def test_an_unsure_focal_length_is_warned_of_and_a_given_one_is_sure(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    flat = Rotation.from_euler("z", 20, degrees=True)
+    photos = write_photos(tmp_path / "photos", [draw_board(angle, tilt=flat) for angle in ANGLES[::2]])
+    command = ["pose", str(photos), "--out", str(tmp_path / "table"), "--turntable", "board", *OPTIONS]
+    assert main(command) == 0
+    said = capsys.readouterr().err
+    assert re.search(r"camera: focal length 69\d \+- \d.* px \(1.\d%\): .* as uncertain; photograph the board", said)
+    written = json.loads((tmp_path / "table" / "pose.json").read_text())
+    assert 7 < written["lenses"][0]["focal_length"]["deviation"] < 14
+    assert written["warnings"] == [said.removeprefix("mvseg: warning: ").rstrip()]
+
+    lens = tmp_path / "lens.yaml"
+    matrix = K - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]  # OpenCV's first pixel has its centre at (0, 0)
+    lens.write_text(yaml.safe_dump({"K": matrix.tolist(), "D": [0.0] * 5}))
+    assert main([*command, "--calibration", str(lens)]) == 0
+    assert capsys.readouterr().err == ""
+    written = json.loads((tmp_path / "table" / "turntable.json").read_text())
+    np.testing.assert_allclose(written["cameras"]["camera"]["K"], K)
+    lens.write_text(yaml.safe_dump({"K": K.tolist(), "D": [0.1] * 8}))
+    assert main([*command, "--calibration", str(lens)]) == 2
+    assert "lens.yaml: expected K without skew and k1, k2, p1, p2, k3" in capsys.readouterr().err
 
 
 @pytest.mark.slow

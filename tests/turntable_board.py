@@ -21,7 +21,11 @@ R = np.array([
 T = np.array([0.0, 0, DISTANCE])
 # The board lies off the axis, tilted by some degrees.
 BOARD_TURN = Rotation.from_euler("xyz", [6, -4, 20], degrees=True)
-BOARD_SHIFT = BOARD_TURN.apply([-90.0, -70, 0]) + [12, -7, 0]
+
+
+def board_shift(tilt: Rotation) -> np.ndarray:
+    """(3,) where the board's corner is on the table, so that its middle is nearly on the axis."""
+    return tilt.apply([-90.0, -70, 0]) + [12, -7, 0]
 
 
 # A second camera, lower and on another side.
@@ -35,9 +39,11 @@ def draw_board(
     *,
     shift: tuple[float, float, float] = (0, 0, 0),
     pose: tuple[np.ndarray, np.ndarray] = (R, T),
+    tilt: Rotation = BOARD_TURN,
     has_texture: bool = False,
 ) -> np.ndarray:
-    """(H, W) uint8: the board after the table has turned by `angle` degrees; `shift` of the table, mm.
+    """(H, W) uint8: the board after the table has turned by `angle` degrees; `shift` of the table, mm; `tilt` turns
+    the board on it.
 
     Seen by a camera whose cam_from_world is `pose` at angle 0. With texture, a poster lies in place of the board.
     """
@@ -49,8 +55,8 @@ def draw_board(
     board_from_picture = np.diag([1 / PX_PER_MM, -1 / PX_PER_MM, 1.0])
     board_from_picture[:2, 2] = [-10, BOARD.rows * BOARD.square + 10]
     turn = Rotation.from_euler("z", angle, degrees=True)
-    axes = (turn * BOARD_TURN).as_matrix()
-    plane = np.column_stack([R @ axes[:, :2], R @ (turn.apply(BOARD_SHIFT) + shift) + T])
+    axes = (turn * tilt).as_matrix()
+    plane = np.column_stack([R @ axes[:, :2], R @ (turn.apply(board_shift(tilt)) + shift) + T])
     half = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1]])
     larger = half @ np.diag([3.0, 3, 1]) @ K @ plane @ board_from_picture @ np.linalg.inv(half)
     photo = cv2.warpPerspective(picture, larger, (3 * WIDTH, 3 * HEIGHT), flags=cv2.INTER_LINEAR, borderValue=90)

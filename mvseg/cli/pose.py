@@ -69,7 +69,7 @@ def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
     is_board = args.turntable == "board"
     used = ("marker", "distance", "positions") if is_board else ("board", "marker", "distance", "positions", "unit")
     useless = [name for name in used if getattr(known, name)] + (["up"] if args.up is not None else [])
-    if config != PoseConfig():
+    if config != PoseConfig(calibration=config.calibration if is_board else None):
         useless.append("the options of structure from motion")
     if useless:
         raise InputError(f"{', '.join(useless)}: no effect with --turntable {args.turntable}, expected none of them")
@@ -85,7 +85,7 @@ def _run_turntable(args: Namespace, known: Known, config: PoseConfig) -> None:
     elif known.board is None:
         raise InputError("--turntable board needs the board: --board.columns, .rows, .square and .marker")
     else:
-        pose_board_photos(args.photos, args.out, board=known.board, unit=known.unit)
+        pose_board_photos(args.photos, args.out, board=known.board, unit=known.unit, calibration=config.calibration)
 
 
 def _read_distance(words: list[str] | None) -> tuple[str, str, float] | None:

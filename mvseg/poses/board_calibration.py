@@ -1,7 +1,7 @@
 """Calibrates a turntable once: fixed cameras, and photos of a board on the table at several angles.
 
-The unknowns are the cameras (initialised by OpenCV's calibration), their poses, the board's pose on the table and the
-angles. All are refined together for the least reprojection error, with all photos being rotations about one axis.
+The unknowns are the cameras, their poses, the board's pose on the table and the angles. All are found together for the
+least reprojection error (see `table_fit.py`), with all photos being rotations about one axis.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from mvseg.errors import InputError
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.markers import Grey, find_board
-from mvseg.poses.table_fit import HALF, Floats, Sightings, TableCamera, fit_table
+from mvseg.poses.table_fit import HALF, Floats, Sightings, TableCamera, TableFit, fit_table, opencv_matrix
 
 LEAST_PHOTOS = 4
 LEAST_CORNERS = 6  # of a photo
@@ -25,6 +25,11 @@ LEAST_TURN = 10.0  # degrees, of all photos together
 FLAT = 0.7  # cosine between the axis and the normal of a board that lies, more or less, flat
 MOST_RESIDUAL = 0.005  # in widths of the photo, above which the motion was not a pure rotation
 
+ROUGH, FINE = 1e-3, 1e-8  # relative changes of squared residuals, at which the first search ends, and the last
+STARTS = (0.7, 1.4, 2.8)  # focal lengths in longer sides of the photo, from wide phones to short telephoto lenses
+NOISE_PX, LEAST_NOISE_PX = 0.1, 0.02  # of the corners: until it is measured, and the least that is believed
+
+Seen = dict[int, tuple[np.ndarray, Floats]]  # {place of the angle: numbers and pixels of the corners}
 Poses = dict[int, pycolmap.Rigid3d]  # {place of the angle: cam_from_board}
 
 
@@ -45,7 +50,9 @@ class TurntableCalibration:
     num_corners: int
 
 
-def calibrate_turntable(photos: Mapping[str, Sequence[Grey]], board: BoardConfig) -> TurntableCalibration:
+def calibrate_turntable(
+    photos: Mapping[str, Sequence[Grey]], board: BoardConfig, *, lens: TableCamera | None = None
+) -> TurntableCalibration:
     """Cameras, axis and angles from photos of a board that turns with the table.
 
     Angle 0 is the first at which a camera sees the board. The world's origin is on the axis, at the height of the
@@ -54,7 +61,9 @@ def calibrate_turntable(photos: Mapping[str, Sequence[Grey]], board: BoardConfig
     Args:
         photos: A photos of each camera, at the same angles in the same order: (H, W) uint8, of one size for each
             camera, with lens distortion.
-        board: printed; it may lie or stand on the table, tilted or not.
+        board: printed; it may lie or stand on the table. Tilted by 10 to 30 degrees it shows the focal length best.
+        lens: K, distortion and size of every camera, which then stay as they are (its pose has no meaning); None: they
+            are found, with square pixels.
 
     Raises:
         InputError: photos of one camera of different sizes, another number of photos than of the other cameras, too few
@@ -70,33 +79,27 @@ def calibrate_turntable(photos: Mapping[str, Sequence[Grey]], board: BoardConfig
             message = f"{len(each)} photos, {num_angles} of camera {first}"
             raise InputError(f"{where}{message}, expected as many, at the same angles in the same order")
         seen[name] = _find_boards(each, board, where)
-    lenses, poses = {}, {}
-    for name, found in seen.items():
-        lenses[name], poses[name] = _calibrate_camera(found, board, size=photos[name][0].shape[::-1])
-    corners = np.concatenate([board.corners()[numbers] for found in seen.values() for numbers, _ in found.values()])
-    cameras, angles, world_from_board = _initialise(lenses, poses, middle=corners.mean(0))
-    used = sorted(angles)
-    rows = [
-        (np.full(len(px), index), np.full(len(px), used.index(angle)), board.corners()[numbers], px)
-        for index, name in enumerate(cameras)
-        for angle, (numbers, px) in seen[name].items()
-    ]
-    camera, angle, point, px = (np.concatenate(column) for column in zip(*rows, strict=True))
-    sightings = Sightings(camera=camera, angle=angle, point=point, px=px)
-    given = np.array([angles[each] for each in used])
-    fitted, turned, residuals = fit_table(list(cameras.values()), given, world_from_board, sightings=sightings)
-    residual = float(np.sqrt((residuals**2).sum(1).mean()))
-    if residual > MOST_RESIDUAL * max(each.size[0] for each in fitted):
-        message = f"one axis of rotation explains the board to {residual:.1f} px only"
+    is_given = lens is not None
+    starts = [dict.fromkeys(photos, lens)] if lens else [_middling_lenses(photos, focal) for focal in STARTS]
+    fits = [_fit(seen, board, start, noise_px=NOISE_PX, fix_lenses=is_given, tolerance=ROUGH)[1] for start in starts]
+    rough = min(fits, key=lambda fit: fit.cost)  # from a wrong focal length, side minima are possible
+    if rough.residual_px > MOST_RESIDUAL * max(each.size[0] for each in rough.cameras):
+        message = f"one axis of rotation explains the board to {rough.residual_px:.1f} px only"
         raise InputError(f"{message}: did a camera move, or the board on the table?")
-    all_angles = np.full(num_angles, np.nan)
-    all_angles[used] = turned
+    lenses = dict(zip(photos, rough.cameras, strict=True))
+    noise_px = max(LEAST_NOISE_PX, float(np.sqrt((rough.residuals**2).mean())))
+    used, fit = _fit(seen, board, lenses, noise_px=noise_px, fix_lenses=is_given, tolerance=FINE)
+    angles = np.full(num_angles, np.nan)
+    angles[used] = fit.angles
     return TurntableCalibration(
-        cameras=dict(zip(cameras, fitted, strict=True)), angles=all_angles, residual_px=residual, num_corners=len(px)
+        cameras=dict(zip(photos, fit.cameras, strict=True)),
+        angles=angles,
+        residual_px=fit.residual_px,
+        num_corners=len(fit.residuals),
     )
 
 
-def _find_boards(photos: Sequence[Grey], board: BoardConfig, where: str) -> dict[int, tuple[np.ndarray, Floats]]:
+def _find_boards(photos: Sequence[Grey], board: BoardConfig, where: str) -> Seen:
     """{index of a photo: numbers and pixels of the corners}, of photos that show enough of them."""
     size = photos[0].shape[::-1]
     for index, photo in enumerate(photos):
@@ -111,23 +114,55 @@ def _find_boards(photos: Sequence[Grey], board: BoardConfig, where: str) -> dict
     return found
 
 
-def _calibrate_camera(
-    seen: Mapping[int, tuple[np.ndarray, Floats]], board: BoardConfig, *, size: tuple[int, ...]
-) -> tuple[TableCamera, Poses]:
-    """OpenCV's calibration: the lens, in a camera without a pose, and cam_from_board at each angle."""
-    width, height = size
-    world = [board.corners()[numbers].astype(np.float32)[:, None] for numbers, _ in seen.values()]
-    image = [(px - HALF).astype(np.float32)[:, None] for _, px in seen.values()]
-    guess = np.array([[1.2 * max(size), 0, width / 2], [0, 1.2 * max(size), height / 2], [0, 0, 1]])
-    flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K3
-    _, K, distortion, turns, shifts = cv2.calibrateCamera(world, image, (width, height), guess, None, flags=flags)
-    poses = {
-        angle: _rigid(Rotation.from_rotvec(np.ravel(turn)), np.ravel(shift))
-        for angle, turn, shift in zip(seen, turns, shifts, strict=True)
-    }
-    matrix: Floats = np.array(K, dtype=np.float64) + [[0, 0, HALF], [0, 0, HALF], [0, 0, 0]]
-    lens = np.array(distortion, dtype=np.float64).ravel()[:5]
-    return TableCamera(K=matrix, distortion=lens, R=np.eye(3), t=np.zeros(3), size=(width, height)), poses
+def _middling_lenses(photos: Mapping[str, Sequence[Grey]], focal: float) -> dict[str, TableCamera]:
+    """Pinholes with this focal length, in longer sides of the photos, in cameras without poses."""
+    lenses = {}
+    for name, each in photos.items():
+        height, width = each[0].shape
+        f = focal * max(height, width)
+        K = np.array([[f, 0, width / 2], [0, f, height / 2], [0, 0, 1]])
+        lenses[name] = TableCamera(K=K, distortion=np.zeros(5), R=np.eye(3), t=np.zeros(3), size=(width, height))
+    return lenses
+
+
+def _fit(
+    seen: Mapping[str, Seen],
+    board: BoardConfig,
+    lenses: Mapping[str, TableCamera],
+    *,
+    noise_px: float,
+    fix_lenses: bool,
+    tolerance: float,
+) -> tuple[list[int], TableFit]:
+    """The table as these cameras see it, from lenses that are nearly right: places of the angles at which the board is
+    seen, and what explains it best; its cameras are in the order of `seen`."""
+    poses = {name: {angle: _board_pose(*each, board, lenses[name]) for angle, each in found.items()}
+             for name, found in seen.items()}  # fmt: skip
+    corners = np.concatenate([board.corners()[numbers] for found in seen.values() for numbers, _ in found.values()])
+    cameras, angles, world_from_board = _initialise(lenses, poses, middle=corners.mean(0))
+    used = sorted(angles)
+    rows = [
+        (np.full(len(px), index), np.full(len(px), used.index(angle)), board.corners()[numbers], px)
+        for index, found in enumerate(seen.values())
+        for angle, (numbers, px) in found.items()
+    ]
+    camera, angle, point, px = (np.concatenate(column) for column in zip(*rows, strict=True))
+    fit = fit_table(
+        [cameras[name] for name in seen],
+        np.array([angles[each] for each in used]),
+        world_from_board,
+        sightings=Sightings(camera=camera, angle=angle, point=point, px=px),
+        noise_px=noise_px,
+        fix_lenses=fix_lenses,
+        tolerance=tolerance,
+    )
+    return used, fit
+
+
+def _board_pose(numbers: np.ndarray, px: Floats, board: BoardConfig, lens: TableCamera) -> pycolmap.Rigid3d:
+    """cam_from_board of one photo."""
+    _, turn, shift = cv2.solvePnP(board.corners()[numbers], px - HALF, opencv_matrix(lens.K), lens.distortion)
+    return _rigid(Rotation.from_rotvec(np.ravel(turn)), np.ravel(shift))
 
 
 def _initialise(

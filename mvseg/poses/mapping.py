@@ -18,7 +18,7 @@ from mvseg.poses.cancellable import run_cancellable
 from mvseg.poses.config import LEAST, LEAST_SHARE, PoseConfig
 from mvseg.poses.features import SEED, extract_features, find_features, make_database, match_features, number_photos
 from mvseg.poses.pairs import Pair, choose_pairs, pairs_with
-from mvseg.poses.photo_files import PhotoFile
+from mvseg.poses.photo_files import PhotoFile, calibrated_size
 from mvseg.system.running import progress_bar
 
 FEW_FEATURES = 300  # of a photo, below which it has too little texture
@@ -213,11 +213,7 @@ def _too_few(found: int, num_photos: int, least: int, *, plain: Sequence[str], g
 
 def _fixed_lens(calibration: Calibration, photos: Sequence[PhotoFile]) -> pycolmap.Camera:
     """The calibrated camera of all photos."""
-    size = (calibration.width or photos[0].width, calibration.height or photos[0].height)
-    other = next((photo for photo in photos if photo.size != size), None)
-    if other is not None:
-        given = f"the calibration is of {size[0]} x {size[1]} pixels"
-        raise InputError(f"{other.name}: {given}, the photo has {other.width} x {other.height}")
+    size = calibrated_size(calibration, photos)
     if calibration.is_fisheye:
         raise InputError("the calibration is of a fisheye, expected one with k1, k2, p1, p2 (, k3)")
     K = calibration.K

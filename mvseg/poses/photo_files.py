@@ -22,6 +22,7 @@ from mvseg.formats.image_file import (
     sensor_bits,
     write_png,
 )
+from mvseg.formats.opencv_yaml import Calibration
 from mvseg.system.running import progress_bar
 
 FOCAL_LENGTH, FOCAL_LENGTH_35MM, CAMERA_MODEL, EXIF_BLOCK = 0x920A, 0xA405, 0x0110, 0x8769  # EXIF tags
@@ -53,6 +54,20 @@ class PhotoFile:
     @property
     def size(self) -> tuple[int, int]:
         return self.width, self.height
+
+
+def calibrated_size(calibration: Calibration, photos: Sequence[PhotoFile]) -> tuple[int, int]:
+    """Width and height of photos that were all taken with a calibrated camera.
+
+    Raises:
+        InputError: a photo has another size than the calibration, or than the first photo if that says none.
+    """
+    size = (calibration.width or photos[0].width, calibration.height or photos[0].height)
+    other = next((photo for photo in photos if photo.size != size), None)
+    if other is not None:
+        given = f"the calibration is of {size[0]} x {size[1]} pixels"
+        raise InputError(f"{other.name}: {given}, the photo has {other.width} x {other.height}")
+    return size
 
 
 def list_photos(folder: Path) -> tuple[Path, list[str]]:

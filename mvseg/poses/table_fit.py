@@ -3,6 +3,11 @@
 The world is fixed to the table and turns with it; its z axis is that of the table, upwards. Unknown are the cameras,
 the board's pose on the table and the angles. All cameras share axis and angles, and every photo is a turn about that
 axis.
+
+A flat board seen from one height shows the same few degrees of perspective in every photo: focal length, principal
+point, distortion and height trade off, and no residual tells. Pixels are therefore square, and what lenses are like
+(`USUAL`) counts as one more measurement each: it decides where the photos do not, it is outweighed where they do, and
+what it leaves open is in the deviation of the focal length.
 """
 
 from __future__ import annotations
@@ -17,11 +22,18 @@ from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
+from mvseg.poses.focal_length import OFF_MIDDLE
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 HALF = 0.5  # OpenCV's pixels start at -0.5
-NUM_CAMERA = 14  # numbers of a camera: fx, fy, cx, cy, k1, k2, p1, p2, and its pose
+NUM_LENS = 7  # numbers of a lens: f in widths of the photo; cx and cy from its middle, in widths; k1, k2, p1, p2
+NUM_CAMERA = NUM_LENS + 6  # and its pose
+# How far lenses of phones, cameras and webcams are from a pinhole with its axis in the middle: standard deviations of
+# the numbers of a lens but f. Most of what a flat board leaves open is the principal point's: at twice that, f is half
+# as sure; a third of the others changes its deviation by less than a twentieth.
+USUAL = np.array([OFF_MIDDLE, OFF_MIDDLE, 0.3, 0.3, 0.001, 0.001])
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,6 +46,7 @@ class TableCamera:
         R: (3, 3) float64 of cam_from_world at angle 0.
         t: (3,) float64 of cam_from_world at angle 0, in the unit of the scene.
         size: width and height of the photos.
+        focal_deviation: standard deviation of the focal length, pixels; None where the lens was given.
     """
 
     K: Floats
@@ -41,6 +54,7 @@ class TableCamera:
     R: Floats
     t: Floats
     size: tuple[int, int]
+    focal_deviation: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,9 +74,38 @@ class Sightings:
     px: Floats
 
 
+@dataclass(frozen=True, eq=False)
+class TableFit:
+    """What explains the sightings best.
+
+    Attributes:
+        cameras: C, with the deviations of their focal lengths.
+        angles: (A,) degrees.
+        residuals: (P, 2) reprojection errors, pixels.
+        cost: squared residuals over `noise_px`, and squared departures of the lenses from what is usual, added up.
+    """
+
+    cameras: list[TableCamera]
+    angles: Floats
+    residuals: Floats
+    cost: float
+
+    @property
+    def residual_px(self) -> float:
+        """Root mean square distance of the corners from where they should be."""
+        return float(np.sqrt((self.residuals**2).sum(1).mean()))
+
+
 def fit_table(
-    cameras: Sequence[TableCamera], angles: Floats, world_from_board: pycolmap.Rigid3d, *, sightings: Sightings
-) -> tuple[list[TableCamera], Floats, Floats]:
+    cameras: Sequence[TableCamera],
+    angles: Floats,
+    world_from_board: pycolmap.Rigid3d,
+    *,
+    sightings: Sightings,
+    noise_px: float,
+    fix_lenses: bool,
+    tolerance: float,
+) -> TableFit:
     """Least squares over cameras (but for k3), poses and angles.
 
     Args:
@@ -70,56 +113,71 @@ def fit_table(
         angles: (A,) degrees, initial values; the first stays as it is.
         world_from_board: initial value. Its height is fixed: it and the first angle define the world.
         sightings: of the board, with every camera and every angle in it.
-
-    Returns:
-        The C cameras, (A,) angles in degrees, and reprojection errors (P, 2) in pixels.
+        noise_px: standard deviation of each coordinate of a sighting, which weighs it against what is usual.
+        fix_lenses: K and distortion of the cameras stay as they are.
+        tolerance: relative change of the cost at which the search ends.
     """
-    turn, shift = Rotation.from_matrix(world_from_board.rotation.matrix()), world_from_board.translation
+    shift = world_from_board.translation
+    num_lens = 0 if fix_lenses else NUM_LENS
     # The cameras one after another, the pose of the board without its height, and all angles but the first.
-    start = np.concatenate([*map(_camera_numbers, cameras), turn.as_rotvec(), shift[:2], np.radians(angles[1:])])
+    of_cameras = np.stack([_camera_numbers(camera)[NUM_LENS - num_lens :] for camera in cameras])
+    turn = Rotation.from_matrix(world_from_board.rotation.matrix()).as_rotvec()
+    start = np.concatenate([of_cameras.ravel(), turn, shift[:2], np.radians(angles[1:])])
 
-    def split(numbers: Floats) -> tuple[Floats, Floats, Floats]:
-        of_cameras, rest = np.split(numbers, [NUM_CAMERA * len(cameras)])
-        pose = np.append(rest[:5], shift[2])
-        return of_cameras.reshape(-1, NUM_CAMERA), pose, np.append(np.radians(angles[0]), rest[5:])
+    def split(numbers: Floats) -> tuple[list[TableCamera], Floats, Floats]:
+        each, rest = np.split(numbers, [of_cameras.size])
+        found = [_with_numbers(*pair) for pair in zip(cameras, each.reshape(of_cameras.shape), strict=True)]
+        return found, np.append(rest[:5], shift[2]), np.append(np.radians(angles[0]), rest[5:])
 
-    fit = least_squares(
-        lambda numbers: _residuals(*split(numbers), sightings).ravel(),
-        start,
-        x_scale=np.maximum(np.abs(start), 1e-2),
-        max_nfev=200,
-    )
+    def residuals(numbers: Floats) -> Floats:
+        lenses = numbers[: of_cameras.size].reshape(of_cameras.shape)[:, 1:num_lens]
+        unusual = lenses / USUAL[: lenses.shape[1]]
+        return np.append(_project(*split(numbers), sightings) / noise_px, unusual)
+
+    fit = least_squares(residuals, start, x_scale="jac", ftol=tolerance, max_nfev=200)
     found, pose, turned = split(fit.x)
-    fitted = [_with_numbers(camera, each) for camera, each in zip(cameras, found, strict=True)]
-    return fitted, np.degrees(turned), _residuals(found, pose, turned, sightings)
+    if not fix_lenses:
+        variances = np.diag(np.linalg.pinv(fit.jac.T @ fit.jac))[: of_cameras.size].reshape(of_cameras.shape)[:, 0]
+        sizes = [max(camera.size) for camera in cameras]
+        deviations = np.sqrt(variances.clip(min=0)) * sizes
+        pairs = zip(found, deviations.tolist(), strict=True)
+        found = [replace(camera, focal_deviation=deviation) for camera, deviation in pairs]
+    errors = _project(found, pose, turned, sightings)
+    return TableFit(cameras=found, angles=np.degrees(turned), residuals=errors, cost=2 * float(fit.cost))
 
 
 def _camera_numbers(camera: TableCamera) -> Floats:
-    K = camera.K
-    lens = [K[0, 0], K[1, 1], K[0, 2] - HALF, K[1, 2] - HALF, *camera.distortion[:4]]
+    """(13,) of its lens and its pose."""
+    (width, height), longer, K = camera.size, max(camera.size), camera.K
+    lens = [K[0, 0] / longer, (K[0, 2] - width / 2) / longer, (K[1, 2] - height / 2) / longer, *camera.distortion[:4]]
     return np.concatenate([lens, Rotation.from_matrix(camera.R).as_rotvec(), camera.t])
 
 
 def _with_numbers(camera: TableCamera, numbers: Floats) -> TableCamera:
-    fx, fy, cx, cy = numbers[:4]
-    return replace(
-        camera,
-        K=np.array([[fx, 0, cx + HALF], [0, fy, cy + HALF], [0, 0, 1]]),
-        distortion=np.append(numbers[4:8], 0.0),
-        R=Rotation.from_rotvec(numbers[8:11]).as_matrix(),
-        t=numbers[11:14],
-    )
+    """The camera with other numbers, (13,), or (6,) of another pose alone; k3 and the shape of its pixels stay."""
+    lens, pose = np.split(numbers, [len(numbers) - 6])
+    moved = replace(camera, R=Rotation.from_rotvec(pose[:3]).as_matrix(), t=pose[3:])
+    if not len(lens):
+        return moved
+    (width, height), longer = camera.size, max(camera.size)
+    fx, cx, cy = longer * lens[:3] + [0, width / 2, height / 2]
+    K = np.array([[fx, 0, cx], [0, fx * camera.K[1, 1] / camera.K[0, 0], cy], [0, 0, 1]])
+    return replace(moved, K=K, distortion=np.append(lens[3:], camera.distortion[4]))
 
 
-def _residuals(cameras: Floats, pose: Floats, angles: Floats, sightings: Sightings) -> Floats:
-    """(P, 2) reprojection errors, pixels; cameras (C, 14), world_from_board (6,) and angles (A,) in radians."""
+def _project(cameras: Sequence[TableCamera], pose: Floats, angles: Floats, sightings: Sightings) -> Floats:
+    """(P, 2) reprojection errors, pixels; world_from_board (6,) and angles (A,) in radians."""
     shape = Rotation.from_rotvec(pose[:3]).apply(sightings.point) + pose[3:]
     turned = Rotation.from_rotvec(angles[sightings.angle][:, None] * [0, 0, 1.0]).apply(shape)
-    residuals = np.zeros_like(sightings.px)
+    errors = np.zeros_like(sightings.px)
     for index, camera in enumerate(cameras):
         here = sightings.camera == index
-        fx, fy, cx, cy = camera[:4]
-        K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-        px, _ = cv2.projectPoints(turned[here], camera[8:11], camera[11:14], K, camera[4:8])
-        residuals[here] = px[:, 0] - (sightings.px[here] - HALF)
-    return residuals
+        turn = Rotation.from_matrix(camera.R).as_rotvec()
+        px, _ = cv2.projectPoints(turned[here], turn, camera.t, opencv_matrix(camera.K), camera.distortion)
+        errors[here] = px[:, 0] - (sightings.px[here] - HALF)
+    return errors
+
+
+def opencv_matrix(K: Floats) -> Floats:
+    """K for OpenCV, whose first pixel has its centre at (0, 0)."""
+    return K - [[0, 0, HALF], [0, 0, HALF], [0, 0, 0]]

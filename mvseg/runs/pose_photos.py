@@ -14,11 +14,12 @@ from typing import Any
 import pycolmap
 
 from mvseg._version import made_by
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.positions import read_positions
 from mvseg.poses.config import Known, PoseConfig
+from mvseg.poses.focal_length import FocalLength, focal_lengths, least_sure
 from mvseg.poses.known_world import Placement, place
 from mvseg.poses.mapping import Structure, find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
@@ -30,6 +31,8 @@ from mvseg.system.atomic import sweep_abandoned
 from mvseg.system.running import now_running
 from mvseg.traits.config import Up
 from mvseg.traits.up import place_scene
+
+MEND = "take photos from more heights, or give the lens (--calibration)"  # of a focal length that is unsure
 
 
 def pose_photos(
@@ -68,18 +71,22 @@ def pose_photos(
         warnings.simplefilter("always", InputWarning)
         files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, folder / IMAGES)
         structure = find_structure(folder / IMAGES, files, config=config, calibration=calibration, work=folder)
+        lengths = focal_lengths(structure.model, is_given=calibration is not None)
+        for sentence in least_sure(lengths).doubts(mend=MEND):
+            warn(sentence)
         placement = place(write_structure(structure, folder), known)
         scene = move_structure(structure, placement.similarity, folder)
         scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
         write_cameras(scene, folder)
         messages = list(dict.fromkeys(str(each.message) for each in caught))
-        run |= describe_poses(structure, placement, files)
+        run |= describe_poses(structure, placement, files=files, lengths=lengths)
         run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
         run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}
     for message in messages:
         print(f"mvseg: warning: {message}", file=sys.stderr)
     if now_running().progress:
         print(summarize_poses(out, structure, placement=placement, scene=scene))
+        print(f"  {least_sure(lengths).describe()}" + (", the least sure" if len(lengths) > 1 else ""))
     return scene
 
 
@@ -113,9 +120,11 @@ def _copy_frames(clip: Path, folder: Path, *, config: PoseConfig) -> list[PhotoF
         return copy_photos(Path(work) / "frames", names, folder / IMAGES)
 
 
-def describe_poses(structure: Structure, placement: Placement, files: Sequence[PhotoFile]) -> dict[str, Any]:
+def describe_poses(
+    structure: Structure, placement: Placement, *, files: Sequence[PhotoFile], lengths: Sequence[FocalLength]
+) -> dict[str, Any]:
     """What pose.json says besides options and files."""
-    cameras = structure.model.cameras.values()
+    cameras = [camera for _, camera in sorted(structure.model.cameras.items())]
     turned = [photo.name for photo in files if photo.is_turned]
     return {
         "pycolmap": pycolmap.__version__,
@@ -126,7 +135,10 @@ def describe_poses(structure: Structure, placement: Placement, files: Sequence[P
         "turned_upright": turned,
         "residual_px": round(structure.residual_px, 4),
         "points": structure.model.num_points3D(),
-        "lenses": [{"model": each.model_name, "params": list(map(float, each.params))} for each in cameras],
+        "lenses": [
+            {"model": each.model_name, "params": list(map(float, each.params)), "focal_length": asdict(length)}
+            for each, length in zip(cameras, lengths, strict=True)
+        ],
         "scale": {
             "unit": placement.unit,
             "source": placement.source,

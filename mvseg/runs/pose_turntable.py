@@ -12,14 +12,16 @@ import cv2
 import numpy as np
 
 from mvseg._version import made_by
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.image_file import read_rgb
+from mvseg.formats.opencv_yaml import Calibration, read_calibration
 from mvseg.formats.positions import read_photo_angles
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.turntable import read_turntable_parts, write_turntable
 from mvseg.poses.board_calibration import calibrate_turntable
-from mvseg.poses.photo_files import PhotoFile, copy_photos
+from mvseg.poses.focal_length import FocalLength
+from mvseg.poses.photo_files import PhotoFile, calibrated_size, copy_photos
 from mvseg.poses.scene_files import IMAGES
 from mvseg.poses.table_fit import TableCamera
 from mvseg.results.earlier import Output, replace_result
@@ -29,11 +31,14 @@ from mvseg.system.running import now_running, progress_bar
 
 TURNTABLE_FILE = "turntable.json"
 ONLY_CAMERA = "camera"  # name of a camera without a folder for its photos
+MEND = "photograph the board tilted by 10 to 30 degrees on the table, or give the lens (--calibration)"
 
 Angles = Path | float | None
 
 
-def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str = "") -> Scene:
+def pose_board_photos(
+    photos: Path, out: Path, *, board: BoardConfig, unit: str = "", calibration: Path | None = None
+) -> Scene:
     """Calibrate a turntable from photos of a board on it, and write a scene folder with a `turntable.json`.
 
     Args:
@@ -42,12 +47,18 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
         out: the scene folder; an earlier one is replaced, files of the user in it stay.
         board: what is printed; its lengths are in `unit`.
         unit: name of the unit.
+        calibration: file of OpenCV or ROS with the camera matrix and distortion of all cameras, which are then not
+            estimated.
+
+    Warns (InputWarning) of a focal length that the photos leave uncertain.
 
     Raises:
-        InputError: see `calibrate_turntable`; a photo is broken, or `out` holds something else.
+        InputError: see `calibrate_turntable`; the calibration is of another size or a lens that a turntable file cannot
+            hold, a photo is broken, or `out` holds something else.
     """
     output = Output("scene", of=(photos,))
     source, names = check_folders(photos, out, output)
+    given = None if calibration is None else read_calibration(calibration.parent, calibration.name)
     run: dict[str, Any] = made_by() | {"board": asdict(board), "unit": unit}
     with replace_result(out, run, output) as folder:
         files = copy_photos(source, names, folder / IMAGES)
@@ -58,7 +69,9 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
             by_camera.setdefault(camera, []).append(file)
             photo = cv2.cvtColor(read_rgb(folder / IMAGES / file.name), cv2.COLOR_RGB2GRAY)
             grey.setdefault(camera, []).append(photo)
-        found = calibrate_turntable(grey, board)
+        with faults_of(calibration):
+            lens = None if given is None else _given_lens(given, files)
+        found = calibrate_turntable(grey, board, lens=lens)
         views = []
         for camera, each in by_camera.items():
             for file, angle in zip(each, found.angles.tolist(), strict=True):
@@ -70,10 +83,18 @@ def pose_board_photos(photos: Path, out: Path, *, board: BoardConfig, unit: str 
         write_turntable(folder / TURNTABLE_FILE, cameras, views, unit=unit)
         scene = load_scene(folder)
         run |= {"residual_px": round(found.residual_px, 4), "corners": found.num_corners, "photos": len(files)}
+        lengths = {name: FocalLength(float(each.K[0, 0]), each.focal_deviation) for name, each in found.cameras.items()}
+        run["lenses"] = [{"camera": name, "focal_length": asdict(length)} for name, length in lengths.items()]
+        doubts = [f"{name}: {each}" for name, length in lengths.items() for each in length.doubts(mend=MEND)]
+        run["warnings"] = doubts
         run["registered"] = [name.removeprefix(f"{IMAGES}/") for name, _, _ in views]
+    for sentence in doubts:
+        warn(sentence)
     if now_running().progress:
         share = f"{len(views)} of {len(files)} photos are at angles at which the board is seen"
         print(f"{out}: {share}, {found.residual_px:.2f} px, axis and cameras are in {TURNTABLE_FILE}")
+        for name, length in lengths.items():
+            print(f"  {name}: {length.describe()}")
         print(f"  the same turntable with a plant: mvseg pose PHOTOS --out SCENE --turntable {out / TURNTABLE_FILE}")
     return scene
 
@@ -157,6 +178,15 @@ def _angles_of(
             problem = f"{turntable}: {num_views} views{of} for {count} photos"
             raise InputError(f"{problem}, expected one per photo, in the order of their names, or --angles")
     return [of_camera[camera][place] for camera, place in zip(camera_of, places, strict=True)]
+
+
+def _given_lens(given: Calibration, files: Sequence[PhotoFile]) -> TableCamera:
+    """The calibrated lens of all photos, in a camera without a pose."""
+    lens = np.append(given.distortion, np.zeros(max(0, 5 - len(given.distortion))))
+    if given.is_fisheye or len(lens) > 5 or given.K[0, 1]:
+        raise InputError("expected K without skew and k1, k2, p1, p2, k3, which a turntable file can hold")
+    size = calibrated_size(given, files)
+    return TableCamera(K=given.K, distortion=lens, R=np.eye(3), t=np.zeros(3), size=size)
 
 
 def _describe_camera(camera: TableCamera) -> dict[str, Any]:

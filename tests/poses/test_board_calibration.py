@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from mvseg.errors import InputError
 from mvseg.formats.markers import find_board
 from mvseg.poses import board_calibration
 from mvseg.poses.board_calibration import calibrate_turntable
+from mvseg.poses.table_fit import TableCamera, opencv_matrix
 from room_scene import BOARD
 from turntable_board import ANGLES, HEIGHT, SIDE_R, SIDE_T, WIDTH, K, R, T, draw_board
 
@@ -58,6 +62,40 @@ def test_one_more_photo_changes_little(top: list[np.ndarray]) -> None:
     assert both.angles[-1] % 360 == pytest.approx(300, abs=0.2)
     np.testing.assert_allclose(found.angles, both.angles[:-1], atol=0.2)
     np.testing.assert_allclose(found.cameras["camera"].K, both.cameras["camera"].K, atol=4)
+
+
+def test_a_flat_board_from_one_height_gives_lengths_above_it() -> None:
+    """Nothing but one flat board at one height: focal length, height and tilt trade off, and no residual shows it."""
+    flat = Rotation.from_euler("z", 20, degrees=True)
+    photos = [draw_board(angle, tilt=flat) for angle in ANGLES]
+    found = calibrate_turntable({"camera": photos}, BOARD)
+    camera = found.cameras["camera"]
+    assert camera.focal_deviation is not None
+    assert abs(camera.K[0, 0] - K[0, 0]) < 2 * camera.focal_deviation < 0.03 * K[0, 0]
+    assert camera.K[0, 0] == camera.K[1, 1]
+    assert height_above_table(camera, found.angles) == pytest.approx(100, abs=0.5)  # mm
+    given = replace(camera, K=K, distortion=np.zeros(5))
+    sure = calibrate_turntable({"camera": photos}, BOARD, lens=given)
+    np.testing.assert_array_equal(sure.cameras["camera"].K, K)
+    assert height_above_table(sure.cameras["camera"], sure.angles) == pytest.approx(100, abs=0.5)
+    once = calibrate_turntable({"camera": photos[:4]}, BOARD, lens=given)  # nothing is left to trade off
+    assert height_above_table(once.cameras["camera"], once.angles) == pytest.approx(100, abs=1.0)
+
+
+def height_above_table(camera: TableCamera, angles: np.ndarray) -> float:
+    """How far apart two points on the table and 100 mm above it are, triangulated with a calibration, mm."""
+    points = []
+    for height in (0.0, 100.0):
+        rays, turned = [], [Rotation.from_euler("z", angle, degrees=True) for angle in angles]
+        for true_angle, turn in zip(ANGLES, turned, strict=False):
+            place = Rotation.from_euler("z", true_angle, degrees=True).apply([20, 10, height])
+            px = K @ (R @ place + T)
+            x, y = cv2.undistortPoints(px[:2] / px[2] - 0.5, opencv_matrix(camera.K), camera.distortion).ravel()
+            pose = np.column_stack([camera.R @ turn.as_matrix(), camera.t])
+            rays += [x * pose[2] - pose[0], y * pose[2] - pose[1]]
+        point = np.linalg.svd(np.array(rays))[2][-1]
+        points.append(point[:3] / point[3])
+    return float(np.linalg.norm(points[1] - points[0]))
 
 
 def test_two_cameras_share_axis_and_angles(top: list[np.ndarray]) -> None:

@@ -1,0 +1,88 @@
+"""How sure a focal length is: it scales all depths and heights, and residuals do not show that it is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+SURE = 0.01  # of the focal length: what a larger deviation does to heights shows beside what outlines do
+
+OFF_MIDDLE = 0.01  # of the photo's longer side: what principal points of phones, cameras and webcams are usually off
+
+
+@dataclass(frozen=True)
+class FocalLength:
+    """A focal length and its standard deviation, which is None where the lens was given; pixels."""
+
+    px: float
+    deviation: float | None
+
+    def describe(self) -> str:
+        if self.deviation is None:
+            return f"focal length {self.px:.0f} px, as given"
+        return f"focal length {self.px:.0f} +- {self.deviation:.2g} px ({self.deviation / self.px:.1%})"
+
+    def doubts(self, *, mend: str) -> list[str]:
+        """A sentence where the deviation is above SURE, none where it is not; `mend` says what to do."""
+        if self.deviation is None or self.deviation <= SURE * self.px:
+            return []
+        return [f"{self.describe()}: lengths above the table are as uncertain; {mend}"]
+
+
+def least_sure(lengths: Sequence[FocalLength]) -> FocalLength:
+    """The one with the largest relative deviation."""
+    return max(lengths, key=lambda length: (length.deviation or 0.0) / length.px)
+
+
+def focal_lengths(model: pycolmap.Reconstruction, *, is_given: bool) -> list[FocalLength]:
+    """The focal length (the first of two) of each camera of a model, in order of their numbers.
+
+    Deviations are those of its bundle adjustment, which has the principal point in the middle, and what a principal
+    point OFF_MIDDLE changes: of flat scenes and photos from one height nearly all. 100 % where nothing is determined.
+    """
+    covariance = None if is_given else _covariance(model)
+    noise_px, found = _noise_px(model), []
+    for _, camera in sorted(model.cameras.items()):
+        focal, *_ = camera.focal_length_idxs()
+        px, deviation = float(camera.params[focal]), None
+        if not is_given:
+            deviation = px
+        if covariance is not None:
+            of_lens = covariance.get_other_params_cov(camera.params)
+            deviation = px if of_lens is None else _deviation(camera, noise_px**2 * of_lens, focal)
+        found.append(FocalLength(px, deviation))
+    return found
+
+
+def _deviation(camera: pycolmap.Camera, covariance: NDArray[np.float64], focal: int) -> float:
+    """Of the focal length that an adjustment finds which takes the principal point as it is; `covariance` is of all
+    numbers of the camera, the principal point free."""
+    principal = camera.principal_point_idxs()
+    gain = np.linalg.solve(covariance[np.ix_(principal, principal)], covariance[principal, focal])
+    variance = covariance[focal, focal] - gain @ covariance[principal, focal]
+    shift_px = OFF_MIDDLE * max(camera.width, camera.height)
+    return float(np.sqrt(max(variance, 0) + shift_px**2 * (gain @ gain)))
+
+
+def _covariance(model: pycolmap.Reconstruction) -> pycolmap.BACovariance | None:
+    """Of all parameters, for residuals of 1 pixel; None where they are not determined."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for image in model.reg_image_ids():
+        config.add_image(image)
+    config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    options = pycolmap.BundleAdjustmentOptions(refine_principal_point=True)
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    return pycolmap.estimate_ba_covariance(pycolmap.BACovarianceOptions(), model, adjuster)
+
+
+def _noise_px(model: pycolmap.Reconstruction) -> float:
+    """Standard deviation of each coordinate of a feature: more than residuals, which points and poses make small."""
+    points = model.points3D.values()
+    lengths = np.array([point.track.length() for point in points])
+    errors = np.array([point.error for point in points])  # means of distances, which are Rayleigh-distributed
+    free = 2 * lengths.sum() - 3 * len(lengths) - 6 * model.num_reg_images()
+    return float(np.sqrt(4 / np.pi * (lengths * errors**2).sum() / max(free, 1)))
