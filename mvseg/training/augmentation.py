@@ -63,7 +63,12 @@ class AugmentedSamples(Dataset[tuple[Tensor, Target, int]]):
 
 
 def augment(
-    labelled: LabelledPhoto, config: TrainConfig, seed: int, *, backgrounds: tuple[Path, ...] = ()
+    labelled: LabelledPhoto,
+    config: TrainConfig,
+    seed: int,
+    *,
+    backgrounds: tuple[Path, ...] = (),
+    is_padded: bool = True,
 ) -> tuple[Tensor, Target]:
     """Augment one sample as the config says; torch's global generator is left as it was.
 
@@ -71,7 +76,8 @@ def augment(
     from them.
 
     Returns:
-        (3, S, S) float32 photo in [0, 1] and its target, see `make_target`.
+        (3, S, S) float32 photo in [0, 1] and its target, see `make_target`. Not `is_padded`: S x S or less, no more
+        than the scaled photo.
     """
     photo = labelled.photo.clone()
     photo[:, labelled.ignore] = torch.tensor(MEAN_COLOR, dtype=photo.dtype)[:, None]
@@ -80,7 +86,7 @@ def augment(
         if config.recolor:
             photo = recolor(photo, labelled.layers, draw_background(backgrounds, photo))
         photo, layers = orient(photo, labelled.layers, config.orientation)
-        photo, layers = rescale(photo, layers, config)
+        photo, layers = rescale(photo, layers, config, is_padded=is_padded)
         if happens(config.tint_probability):
             photo = tint_leaves(photo, layers)
         if happens(config.clutter_probability):
@@ -109,8 +115,9 @@ def orient(photo: Tensor, layers: Tensor, orientation: Orientation) -> tuple[Ten
     return photo, layers
 
 
-def rescale(photo: Tensor, layers: Tensor, config: TrainConfig) -> tuple[Tensor, Tensor]:
-    """Scale by a random factor and take, or fill, an S x S window at a random place.
+def rescale(photo: Tensor, layers: Tensor, config: TrainConfig, *, is_padded: bool = True) -> tuple[Tensor, Tensor]:
+    """Scale by a random factor and take an S x S window at a random place; fill it, or take less, where the photo is
+    smaller.
 
     Layers are resized with nearest-exact: plain nearest, which torchvision's transforms use, shifts a mask against its
     photo by up to half a pixel.
@@ -121,7 +128,7 @@ def rescale(photo: Tensor, layers: Tensor, config: TrainConfig) -> tuple[Tensor,
     size = [max(1, round(factor * length)) for length in photo.shape[1:]]
     photo = v2.functional.resize(photo, size, antialias=True)
     layers = functional.interpolate(layers[None].float(), size, mode="nearest-exact")[0].to(layers.dtype)
-    free = [side - length for length in size]
+    free = [(side if is_padded else min(side, length)) - length for length in size]
     top, left = (int(torch.randint(min(0, length), max(0, length) + 1, ())) for length in free)
     around = [left, free[1] - left, top, free[0] - top]  # negative where the photo is cropped
     mean = torch.tensor(MEAN_COLOR, dtype=torch.int16)[:, None, None]
