@@ -31,7 +31,7 @@ ARITHMETICS: dict[str, tuple[str | None, dict[str, str]]] = {
 }  # fmt: skip
 VARIABLES = {name for _, variables in ARITHMETICS.values() for name in variables}
 TESTS = (
-    ["tests/test_masks.py", "tests/test_run.py"]
+    ["tests/test_masks.py", "tests/test_pipeline.py"]
     + [f"tests/{room}" for room in ("matching", "reconstruction", "detection", "verification", "traits")],
     # the plant that ships, slow tests included: its ids, shapes and traits, from masks and from pixels
     ["-m", "", "-k", "test_jitter or test_demo", "tests/test_jitter.py", "tests/test_cli.py"],

@@ -46,9 +46,10 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.masks import Masks
-from mvseg.open_scene import Opened
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.finish import shape_leaves
+from mvseg.pipeline.open_scene import Opened
 from mvseg.results.overlay import draw_overlay
-from mvseg.run import find_leaves, shape_leaves
 from mvseg.scene import Scene
 from mvseg.training.data import list_samples
 from mvseg.training.validation import detect_and_label
@@ -83,7 +84,7 @@ def find_masks(scene: Scene, options: DetectConfig, cache: Path | None) -> tuple
     """Masks as they are found and matched, and as they leave the whole job."""
     config = RunConfig(reconstruct=None, detect=options)
     opened = Opened(scene, Photos(scene), None, mask_kind="", views_left_out=(), config=config)
-    known = find_leaves(opened, cache=None if cache is None else CachedDetections(cache))
+    known = find_in_photos(opened, cache=None if cache is None else CachedDetections(cache))
     return known.matched[0], shape_leaves(known).masks
 
 

@@ -53,10 +53,13 @@ from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.evaluation.truth import shown_instances
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks
-from mvseg.open_scene import Opened, open_scene
+from mvseg.pipeline.apply_edits import apply_edits
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.finish import shape_leaves
+from mvseg.pipeline.known import Known, match_given
+from mvseg.pipeline.open_scene import Opened, open_scene
 from mvseg.regions import IGNORE_LABEL
 from mvseg.results.result import Result
-from mvseg.run import Known, apply_edits, find_leaves, match_given, shape_leaves
 from mvseg.scene import Scene, View
 from mvseg.simulation.dataset import PRESETS, SceneSpec, scene_cameras
 from mvseg.simulation.growth import grow_plant
@@ -114,7 +117,7 @@ def list_cases(args: argparse.Namespace) -> Iterator[Case]:
 def detect_case(folder: Path, config: RunConfig, *, cache: Path | None = None) -> Case:
     """A scene whose leaves the detector finds."""
     kept = None if cache is None else CachedDetections(cache)
-    known = find_leaves(open_scene(folder, None, config), cache=kept)
+    known = find_in_photos(open_scene(folder, None, config), cache=kept)
     return Case(f"detected_{folder.name}", known, true_maps(folder, known.scene), has_masks=False)
 
 
@@ -126,7 +129,7 @@ def degraded_case(spec: SceneSpec, cache: Path) -> Case:
     scene = Scene(name=name, views=views, cameras=maps.cameras, unit="mm", up=(0.0, 0.0, 1.0))
     given = Masks.of(regions)
     opened = Opened(scene, Photos(scene), given, mask_kind="label images", views_left_out=(), config=config)
-    return Case(f"degraded_{name}", match_given(opened, given), list(maps.true), has_masks=True)
+    return Case(f"degraded_{name}", match_given(opened), list(maps.true), has_masks=True)
 
 
 def render(spec: SceneSpec, cache: Path) -> Path:
@@ -143,7 +146,7 @@ def render(spec: SceneSpec, cache: Path) -> Path:
 
 def compute(case: Case, corrections: Corrections) -> Result:
     """What a run makes of the scene with these corrections, without traits."""
-    return shape_leaves(apply_edits(case.known, corrections) if corrections.edits else case.known)
+    return shape_leaves(apply_edits(case.known, corrections))
 
 
 def judge(masks: Masks, truth: Sequence[Labels]) -> dict[str, float]:

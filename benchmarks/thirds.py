@@ -60,12 +60,12 @@ from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.split import split_merged
 from mvseg.matching.view_graph import ViewGraph
+from mvseg.pipeline.known import Known
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
-from mvseg.run import Known
 from mvseg.scene import Cameras
 from mvseg.simulation.dataset import PRESETS, SceneSpec, list_scenes, plant_index
 from mvseg.simulation.growth import grow_plant

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from mvseg.matching.result import MatchReport as MatchReport
     from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
+    from mvseg.pipeline.run_scene import run_scene as run_scene
     from mvseg.poses.refine_poses import RefinedPoses as RefinedPoses
     from mvseg.poses.refine_poses import refine_poses as refine_poses
     from mvseg.reconstruction.config import ReconstructConfig as ReconstructConfig
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
     from mvseg.regions import regions_from_label_maps as regions_from_label_maps
     from mvseg.results.read import load_result as load_result
     from mvseg.results.same_result import assert_same_result as assert_same_result
-    from mvseg.run import run_scene as run_scene
     from mvseg.scene import Cameras as Cameras
     from mvseg.scene import Scene as Scene
     from mvseg.system.running import running as running
@@ -106,7 +106,7 @@ _HOME = {
     "corrections.track_links": ("LeafLink",),
     "results.read": ("load_result",),
     "results.same_result": ("assert_same_result",),
-    "run": ("run_scene",),
+    "pipeline.run_scene": ("run_scene",),
     "tracking.track": ("Tracks", "track_leaves"),
     "system.running": ("running",),
 }

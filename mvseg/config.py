@@ -24,6 +24,8 @@ class RunConfig:
         match: how regions are matched across views.
         reconstruct: how instances become shapes; None for ids only.
         traits: which instances count as leaves in the tables of traits.
+        learn: let the views teach the detector, where it finds the masks: so many rounds at most, or "off"; "auto" does
+            where most leaves score less than the detector is sure of, as those of a species that it has not seen.
         views: take so many views, evenly spread by direction around what the cameras look at; "all" for all; None for
             all where masks are given, and `ENOUGH_VIEWS` otherwise. Views that corrections name are taken besides.
         scale: factor of all lengths of the world; None for 1. Cameras that state their unit need `unit` with it.
@@ -44,6 +46,7 @@ class RunConfig:
     match: MatchConfig = MatchConfig()
     reconstruct: ReconstructConfig | None = ReconstructConfig()
     traits: TraitsConfig = TraitsConfig()
+    learn: int | Literal["auto", "off"] = "auto"
     views: int | Literal["all"] | None = None
     scale: float | None = None
     unit: str | None = None
@@ -55,6 +58,8 @@ class RunConfig:
     categories: str | None = None
 
     def __post_init__(self) -> None:
+        if isinstance(self.learn, int) and self.learn < 1:
+            raise InputError(f"learn is {self.learn}, expected 1 or more rounds, auto or off")
         if isinstance(self.views, int) and self.views < 2:
             raise InputError(f"views is {self.views}, expected 2 or more, or all")
         if self.scale is not None and not 0 < self.scale < math.inf:

@@ -11,7 +11,7 @@ from mvseg.config import RunConfig
 from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching
-from mvseg.open_scene import Opened
+from mvseg.pipeline.open_scene import Opened
 from mvseg.scene import Cameras, Scene
 
 

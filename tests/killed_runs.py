@@ -17,9 +17,9 @@ from typing import Any
 
 import torch
 
+import mvseg.pipeline.run_scene
 import mvseg.results.folder
 import mvseg.results.plant_files
-import mvseg.run
 import mvseg.training.state
 from mvseg.cli import main
 from mvseg.simulation.dataset import PRESETS, Preset

@@ -21,9 +21,9 @@ from mvseg.config import RunConfig
 from mvseg.demo import demo_scene as demo_folder
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.regions import Regions
-from mvseg.run import run_scene
 from mvseg.scene import Scene
 from scene_folders import write_image, write_scene
 

@@ -31,10 +31,10 @@ from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.surface.kept_surfaces import name_instance
 from mvseg.regions import regions_from_label_maps
 from mvseg.results.result import Instances, Result
-from mvseg.run import run_scene
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.scene import Scene, View
 from mvseg.server.correction_server import CHANGED, CorrectionServer, Corrector

@@ -14,7 +14,7 @@ import torch
 from mvseg import Corrections, InputError, InputWarning, ReconstructConfig, RunConfig, run_scene
 from mvseg.cli import main
 from mvseg.corrections.file import FORMAT, parse_corrections
-from mvseg.open_scene import open_scene
+from mvseg.pipeline.open_scene import open_scene
 from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult
 from scene_folders import write_scene
 
@@ -74,7 +74,7 @@ def test_photos_alone_are_as_many_as_are_enough_and_given_masks_are_all(
     plant: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert len(taken(plant, None)) == 9
-    monkeypatch.setattr("mvseg.open_scene.ENOUGH_VIEWS", 5)
+    monkeypatch.setattr("mvseg.pipeline.open_scene.ENOUGH_VIEWS", 5)
     assert taken(plant, None) == taken(plant, 5)
     assert len(taken(plant, "all")) == len(taken(plant, 9)) == len(taken(plant, 500)) == 9
     assert len(run_scene(plant, plant / "masks", IDS_ONLY).regions) == 27

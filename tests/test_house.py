@@ -43,8 +43,8 @@ FLOORS = (
     ("corrections", "detection"),
     ("config",),
     ("results",),
-    ("open_scene", "tracking", "training"),
-    ("run",),
+    ("tracking", "training"),
+    ("pipeline",),
     ("runs",),
     ("batch", "server"),
     ("__init__",),
@@ -107,8 +107,8 @@ def test_imports_go_one_way() -> None:
         ("import mvseg", "__init__"),
         ("from mvseg import regions", "__init__"),
         ("from .. import regions", "__init__"),
-        ("def run():\n    import mvseg.run", "run"),
-        ("if TYPE_CHECKING:\n    from mvseg.run import run_scene", "run"),
+        ("def run():\n    import mvseg.pipeline", "pipeline"),
+        ("if TYPE_CHECKING:\n    from mvseg.pipeline.run_scene import run_scene", "pipeline"),
         ("try:\n    pass\nexcept ImportError:\n    from mvseg import cli", "__init__"),
         ("class Lazy:\n    def run(self):\n        from ..cli import main", "cli"),
         ("from mvseg.matching.affinity import Affinity", "matching"),  # a room of the same floor
@@ -127,8 +127,8 @@ def test_every_kind_of_forbidden_import_is_seen(line: str, room: str) -> None:
         ("mvseg.formats.__init__", "from . import lens\nfrom .. errors import InputError"),
         ("mvseg.formats.coco", "import models\nfrom mvsegment import x\nimport mvsegment.results"),  # other packages
         ("mvseg.formats.coco", "from mvseg.scene import Scene\nfrom ..regions import Regions\nimport mvseg.demo"),
-        ("mvseg.cli.infer", "import mvseg\nfrom mvseg.run import run_scene\nfrom .batch import run_batch"),
-        ("mvseg.__init__", "from mvseg.run import run_scene\nfrom ._version import __version__"),
+        ("mvseg.cli.infer", "import mvseg\nfrom mvseg.pipeline import run_scene\nfrom .batch import run_batch"),
+        ("mvseg.__init__", "from mvseg.pipeline.run_scene import run_scene\nfrom ._version import __version__"),
     ],
 )
 def test_imports_from_above_are_fine(module: str, source: str) -> None:
@@ -139,7 +139,7 @@ def test_other_floors_are_one_way_too() -> None:
     assert forbidden_rooms("from ...results import folder", "mvseg.matching.nview.search") == {"results"}
     assert forbidden_rooms("from mvseg.cli import main", "mvseg.__init__") == {"cli"}
     assert forbidden_rooms("from mvseg.regions import Regions", "mvseg.scene") == {"regions"}
-    assert forbidden_rooms("import mvseg", "mvseg.run") == {"__init__"}
+    assert forbidden_rooms("import mvseg", "mvseg.pipeline.run_scene") == {"__init__"}
 
 
 WARN_BY_HAND = {"errors"}  # warns as of the line outside of the package

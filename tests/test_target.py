@@ -21,8 +21,8 @@ from mvseg.formats.markers import find_markers, read_grey
 from mvseg.formats.photos import Photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, leaf_outline, list_shapes, tag_corners, tag_distance
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.result import Result
-from mvseg.run import run_scene
 from mvseg.runs import check_target
 from mvseg.scene import Cameras
 

@@ -19,15 +19,16 @@ class DetectConfig:
     """How leaves are found in the photos when no masks are given.
 
     Attributes:
-        weights: name of a shipped detector (`mvseg models`), or a model.safetensors that a training run wrote.
+        weights: name of a shipped detector (`mvseg models`), a model.safetensors that a training run wrote, or a result
+            folder whose plant a detector has learned (`--learn`).
         min_probability: what is less likely a leaf is left out; in [0, 1]. The probability is calibrated: of leaves
             with 0.8 to 0.9, that part or more is right on plants that it was not fitted on (docs/detector.md). Null:
             where precision and recall of the leaves together are expected to be best, never above 0.5.
         min_score: proposals that score less are not matched at first; in [0, 1]. The score is the detector's confidence
             that it sees a leaf, times the expected IoU of its mask. Without `verify`, they are discarded.
         image_size: longer side, in pixels, that photos are scaled to. Null: larger photos are scaled down to the
-            size given with the weights, smaller ones stay as they are; and where few masks are surely matched, as where
-            leaves are very large, half of that is tried.
+            size given with the weights, smaller ones stay as they are; where the plant fills the photos, or most leaves
+            score low, smaller sizes are tried, and the views decide.
         crop: auto: where the plant fills a small part of large photos, a second pass runs on their parts that show
             it: leaves are seen larger. off: one pass over whole photos.
         num_iterations: rounds of assignment to epipolar maps and NMS; 0 only matches what plain NMS keeps.

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
-import torch
 from torch import Tensor
 
 from mvseg.detection.config import MORE_SCORE, SURE_SCORE, DetectConfig
@@ -20,7 +19,7 @@ from mvseg.matching.split import split_merged
 from mvseg.regions import stack_regions
 from mvseg.scene import Cameras
 from mvseg.system.running import timed
-from mvseg.verification.choose import DIGITS, Leaves, choose_leaves
+from mvseg.verification.choose import Leaves, choose_leaves, expect_right
 from mvseg.verification.unexplained import is_familiar
 
 if TYPE_CHECKING:
@@ -111,15 +110,6 @@ class Found:
         """E, the expected number of right masks: the sum over leaves of P times the sum of q of their masks. It orders
         detectors and sizes, for one plant, as the truth does (docs/notes/detector.md)."""
         return expect_right(self.leaves.masks, self.leaves.probabilities)
-
-
-def expect_right(masks: Masks, probabilities: Mapping[int, float]) -> float:
-    """The expected number of right masks among D masks whose match scores are q, for `probabilities` {id: P}."""
-    chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)
-    for instance, chance in probabilities.items():
-        chances[instance] = chance
-    ids = masks.instance_ids.clamp(min=0).cpu()
-    return round(float((chances[ids] * masks.match_scores.cpu().double()).sum()), DIGITS)
 
 
 def find_leaves(

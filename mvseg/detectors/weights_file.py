@@ -18,6 +18,7 @@ from torch import Tensor, nn
 
 from mvseg.errors import InputError
 
+DETECTOR_FILE = "detector.safetensors"  # in a result folder: the weights that have learned its plant
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384  # pixels that photos are scaled to
 
 

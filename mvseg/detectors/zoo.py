@@ -26,7 +26,7 @@ from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.transform import GeneralizedRCNNTransform
 
 from mvseg.detectors.mask_rcnn import build_detector
-from mvseg.detectors.weights_file import read_weights
+from mvseg.detectors.weights_file import DETECTOR_FILE, read_weights
 from mvseg.errors import InputError
 
 WEIGHTS, HASH = "weights.safetensors", "weights.safetensors.sha256"
@@ -93,15 +93,18 @@ def find_weights(name: str) -> Path | None:
 
 
 def weights_path(name: str | Path) -> Path:
-    """The weights file of a shipped detector, or else the path itself, which need not exist; see `find_weights`."""
-    return find_weights(str(name)) or Path(name)
+    """The weights file of a shipped detector, or that of a result whose plant a detector has learned, or else the path
+    itself, which need not exist; see `find_weights`."""
+    learned = Path(name) / DETECTOR_FILE
+    return find_weights(str(name)) or (learned if learned.is_file() else Path(name))
 
 
 def load_detector(weights: str | Path, *, image_size: int | None = None, min_score: float | None = None) -> MaskRCNN:
     """A trained detector, in eval mode, on the CPU, in float32.
 
     Args:
-        weights: the name of a shipped detector (`list_detectors`), or a .safetensors file that a training run wrote.
+        weights: the name of a shipped detector (`list_detectors`), a .safetensors file that a training run wrote, or a
+            result folder whose plant a detector has learned.
         image_size: longer side, in pixels, that photos are scaled to. None: larger photos are scaled down to what the
             file says, smaller ones stay as they are.
         min_score: detections that score less are discarded; `mvseg infer` does so at 0.3. None for torchvision's 0.05.

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.corrections.file import dump_edits
+from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.formats.coco import encode_mask, write_coco
 from mvseg.formats.image_file import write_png
 from mvseg.formats.label_png import write_label_png
@@ -75,6 +76,8 @@ def save_result(
             write_plant(result, folder)
         if result.poses is not None and result.poses.is_refined:
             write_refined(folder / CAMERAS_FILE, result.scene)
+        if result.learned.weights is not None:
+            (folder / DETECTOR_FILE).write_bytes(result.learned.weights)
         if report:
             from mvseg.results.report.page import write_report  # loads trimesh
 
@@ -108,6 +111,8 @@ def describe_result(result: Result) -> dict[str, Any]:
         said["poses"] = {"refined": poses.is_refined, "residual_px": residuals}
     if (traits := result.traits) is not None:
         said["traits"] = {"unit": traits.unit or None, "up": traits.up, "rejected": traits.rejected}
+    if (learned := result.learned).expected_right:
+        said["learned"] = {"rounds": learned.rounds, "expected_right": learned.expected_right}
     if result.corrections is not None and result.corrections.edits:
         said["edits"] = dump_edits(result.corrections.edits)
     if result.fates:

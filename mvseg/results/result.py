@@ -72,6 +72,26 @@ class Instances:
 
 
 @dataclass(frozen=True, eq=False)
+class Learned:
+    """What came of it that the views taught the detector, see `mvseg.pipeline.learn`.
+
+    Attributes:
+        weights: content of the file of the weights that found the leaves, if they were learned here; None: they were
+            not.
+        rounds: that they took.
+        expected_right: E, the number of masks that are expected to be right, before and after each round that was
+            tried; () where nothing was to be learned.
+    """
+
+    weights: bytes | None = None
+    rounds: int = 0
+    expected_right: tuple[float, ...] = ()
+
+
+NOTHING_LEARNED = Learned()
+
+
+@dataclass(frozen=True, eq=False)
 class Result:
     """Everything known about one scene.
 
@@ -89,6 +109,7 @@ class Result:
         views_left_out: names of the scene's other views, see `RunConfig.views`.
         corrections: of a person; None where there were none.
         fates: the outcome of each of them.
+        learned: by the detector from this scene.
         run: that made a result which was loaded from its folder; None before it was saved.
     """
 
@@ -104,6 +125,7 @@ class Result:
     views_left_out: tuple[str, ...] = ()
     corrections: Corrections | None = None
     fates: tuple[Fate, ...] = ()
+    learned: Learned = NOTHING_LEARNED
     run: RunRecord | None = None
 
     @property

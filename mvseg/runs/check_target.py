@@ -24,11 +24,11 @@ from mvseg.formats.markers import find_markers, read_grey
 from mvseg.formats.photos import Photos, require_photos
 from mvseg.formats.scene_folder import load_scene
 from mvseg.formats.target import BAR, FAMILY, Shape, list_shapes, tag_corners
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.poses.alignment import align
 from mvseg.reconstruction.triangulate import triangulate_points
 from mvseg.results.plant_files import METRES
 from mvseg.results.result import Result
-from mvseg.run import run_scene
 from mvseg.system.running import progress_bar
 from mvseg.traits.leaf import missing
 

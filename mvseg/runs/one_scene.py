@@ -20,10 +20,10 @@ from mvseg.detection.config import DetectConfig
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.photos import Photos
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.earlier import Output, check_out
 from mvseg.results.folder import photos_folder, save_result
 from mvseg.results.result import Result
-from mvseg.run import run_scene
 from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.file_hash import hash_files

@@ -18,13 +18,16 @@ from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.errors import InputError, collect_warnings
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.open_scene import open_scene
+from mvseg.pipeline.apply_edits import apply_edits
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.finish import shape_leaves
+from mvseg.pipeline.known import Known, match_given
+from mvseg.pipeline.open_scene import open_scene
 from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.regions import stack_regions
 from mvseg.results.read import load_result
 from mvseg.results.report.correct import describe_fate
 from mvseg.results.result import Result
-from mvseg.run import Known, apply_edits, find_leaves, match_given, shape_leaves
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.system.atomic import lock_place
 from mvseg.system.running import running
@@ -91,7 +94,7 @@ class OpenResult:
         """
         known, messages = self._known
         with running(is_cancelled=is_old), collect_warnings() as more:
-            edited = apply_edits(known, corrections) if corrections.edits else known
+            edited = apply_edits(known, corrections)
             result = shape_leaves(edited)
         shown = keep_numbers(replace(result, corrections=corrections), self._numbers)
         told = {fate.message for fate in shown.fates}
@@ -105,8 +108,7 @@ class OpenResult:
     def _known(self) -> tuple[Known, list[str]]:
         """What is known without a person, and the warnings on the way; it stays."""
         with collect_warnings() as messages:
-            given = self.opened.given
-            known = find_leaves(self.opened) if given is None else match_given(self.opened, given)
+            known = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
         return known, messages
 
 

@@ -5,6 +5,7 @@ Stages ask here, so that no signature hands it on (as with `decimal.localcontext
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -93,6 +94,12 @@ def timed(stage: str) -> Iterator[None]:
     begun = time.perf_counter()
     yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
+
+
+def say(sentence: str) -> None:
+    """A line that says what is done, beside the progress bars; nothing where the run is silent."""
+    if now_running().progress:
+        tqdm.write(f"mvseg: {sentence}", file=sys.stderr)
 
 
 def progress_bar(items: Iterable[Any] | None = None, name: str = "", total: int | None = None, **how: Any) -> Any:

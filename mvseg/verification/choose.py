@@ -9,7 +9,7 @@ leaves fall by themselves. The paper's idea of an excessive set from which the v
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -117,6 +117,22 @@ def choose_leaves(
     usable = np.concatenate((left, np.ones(len(added), bool)))
     chosen = choose(candidates, table, drawn=drawn, usable=usable, min_probability=min_probability)
     return _take(chosen, candidates, table, is_held=held)
+
+
+def expect_right(masks: Masks, probabilities: Mapping[int, float]) -> float:
+    """E, the expected number of right masks: the sum over leaves of P times the sum of q of their masks.
+
+    For one plant it orders detectors, and the sizes that they look at, as the truth does (docs/notes/detector.md).
+
+    Args:
+        masks: D masks whose match scores are q.
+        probabilities: {instance id: P}.
+    """
+    chances = torch.zeros(max([masks.num_instances, *probabilities]) + 1, dtype=torch.float64)
+    for instance, chance in probabilities.items():
+        chances[instance] = chance
+    ids = masks.instance_ids.clamp(min=0).cpu()
+    return round(float((chances[ids] * masks.match_scores.cpu().double()).sum()), DIGITS)
 
 
 def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:

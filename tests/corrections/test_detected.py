@@ -15,8 +15,10 @@ from mvseg.corrections.apply import APPLIED
 from mvseg.corrections.file import Corrections, Edit, Reject
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline.apply_edits import apply_edits
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.known import Known
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
-from mvseg.run import Known, apply_edits, find_leaves
 from mvseg.scene import Cameras, Scene, View
 from mvseg.verification import choose as choosing
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -51,7 +53,7 @@ def at(leaf: int, view: int) -> tuple[float, float]:
 
 
 def run(*edits: Edit) -> Known:
-    known = find_leaves(open_photos(SCENE))
+    known = find_in_photos(open_photos(SCENE))
     return apply_edits(known, Corrections(edits)) if edits else known
 
 
@@ -89,7 +91,7 @@ def test_an_answer_that_changes_nothing_changes_nothing() -> None:
 
 
 def test_what_is_known_without_a_person_is_found_once() -> None:
-    known = find_leaves(open_photos(SCENE))
+    known = find_in_photos(open_photos(SCENE))
     assert len(known.instances.probabilities) == 3
     assert [len(each) for each in known.matched] == [int((IDS != WEAK).sum()), len(IDS)]
     once, twice = (apply_edits(known, Corrections((Reject(view="v0", at=at(1, 0), everywhere=True),))) for _ in (1, 2))

@@ -16,11 +16,12 @@ from mvseg import demo_scene, load_scene
 from mvseg.config import RunConfig
 from mvseg.detection.choose_size import choose_size
 from mvseg.detection.config import DetectConfig
-from mvseg.detection.find_leaves import expect_right, find_leaves
+from mvseg.detection.find_leaves import find_leaves
 from mvseg.errors import warn
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.run import find_leaves as find_in_photos
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.verification.choose import expect_right
 
 
 def squares(views: int, *, side: int = 20, score: float = 0.9) -> Masks:

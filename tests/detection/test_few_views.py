@@ -20,8 +20,9 @@ from mvseg.detection.few_views import select_by_views
 from mvseg.errors import InputError, InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.finish import finish
 from mvseg.results.folder import save_result
-from mvseg.run import find_leaves, finish
 
 SIZE = 40
 
@@ -100,7 +101,7 @@ def test_a_leaf_in_one_photo_comes_out_marked(
     matching = Matching(found, MatchReport("nview", has_probabilities=True))
     see_masks(monkeypatch, FoundMasks.of(matching))
     with pytest.warns(InputWarning, match="no other view verifies: 1") if min_views == 1 else nullcontext():
-        result = finish(find_leaves(open_photos(leafy.scene, config)))
+        result = finish(find_in_photos(open_photos(leafy.scene, config)))
     assert result.surfaces is not None
     assert result.traits is not None
     save_result(result, tmp_path / "out", {})

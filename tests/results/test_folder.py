@@ -27,6 +27,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import MergedMask
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -35,7 +36,6 @@ from mvseg.results.folder import save_result
 from mvseg.results.overlay import instance_color
 from mvseg.results.read import read_instances
 from mvseg.results.result import Instances, Result
-from mvseg.run import run_scene
 from mvseg.traits.measure import measure_plant
 from scene_folders import (
     BALLS,

@@ -29,6 +29,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.masks import MergedMask, Origin
 from mvseg.matching.result import MatchReport
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
@@ -36,7 +37,6 @@ from mvseg.regions import mask_box
 from mvseg.results.folder import save_result
 from mvseg.results.result import Instances, Result
 from mvseg.results.shapes_file import write_surfaces
-from mvseg.run import run_scene
 from mvseg.traits.config import TraitsConfig
 from mvseg.traits.measure import measure_plant
 from scene_folders import HEIGHT, WIDTH, K, edit_rig, write_image, write_scene

@@ -18,7 +18,8 @@ from mvseg.corrections.apply import Fate
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
-from mvseg.run import find_leaves, finish
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.finish import finish
 from mvseg.verification.unexplained import describe_missing, share_unexplained
 from three_leaves import true_maps
 
@@ -74,7 +75,7 @@ def test_a_run_that_finds_no_leaf_says_so(tmp_path: Path, monkeypatch: pytest.Mo
     nothing = Masks.of(leafy.regions.select(torch.zeros(0, dtype=torch.int64)), origin=Origin.DETECTED)
     see_masks(monkeypatch, FoundMasks.of(Matching(nothing, MatchReport("none"))))
     with pytest.warns(InputWarning, match="the detector finds nothing that scores"):
-        known = find_leaves(open_photos(leafy.scene, RunConfig(reconstruct=None)))
+        known = find_in_photos(open_photos(leafy.scene, RunConfig(reconstruct=None)))
     with pytest.warns(InputWarning, match="no leaf was found"):
         finish(known)
     rejected = replace(known, edits=(Fate(1, "reject", "applied"),))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from mvseg.config import RunConfig
+from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.results.result import Result
-from mvseg.run import run_scene
 from scene_folders import write_scene
 
 

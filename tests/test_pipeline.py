@@ -38,11 +38,11 @@ from mvseg.formats.photos import Photos, read_photo
 from mvseg.masks import Masks, MergedMask
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
+from mvseg.pipeline.known import match_given
 from mvseg.poses.refine_poses import RefinedPoses
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import reconstruct_instances
 from mvseg.results.folder import save_result
-from mvseg.run import match_given
 from mvseg.runs.one_scene import describe_run
 from mvseg.scene import Scene, View
 from mvseg.system.running import running
@@ -104,7 +104,7 @@ def test_refined_poses_are_those_of_the_scene(plant: Path, monkeypatch: pytest.M
     given = Masks.of(load_masks(scene, plant / "masks"))
     opened = open_photos(odd, replace(IDS_ONLY, refine_poses=True), given)
     with pytest.warns(InputWarning, match="view 000 has a lens that no rig file can hold"):
-        assert match_given(opened, given).scene.cameras is better
+        assert match_given(opened).scene.cameras is better
 
 
 def test_nothing_is_written_and_photos_are_not_read(tmp_path: Path) -> None:
@@ -283,7 +283,7 @@ def test_masks_are_cut_once_surfaces_checked_the_ids_and_both_leaves_are_fitted_
 
     monkeypatch.setattr("mvseg.reconstruction.surface.kept_surfaces.fit_surfaces", fit)
     monkeypatch.setattr("mvseg.verification.checked_ids.check_ids", check)
-    monkeypatch.setattr("mvseg.run.match_masks", match)
+    monkeypatch.setattr("mvseg.pipeline.known.match_masks", match)
     config = RunConfig(split_merged=True, reconstruct=ReconstructConfig(check_ids=is_checked, voxel_budget=500))
     result = run_scene(plant, plant / "masks", config)
     ids = result.matching.instance_ids.tolist()

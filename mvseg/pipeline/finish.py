@@ -1,0 +1,113 @@
+"""From what is known to the result: final masks and ids, shapes, traits, and what there is to say of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+from mvseg.checks.check_scene import warn_of_contradictions
+from mvseg.config import RunConfig
+from mvseg.corrections.settle import settle
+from mvseg.errors import warn
+from mvseg.matching.split import split_merged
+from mvseg.pipeline.known import Known
+from mvseg.results.result import Result
+from mvseg.system.running import timed
+
+if TYPE_CHECKING:
+    from mvseg.reconstruction.config import ReconstructConfig
+    from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+
+# What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
+# scenes to match.
+
+
+def finish(known: Known) -> Result:
+    """The final masks and ids, shapes and traits; and what there is to say of them."""
+    result, config = shape_leaves(known), known.opened.config
+    _warn_of_missing(known, result)
+    with timed("check"):
+        has_photos = config.reconstruct is not None and known.opened.photos.exist
+        warn_of_contradictions(result.scene, result.regions, photos=known.opened.photos if has_photos else None)
+    return result if config.reconstruct is None else _measure(result, config, config.reconstruct)
+
+
+def shape_leaves(known: Known) -> Result:
+    """The final masks and ids, and their surfaces: what the page shows that a person corrects.
+
+    Warns (InputWarning) of each edit that points at nothing, is odd, or contradicted by a later one.
+    """
+    opened, config, num_moved = known.opened, known.opened.config, None
+    if opened.is_chosen:
+        from mvseg.verification.snap_edges import snap_masks
+
+        with timed("snap"):
+            known = known.with_masks(snap_masks(known.masks, opened.photos))
+    if opened.is_checked:
+        from mvseg.verification.checked_ids import check_ids
+
+        fitted = _fit_surfaces(known)
+        with timed("check_ids"):
+            checked = check_ids(known.masks, fitted, cameras=known.scene.cameras, config=config.match)
+        num_moved = int((known.masks.instance_ids != checked.instance_ids).sum())
+        known = known.with_masks(split_merged(checked.close_gaps()) if config.split_merged else checked)
+    has_surfaces = config.reconstruct is not None and config.reconstruct.shape != "voxels"
+    surfaces = _fit_surfaces(known) if has_surfaces else None
+    shown = surfaces or known.instances.starts
+    left, fates = settle(known.edits, known.refused, known.left, shown, cameras=known.scene.cameras)
+    for fate in fates:
+        if fate.message:
+            warn(fate.message)
+    return Result(
+        scene=known.scene,
+        matching=known.matching,
+        instances=replace(known.instances, surfaces=surfaces),
+        photos=opened.photos,
+        left=left,
+        poses=known.poses,
+        mask_kind=opened.mask_kind,
+        num_moved=num_moved,
+        views_left_out=opened.views_left_out,
+        fates=fates,
+        learned=known.learned,
+    )
+
+
+def _fit_surfaces(known: Known) -> Mapping[int, LeafSurface]:
+    from mvseg.reconstruction.surface.kept_surfaces import fit_kept
+
+    with timed("surfaces"):
+        masks, starts = known.masks, known.instances.starts
+        return fit_kept(masks.regions, masks.instance_ids, known.scene.cameras, starts=starts)
+
+
+def _warn_of_missing(known: Known, result: Result) -> None:
+    """Warns (InputWarning) where leaves were probably missed, see `describe_missing`."""
+    from mvseg.detection.config import SURE_SCORE
+    from mvseg.verification.unexplained import describe_missing
+
+    if not known.opened.is_chosen or (known.edits and not len(result.masks)):  # a person says that there is none
+        return
+    if said := describe_missing(result.masks, known.opened.photos, sure_score=SURE_SCORE):
+        warn(said)
+
+
+def _measure(result: Result, config: RunConfig, shapes: ReconstructConfig) -> Result:
+    """Voxels, and traits of the leaves and of the plant, see `measure_plant`."""
+    from mvseg.reconstruction.shapes import reconstruct_voxels
+    from mvseg.traits.measure import measure_plant
+
+    masks, cameras = result.masks, result.scene.cameras
+    with timed("voxels"):
+        voxels = reconstruct_voxels(masks.regions, masks.instance_ids, cameras, config=shapes, surfaces=result.surfaces)
+    with timed("measure"):
+        traits = measure_plant(
+            result.scene,
+            result.matching,
+            surfaces=result.surfaces,
+            voxels=voxels,
+            photos=result.photos,
+            config=config.traits,
+        )
+    return replace(result, instances=replace(result.instances, voxels=voxels, traits=traits))

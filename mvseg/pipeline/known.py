@@ -1,0 +1,117 @@
+"""What is known of a scene, from the first matching to the last edit; and masks that were given, matched."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.corrections.apply import Fate, Refused
+from mvseg.masks import Masks
+from mvseg.matching.match import match_masks
+from mvseg.matching.result import Matching
+from mvseg.matching.split import split_merged
+from mvseg.pipeline.open_scene import Opened
+from mvseg.poses.refine_poses import RefinedPoses, refine_scene
+from mvseg.results.result import NOTHING_LEARNED, Instances, Learned
+from mvseg.scene import Scene
+from mvseg.system.running import timed
+from mvseg.verification.choose import expect_right
+from mvseg.verification.leaf_color import colors_of_leaves
+
+if TYPE_CHECKING:
+    from mvseg.detection.find_leaves import Look
+    from mvseg.verification.choose import Leaves, LeftOut
+
+
+@dataclass(frozen=True, eq=False)
+class Known:
+    """What is known of a scene: which mask shows which leaf, and what else there is to choose from.
+
+    Attributes:
+        opened: the scene as it was opened.
+        scene: the same, with refined cameras where they were asked for, and are better.
+        matching: the masks with their ids, and what matching says of the scene.
+        instances: `starts` and `probabilities` of those that the views chose; nothing else.
+        proposals: R masks on the CPU, the excessive set of the detector; those that were given.
+        matched: tables of masks of it that are matched, the sure ones first; () where masks were given.
+        looks: that it was proposed in; () where masks were given.
+        left: candidates that the views did not choose.
+        poses: what came of refining the cameras; None: nobody asked for it.
+        edits: what came of a person's edits; () without any.
+        refused: pixels where a person says that no leaf is, and where no mask is.
+        learned: by the detector from this scene.
+    """
+
+    opened: Opened
+    scene: Scene
+    matching: Matching
+    instances: Instances
+    proposals: Masks
+    matched: tuple[Masks, ...]
+    looks: tuple[Look, ...]
+    left: tuple[LeftOut, ...]
+    poses: RefinedPoses | None
+    edits: tuple[Fate, ...] = ()
+    refused: tuple[Refused, ...] = ()
+    learned: Learned = NOTHING_LEARNED
+
+    @property
+    def masks(self) -> Masks:
+        """The table of masks."""
+        return self.matching.masks
+
+    @property
+    def expected_right(self) -> float:
+        """E, see `expect_right`."""
+        return expect_right(self.masks, self.instances.probabilities)
+
+    @cached_property
+    def leaf_colors(self) -> NDArray[np.bool_]:
+        """The colours of leaves, see `colors_of_leaves`."""
+        return colors_of_leaves(self.masks.to("cpu"), self.opened.photos)
+
+    def with_masks(self, masks: Masks) -> Known:
+        """The same with other masks. Gaps between their ids close; what is known of the instances follows."""
+        return replace(
+            self, matching=self.matching.with_masks(masks.close_gaps()), instances=self.instances.close_gaps(masks)
+        )
+
+    def with_leaves(self, leaves: Leaves) -> Known:
+        """The same with the leaves that the views chose."""
+        from mvseg.detection.few_views import select_by_views
+
+        masks = select_by_views(leaves.masks, self.masks, min_views=self.opened.config.detect.min_views)
+        instances = Instances(starts=leaves.surfaces, probabilities=leaves.probabilities)
+        return replace(self, instances=instances, left=leaves.left).with_masks(masks)
+
+    def cut_merged(self) -> Known:
+        """Masks that show two leaves are cut, where that is asked for; surfaces know best which ones do, so where they
+        check the ids, they come first."""
+        return self.with_masks(split_merged(self.masks)) if self.opened.is_cut else self
+
+
+def match_given(opened: Opened) -> Known:
+    """The same id for given masks of the same leaf, see `match_masks`."""
+    config, scene, given, poses = opened.config, opened.scene, opened.given, None
+    assert given is not None, "expected a scene with masks"
+    with timed("match"):
+        match = partial(match_masks, given, config=config.match)
+        if config.refine_poses:
+            scene, poses = refine_scene(scene, match)
+        matching = match(scene.cameras)
+    known = Known(
+        opened=opened,
+        scene=scene,
+        matching=matching,
+        instances=Instances(),
+        proposals=given.to("cpu"),
+        matched=(),
+        looks=(),
+        left=(),
+        poses=poses,
+    )
+    return known.cut_merged()

@@ -1,0 +1,143 @@
+"""The views teach the detector: it learns the leaves that they agree about, looks again, and finds the others.
+
+The paper feeds the ids of clusters back into the proposals of the same network (Sec. 3.2); this feeds them back into
+its weights. It is self-training (Xie et al., "Self-training with Noisy Student", CVPR 2020) at test time (Sun et al.,
+"Test-Time Training with Self-Supervision", ICML 2020), in which calibrated views, not the network, say what is right:
+before each round, what a label is, and after it, whether the new weights stay.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from mvseg._version import code_hash
+from mvseg.corrections.file import Corrections
+from mvseg.detection.cached_detections import CachedDetections
+from mvseg.detection.config import SURE_SCORE, DetectConfig
+from mvseg.detection.find_leaves import Look
+from mvseg.detectors.weights_file import encode_weights, read_weights
+from mvseg.detectors.zoo import load_detector, weights_path
+from mvseg.errors import InputError, collect_warnings, warn
+from mvseg.pipeline.apply_edits import apply_edits
+from mvseg.pipeline.find_leaves import know, look_once
+from mvseg.pipeline.known import Known
+from mvseg.results.result import Learned
+from mvseg.system.atomic import write_whole
+from mvseg.system.file_hash import hash_files
+from mvseg.system.running import say, timed
+from mvseg.training.fine_tune import STEPS, fine_tune
+from mvseg.training.view_labels import LEAST_LEAVES, ViewLabels, label_views
+from mvseg.verification.unexplained import is_familiar
+
+ROUNDS = 2  # where nobody says how many: a third one gained nothing on any plant (docs/detector.md)
+GROWTH = 1.1  # of E, from which new weights stay: where there is nothing to learn, it does not grow (docs/detector.md)
+
+
+def learn(known: Known, *, cache: CachedDetections, corrections: Corrections | None = None) -> Known:
+    """Let the detector learn the plant at hand, in the rounds that `RunConfig.learn` asks for.
+
+    A round: labels from what the views chose, and from what a person corrected; the weights that the run began with
+    learn these (`fine_tune`); the detector looks again, at the same size; the views choose. The better one stays, by
+    E, the expected number of right masks. Rounds end when E grows by less than a tenth. Ctrl-C ends them, too, and what
+    was there stays.
+
+    Args:
+        known: of leaves that the views chose.
+        cache: where the weights lie; rounds that are there already are not learned again.
+        corrections: of a person; his masks are certain.
+
+    Returns:
+        The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
+    """
+    best, expected = known, [known.expected_right]
+    try:
+        for number in range(1, _count_rounds(known) + 1):
+            with collect_warnings():  # what there is to say of edits, is said when they are applied
+                edited = apply_edits(best, corrections)
+            chances = edited.instances.probabilities
+            photos = known.opened.photos
+            labels = label_views(edited.masks, best.proposals, photos, probabilities=chances)
+            if not labels.are_enough:
+                few = f"the views agree about {labels.num_leaves} leaves, and it takes {LEAST_LEAVES} to learn from"
+                warn(f"the detector has not learned this plant: {few}; outline some (mvseg correct), or give masks")
+                break
+            say(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
+            seen = _learn_once(known, labels, cache)
+            expected.append(seen.expected_right)
+            if seen.expected_right < GROWTH * best.expected_right:
+                break
+            best = replace(seen, learned=replace(seen.learned, rounds=number))
+    except KeyboardInterrupt:
+        warn(f"learning was interrupted after {len(expected) - 1} rounds: what was found until then stays")
+    except InputError as error:
+        warn(f"the detector has not learned this plant: {error}")
+    return replace(best, learned=replace(best.learned, expected_right=tuple(expected)))
+
+
+def _count_rounds(known: Known) -> int:
+    """How many rounds to try; with "auto", none where the detector knows the species."""
+    opened = known.opened
+    if not opened.is_chosen or opened.config.learn == "off":
+        return 0
+    if opened.config.learn != "auto":
+        return opened.config.learn
+    return 0 if is_familiar(known.masks, sure_score=SURE_SCORE) else ROUNDS
+
+
+def _learn_once(known: Known, labels: ViewLabels, cache: CachedDetections) -> Known:
+    """The scene, seen with weights that have learned these labels."""
+    opened, look = known.opened, known.looks[0]
+    boxes = look.boxes
+    if boxes is None:
+        sizes = opened.scene.cameras.sizes
+        boxes = torch.cat((torch.zeros_like(sizes), sizes), 1)
+    path = cache.learned(_describe(opened.config.detect, look, labels, boxes))
+    if not path.is_file():
+        with timed("learn"):
+            content = _fine_tune(opened.config.detect, known, labels, boxes)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_whole(path, lambda partial: partial.write_bytes(content))
+    detect = replace(opened.config.detect, weights=str(path))
+    found = look_once(opened, detect, scene=known.scene, cache=cache, boxes=look.boxes)
+    with collect_warnings():
+        seen = know(opened, found, scene=known.scene, poses=known.poses)
+    return replace(seen, learned=Learned(weights=path.read_bytes()))
+
+
+def _fine_tune(detect: DetectConfig, known: Known, labels: ViewLabels, boxes: Tensor) -> bytes:
+    """The content of a file of weights that have learned the labels, at the size of the look that they come from."""
+    _, description = read_weights(weights_path(detect.weights))
+    if description is None or len(description.categories) != 1:
+        raise InputError(f"{detect.weights} tells several kinds of objects apart, expected a detector of leaves alone")
+    detector = load_detector(detect.weights)
+    detector.transform = transform = known.looks[0].model.transform
+    device = next(known.looks[0].model.parameters()).device
+    learned = fine_tune(detector.to(device), known.opened.photos, labels, boxes=boxes)
+    halves = {name: each.half() if each.is_floating_point() else each for name, each in learned.state_dict().items()}
+    return encode_weights(halves, replace(description, image_size=int(transform.max_size)))
+
+
+def _describe(detect: DetectConfig, look: Look, labels: ViewLabels, boxes: Tensor) -> str:
+    """All that learned weights depend on."""
+    shown = [each.regions for each in (labels.leaves, labels.doubtful)]
+    tensors = [boxes, *(part for each in shown for part in (each.view_index, each.boxes, each.crops))]
+    digest = hashlib.sha256(b"".join(each.cpu().numpy().tobytes() for each in tensors))
+    digest.update(np.ascontiguousarray(labels.colors).tobytes())
+    return json.dumps(
+        {
+            "weights": hash_files(Path(weights_path(detect.weights))),
+            "labels": digest.hexdigest(),
+            "size": int(look.model.transform.max_size),
+            "steps": STEPS,
+            "code": code_hash(),
+            "torch": torch.__version__,
+            "device": next(look.model.parameters()).device.type,
+        }
+    )
