@@ -90,6 +90,8 @@ class Cameras:
         return self.K.device
 
     def to(self, device: torch.device | str) -> Cameras:
+        if self.device == torch.device(device):  # they need no second check
+            return self
         return Cameras(K=self.K.to(device), R=self.R.to(device), t=self.t.to(device), sizes=self.sizes.to(device))
 
     @property

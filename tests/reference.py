@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import cv2
 import numpy as np
@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 from torchvision.ops import box_iou
 
+from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
@@ -332,6 +333,19 @@ def leaf_metrics_reference(
         "num_false": len(wrong),
         "num_missed": len(leaves) - len(whole),
     }
+
+
+def nearest_edge_reference(masks: MaskStack, view: int, px: np.ndarray, *, normal: np.ndarray, reach: float) -> float:
+    """How far along a normal the nearest edge from inside to outside is, step by step; NaN for none in reach."""
+    num_steps = 2 * int(np.ceil(reach))
+    steps = [reach * (2 * number / num_steps - 1) for number in range(num_steps + 1)]
+    value = [masks.interpolate(masks.blurred, np.array([view]), (px + at * normal)[None, None]).item() for at in steps]
+    nearest = np.nan
+    for (here, low), (after, high) in pairwise(zip(value, steps, strict=True)):
+        if here >= 0.5 > after:
+            place = low + (high - low) * (here - 0.5) / (here - after)
+            nearest = place if np.isnan(nearest) or abs(place) < abs(nearest) else nearest
+    return nearest
 
 
 def soft_affinity_reference(

@@ -83,14 +83,14 @@ class Evidence:
 def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras: Cameras) -> tuple[Drawn, ...]:
     """V views of D regions and K surfaces, on the CPU; what lies behind a camera is left out."""
     drawn, all_depths = [], _depths(surfaces, cameras)
-    nothing = Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))
+    nothing = [Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))] * len(cameras)
+    shown = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
         step = -(-max(width, height) // MOST_PX)
         size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
-        camera, rows = cameras[[view]], (regions.view_index == view).nonzero()[:, 0].numpy()
+        rows = (regions.view_index == view).nonzero()[:, 0].numpy()
         masks = [regions.placed(row) for row in rows.tolist()]
-        parts = [nothing if each is None else each.project_parts(camera)[0] for each in surfaces]
-        pixels, covered = _columns(masks, size, step), _columns(parts, size, step)
+        pixels, covered = _columns(masks, size, step), _columns([parts[view] for parts in shown], size, step)
         drawn.append(Drawn(rows=rows, masks=pixels, parts=covered, depth=all_depths[view]))
     return tuple(drawn)
 

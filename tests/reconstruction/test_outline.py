@@ -20,7 +20,7 @@ from mvseg.reconstruction.surface.leaf_patch import (
     patch_prior,
 )
 from mvseg.reconstruction.surface.mask_stack import FRAME, MARGIN, MaskStack, stack_masks
-from mvseg.reconstruction.surface.outline import nearest_samples, outline_distances, outline_samples
+from mvseg.reconstruction.surface.outline import nearest_samples, outline_distances, outline_samples, search_edges
 from mvseg.reconstruction.surface.patch_image import (
     DRAWN_TOO_FAR,
     NEAR_PX,
@@ -37,6 +37,7 @@ from mvseg.reconstruction.surface.patch_image import (
     project_points,
     view_ious,
 )
+from reference import nearest_edge_reference
 
 CAMERAS = ring_cameras(4)
 GRID = patch_grid(36, 9)
@@ -217,6 +218,23 @@ def test_nearest_samples_of_all_views_at_once_are_those_of_each() -> None:
     assert edge.tolist() == list(pairs)
     assert own.tolist() == [nearest for nearest, _ in pairs.values()]
     assert toward == pytest.approx(np.array([direction for _, direction in pairs.values()]))
+
+
+@pytest.mark.parametrize("reach", [14.0, 6.8, 1.0])
+def test_nearest_edges_of_all_samples_at_once_are_those_of_each(reach: float) -> None:
+    """With edges near by, far away, in front and behind, several along one normal, and none."""
+    stripes = np.where(np.arange(SIZE) % 11 > 3, NOTHING, np.int32(7))
+    masks, num_found = stack([stripes] * len(CAMERAS)), 0
+    for patch in (ellipse(), ellipse(0.8, 0.4)):
+        samples, _ = outline_samples(masks, GRID, project_points(masks.px_from_world, GRID.points(patch)))
+        found, _ = search_edges(masks, samples, masks.blurred, reach=reach, offsets=np.zeros(len(masks)))
+        slow = [
+            nearest_edge_reference(masks, view, px, normal=normal, reach=reach)
+            for view, px, normal in zip(samples.stack, samples.px, samples.normals, strict=True)
+        ]
+        assert found == pytest.approx(np.array(slow), abs=1e-6, nan_ok=True)
+        num_found += int(np.isfinite(found).sum())
+    assert num_found > 10
 
 
 def test_medians_of_each_view() -> None:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid, patch_prior
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, PatchSize, measure_patch, patch_grid, patch_prior
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
@@ -144,7 +144,7 @@ def _covariance(coefficients: Floats, equations: _Equations, stack: NDArray, *, 
 
     NaN where the normal matrix is singular. The factors were found on simulated leaves, see docs/surfaces.md.
     """
-    inverse = invert_normal(_normal_matrix(coefficients, equations)[0])
+    inverse = invert_normal(_normal_matrix(coefficients, equations, measure_patch(coefficients))[0])
     weight, px = equations.weight, equations.px
     num_views = int(stack.max(initial=0)) + 1
     jacobian = equations.distances.jacobian
@@ -215,17 +215,20 @@ def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
 
 def per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
     """(S,) medians; NaN for a view without samples."""
-    ordered = np.append(values[np.lexsort((values, stack))], np.nan)
-    counts = np.bincount(stack, minlength=num_views)
+    order, counts = np.argsort(stack, kind="stable"), np.bincount(stack, minlength=num_views)
     first = np.cumsum(counts) - counts
-    low, high = (np.where(counts > 0, first + (counts + odd) // 2, len(values)) for odd in (-1, 0))
-    medians: Floats = (ordered[low] + ordered[high]) / 2
-    return medians
+    ordered = np.full((num_views, 1 + counts.max(initial=0)), np.inf)
+    own = stack[order]
+    ordered[own, np.arange(len(own)) - first[own]] = values[order]
+    ordered.sort(1)
+    view = np.arange(num_views)
+    medians: Floats = (ordered[view, np.maximum(counts - 1, 0) // 2] + ordered[view, counts // 2]) / 2
+    return np.where(counts > 0, medians, np.nan)
 
 
-def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats, Floats]:
-    """(78, 78) and (78,): outlines and prior together, about the present coefficients."""
-    prior, target = patch_prior(coefficients, measure_patch(coefficients), noise=equations.noise)
+def _normal_matrix(coefficients: Floats, equations: _Equations, size: PatchSize) -> tuple[Floats, Floats]:
+    """(78, 78) and (78,): outlines and prior together, about the present coefficients of a patch of this size."""
+    prior, target = patch_prior(coefficients, size, noise=equations.noise)
     matrix, right = equations.distances.normal_equations(equations.px, equations.weight)
     return matrix + prior.T @ prior, right + prior.T @ (target - prior @ coefficients.ravel())
 
@@ -233,11 +236,11 @@ def _normal_matrix(coefficients: Floats, equations: _Equations) -> tuple[Floats,
 def _step(coefficients: Floats, equations: _Equations, damping_and_cap: tuple[float, float]) -> Floats:
     """One damped Gauss-Newton step; no point of the patch moves by more than `cap` half-widths."""
     damping, cap = damping_and_cap
-    matrix, right = _normal_matrix(coefficients, equations)
+    size = measure_patch(coefficients)
+    matrix, right = _normal_matrix(coefficients, equations, size)
     matrix[np.diag_indices_from(matrix)] *= 1 + damping
     step = np.linalg.solve(matrix, right).reshape(-1, 3)
     longest = np.linalg.norm(patch_grid(*FIT_GRID).basis @ step, axis=1).max()
-    size = measure_patch(coefficients)
     limit = cap * max(size.half_width, NARROW * size.length)
     return coefficients + step * min(1.0, limit / max(longest, 1e-12))
 

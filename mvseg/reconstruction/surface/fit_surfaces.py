@@ -83,7 +83,8 @@ def fit_surfaces(
         known: instance id -> a surface that is returned as it is. The others are fitted as if it had been fitted with
             them: it hides what lies behind it, and its masks tell how all masks err.
         most_views: at least 2.
-        is_rough: leave out the second fit, which knows what the leaves hide of each other, and how the masks err.
+        is_rough: leave out the second fit, which knows what the leaves hide of each other, and how the masks err, and
+            the reasons to doubt a surface.
 
     Returns:
         {instance id: surface} for every instance. Where no surface can be fitted (one view, masks that agree on no
@@ -137,7 +138,7 @@ def fit_surfaces(
         refitted = map_in_order(partial(_fit_again, points, errors), asked, workers)
         for instance, (masks, better) in zip(unknown, refitted, strict=True):
             stacks[instance], fits[instance] = masks, better
-    surfaces |= {instance: _surface(stacks[instance], fits[instance]) for instance in unknown}
+    surfaces |= {instance: _surface(stacks[instance], fits[instance], is_judged=not is_rough) for instance in unknown}
     oriented = orient_surfaces(dict(sorted({**surfaces, **known}.items())), cameras)
     return {**oriented, **known}
 
@@ -293,7 +294,7 @@ def _fit_again(
     return masks, fit_patch(masks, fit.coefficients, errors=errors)
 
 
-def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
+def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface:
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "its masks do not tell its shape")
     points = patch_grid(*FIT_GRID).points(fit.coefficients)
@@ -307,7 +308,7 @@ def _surface(masks: MaskStack, fit: PatchFit) -> LeafSurface:
         is_oriented=False,
         quality=Quality(),
     )
-    return replace(surface, quality=_judge(surface))
+    return replace(surface, quality=_judge(surface)) if is_judged else surface
 
 
 def _judge(surface: LeafSurface) -> Quality:

@@ -33,6 +33,7 @@ NORMAL_SD = 0.35  # R and S along the normal
 FOLD_STEP_SD = 0.2  # differences of R
 SHEAR_SD = 0.15  # Q along the midrib, and R and S within the blade
 NUM_PIECES = 10  # the midrib has so many pieces, for SWAY and SPEED
+FRAMES = (*COUNTS[1:], NUM_PIECES + 1)  # the prior needs directions at so many places, evenly spaced along the leaf
 
 
 def place_stations(num_rows: int) -> Floats:
@@ -152,7 +153,7 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
     """
     length, half = size.length, size.half_width
     bend, side, fold = _difference_rows()
-    frames = [_frames(coefficients, count) for count in COUNTS[1:]]
+    *frames, pieces = _frames(coefficients)
     tangents = _unit(_speed_rows() @ coefficients)
     equations = [bend / (BEND_SD * length), side / (SIDE_SD * half), fold * (noise / (FOLD_STEP_SD * half))]
     shear, upright = noise / (SHEAR_SD * half), noise / (NORMAL_SD * half)
@@ -163,7 +164,7 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
             equations += [_along(rows[place], across) * shear, _along(rows[place], normal) * upright]
     # The outline of a round blade does not tell where its midrib runs, which would wind and come out too long. That of
     # a narrow one does.
-    turns, sideways = np.diff(_speed_rows(), axis=0), _frames(coefficients, NUM_PIECES + 1)[1][1:-1]
+    turns, sideways = np.diff(_speed_rows(), axis=0), pieces[1][1:-1]
     equations.append(_along(turns, sideways) * (2 * half / (SWAY_SD * length**2)))
     equations.append(_along(_speed_rows(), tangents) / (SPEED_SD * length))
     target = np.zeros(sum(map(len, equations)))
@@ -193,21 +194,24 @@ def _speed_rows() -> Floats:
     return np.diff(patch_basis(u, np.zeros_like(u)), axis=0) * NUM_PIECES
 
 
-def _frames(coefficients: Floats, count: int) -> tuple[Floats, Floats, Floats]:
-    """Directions along, across and normal to the blade, (count, 3) each, at the places of `count` coefficients."""
-    ahead, sideways = _frame_rows(count)
+def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
+    """Directions along, across and normal to the blade, (count, 3) each, at the places of each count of `FRAMES`."""
+    ahead, sideways = _frame_rows()
     along = _unit(ahead @ coefficients)
     side = sideways @ coefficients[SIDE]
     # Where the side vector vanishes (pointed ends) the mean one stands in.
     side = side + 1e-3 * coefficients[SIDE].mean(0)
     across = _unit(side - (side * along).sum(1, keepdims=True) * along)
-    return along, across, np.cross(along, across)
+    (ax, ay, az), (bx, by, bz) = along.T, across.T
+    normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)  # np.cross is slow on few
+    ends = np.cumsum(FRAMES)[:-1]
+    return list(zip(*(np.split(each, ends) for each in (along, across, normal)), strict=True))
 
 
 @cache
-def _frame_rows(count: int) -> tuple[Floats, Floats]:
-    """(count, 26) rows of directions along the midrib, and (count, 12) of the side vectors."""
-    middle = np.clip(np.linspace(0, 1, count), 0.02, 0.98)
+def _frame_rows() -> tuple[Floats, Floats]:
+    """(sum of `FRAMES`, 26) rows of directions along the midrib, and (same, 12) of the side vectors."""
+    middle = np.clip(np.concatenate([np.linspace(0, 1, count) for count in FRAMES]), 0.02, 0.98)
     zeros = np.zeros_like(middle)
     ahead = patch_basis(middle + 0.02, zeros) - patch_basis(middle - 0.02, zeros)
     return ahead, spline_basis(middle, COUNTS[1])

@@ -69,9 +69,16 @@ class MaskStack:
 
     def look_up(self, values: NDArray, stack: NDArray, px: Floats) -> NDArray:
         """Values (S, H, W) of the pixels that the positions (P, 2) lie in; outside of a crop those of its border."""
+        found: NDArray = values.ravel().take(self.place_of(stack, px))
+        return found
+
+    def place_of(self, stack: NDArray, px: Floats) -> NDArray[np.int64]:
+        """(P,) where `look_up` looks in flat values."""
         rows, columns = self.size
-        column, row = np.floor(np.clip(px, 0, (columns - 1, rows - 1))).astype(np.int64).T
-        return values[stack, row, column]
+        column = np.minimum(np.maximum(px[:, 0], 0), columns - 1).astype(np.int64)
+        row = np.minimum(np.maximum(px[:, 1], 0), rows - 1).astype(np.int64)
+        place: NDArray[np.int64] = (stack * rows + row) * columns + column
+        return place
 
     def interpolate(self, values: NDArray[np.float32], stack: NDArray, px: Floats) -> NDArray[np.floating]:
         """(P, T) of values (S, H, W) at positions (P, T, 2), bilinear between pixel centres."""
@@ -80,11 +87,12 @@ class MaskStack:
         y = np.clip(px[..., 1] - 0.5, 0, rows - 1.001).astype(np.float32)
         column, row = x.astype(np.int64), y.astype(np.int64)
         x, y = x - column, y - row
+        left, above = 1 - x, 1 - y
         flat = values.ravel()
         first = (stack[:, None] * rows + row) * columns + column
-        top = flat.take(first) * (1 - x) + flat.take(first + 1) * x
-        bottom = flat.take(first + columns) * (1 - x) + flat.take(first + columns + 1) * x
-        return top * (1 - y) + bottom * y
+        top = flat.take(first) * left + flat[1:].take(first) * x
+        bottom = flat[columns:].take(first) * left + flat[columns + 1 :].take(first) * x
+        return top * above + bottom * y
 
     def select(self, keep: NDArray[np.bool_]) -> MaskStack:
         """Only the views (S,) that are to be kept."""

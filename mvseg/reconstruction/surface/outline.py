@@ -9,6 +9,7 @@ rim: there the patch only has to cover the mask, and a negative distance does no
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +33,8 @@ OUTSIDE_PX = 1.6
 REVERSE_WEIGHT = 0.5  # samples of the masks' edges have this weight, those of the patch 1
 PULL_FROM_PX = 4.0  # an edge pulls at its nearest sample if it is farther than this outside the patch
 SIMILAR = 0.5  # two samples match if the cosine between their normals is at least this
+# An edge is looked for at so many steps of a pixel to either side first: most edges are there (a technical limit).
+NEAR_STEPS = 3
 MOST_SHIFT_PX = 5.0  # outline of a patch and edge of its image may be apart by at most this
 
 
@@ -54,7 +57,9 @@ class OutlineSamples:
     depth: Floats
 
     def select(self, keep: NDArray) -> OutlineSamples:
-        return OutlineSamples(*(getattr(self, field.name)[keep] for field in fields(self)))
+        """Those at places (N,), or where `keep` (K,) is true."""
+        places = np.flatnonzero(keep) if keep.dtype == bool else keep
+        return OutlineSamples(*(getattr(self, field.name).take(places, 0) for field in fields(self)))
 
 
 def outline_samples(
@@ -77,42 +82,54 @@ def _concatenate(first: OutlineSamples, second: OutlineSamples) -> OutlineSample
 
 def _rim_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     """All points of the rim: down one side of the grid and up the other."""
-    rows, columns = grid.shape
+    place, inner = _rim_places(*grid.shape)
+    num_views, count = len(projection.px), len(place)
+    flat = projection.px.reshape(num_views, -1, 2)
+    px = flat.take(place, 1)
+    around = np.concatenate([px[:, -1:], px, px[:, :1]], 1)
+    normals = _outwards(around[:, 2:] - around[:, :-2], px - flat.take(inner, 1))
+    return OutlineSamples(
+        stack=np.repeat(np.arange(num_views), count),
+        px=px.reshape(-1, 2),
+        normals=normals.reshape(-1, 2),
+        place=np.tile(place, num_views),
+        depth=projection.depth.reshape(num_views, -1).take(place, 1).ravel(),
+    )
+
+
+@cache
+def _rim_places(rows: int, columns: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """(n,) the points of the rim, as places in the flat grid, and for each a point that lies further inside."""
     down, up = np.arange(rows), np.arange(rows - 2, 0, -1)
     row = np.concatenate([down, up])
     column = np.concatenate([np.zeros(rows, int), np.full(rows - 2, columns - 1)])
     inner_row = np.clip(row, 1, rows - 2)
     inner_column = np.where(column == 0, 1, columns - 2)
     inner_column[[0, rows - 1]] = columns // 2
-    px = projection.px[:, row, column]
-    tangent = np.roll(px, -1, 1) - np.roll(px, 1, 1)
-    normals = _outwards(tangent, px - projection.px[:, inner_row, inner_column])
-    num_views, count = px.shape[:2]
-    return OutlineSamples(
-        stack=np.repeat(np.arange(num_views), count),
-        px=px.reshape(-1, 2),
-        normals=normals.reshape(-1, 2),
-        place=np.tile(row * columns + column, num_views),
-        depth=projection.depth[:, row, column].ravel(),
-    )
+    return row * columns + column, inner_row * columns + inner_column
 
 
 def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     """Middles of the grid edges between quads that are seen from different sides."""
     px = projection.px
     is_front = grid_orientations(px) > 0
-    centres = (px[:, 1:, 1:] + px[:, :-1, :-1] + px[:, 1:, :-1] + px[:, :-1, 1:]) / 4
     columns = grid.shape[1]
+
+    def centres(stack: NDArray, row: NDArray, column: NDArray) -> Floats:
+        """Of quads."""
+        around = px[stack, row + 1, column + 1] + px[stack, row, column]
+        return (around + px[stack, row + 1, column] + px[stack, row, column + 1]) / 4
+
     parts = []
     for along_rows, first in ((True, px[0, ..., 0].size), (False, 2 * px[0, ..., 0].size)):
         if along_rows:  # edges from row to row, between quads side by side
             stack, row, column = np.nonzero(is_front[:, :, 1:] != is_front[:, :, :-1])
             a, b = (row, column + 1), (row + 1, column + 1)
-            inner = (centres[stack, row, column] + centres[stack, row, column + 1]) / 2
+            inner = (centres(stack, row, column) + centres(stack, row, column + 1)) / 2
         else:
             stack, row, column = np.nonzero(is_front[:, 1:] != is_front[:, :-1])
             a, b = (row + 1, column), (row + 1, column + 1)
-            inner = (centres[stack, row, column] + centres[stack, row + 1, column]) / 2
+            inner = (centres(stack, row, column) + centres(stack, row + 1, column)) / 2
         middle = (px[stack, *a] + px[stack, *b]) / 2
         parts.append(
             OutlineSamples(
@@ -164,11 +181,12 @@ class Distances:
 
         The same place is seen in many views: what these ask of it is added up before it is spread over coefficients.
         """
-        places, index = np.unique(self.place, return_inverse=True)
+        is_asked = np.bincount(self.place, minlength=len(self.grid.outline_basis)) > 0
+        places, index = np.flatnonzero(is_asked), (is_asked.cumsum() - 1)[self.place]
         basis = self.grid.outline_basis[places]
-        pulled = self.gradient * weight[:, None]
-        asked = np.concatenate([pulled * by[:, None] for by in (*self.gradient.T, px)], 1)
-        asked = np.stack([np.bincount(index, column, len(places)) for column in asked.T], 1)
+        ahead = np.ascontiguousarray(self.gradient.T)
+        pulled = ahead * weight
+        asked = np.stack([np.bincount(index, by * along, len(places)) for by in (*ahead, px) for along in pulled], 1)
         size = basis.shape[1]
         spread = (asked[:, :9, None] * basis[:, None]).reshape(len(places), 9 * size)
         matrix = (basis.T @ spread).reshape(size, 3, 3, size).transpose(0, 1, 3, 2)
@@ -193,12 +211,12 @@ def outline_distances(
     projection = project_points(masks.px_from_world, grid.points(coefficients))
     samples, covered = outline_samples(masks, grid, projection)
     offsets = np.zeros(len(masks)) if offsets is None else offsets
-    to_edge, hidden = _search_edges(masks, samples, masks.blurred, reach=reach, offsets=offsets)
+    to_edge, hidden = search_edges(masks, samples, masks.blurred, reach=reach, offsets=offsets)
     shift = np.zeros(len(to_edge))
     if is_imaged:
         drawn = draw_patch(masks, projection, offsets=offsets)
         most = MOST_SHIFT_PX + float(np.abs(offsets).max(initial=0))
-        shift = _search_edges(masks, samples, drawn, reach=most, offsets=offsets)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
+        shift = search_edges(masks, samples, drawn, reach=most, offsets=offsets)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
     counts = np.isfinite(to_edge) & np.isfinite(shift) & ~(hidden & (to_edge < shift))
     own, edge, toward = nearest_samples(masks, samples, covered, reach=reach)
     back = ((masks.edge_px[edge] - samples.px[own]) * toward).sum(1) - shift[own]
@@ -223,10 +241,11 @@ def outline_distances(
 def _gradients(px_from_world: Floats, samples: OutlineSamples, normals: Floats) -> Floats:
     """(N, 3) derivative of normal . px by the world position."""
     rows = px_from_world[:, :2, :3] - samples.px[:, :, None] * px_from_world[:, 2:, :3]
-    return (normals[:, :, None] * rows).sum(1) / samples.depth[:, None]
+    across: Floats = normals[:, :1] * rows[:, 0] + normals[:, 1:] * rows[:, 1]
+    return across / samples.depth[:, None]
 
 
-def _search_edges(
+def search_edges(
     masks: MaskStack, samples: OutlineSamples, blurred: NDArray[np.float32], *, reach: float, offsets: Floats
 ) -> tuple[Floats, NDArray[np.bool_]]:
     """Signed distance (K,) along the normals to the nearest edge from inside to outside, NaN for none in reach.
@@ -234,16 +253,32 @@ def _search_edges(
     Also, is the leaf hidden beyond that edge?
     """
     steps = np.linspace(-reach, reach, 2 * int(np.ceil(reach)) + 1)
-    values = masks.interpolate(blurred, samples.stack, samples.px[:, None] + steps[:, None] * samples.normals[:, None])
-    leaves = (values[:, :-1] >= 0.5) & (values[:, 1:] < 0.5)
-    drop = np.where(leaves, values[:, :-1] - values[:, 1:], 1)
-    place = steps[:-1] + (steps[1] - steps[0]) * (values[:, :-1] - 0.5) / drop
-    place = np.where(leaves, place, np.inf)
-    nearest = np.abs(place).argmin(1) if len(place) else np.zeros(0, int)
-    distance = place[np.arange(len(place)), nearest]
+    middle = len(steps) // 2
+    near = steps[max(middle - NEAR_STEPS, 0) : middle + NEAR_STEPS + 1]
+    distance = _nearest_edges(masks, samples, blurred, steps=near)
+    missed = np.flatnonzero(np.isinf(distance))  # a nearer edge is not to be had farther away
+    distance[missed] = _nearest_edges(masks, samples.select(missed), blurred, steps=steps)
     edge = samples.px + np.where(np.isfinite(distance), distance, 0)[:, None] * samples.normals
     hidden = _is_hidden(masks, samples.stack, edge, normals=samples.normals, offsets=offsets)
     return np.where(np.isfinite(distance), distance, np.nan), hidden
+
+
+def _nearest_edges(masks: MaskStack, samples: OutlineSamples, blurred: NDArray[np.float32], *, steps: Floats) -> Floats:
+    """Signed distance (K,) to the nearest edge from inside to outside between the first and the last of the places
+    `steps` along the normals, evenly spaced; infinite where there is none."""
+    px = np.empty((2, len(samples.px), len(steps)))  # all x, then all y: broadcasting over two numbers is slow
+    for axis, along in enumerate(px):
+        np.multiply(samples.normals[:, axis, None], steps, out=along)
+        along += samples.px[:, axis, None]
+    values = masks.interpolate(blurred, samples.stack, np.moveaxis(px, 0, 2))
+    is_inside = values >= 0.5
+    sample, step = np.nonzero(is_inside[:, :-1] & ~is_inside[:, 1:])
+    before = values[sample, step]
+    place = steps[step] + (steps[1] - steps[0]) * (before - 0.5) / (before - values[sample, step + 1])
+    distance = np.full(len(values), np.inf)
+    order = np.lexsort((-step, -np.abs(place)))  # the nearest edge is written last; of two that are as near, the first
+    distance[sample[order]] = place[order]
+    return distance
 
 
 def _is_hidden(
@@ -272,16 +307,17 @@ def nearest_samples(
     edge, own = _places(masks.edge_stack, len(masks)), _places(samples.stack, len(masks))
     there = _take(masks.edge_px, edge)
     here = _take(samples.px, own)
-    square = (there**2).sum(2)[:, :, None] - 2 * there @ here.transpose(0, 2, 1) + (here**2).sum(2)[:, None]
+    from_edge, from_own = (np.where(at < 0, np.inf, (px**2).sum(2)) for at, px in ((edge, there), (own, here)))
+    square = from_edge[:, :, None] - 2 * there @ here.transpose(0, 2, 1) + from_own[:, None]
     if not square.size:
         return np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2))
-    square[(edge < 0)[:, :, None] | (own < 0)[:, None]] = np.inf
     straight = square.argmin(2)
     is_outside = _take(masks.look_up(covered, masks.edge_stack, masks.edge_px) == 0, edge)
     normals = _take(masks.edge_normals, edge)
     nearest_square = np.take_along_axis(square, straight[:, :, None], 2)[:, :, 0]
     pulls = is_outside & (nearest_square > PULL_FROM_PX**2) & np.isfinite(nearest_square)
-    square[normals @ _take(samples.normals, own).transpose(0, 2, 1) < SIMILAR] = np.inf
+    is_other = normals @ _take(samples.normals, own).transpose(0, 2, 1) < SIMILAR
+    np.copyto(square, np.inf, where=is_other)
     nearest = np.where(pulls, straight, square.argmin(2))
     found = pulls | (np.take_along_axis(square, nearest[:, :, None], 2)[:, :, 0] < (2 * reach) ** 2)
     view, place = np.nonzero(found)

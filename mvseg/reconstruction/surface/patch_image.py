@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cache
 
 import cv2
 import numpy as np
@@ -35,7 +36,10 @@ def project_points(px_from_world: Floats, points: Floats) -> Projection:
     cam = flat @ px_from_world[:, :, :3].transpose(0, 2, 1) + px_from_world[:, None, :, 3]
     depth = np.maximum(cam[..., 2], 1e-9)
     shape = (len(px_from_world), *points.shape[:2])
-    return Projection(px=(cam[..., :2] / depth[..., None]).reshape(*shape, 2), depth=depth.reshape(shape))
+    px = np.empty((*depth.shape, 2))
+    for axis in (0, 1):  # one after the other: broadcasting over two numbers is slow
+        np.divide(cam[..., axis], depth, out=px[..., axis])
+    return Projection(px=px.reshape(*shape, 2), depth=depth.reshape(shape))
 
 
 def cover_crops(masks: MaskStack, projection: Projection) -> NDArray[np.uint8]:
@@ -63,8 +67,8 @@ def crop_ious(masks: MaskStack, covered: NDArray[np.bool_], *, offsets: Floats |
     """
     inside = masks.inside if offsets is None else masks.depth_px > offsets[:, None, None]
     covered = covered & (masks.others == 0)
-    common, either = covered & inside, covered | inside
-    ious: Floats = common.sum((1, 2)) / np.maximum(either.sum((1, 2)), 1)
+    common, either = (np.array(list(map(np.count_nonzero, each))) for each in (covered & inside, covered | inside))
+    ious: Floats = common / np.maximum(either, 1)
     return ious
 
 
@@ -107,15 +111,16 @@ def fill_grids(canvases: Iterable[NDArray[np.uint8]], px: Floats) -> None:
     Its rim as one polygon has all pixels under an odd number of layers. Where there are two, one of them is seen from
     the other side: the quads of the side that shows fewer of them do the rest.
     """
-    corners = _fixed(px)
+    corners, quads = _fixed(px), _quad_places(*px.shape[1:3])
     rims = np.ascontiguousarray(np.concatenate([corners[:, :, 0], corners[:, -2:0:-1, -1]], 1))
     is_front = (grid_orientations(px) > 0).reshape(len(px), -1)
     is_rare = is_front == (2 * np.count_nonzero(is_front, axis=1) < is_front.shape[1])[:, None]
+    corners = corners.reshape(len(px), -1, 2)
     for canvas, grid, rim, rare, folds in zip(canvases, corners, rims, is_rare, is_rare.any(1), strict=True):
         if canvas.size:
             cv2.fillPoly(canvas, [rim], 255, shift=SUB_PIXEL_BITS)
         if canvas.size and folds:
-            cv2.fillPoly(canvas, list(grid_quads(grid)[rare]), 255, shift=SUB_PIXEL_BITS)
+            cv2.fillPoly(canvas, list(grid[quads[rare]]), 255, shift=SUB_PIXEL_BITS)
 
 
 def _fixed(px: Floats) -> NDArray[np.int32]:
@@ -134,8 +139,14 @@ def grid_orientations(px: Floats) -> Floats:
 
 def grid_quads(grid: Floats) -> Floats:
     """(quads, 4, n) corners in turn of the cells of a grid (rows, columns, n)."""
-    quads = np.stack([grid[:-1, :-1], grid[:-1, 1:], grid[1:, 1:], grid[1:, :-1]], 2)
-    return quads.reshape(-1, 4, grid.shape[-1])
+    return grid.reshape(-1, grid.shape[-1])[_quad_places(*grid.shape[:2])]
+
+
+@cache
+def _quad_places(rows: int, columns: int) -> NDArray[np.int64]:
+    """(quads, 4) the corners in turn of each cell, as places in a flat grid."""
+    place = np.arange(rows * columns).reshape(rows, columns)
+    return np.stack([place[:-1, :-1], place[:-1, 1:], place[1:, 1:], place[1:, :-1]], 2).reshape(-1, 4)
 
 
 def draw_polygons(polygons: Floats, size: tuple[int, int], corner: Floats) -> NDArray[np.float32]:

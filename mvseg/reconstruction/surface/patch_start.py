@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -151,5 +153,12 @@ def _coefficients(middles: Floats, sides: Floats) -> Floats:
 
 def _smooth_fit(u: Floats, values: Floats, count: int) -> Floats:
     """(count, 3) spline coefficients near the values, with small second differences where the values leave freedom."""
+    return _smoother(u.tobytes(), count) @ values
+
+
+@cache
+def _smoother(places: bytes, count: int) -> Floats:
+    """(count, P) from values at the places u (P,) to the coefficients of `_smooth_fit`."""
+    u = np.frombuffer(places)
     rows = np.concatenate([spline_basis(u, count), 0.3 * np.diff(np.eye(count), 2, axis=0)])
-    return np.linalg.lstsq(rows, np.concatenate([values, np.zeros((count - 2, 3))]), rcond=None)[0]
+    return np.linalg.pinv(rows)[:, : len(u)]
