@@ -14,6 +14,7 @@ from torch import Tensor
 from mvseg.crop import Crop
 from mvseg.errors import InputError
 
+BAND = 256  # rows of a label map that are looked at together
 IGNORE_LABEL = 65535  # in label maps: pixels that belong to no region and are left out of every score
 
 
@@ -277,25 +278,44 @@ def regions_from_label_maps(label_maps: Iterable[np.ndarray]) -> Regions:
     view_index, boxes, crops, labels, num_views = [], [], [], [], 0
     for view, label_map in enumerate(label_maps):
         num_views = view + 1
-        numbers, dense = _number_densely(np.asarray(label_map))
-        for number, window in zip(numbers.tolist(), ndimage.find_objects(dense), strict=True):
-            if number in (0, IGNORE_LABEL):
-                continue
-            rows, columns = window
+        for number, (x1, y1, x2, y2) in sorted(label_boxes(label_map).items()):
             view_index.append(view)
-            boxes.append((columns.start, rows.start, columns.stop, rows.stop))
-            crops.append(torch.from_numpy(label_map[window] == number).flatten())
+            boxes.append((x1, y1, x2, y2))
+            crops.append(torch.from_numpy(label_map[y1:y2, x1:x2] == number).flatten())
             labels.append(number)
     return stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
 
 
-def _number_densely(label_map: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers that occur in a label map, ascending, and the map with 1, 2, ... in their place."""
-    if label_map.dtype in (np.uint8, np.uint16):  # counted, not sorted
-        occurs = np.bincount(label_map.ravel(), minlength=1) > 0
-        return np.flatnonzero(occurs), occurs.cumsum(dtype=np.int32)[label_map]
-    numbers, dense = np.unique(label_map, return_inverse=True)
-    return numbers, dense.reshape(label_map.shape) + 1
+def label_boxes(label_map: np.ndarray) -> dict[int, tuple[int, int, int, int]]:
+    """{number: x1, y1, x2, y2 (half-open)} of an integer label map (H, W), without 0 and 65535.
+
+    `BAND` rows are looked at together, since this needs arrays that are several times as large.
+    """
+    boxes: dict[int, tuple[int, int, int, int]] = {}
+    for top in range(0, len(label_map), BAND):
+        band = np.asarray(label_map[top : top + BAND])
+        columns = np.flatnonzero(band.any(0))
+        if not len(columns):
+            continue
+        left = int(columns[0])
+        numbers, dense = _number_densely(band[:, left : columns[-1] + 1])
+        for number, (down, along) in zip(numbers.tolist(), ndimage.find_objects(dense), strict=True):
+            if number in (0, IGNORE_LABEL):
+                continue
+            box = (left + along.start, top + down.start, left + along.stop, top + down.stop)
+            x1, y1, x2, y2 = boxes.get(number, box)
+            boxes[number] = (min(x1, box[0]), min(y1, box[1]), max(x2, box[2]), max(y2, box[3]))
+    return boxes
+
+
+def _number_densely(band: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers that occur, ascending, and the band with 1, 2, ... in their place."""
+    if band.dtype in (np.uint8, np.uint16):  # looked up, not sorted
+        occurs = np.zeros(np.iinfo(band.dtype).max + 1, bool)
+        occurs[band] = True
+        return np.flatnonzero(occurs), occurs.cumsum(dtype=np.int32)[band]
+    numbers, dense = np.unique(band, return_inverse=True)
+    return numbers, dense.reshape(band.shape) + 1
 
 
 def stack_regions(

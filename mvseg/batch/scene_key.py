@@ -12,7 +12,7 @@ from typing import Any
 from mvseg._version import code_hash
 from mvseg.config import RunConfig
 from mvseg.errors import InputError
-from mvseg.formats.masks.yolo import NAME_FILES
+from mvseg.formats.masks.yolo import name_files
 from mvseg.scene import Scene
 from mvseg.system.file_hash import hash_files
 
@@ -61,8 +61,8 @@ def _describe_file(path: Path, start: Path) -> list[str | int]:
 
 
 def _mask_files(masks: Path) -> list[Path]:
-    """The files of masks, and the names of classes that may lie in the folder above."""
+    """The files of masks, and the names of classes that may lie in the folders above."""
     if not masks.is_dir():
         return [masks]
     files = sorted(path for path in masks.rglob("*") if path.is_file() and not path.name.startswith("."))
-    return files + [masks.parent / name for name in NAME_FILES if (masks.parent / name).is_file()]
+    return files + [path for path in name_files(masks) if path.is_file() and path.parent != masks]

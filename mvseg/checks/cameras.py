@@ -9,7 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.checks.finding import Finding, Rule, list_findings, name_views
+from mvseg.checks.finding import Finding, Rule, list_findings
+from mvseg.formats.find_views import name_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras, Scene
 

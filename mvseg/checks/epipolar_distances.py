@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from mvseg.checks.finding import Finding, Rule, list_findings, name_views
+from mvseg.checks.finding import Finding, Rule, list_findings
 from mvseg.checks.groups import NAMED, NEXT_STEP
 from mvseg.checks.photo_matches import PhotoMatches
+from mvseg.formats.find_views import name_views
 from mvseg.scene import Cameras
 
 Floats = NDArray[np.float64]

@@ -6,10 +6,11 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from mvseg.formats.find_views import name_views
+
 Level = Literal["note", "warning", "error"]
 # Views (None: the whole scene), and a sentence in which "{}" stands for them.
 Rule = tuple[Level, Sequence[int] | None, str]
-SHOWN = 3  # names in a sentence
 
 
 @dataclass(frozen=True)
@@ -28,14 +29,6 @@ class Finding:
     what: str
     level: Level
     views: tuple[int, ...] = ()
-
-
-def name_views(views: tuple[int, ...], names: tuple[str, ...], *, shown: int = SHOWN) -> str:
-    """The views in a sentence: "view 3 (003)", or "5 views (000, 001, 002 and 2 more)"."""
-    if len(views) == 1:
-        return f"view {views[0]} ({names[views[0]]})"
-    more = f" and {len(views) - shown} more" if len(views) > shown else ""
-    return f"{len(views)} views ({', '.join(names[view] for view in views[:shown])}{more})"
 
 
 def list_findings(where: str, rules: Iterable[Rule], names: tuple[str, ...]) -> list[Finding]:

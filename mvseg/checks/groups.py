@@ -11,8 +11,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.checks.finding import Finding, Level, list_findings, name_views
+from mvseg.checks.finding import Finding, Level, list_findings
 from mvseg.checks.poses import OFFSET, PoseAgreement, is_sure, view_agreement
+from mvseg.formats.find_views import name_views
 
 Floats = NDArray[np.float64]
 

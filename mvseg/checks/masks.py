@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.checks.finding import Finding, Rule, list_findings
+from mvseg.formats.masks.faults import mask_faults
 from mvseg.matching.tangency import touches_border, without_small_components
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -13,24 +14,22 @@ from mvseg.scene import Cameras
 TINY_PX = 30  # pixels; smaller masks carry no information
 MANY = 0.25  # share of the masks
 FEW = 0.34  # of the median number of masks per view
-COVERS = 0.8  # of the photo: the background
 BEYOND = 0.1  # of the photo's longer side: how far small components reach beyond the rest of their mask
 
 
 def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
     """The findings about the D masks of V views."""
-    rules: list[Rule] = [("error", None, "the masks of all views are empty: there are no instances to match")]
+    rules: list[Rule] = [("error", *fault) for fault in mask_faults(regions, cameras.sizes.tolist())]
     if len(regions):
-        rules = [*_count_rules(regions.num_per_view.numpy()), *_size_rules(regions, cameras)]
+        rules += [*_count_rules(regions.num_per_view.numpy()), *_size_rules(regions, cameras)]
         rules.append(_small_component_rule(regions, cameras))
     return list_findings("masks", rules, names)
 
 
 def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
     empty = np.flatnonzero(counts == 0).tolist()
-    if len(counts) - len(empty) < 2:
-        what = "only one view has masks, so that there is nothing to match: segment the other photos"
-        return [("error", empty, what)]
+    if len(counts) - len(empty) < 2:  # an error, see `mask_faults`
+        return []
     usual = float(np.median(counts[counts > 0]))
     few = np.flatnonzero((counts > 0) & (counts < FEW * usual)).tolist()
     facts = f"there are {counts[counts > 0].min()} masks in {{}} where {usual:.0f} are usual"
@@ -42,15 +41,12 @@ def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
 
 def _size_rules(regions: Regions, cameras: Cameras) -> list[Rule]:
     rules: list[Rule] = []
-    areas, view = regions.areas.numpy(), regions.view_index
+    areas = regions.areas.numpy()
     tiny = areas < TINY_PX
     if tiny.mean() > MANY:
         sizes = f"fewer than {TINY_PX} pixels (median {np.median(areas):.0f})"
         what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove small components, or segment larger photos"
         rules.append(("warning", None, what))
-    photo = cameras.sizes[view].prod(1).numpy()
-    whole = sorted(set(view.numpy()[areas > COVERS * photo].tolist()))
-    rules.append(("error", whole, f"a mask covers more than {COVERS:.0%} of {{}}: if it is the background, make it 0"))
     cut = touches_border(regions, cameras).numpy()
     if cut.mean() > MANY:
         what = f"{cut.sum()} of {len(regions)} masks touch the border of their photo, and cut leaves come out small: "

@@ -67,6 +67,7 @@ def run(args: Namespace) -> int:
         except InputError as error:  # the findings about cameras and photos may explain it
             unread = error
     check = check_scene(scene, regions)
+    found = [each for each in found if not any(each.what.endswith(own.what) for own in check.findings)]  # as errors
     # without readable masks, missing photos are no fault of their own
     found += [each for each in check.findings if unread is None or not each.what.startswith(NOTHING_TO_SEE)]
     _print_table(check)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,8 +19,9 @@ from pydantic import BaseModel, FiniteFloat, NonNegativeInt, RootModel, TypeAdap
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.find_views import base_name, find_views, list_some
 from mvseg.formats.image_file import describe_turn
-from mvseg.formats.json_file import Int64, Items, check_content, load_json
+from mvseg.formats.json_file import Int64, Items, check_content, load_json, read_json
 from mvseg.formats.masks.found_mask import check_categories
+from mvseg.formats.masks.other_json import refuse_other
 from mvseg.scene import Scene
 
 
@@ -71,7 +72,6 @@ class Rle(BaseModel):
 
 
 MOST_CHARACTERS = 8  # of a number: 40 bits are more pixels than any image has
-VIA_MARKS = (b'"_via_', b'"shape_attributes"', b"__VIA_PROJECT_ID__")  # of its versions 2 and 3, projects and JSON
 Crowd = Literal["mask", "ignore"]
 _SEGMENTATION: TypeAdapter[list[list[float]] | Rle] = TypeAdapter(Items[Items[FiniteFloat]] | Rle)
 
@@ -84,9 +84,10 @@ def read_coco(
     Masks are decoded lazily: hundreds of masks of large photos do not fit into memory together.
 
     Images are found by file name, see `find_views`; those that are not in the scene are left out. A list of results
-    (annotations alone) is read, too: there the `image_id` is the name of a photo, or the number that it consists of.
-    Warns (InputWarning) of everything that is left out or ambiguous: crowds, boxes without a mask, views that the
-    file does not list, annotations of images that it does not list, several categories.
+    (annotations alone) is read, too: its images are those of the COCO file beside it that lists their ids; without one,
+    `image_id` is the name of a photo, or the number that it consists of.
+    Warns (InputWarning) of everything that is left out, guessed or ambiguous: crowds, boxes without a mask, views that
+    the file does not list, annotations of images that it does not list, several categories.
 
     Args:
         path: the file; of several, their folder, which messages name.
@@ -101,8 +102,9 @@ def read_coco(
         are the annotation ids or, where an id is missing or no integer, the places in the file, from 1.
 
     Raises:
-        InputError: the file is broken, none of its images is in the scene, an entry fits several views or has another
-            size than its camera, two parts list one image, or a category is not there. From the iterators: a
+        InputError: the file is broken, or another program's; none of its images is in the scene, an entry fits several
+            views or has another size than its camera, two entries or parts list one image; there are annotations, and
+            none has a mask; all polygons lie between 0 and 1; or a category is not there. From the iterators: a
             segmentation cannot be decoded.
     """
     coco = _merge([(part, _read_file(part, scene)) for part in parts]) if len(parts) > 1 else _read_file(path, scene)
@@ -129,7 +131,12 @@ def read_coco(
         what = "taken as masks (--coco_crowd ignore leaves them out)" if crowd == "mask" else "left out"
         warn(f"{path}: {num_crowds} annotations with iscrowd are {what}")
     if num_boxes:
-        warn(f"{path}: {num_boxes} annotations have no mask (a box at most) and are left out")
+        what = f"{num_boxes} annotations have no mask (a box at most)"
+        if not counts.total():
+            raise InputError(f"{path}: {what}, and no others are there")
+        warn(f"{path}: {what} and are left out")
+    with faults_of(path):
+        check_corners(annotation.segmentation for view in chosen for _, annotation in view)
     check_categories(counts, categories, known=names.values(), source=path)
     sizes = scene.cameras.sizes.tolist()
     return [_decode_all(path, each, size, has_ids=has_ids) for each, size in zip(chosen, sizes, strict=True)]
@@ -142,20 +149,52 @@ def _read_file(path: Path, scene: Scene) -> _MaskFile:
         try:
             return check_content(path, content, _MaskFile)
         except InputError:
-            if any(mark in path.read_bytes() for mark in VIA_MARKS):
-                expected = "expected its COCO export (Annotation > Export Annotations (COCO format))"
-                raise InputError(f"{path}: is a project or the annotations of VIA, {expected}") from None
+            refuse_other(path, path.read_bytes())
             raise
-    results = check_content(path, content, _Results).root
+    results = check_content(path, content, _Results, expected="COCO").root
+    listed = _find_data_set(path, results)
+    if listed is None:
+        return _MaskFile(images=_guess_images(path, results, scene), annotations=results)
+    return _MaskFile(images=listed.images, annotations=results, categories=listed.categories)
+
+
+def _find_data_set(path: Path, results: list[CocoAnnotation]) -> _MaskFile | None:
+    """The COCO file beside a list of results that lists all images of its ids; None if there is none, or several."""
+    ids, found = {str(result.image_id) for result in results}, []
+    for other in sorted(path.parent.glob("*.json")):
+        try:
+            listed = read_json(other, _MaskFile)
+        except InputError:  # no COCO file, which includes the results
+            continue
+        if ids and ids <= {str(image.id) for image in listed.images}:
+            found.append(listed)
+    return found[0] if len(found) == 1 else None
+
+
+def _guess_images(path: Path, results: list[CocoAnnotation], scene: Scene) -> list[CocoImage]:
+    """The images of a list of results by their ids alone: the name of a photo, or the number that its name is, which is
+    a guess, and said.
+
+    Raises:
+        InputError: some of the ids are such numbers, and others are not.
+    """
     stems = [base_name(view.name) for view in scene.views]
     by_number = {int(stem): view.name for stem, view in zip(stems, scene.views, strict=True) if stem.isdecimal()}
     if len(by_number) < len(stems):  # not every photo has a number of its own
         by_number = {}
-    images = []
-    for image_id in dict.fromkeys(result.image_id for result in results):
-        name = by_number.get(image_id, str(image_id)) if isinstance(image_id, int) else image_id
-        images.append(CocoImage(id=image_id, file_name=name, width=0, height=0))
-    return _MaskFile(images=images, annotations=results)
+    ids = list(dict.fromkeys(result.image_id for result in results))
+    numbers = [image_id for image_id in ids if isinstance(image_id, int)]
+    known = [number for number in numbers if number in by_number]
+    beside = "put the JSON of its data set, which lists the images, beside it"
+    if known and len(known) < len(numbers):
+        other = next(number for number in numbers if number not in by_number)
+        reason = f"image_id {known[0]} is the number of a photo, {other} is none"
+        raise InputError(f"{path}: {reason}: image ids of results are those of their data set; {beside}")
+    if known:
+        first = by_number[known[0]]
+        warn(f"{path}: image ids are taken for the numbers of photos ({known[0]}: {first}); if they are not, {beside}")
+    names = [by_number.get(each, str(each)) if isinstance(each, int) else each for each in ids]
+    return [CocoImage(id=each, file_name=name, width=0, height=0) for each, name in zip(ids, names, strict=True)]
 
 
 def _merge(parts: list[tuple[Path, _MaskFile]]) -> _MaskFile:
@@ -196,7 +235,13 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
         first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
         message = f"{len(missing)} views have no entry among the images and no masks, the first is {first_view}"
         warn(f"{path}: {message}; the file holds {list_some(names)}")
+    annotated = {str(annotation.image_id) for annotation in coco.annotations}
+    first_of: dict[int, CocoImage] = {}
     for image, view in zip(coco.images, views, strict=True):
+        if view is not None and str(image.id) in annotated and first_of.setdefault(view, image) is not image:
+            first, photo = first_of[view], scene.views[view].path.name
+            what = f"images {first.id} ({first.file_name}) and {image.id} ({image.file_name}) are both {photo}"
+            raise InputError(f"{path}: {what}, and both have annotations: is the data set in the file twice?")
         width, height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
         if view is not None and (image.width, image.height) not in ((0, 0), (width, height)):  # 0 x 0: not known
             found = f"image {image.file_name} is {image.width} x {image.height}, its camera says {width} x {height}"
@@ -239,6 +284,18 @@ def decode_segmentation(segmentation: Any, width: int, height: int) -> np.ndarra
     if checked.size != (height, width):
         raise InputError(f"its mask is {checked.size[1]} x {checked.size[0]}, expected {width} x {height}")
     return decode_rle(checked.counts, width, height)
+
+
+def check_corners(segmentations: Iterable[Any]) -> None:
+    """Raises InputError: all corners of the polygons among these lie between 0 and 1, as shares of the size do."""
+    polygons = [each for each in segmentations if isinstance(each, list) and each]
+    outlines = (part for each in polygons for part in (each if isinstance(each[0], list) else [each]))
+    if polygons and all(isinstance(part, list) and all(map(_is_share, part)) for part in outlines):
+        raise InputError("all corners lie between 0 and 1: are they shares of the photo's size? expected pixels")
+
+
+def _is_share(number: Any) -> bool:
+    return isinstance(number, (int, float)) and 0 <= number <= 1
 
 
 def _decode_polygons(polygons: list[list[float]], width: int, height: int) -> np.ndarray:

@@ -69,6 +69,14 @@ def list_some(names: Sequence[str]) -> str:
     return ", ".join(distinct[:SHOWN]) + more if distinct else "nothing"
 
 
+def name_views(views: Sequence[int], names: Sequence[str], *, shown: int = SHOWN) -> str:
+    """The views in a sentence: "view 3 (003)", or "5 views (000, 001, 002 and 2 more)"."""
+    if len(views) == 1:
+        return f"view {views[0]} ({names[views[0]]})"
+    more = f" and {len(views) - shown} more" if len(views) > shown else ""
+    return f"{len(views)} views ({', '.join(names[view] for view in views[:shown])}{more})"
+
+
 def natural_order(name: str) -> list[tuple[int, int | str]]:
     """A key for natural sorting: 2.jpg before 10.jpg."""
     parts = re.split(r"(\d+)", name.lower())

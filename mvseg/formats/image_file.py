@@ -142,7 +142,7 @@ def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) 
         InputError: see `read_image`; or the pixels are signed, or have 32 bits.
     """
     image = read_image(path, size)
-    deep = _read_deep(path, image)
+    deep = read_deep(path, image)
     if deep is not None:
         bits = max(bits, _bits_of(deep))
         if bits < 16 or deep.ndim == 2:
@@ -177,7 +177,7 @@ def _bits_of_file(path: Path, size: tuple[int, int] | None, modified_ns: int, nu
         file.seek(0)
         if not _is_deep(head, _find_reader(head)(file)):
             return 8
-    deep = _read_deep(path, read_image(path, size))
+    deep = read_deep(path, read_image(path, size))
     return 8 if deep is None else _bits_of(deep)
 
 
@@ -193,7 +193,7 @@ def _is_deep(head: bytes, image: Image.Image) -> bool:
     return isinstance(image, PngImageFile) and head[24:25] == b"\x10"
 
 
-def _read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
+def read_deep(path: Path, image: Image.Image) -> np.ndarray | None:
     """(H, W) or (H, W, 3) uint16, RGB, of an image of 16 bits; None of others. Pillow reduces colours to 8 bits, so
     OpenCV reads them, after Pillow has verified the file."""
     if image.mode.startswith("I;16"):

@@ -4,7 +4,7 @@ A palette PNG gives its indices, not its colours: the tools that write labels wi
 the index. VOC's border of 255 around its numbers is ignored.
 
 Masks of other tools (`read_label_image`) may also be TIFF, have 32 bits (numbers of cellpose and ImageJ, floats
-included) or colours (CVAT's and datumaro's VOC export): each colour is one mask, black is nothing.
+included) or colours of 8 or 16 bits (CVAT's and datumaro's VOC export): each colour is one mask, black is nothing.
 """
 
 from __future__ import annotations
@@ -14,13 +14,15 @@ from pathlib import Path
 
 import numpy as np
 from PIL import Image
+from scipy import ndimage
 
 from mvseg.errors import InputError
-from mvseg.formats.image_file import WrongSize, read_image, write_png
+from mvseg.formats.image_file import WrongSize, read_deep, read_image, write_png
 from mvseg.formats.masks.found_mask import FoundMask
 from mvseg.regions import IGNORE_LABEL
 
 MAX_COLOURS = 1000  # more than leaves on a photo; photos and blurred masks have far more
+CHUNK = 1 << 24  # pixels
 VOC_BORDER = 255  # index, in palette PNGs
 VOC_BORDER_COLOUR = (224 << 16) + (224 << 8) + 192  # of that index
 
@@ -73,7 +75,13 @@ def labels_of(image: Image.Image, path: Path) -> np.ndarray:
         raise InputError(f"{path}: has {num_channels} colour channels, expected a label PNG with a single channel")
     if image.mode in ("I", "F"):
         raise InputError(f"{path}: holds signed or 32-bit numbers, expected 8 or 16 bits without sign")
-    labels = np.array(image.convert("L") if image.mode == "1" else image).astype(np.uint16)
+    image = image.convert("L") if image.mode == "1" else image
+    labels = np.zeros((image.height, image.width), np.uint16)
+    x1, y1, x2, y2 = image.getbbox() or (0, 0, 1, 0)
+    num_rows = max(1, CHUNK // (x2 - x1))
+    for top in range(y1, y2, num_rows):  # a part at a time, which Pillow copies several times
+        bottom = min(top + num_rows, y2)
+        labels[top:bottom, x1:x2] = np.asarray(image.crop((x1, top, x2, bottom)))
     if image.mode == "P" and ((labels > 0) & (labels < VOC_BORDER)).any():
         labels[labels == VOC_BORDER] = IGNORE_LABEL
     return labels
@@ -96,10 +104,26 @@ def read_label_image(path: Path, width: int, height: int) -> np.ndarray:
     if num_pages > 1:
         raise InputError(f"{path}: holds {num_pages} pages, expected a single label image")
     if image.mode in ("RGB", "RGBA"):
-        return _number_colours(path, image)
+        return _number_colours(path, image, read_deep(path, image))
     if image.mode in ("I", "F"):
         return labels_of_numbers(path, np.asarray(image))
     return labels_of(image, path)
+
+
+def ignore_border(labels: np.ndarray) -> bool:
+    """Whether 255 is VOC's border in a label map (H, W) uint16, which then becomes 65535 in place: more of the other
+    masks' pixels touch it than touch nothing. In palette PNGs it is ignored in any case."""
+    if labels.max(initial=0) != VOC_BORDER:
+        return False
+    border = labels == VOC_BORDER
+    is_other = (labels > 0) & ~border
+    beside_border, beside_nothing = (
+        np.count_nonzero(is_other & ndimage.binary_dilation(each)) for each in (border, labels == 0)
+    )
+    is_voc = bool(beside_border > beside_nothing)
+    if is_voc:
+        labels[border] = IGNORE_LABEL
+    return is_voc
 
 
 def labels_of_numbers(path: Path, numbers: np.ndarray) -> np.ndarray:
@@ -120,18 +144,21 @@ def labels_of_numbers(path: Path, numbers: np.ndarray) -> np.ndarray:
     return (indices.reshape(numbers.shape) + (distinct[0] != 0)).astype(np.uint16)
 
 
-def _number_colours(path: Path, image: Image.Image) -> np.ndarray:
-    channels = np.asarray(image).astype(np.int64)
-    red, green, blue = channels[..., 0], channels[..., 1], channels[..., 2]
+def _number_colours(path: Path, image: Image.Image, deep: np.ndarray | None) -> np.ndarray:
+    """`deep`: its colours (H, W, 3) uint16, if it has 16 bits."""
+    channels = np.asarray(image)
+    colours, bits = (channels, 8) if deep is None else (deep, 16)
+    red, green, blue = (colours[..., channel].astype(np.int64) for channel in range(3))
     if ((red == green) & (green == blue)).all():
         labels = red.astype(np.uint16)
     else:
-        codes, indices = np.unique((red << 16) + (green << 8) + blue, return_inverse=True)
+        codes, indices = np.unique((red << 2 * bits) + (green << bits) + blue, return_inverse=True)
         if len(codes) > MAX_COLOURS:
             message = f"holds {len(codes)} colours, expected one per mask and at most {MAX_COLOURS}"
             raise InputError(f"{path}: {message}; is it a photo, or a mask that was scaled or blurred?")
         numbers = np.arange(len(codes)) + (codes[0] != 0)
-        numbers[codes == VOC_BORDER_COLOUR] = IGNORE_LABEL
+        if bits == 8:
+            numbers[codes == VOC_BORDER_COLOUR] = IGNORE_LABEL
         labels = numbers[indices].reshape(red.shape).astype(np.uint16)
     if image.mode == "RGBA":
         labels[channels[..., 3] == 0] = 0

@@ -13,10 +13,10 @@ from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
 from mvseg.formats.find_views import list_some
 from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
-from mvseg.formats.masks.class_numbers import check_numbers
 from mvseg.formats.masks.read_views import read_views
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
 from mvseg.formats.masks.view_regions import stack_views
+from mvseg.formats.masks.yolo import YOLO_TRACKS
 from mvseg.formats.metashape import find_metashape, read_metashape
 from mvseg.formats.rig import is_rig, read_rig
 from mvseg.formats.transforms_json import read_transforms
@@ -33,7 +33,6 @@ READERS: dict[str, Callable[[Path], Scene]] = {
     "*.xml": read_metashape,
     "scene_camera.json": read_bop,
 }
-BINARY = 255  # written by segmenters that only separate leaf from background
 
 
 @np.errstate(over="ignore", invalid="ignore")  # absurd numbers become infinite: no camera has such, and it is named
@@ -102,27 +101,23 @@ def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", catego
 
     Returns:
         Regions in the undistorted frame; `labels` holds the numbers of the masks in their files. Warns (InputWarning)
-        of everything that is left out or matched by its base name only, and of label images that hold 0 and 255 only,
-        or a number per class.
+        of everything that is left out or matched by its base name only, of label images that hold 0 and 255 only, or a
+        number per class, and of what `mvseg check` calls an error (`mask_faults`).
 
     Raises:
-        InputError: a file is missing, broken, or does not fit its view, or a category is not there; see the readers.
+        InputError: a file is missing, broken, or does not fit its view, a category is not there, none of the masks that
+            are there has a pixel, or label images were scaled with interpolation; see the readers.
     """
     return read_masks(scene, recognise_masks(scene, Path(masks)), crowd=crowd, categories=categories)
 
 
 def read_masks(scene: Scene, found: MaskFiles, *, crowd: Crowd = "mask", categories: Collection[str] = ()) -> Regions:
     """The second half of `load_masks`: read the files that were recognised."""
-    if categories and found.kind not in ("COCO", "labelme", "YOLO"):
+    if categories and found.kind not in ("COCO", "labelme", "YOLO", YOLO_TRACKS):
         raise InputError(f"{found.source}: holds {found.kind}, which have no categories to select from")
     if found.kind == "COCO":
         parts = found.files[0]
         path = parts[0] if len(parts) == 1 else found.source
         views = read_coco(path, scene, parts=parts, crowd=crowd, categories=categories)
         return stack_views(views, scene, source=path)
-    regions = stack_views(read_views(scene, found, wanted=categories), scene, source=found.source)
-    if found.kind == "label images" and len(regions) and bool((regions.labels == BINARY).all()):
-        warn(f"{found.source}: holds 0 and 255 only, so that each photo shows one instance; leaves need a number each")
-    elif found.kind in ("label images", "NumPy arrays"):
-        check_numbers(regions, source=found.source)
-    return regions
+    return stack_views(read_views(scene, found, wanted=categories), scene, source=found.source)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import tracemalloc
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from pycocotools.coco import COCO
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.coco import decode_rle, encode_mask, read_coco, write_coco
 from mvseg.formats.masks.view_regions import stack_views
+from mvseg.formats.scene_folder import load_masks
 from mvseg.scene import Cameras, Scene, View
 
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")  # in pycocotools
@@ -178,11 +180,12 @@ def test_masks_of_many_photos_are_never_in_memory_together(tmp_path: Path) -> No
     scene = make_scene(*[f"images/{view}.jpg" for view in range(8)])
     side, per_view = 1000, 6
     scene = Scene("plant", scene.views, replace(scene.cameras, sizes=torch.tensor([[side, side]] * len(scene.views))))
-    mask = np.zeros((side, side), bool)
-    mask[400:450, 300:350] = True
+    masks = np.zeros((per_view, side, side), bool)
+    for number, mask in enumerate(masks):
+        mask[400 + number : 450 + number, 300:350] = True
     images = [{"id": view, "file_name": f"{view}.jpg", "width": side, "height": side} for view in range(8)]
-    rle = encode_mask(mask)
-    annotations = [{"image_id": view, "segmentation": rle} for view in range(8) for _ in range(per_view)]
+    rles = [encode_mask(mask) for mask in masks]
+    annotations = [{"image_id": view, "segmentation": rle} for view in range(8) for rle in rles]
     path = tmp_path / "masks.json"
     path.write_text(json.dumps({"images": images, "annotations": annotations}))
     tracemalloc.start()
@@ -299,17 +302,55 @@ def test_ids_may_be_text_or_missing(scene: Scene, tmp_path: Path) -> None:
 def test_lists_of_results(tmp_path: Path) -> None:
     scene = make_scene("images/000.jpg", "images/017.jpg")
     rles = [encode_mask(random_mask(seed)) for seed in range(2)]
+    path, guess = tmp_path / "results.json", r"results.json: image ids are taken for the numbers of photos \(17: 017\)"
+
+    def write_results(*ids: int | str) -> None:
+        pairs = zip(ids, rles, strict=True)
+        path.write_text(json.dumps([{"image_id": each, "category_id": 1, "segmentation": rle} for each, rle in pairs]))
+
     for ids in ((17, 0), ("017", "000"), ("017.jpg", "000.jpg")):
-        results = [
-            {"image_id": image, "category_id": 1, "segmentation": rle, "score": 0.5}
-            for image, rle in zip(ids, rles, strict=True)
-        ]
-        (tmp_path / "results.json").write_text(json.dumps(results))
-        first, second = read_all(tmp_path / "results.json", scene)
+        write_results(*ids)
+        with pytest.warns(InputWarning, match=guess) if ids[0] == 17 else nullcontext():
+            first, second = read_all(path, scene)
         assert [number for number, _ in [*first, *second]] == [2, 1]
         np.testing.assert_array_equal(second[0][1], random_mask(0))
     with pytest.raises(InputError, match=r"none of its images .*, expected a.jpg, b.jpg, found 017.jpg, 000.jpg"):
-        read_all(tmp_path / "results.json", make_scene("images/a.jpg", "images/b.jpg"))
+        read_all(path, make_scene("images/a.jpg", "images/b.jpg"))
+    write_results(17, 3)  # of a data set that counts its images
+    with pytest.raises(InputError, match=r"image_id 17 is the number of a photo, 3 is none: .* put the JSON of its"):
+        read_all(path, scene)
+    images = [{"id": 3, "file_name": "017.jpg", "width": 60, "height": 40}]
+    images += [{"id": 17, "file_name": "000.jpg", "width": 60, "height": 40}]
+    listed = {"images": images, "annotations": [], "categories": [{"id": 1, "name": "leaf"}]}
+    (tmp_path / "instances.json").write_text(json.dumps(listed))
+    (first,), (second,) = read_all(path, scene, categories=["leaf"])
+    np.testing.assert_array_equal(first[1], random_mask(0))
+    np.testing.assert_array_equal(second[1], random_mask(1))
+
+
+def test_what_stands_twice(scene: Scene, tmp_path: Path) -> None:
+    path = write(tmp_path, [{"segmentation": each} for each in ([POLYGON], [OTHER], [POLYGON])])
+    with pytest.warns(InputWarning) as said:
+        regions = load_masks(scene, path)
+    assert regions.labels.tolist() == [1, 2]
+    assert "1 of 3 masks stand twice, pixel for pixel in one photo, and are taken once" in str(said[0].message)
+    assert "only one view has masks, so that there is nothing to match" in str(said[1].message)
+    write(tmp_path, [{"segmentation": [POLYGON], "image_id": each} for each in (10, 12)], ("a.jpg", "b.jpg", "a.jpg"))
+    with pytest.raises(InputError, match=r"images 10 \(a.jpg\) and 12 \(a.jpg\) are both a.jpg, and both have annotat"):
+        read_all(path, scene)
+
+
+def test_masks_that_read_as_nothing_are_refused(scene: Scene, tmp_path: Path) -> None:
+    """Some of them are shares of the size that happen to fill a pixel."""
+    shares = [[[0.1, 0.2, 0.9, 0.2, 0.5, 0.9]], [[0.0, 0.0, 1.0, 0.0, 1.0, 1.0]]]
+    with pytest.raises(InputError, match=r"masks.json: all corners lie between 0 and 1: are they shares"):
+        read_all(write(tmp_path, [{"segmentation": each} for each in shares]), scene)
+    assert len(read_all(write(tmp_path, [{"segmentation": each} for each in (shares[1], [POLYGON])]), scene)[0]) == 2
+    with pytest.raises(InputError, match=r"masks.json: 2 annotations have no mask \(a box at most\), and no others"):
+        read_all(write(tmp_path, [{"bbox": [1, 2, 3, 4]}] * 2), scene)
+    far = [[100.0, 100, 120, 100, 110, 120]]  # outside of the photo
+    with pytest.raises(InputError, match=r"masks.json: 1 masks show no pixel .*, and no others are there"):
+        load_masks(scene, write(tmp_path, [{"segmentation": far}]))
 
 
 def test_categories_are_selected_or_named(scene: Scene, tmp_path: Path) -> None:

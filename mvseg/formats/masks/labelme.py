@@ -17,7 +17,7 @@ from PIL.PngImagePlugin import PngImageFile
 from pydantic import BaseModel, FiniteFloat
 
 from mvseg.errors import InputError, faults_of
-from mvseg.formats.coco import decode_segmentation
+from mvseg.formats.coco import check_corners, decode_segmentation
 from mvseg.formats.json_file import Items, read_json
 from mvseg.formats.masks.found_mask import FoundMask
 
@@ -46,12 +46,16 @@ def read_labelme(path: Path, width: int, height: int) -> list[FoundMask]:
     are to be ignored have no mask.
 
     Raises:
-        InputError: the file is broken, is of a photo of another size, or a shape is malformed.
+        InputError: the file is broken, is of a photo of another size, all corners of its polygons lie between 0 and 1,
+            or a shape is malformed.
     """
     content = read_json(path, LabelmeFile)
     size = (content.imageWidth or width, content.imageHeight or height)
     if size != (width, height):
         raise InputError(f"{path}: its photo is {size[0]} x {size[1]}, its camera says {width} x {height}")
+    polygons = [shape.points for shape in content.shapes if shape.shape_type in (None, "polygon")]
+    with faults_of(path):
+        check_corners([number for corner in points for number in corner] for points in polygons)
     parts: dict[tuple[str, Any], np.ndarray | None] = {}
     for index, shape in enumerate(content.shapes):
         with faults_of(f"{path}: shapes[{index}] ({shape.label})"):

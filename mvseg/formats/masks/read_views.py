@@ -9,27 +9,31 @@ import numpy as np
 
 from mvseg.errors import InputError, warn
 from mvseg.formats.image_file import describe_turn
-from mvseg.formats.label_png import read_label_image, read_mask_images
+from mvseg.formats.label_png import ignore_border, read_label_image, read_mask_images
 from mvseg.formats.masks.found_mask import FoundMask, check_categories
 from mvseg.formats.masks.labelme import read_labelme
 from mvseg.formats.masks.npy_masks import read_npy
 from mvseg.formats.masks.recognise import MaskFiles
 from mvseg.formats.masks.sam import read_sam
 from mvseg.formats.masks.view_regions import ViewMasks
-from mvseg.formats.masks.yolo import read_class_names, read_yolo
+from mvseg.formats.masks.yolo import YOLO_TRACKS, read_class_names, read_yolo
 from mvseg.scene import Scene
 
 
 def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> Iterator[ViewMasks]:
     """The masks of each view in turn, in the frame of its photo: see `stack_views`.
 
-    At the end, warns (InputWarning) of entries without a mask, and of several categories if none is wanted.
+    At the end, warns (InputWarning) of entries without a mask, of numbers that are ignored, and of several categories
+    if none is wanted.
 
     Raises:
-        InputError: a file is missing, broken, or of another size than its view; or a wanted category is not there.
+        InputError: a file is missing, broken, or of another size than its view; none of the entries has a mask; or a
+            wanted category is not there.
     """
     counts: Counter[str] = Counter()
-    num_boxes = 0
+    num_boxes = num_borders = 0
+    if found.kind == YOLO_TRACKS:
+        warn(f"{found.source}: the last two numbers of each line are taken for a confidence and a track, and left out")
     for view in range(len(found.files)):
         try:
             content = _read_view(scene, view, found)
@@ -37,14 +41,21 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
             turn = describe_turn(scene.views[view].path)
             raise InputError(f"{error} (view {view}{turn})") from None
         if isinstance(content, np.ndarray):
+            num_borders += ignore_border(content)
             yield content
             continue
         counts.update(each.category for each in content if each.mask is not None)
         num_boxes += sum(each.mask is None for each in content)
         taken = [each for each in content if not wanted or each.category in wanted]
         yield [(each.label, each.mask) for each in taken if each.mask is not None]
+    if num_borders:
+        what = f"in {num_borders} label images, 255 lies around the others (VOC's border), and is ignored"
+        warn(f"{found.source}: {what}")
     if num_boxes:
-        warn(f"{found.source}: {num_boxes} entries are boxes, lines, points or to be ignored, and are left out")
+        what = f"{num_boxes} entries are boxes, lines, points or to be ignored"
+        if not counts.total():
+            raise InputError(f"{found.source}: {what}, and none is a mask")
+        warn(f"{found.source}: {what}, and are left out")
     if any(map(bool, counts)) or wanted:
         check_categories(counts, wanted, source=found.source)
 
@@ -66,7 +77,8 @@ def _read_view(scene: Scene, view: int, found: MaskFiles) -> np.ndarray | list[F
             return read_labelme(paths[0], width, height)
         case "SAM":
             return read_sam(paths[0], width, height)
-        case "YOLO":
-            return read_yolo(paths[0], width, height, names=read_class_names(paths[0].parent))
+        case "YOLO" | "YOLO tracks":
+            names = read_class_names(paths[0].parent)
+            return read_yolo(paths[0], width, height, names=names, tracks=found.kind == YOLO_TRACKS)
         case _:
             return read_mask_images(paths, width, height)

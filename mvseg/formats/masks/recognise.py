@@ -10,6 +10,8 @@ from pathlib import Path
 
 from mvseg.errors import InputError, warn
 from mvseg.formats.find_views import base_name, find_views, list_some
+from mvseg.formats.masks.other_json import refuse_other
+from mvseg.formats.masks.yolo import YOLO_TRACKS, has_tracks
 from mvseg.scene import Scene
 
 # Endings of files that are named after their photo; longer ones first, since `_seg.npy` ends on `.npy`.
@@ -41,7 +43,8 @@ class MaskFiles:
 
     Attributes:
         source: the path that was given; messages name it.
-        kind: "COCO", "label images", "NumPy arrays", "cellpose", "labelme", "SAM", "YOLO" or "one image per mask".
+        kind: "COCO", "label images", "NumPy arrays", "cellpose", "labelme", "SAM", "YOLO", "YOLO tracks" or "one image
+            per mask".
         files: V tuples of paths, one per photo but for "one image per mask"; empty for a photo without masks. For COCO
             the same V times: its file, or the parts of one that was split.
     """
@@ -168,14 +171,22 @@ def _complete(scene: Scene, folder: Path, *, kind: str, files: Files) -> Files:
 
 
 def _name_kind(kind: str, files: Files) -> str:
-    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not."""
+    """The reader's name of a kind; labelme's files have shapes, those of Segment Anything do not.
+
+    Raises:
+        InputError: a file cannot be read, or is of another program.
+    """
+    if kind == "YOLO" and has_tracks(path for paths in files for path in paths):
+        return YOLO_TRACKS
     if kind != "JSON":
         return "label images" if kind == CELLPOSE else kind
     first = next(paths[0] for paths in files if paths)
     try:
-        return "labelme" if b'"shapes"' in first.read_bytes() else "SAM"
+        data = first.read_bytes()
     except OSError as error:
         raise InputError(f"{first}: cannot be read ({error.strerror})") from None
+    refuse_other(first, data)
+    return "labelme" if b'"shapes"' in data else "SAM"
 
 
 def _lone_coco(scene: Scene, masks: Path, paths: list[Path], *, unclear: tuple[str, ...]) -> MaskFiles:

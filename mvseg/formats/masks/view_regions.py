@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 
 import numpy as np
+import pycolmap
 import torch
 from torch import Tensor
 
-from mvseg.errors import warn
+from mvseg.errors import InputError, warn
+from mvseg.formats.find_views import name_views
 from mvseg.formats.lens import undistort
-from mvseg.regions import IGNORE_LABEL, Regions, mask_box, regions_from_label_maps, stack_regions
+from mvseg.formats.masks.class_numbers import check_numbers, count_between
+from mvseg.formats.masks.faults import mask_faults
+from mvseg.regions import Regions, label_boxes, mask_box, stack_regions
 from mvseg.scene import Scene
 
 ViewMasks = np.ndarray | Iterable[tuple[int, np.ndarray]]
 Box = tuple[int, int, int, int]
+Cropped = tuple[int, Box | None, np.ndarray]  # number, box (None: no pixel), and the pixels (h, w) bool in the box
 
 
 def stack_views(
@@ -31,31 +36,70 @@ def stack_views(
         num_views: V, if there is no scene.
 
     Returns:
-        Regions ordered by view; `labels` holds the numbers. Warns (InputWarning) of masks without pixels, which are
-        left out: empty ones, and those that the undistorted photo does not show.
+        Regions ordered by view; `labels` holds the numbers. Warns (InputWarning) of masks that are left out: those
+        without pixels, empty or not shown by the undistorted photo, and those that stand twice in one view, pixel for
+        pixel; of what `check_numbers` finds in label maps; and of what `mask_faults` finds in masks of a scene.
+
+    Raises:
+        InputError: there are masks, and none has a pixel; or see `check_numbers`.
     """
-    found: list[tuple[int, Box, Tensor, int]] = []
-    num_empty = 0
+    rows: list[tuple[int, Box, Tensor, int]] = []
+    between, num_empty, num_twice = np.zeros(2, np.int64), 0, 0
     for view, content in enumerate(views):
         lens = None if scene is None else scene.views[view].lens
         K = np.eye(3) if scene is None else scene.cameras.K[view].cpu().numpy()
         if isinstance(content, np.ndarray):
-            part = regions_from_label_maps([undistort(content, lens, K)])
-            num_empty += len(np.setdiff1d(content, [0, IGNORE_LABEL])) - len(part)
-            for index, ((x1, y1, x2, y2), label) in enumerate(
-                zip(part.boxes.tolist(), part.labels.tolist(), strict=True)
-            ):
-                found.append((view, (x1, y1, x2, y2), part.crop(index).flatten(), label))
-            continue
-        for label, mask in content:
-            shown = undistort(mask.view(np.uint8), lens, K).view(bool)
-            if shown.any():
-                x1, y1, x2, y2 = mask_box(torch.from_numpy(shown))
-                found.append((view, (x1, y1, x2, y2), torch.from_numpy(shown[y1:y2, x1:x2].flatten()), label))
-            else:
+            between += count_between(content)
+            found = _crop_labels(content, lens, K)
+        else:
+            found = _crop_masks(content, lens, K)
+        seen: set[tuple[Box, bytes]] = set()
+        for label, box, crop in found:
+            if box is None:
                 num_empty += 1
-    if num_empty:
-        warn(f"{source}: {num_empty} masks show no pixel (empty, or outside of the undistorted photo) and are left out")
+            elif (key := (box, np.packbits(crop).tobytes())) in seen:
+                num_twice += 1
+            else:
+                seen.add(key)
+                rows.append((view, box, torch.from_numpy(crop.flatten()), label))
+    _say_left_out(len(rows), num_empty, num_twice, source=source)
     num_views = num_views or 0 if scene is None else len(scene.views)
-    view_index, boxes, crops, labels = zip(*found, strict=True) if found else ((), (), (), ())
-    return stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
+    view_index, boxes, crops, labels = zip(*rows, strict=True) if rows else ((), (), (), ())
+    regions = stack_regions(view_index, boxes, crops, labels=labels, num_views=num_views)
+    if between[0]:
+        check_numbers(regions, between, source=source)
+    if scene is not None and len(regions):  # without any, a run says so
+        names = [view.name for view in scene.views]
+        for views_of, what in mask_faults(regions, scene.cameras.sizes.tolist()):
+            warn(f"{source}: {what.replace('{}', name_views(views_of, names)) if views_of else what}")
+    return regions
+
+
+def _crop_labels(labels: np.ndarray, lens: pycolmap.Camera | None, K: np.ndarray) -> Iterator[Cropped]:
+    """The masks of a label map, by their numbers."""
+    shown = undistort(labels, lens, K)
+    boxes = label_boxes(shown)
+    for number in sorted(boxes if lens is None else label_boxes(labels)):
+        x1, y1, x2, y2 = box = boxes.get(number, (0, 0, 0, 0))
+        yield number, box if number in boxes else None, shown[y1:y2, x1:x2] == number
+
+
+def _crop_masks(
+    masks: Iterable[tuple[int, np.ndarray]], lens: pycolmap.Camera | None, K: np.ndarray
+) -> Iterator[Cropped]:
+    """The masks with their numbers, one in memory at a time."""
+    for label, mask in masks:
+        shown = undistort(mask.view(np.uint8), lens, K).view(bool)
+        x1, y1, x2, y2 = box = mask_box(torch.from_numpy(shown)) if shown.any() else (0, 0, 0, 0)
+        yield label, box if x2 else None, shown[y1:y2, x1:x2]
+
+
+def _say_left_out(num_kept: int, num_empty: int, num_twice: int, *, source: object) -> None:
+    if num_empty:
+        what = f"{source}: {num_empty} masks show no pixel (empty, or outside of the undistorted photo)"
+        if not num_kept:
+            raise InputError(f"{what}, and no others are there")
+        warn(f"{what} and are left out")
+    if num_twice:
+        total = num_kept + num_twice
+        warn(f"{source}: {num_twice} of {total} masks stand twice, pixel for pixel in one photo, and are taken once")

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import torch
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.label_png import write_label_png
-from mvseg.formats.masks.class_numbers import has_components_apart
+from mvseg.formats.masks.class_numbers import BAND, count_between, has_components_apart
 from mvseg.formats.scene_folder import load_masks, load_scene
+from mvseg.regions import IGNORE_LABEL
 from scene_folders import HEIGHT, WIDTH, write_image, write_scene
 
 CLASSES = np.zeros((HEIGHT, WIDTH), np.uint16)
@@ -43,6 +47,39 @@ def test_a_photo_is_no_label_image(tmp_path: Path) -> None:
     write_image(folder / "masks" / "002.png", noise)
     with pytest.raises(InputError, match=r"masks: the label image of view 2 holds 25\d numbers .* is it a photo\?"):
         load_masks(load_scene(folder), folder / "masks")
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+@pytest.mark.parametrize("interpolation", [cv2.INTER_LINEAR, cv2.INTER_CUBIC])
+def test_label_images_that_were_scaled_with_interpolation(scale: float, interpolation: int, tmp_path: Path) -> None:
+    """Whether new numbers appear, or only those of other leaves; to the nearest pixel, nothing is said."""
+    folder = write_scene(tmp_path / "plant")
+    scene = load_scene(folder)
+    size = (round(scale * WIDTH), round(scale * HEIGHT))
+    sizes = torch.tensor([size] * len(scene.views))
+    scene = replace(scene, cameras=replace(scene.cameras, sizes=sizes))
+    paths = sorted((folder / "masks").iterdir())
+    images = [cv2.imread(str(path), cv2.IMREAD_UNCHANGED) for path in paths]
+    for method in (cv2.INTER_NEAREST, interpolation):
+        for path, image in zip(paths, images, strict=True):
+            write_label_png(path, cv2.resize(image, size, interpolation=method))
+        if method == cv2.INTER_NEAREST:
+            assert load_masks(scene, folder / "masks").num_per_view.tolist() == [3] * 4
+    with pytest.raises(InputError, match=r"masks: numbers lie along the edges .* scaled with interpolation\? scale"):
+        load_masks(scene, folder / "masks")
+
+
+def test_pixels_between_are_counted_as_one_by_one() -> None:
+    labels = np.random.default_rng(0).integers(0, 4, (BAND + 30, 40)).astype(np.uint16)
+    labels[:, :7], labels[5, 9] = 0, IGNORE_LABEL
+    counts = np.zeros(2, np.int64)
+    for row, column in np.ndindex(labels.shape):
+        top = BAND * (row // BAND)
+        near = labels[max(row - 1, top) : min(row + 2, top + BAND), max(column - 1, 0) : column + 2]
+        near = np.where(near == IGNORE_LABEL, 0, near)
+        own = 0 if labels[row, column] == IGNORE_LABEL else labels[row, column]
+        counts += [near.min() != near.max(), near.min() < own < near.max()]
+    np.testing.assert_array_equal(count_between(labels), counts)
 
 
 def pieces(*boxes: tuple[int, int, int, int], scale: int = 1) -> np.ndarray:

@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from mvseg.errors import InputError
-from mvseg.formats.label_png import read_label_image, read_label_png, read_mask_images
+from mvseg.formats.label_png import ignore_border, read_label_image, read_label_png, read_mask_images
 from mvseg.regions import IGNORE_LABEL
 
 
@@ -56,6 +56,20 @@ def test_a_palette_of_0_and_255_only_is_kept(tmp_path: Path) -> None:
     image.putpalette(voc_colours().ravel().tolist())
     image.save(tmp_path / "two.png")
     assert read_label_png(tmp_path / "two.png", 2, 2).tolist() == [[0, 255], [255, 0]]
+
+
+@pytest.mark.parametrize("is_border", [True, False])
+def test_255_is_a_border_where_it_surrounds_the_others(is_border: bool) -> None:
+    """VOC's, in a grey PNG; and a leaf that happens to have this number and touches another one."""
+    labels = np.zeros((40, 60), np.uint16)
+    if is_border:
+        labels[3:27, 3:37] = 255
+    else:
+        labels[20:30, 10:20] = 255
+    labels[8:22, 8:20], labels[8:22, 20:32] = 4, 7
+    before = labels.copy()
+    assert ignore_border(labels) == is_border
+    np.testing.assert_array_equal(labels, np.where(before == 255, 65535, before) if is_border else before)
 
 
 def test_what_is_transparent_is_nothing(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -48,6 +49,11 @@ def colour_png(path: Path, labels: np.ndarray) -> None:
     write_image(Path(f"{path}.png"), colours[labels])
 
 
+def deep_colour_png(path: Path, labels: np.ndarray) -> None:
+    """Numbers in the lower half of each channel, which 8 bits do not show."""
+    write_image(Path(f"{path}.png"), np.dstack((labels * 3, labels + 1, labels * 2)) * (labels > 0)[..., None])
+
+
 def labelme(path: Path, labels: np.ndarray) -> None:
     shapes = [
         {"label": "leaf", "points": np.reshape(outlines(mask)[0], (-1, 2)).tolist(), "shape_type": "polygon"}
@@ -89,6 +95,7 @@ def bop(path: Path, labels: np.ndarray) -> None:
 KINDS: dict[str, tuple[Write, str]] = {
     "palette": (palette_png, "label images"),
     "colours": (colour_png, "label images"),
+    "colours of 16 bits": (deep_colour_png, "label images"),
     "grey in colours": (lambda p, a: write_image(Path(f"{p}.png"), np.dstack([a] * 3).astype("u1")), "label images"),
     "TIFF": (lambda p, a: Image.fromarray(a).save(f"{p}.tif"), "label images"),
     "TIFF of 32 bits": (lambda p, a: Image.fromarray(a.astype(np.int32)).save(f"{p}.tiff"), "label images"),
@@ -243,6 +250,40 @@ def test_masks_without_pixels_are_counted(folder: Path) -> None:
     np.save(masks / "002.npy", np.zeros((5, HEIGHT, WIDTH), bool))
     with pytest.warns(InputWarning, match=r"other: 5 masks show no pixel"):
         assert load_masks(scene, masks).num_per_view.tolist() == [3, 3, 0, 3]
+
+
+OTHER_PROGRAMS = {
+    "Darwin (V7)": {"version": "2.0", "item": {"slots": []}, "annotations": [{"slot_names": ["0"], "polygon": {}}]},
+    "Segments.ai": {"annotations": [{"id": 1, "category_id": 1}], "segmentation_bitmap": {"url": "x"}},
+    "ISAT": {"info": {"description": "ISAT"}, "objects": [{"segmentation": [[1, 2]]}]},
+    "Supervisely": {"size": {}, "objects": [{"classTitle": "leaf", "geometryType": "polygon"}]},
+}
+
+
+@pytest.mark.parametrize("program", OTHER_PROGRAMS)
+def test_json_of_other_programs_is_refused_by_name(program: str, folder: Path) -> None:
+    scene = load_scene(folder)
+    (folder / "other").mkdir()
+    for view in range(4):
+        (folder / "other" / f"{view:03d}.png.json").write_text(json.dumps(OTHER_PROGRAMS[program]))
+    for masks in (folder / "other", folder / "other" / "000.png.json"):
+        named = rf"000.png.json: is a project or .* of {re.escape(program)}, expected .*COCO"
+        with pytest.raises(InputError, match=named):
+            load_masks(scene, masks)
+
+
+def test_entries_that_are_all_boxes_are_no_masks(folder: Path) -> None:
+    scene = load_scene(folder)
+    masks = write_masks(folder, lambda path, _: Path(f"{path}.json").write_text('[{"bbox": [1, 2, 3, 4]}]'))
+    with pytest.raises(InputError, match=r"other: 4 entries are boxes, lines, .*, and none is a mask"):
+        load_masks(scene, masks)
+
+
+def test_the_background_as_a_leaf_is_said(folder: Path) -> None:
+    """`mvseg check` calls it an error."""
+    masks = write_masks(folder, lambda path, labels: write_image(Path(f"{path}.png"), labels + 1))
+    with pytest.warns(InputWarning, match=r"other: a mask covers more than 80% of 4 views \(000, 001, 002"):
+        assert len(load_masks(load_scene(folder), masks)) == 16
 
 
 def test_label_images_have_no_categories(folder: Path) -> None:

@@ -9,12 +9,13 @@ import pytest
 
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
-from mvseg.formats.masks.yolo import read_class_names, read_yolo
+from mvseg.formats.masks.yolo import has_tracks, read_class_names, read_yolo
 
 TRIANGLE = "0.1 0.1 0.9 0.2 0.5 0.8"
 
 
 def write(folder: Path, *lines: str) -> Path:
+    folder.mkdir(exist_ok=True)
     path = folder / "000.txt"
     path.write_text("\n".join(lines))
     return path
@@ -29,6 +30,20 @@ def test_polygons_boxes_and_confidences(tmp_path: Path) -> None:
     expected = decode_segmentation([[8.0, 6, 72, 12, 40, 48]], 80, 60)
     np.testing.assert_array_equal(found[0].mask, expected)
     np.testing.assert_array_equal(found[2].mask, expected)
+
+
+def test_tracks_are_no_corners(tmp_path: Path) -> None:
+    """Of `track` with `save_conf`; the line of a track 1 could be a polygon down to the edge, but all lines end so."""
+    path = write(tmp_path, f"0 {TRIANGLE} 0.62 1", f"0 {TRIANGLE} 0.4 12", "0 0.5 0.5 0.2 0.2 1 3")
+    assert has_tracks([path])
+    found = read_yolo(path, 80, 60, names={}, tracks=True)
+    expected = decode_segmentation([[8.0, 6, 72, 12, 40, 48]], 80, 60)
+    np.testing.assert_array_equal(found[0].mask, expected)
+    assert [each.mask is None for each in found] == [False, False, True]
+    other_ends = ("0.62 1", "0.5 1.0", "0.7", "7 2", "")  # the first is that of two lines
+    for line in (*(f"0 {TRIANGLE} {end}" for end in other_ends), "0 0.1 0.1 0.9 0.2"):
+        assert not has_tracks([path, write(tmp_path / "more", f"0 {TRIANGLE} 0.62 1", line)])
+    assert not has_tracks([])
 
 
 def test_a_rectangle_has_exact_pixels(tmp_path: Path) -> None:
@@ -71,10 +86,11 @@ def test_files_that_cannot_be_read(tmp_path: Path) -> None:
     ],
 )
 def test_names_of_classes(file: str, text: str, tmp_path: Path) -> None:
-    (tmp_path / "labels").mkdir()
-    assert read_class_names(tmp_path / "labels") == {}
+    (tmp_path / "train" / "labels").mkdir(parents=True)
+    assert read_class_names(tmp_path / "train" / "labels") == {}
     (tmp_path / file).write_text(text)
-    assert read_class_names(tmp_path) == read_class_names(tmp_path / "labels") == {0: "leaf", 1: "pot"}
+    for folder in ("", "train", "train/labels"):
+        assert read_class_names(tmp_path / folder) == {0: "leaf", 1: "pot"}
 
 
 @pytest.mark.parametrize("text", ["names: [", "[1, 2]", "names: {a: b}", "names: !!python/object/apply:os.getcwd []"])
