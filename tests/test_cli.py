@@ -327,12 +327,38 @@ def test_help_and_version(arguments: list[str], words: list[str], capsys: pytest
     assert [word for word in words if word not in shown] == []
 
 
+def test_without_words_there_is_help(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([]) == 0
+    assert "{" + ",".join(VERBS) + "}" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("infr plant", "there is no verb 'infr', did you mean infer?"),
+        ("quux", f"there is no verb 'quux', expected one of {', '.join(VERBS)}"),
+        ("infer . --num_pionts 3", "unrecognized arguments: --num_pionts 3: did you mean --match.num_points?"),
+        ("correct . --no_brower", "unrecognized arguments: --no_brower: did you mean --no_browser?"),
+        ("infer . --config run.yaml", "Subcommand 'infer' does not accept option 'scael': did you mean --scale?"),
+    ],
+)
+def test_what_was_probably_meant(
+    words: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("run.yaml").write_text("scael: 2\n")
+    assert main(words.split()) == 2
+    assert complaint(capsys) == message
+
+
 @pytest.mark.parametrize("verb", ["", *VERBS])
 def test_help_fits_a_screen(verb: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     with pytest.raises(SystemExit):
         main([*verb.split(), "--help"])
-    assert len(capsys.readouterr().out.splitlines()) <= 45
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) <= 45
+    assert "<class" not in shown
 
 
 @pytest.mark.parametrize(
@@ -397,7 +423,7 @@ def test_wrong_options(
 
 @pytest.mark.parametrize(
     ("command", "missing"),
-    [("", "verb"), ("guess", "'guess'"), ("match", "scenes"), ("eval", "result"), ("eval results", "truth")],
+    [("guess", "'guess'"), ("match", "scenes"), ("eval", "result"), ("eval results", "truth")],
 )
 def test_incomplete_commands(command: str, missing: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(command.split()) == 2

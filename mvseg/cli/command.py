@@ -11,7 +11,7 @@ from importlib.util import find_spec
 from types import ModuleType
 from typing import TextIO
 
-from jsonargparse import ArgumentParser, Namespace, set_parsing_settings
+from jsonargparse import ArgumentParser, DefaultHelpFormatter, Namespace, set_parsing_settings
 
 from mvseg._version import __version__
 from mvseg.cli import batch, check, correct, infer, match, models, pose, simulate, target, track, train
@@ -69,16 +69,20 @@ def main(argv: Sequence[str] | None = None) -> int:
     # before torch is loaded, which the verbs do when they start.
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")  # mvseg reports a broken image itself, once
+    words = sys.argv[1:] if argv is None else argv
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("always", InputWarning)
             warnings.showwarning = _show_warning
-            args = _parse(join_up(sys.argv[1:] if argv is None else argv))
+            if not words:
+                build_parser(short=True).print_help()
+                return 0
+            args = _parse(join_up(words))
             options = args[args.verb]
             with stopped_by_sigterm(), running(progress=not options.get("quiet", True)):
                 return VERBS[args.verb][0].run(options)
     except (InputError, argparse.ArgumentError) as error:
-        return complain(error, sys.argv[1:] if argv is None else argv)
+        return complain(error, words, known=_list_names(words) if isinstance(error, argparse.ArgumentError) else ())
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
@@ -132,7 +136,9 @@ def _parse(arguments: Sequence[str]) -> Namespace:
 
 def build_parser(*, short: bool = False) -> ArgumentParser:
     """The parser of all verbs; its errors are raised, not printed. With `short`, `--help` shows some options only."""
-    parser = ArgumentParser(prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__)
+    parser = ArgumentParser(
+        prog="mvseg", description=ABOUT, exit_on_error=False, version=__version__, formatter_class=_Help
+    )
     verbs = parser.add_subcommands(dest="verb")
     for name, (verb, about) in VERBS.items():
         of_verb = ArgumentParser(exit_on_error=False, description=verb.__doc__)
@@ -141,6 +147,24 @@ def build_parser(*, short: bool = False) -> ArgumentParser:
         if short and name in MOST_USED:
             _shorten_help(name, of_verb)
     return parser
+
+
+def _list_names(words: Sequence[str]) -> list[str]:
+    """The options of the verb that was typed; without one, the verbs."""
+    verb = next((word for word in words if not word.startswith("-")), "")
+    if verb not in VERBS:
+        return list(VERBS)
+    parser = ArgumentParser(exit_on_error=False)
+    VERBS[verb][0].add_options(parser)
+    return [name for action in parser._actions for name in action.option_strings if name.startswith("--")]
+
+
+class _Help(DefaultHelpFormatter):
+    """Help with the types as people know them."""
+
+    def _get_type_str(self, action: argparse.Action) -> str | None:
+        text = super()._get_type_str(action)
+        return None if text is None else text.replace("<class 'Path'>", "Path")
 
 
 def _shorten_help(verb: str, parser: ArgumentParser) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Sequence
+from difflib import get_close_matches
 
 from mvseg.errors import InputError
 
@@ -14,20 +15,37 @@ BAD_INPUT = 2
 # What jsonargparse says of a value of a wrong type: the option, the types that would be right, and the value.
 WRONG_TYPE = re.compile(r'Parser key "([^"]+)":? (.*?)(?:Got value|Given value): (.*)')
 EXPECTED = re.compile(r"Expected an? (?:<class '([\w.]+)'>|typing\.Literal\[([^\]]*)\])")
+# What argparse and jsonargparse say of names that nothing has.
+UNKNOWN_VERB = re.compile(r"argument verb: invalid choice: '(.*?)'")
+UNKNOWN_OPTION = re.compile(r"[Uu]nrecognized arguments: --([\w.]+)|does not accept option '([\w.]+)'")
 TYPES = {"int": "a whole number", "float": "a number", "bool": "true or false", "str": "text", "NoneType": "null"}
 
 
-def complain(error: Exception, arguments: Sequence[str] = ()) -> int:
+def complain(error: Exception, arguments: Sequence[str] = (), *, known: Sequence[str] = ()) -> int:
     """Print what is wrong with the input, on one line; returns the exit code.
 
     Args:
         error: with the sentence.
         arguments: of the command line; an option among them is named as it stands there.
+        known: verbs or options, one of which was perhaps meant by a name that nothing has.
     """
     if isinstance(error, OSError) and error.filename:
         error = InputError(f"{error.filename}: {error.strerror}")
-    print(f"mvseg: error: {_as_typed(' '.join(str(error).split()), arguments)}", file=sys.stderr)
+    sentence = _suggest(_as_typed(" ".join(str(error).split()), arguments), known)
+    print(f"mvseg: error: {sentence}", file=sys.stderr)
     return BAD_INPUT
+
+
+def _suggest(message: str, known: Sequence[str]) -> str:
+    """A sentence about a verb or an option that there is not, with the one that was perhaps meant."""
+    if unknown := UNKNOWN_VERB.match(message):
+        near = get_close_matches(unknown[1], known, n=1)
+        expected = f"did you mean {near[0]}?" if near else f"expected one of {', '.join(known)}"
+        return f"there is no verb '{unknown[1]}', {expected}"
+    if unknown := UNKNOWN_OPTION.search(message):
+        near = get_close_matches(f"--{unknown[1] or unknown[2]}", known, n=1)
+        return f"{message}: did you mean {near[0]}?" if near else message
+    return message
 
 
 def _as_typed(message: str, arguments: Sequence[str]) -> str:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from mvseg.errors import InputError
-from mvseg.system.atomic import folder_whole, is_partial, resolve_place, write_text_whole
+from mvseg.system.atomic import folder_whole, is_partial, resolve_place, try_writing, write_text_whole
 from mvseg.system.file_hash import hash_files
 
 RUN_FILE, POSE_FILE = "run.json", "pose.json"
@@ -86,7 +86,7 @@ def replace_result(out: Path, run: dict[str, Any], output: Output) -> Iterator[P
 
 
 def check_out(out: Path, output: Output = RESULT) -> None:
-    """Check that a command may write its output to `out`; what is there is looked at, and nothing is changed.
+    """Check that a command may write its output to `out`: what is there is looked at, and writing is tried.
 
     Raises:
         InputError: `out` is a file, lies where nothing can be written, or is a folder that is neither empty nor an
@@ -101,9 +101,7 @@ def check_out(out: Path, output: Output = RESULT) -> None:
             _check_earlier(out, place, output)
     elif place.exists() or any(parent.is_file() for parent in place.parents):
         raise InputError(f"{out}: the output folder is not writable (a file is in the way)")
-    nearest = next((parent for parent in place.parents if parent.exists()), place)
-    if not os.access(nearest, os.W_OK | os.X_OK):
-        raise InputError(f"{out}: the output folder is not writable (no permission to write in {nearest})")
+    _check_writable(out, place)
 
 
 def _check_earlier(out: Path, place: Path, output: Output) -> None:
@@ -130,6 +128,17 @@ def _check_earlier(out: Path, place: Path, output: Output) -> None:
             raise InputError(f"{out / name}: {message}")
 
 
+def _check_writable(out: Path, place: Path) -> None:
+    """Raises InputError: nothing can be written where a folder or file is to be; before the work, not after it."""
+    nearest = next((parent for parent in place.parents if parent.exists()), place)
+    if not os.access(nearest, os.W_OK | os.X_OK):
+        raise InputError(f"{out}: the output folder is not writable (no permission to write in {nearest})")
+    try:
+        try_writing(nearest)
+    except OSError as error:
+        raise InputError(f"{out}: the output folder is not writable ({error.strerror})") from None
+
+
 def claim_folder(out: Path, output: Output) -> None:
     """Make a folder for a command that adds files one by one, and say in it whose it is; see `check_out`."""
     out.mkdir(parents=True, exist_ok=True)
@@ -139,12 +148,13 @@ def claim_folder(out: Path, output: Output) -> None:
 
 
 def check_file(path: Path, sign: bytes | None) -> None:
-    """Check that a command may write a file: none is there, or one that mvseg wrote, which holds `sign` (None: no such
+    """Check that a command may write a file: there is none, or one that mvseg wrote, which holds `sign` (None: no such
     file is ours). A link is replaced, and never followed.
 
     Raises:
-        InputError: there is another file, or a folder.
+        InputError: there is another file, or a folder; or nothing can be written there.
     """
+    _check_writable(path, resolve_place(path.parent) / path.name)
     if path.is_symlink() or not path.exists():
         return
     if sign is None or not path.is_file() or sign not in path.read_bytes():

@@ -16,6 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 from filelock import FileLock, Timeout
@@ -41,6 +42,20 @@ def resolve_place(place: Path) -> Path:
         if error.errno == errno.ELOOP:
             raise InputError(f"{place}: its links form a loop, expected a folder or a new name") from None
     return place.resolve()
+
+
+def try_writing(folder: Path) -> None:
+    """Make a nameless file in a folder: read-only disks and /proc look writable to whoever may do everything, and a
+    lock there would be waited for without end.
+
+    Raises:
+        OSError: nothing can be written there.
+    """
+    try:
+        with TemporaryFile(dir=folder):
+            pass
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from None
 
 
 def is_partial(path: Path) -> bool:
@@ -95,6 +110,8 @@ def _locked(path: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a file that exists only while a process holds the lock, or after its holder was killed."""
     if not path.parent.is_dir():  # filelock would make it
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
+    if wait:
+        try_writing(path.parent)
     lock = FileLock(path, timeout=-1 if wait else 0, fallback_to_soft=False)
     try:
         lock.acquire()

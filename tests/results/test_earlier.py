@@ -119,6 +119,18 @@ def test_single_files_of_the_user_stay(
     assert {Path(name).read_text() for name in ("page.pdf", "cameras.png", "target.json")} == {"mine"}
 
 
+@pytest.mark.skipif(not Path("/proc/self").exists(), reason="a folder that looks writable and is not, of Linux")
+@pytest.mark.parametrize("arguments", ["target /proc/page.pdf", "check . --out /proc/out", "track a b --out /proc/out"])
+def test_a_place_is_tried_before_the_work(
+    arguments: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody waits for a lock there; and a read-only folder is not noticed after the minutes of a run."""
+    monkeypatch.chdir(tmp_path)
+    words = arguments.split() + (["--times", "1", "2"] if arguments.startswith("track") else [])
+    assert main(words) == 2
+    assert "the output folder is not writable (" in capsys.readouterr().err
+
+
 def test_a_page_is_written_again(tmp_path: Path) -> None:
     for _ in range(2):
         assert main(["target", str(tmp_path / "page.pdf")]) == 0
