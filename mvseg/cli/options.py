@@ -77,7 +77,7 @@ SHARED: dict[str, tuple[Any, Any, str]] = {
     "overwrite": (bool, False, "replace what mvseg wrote to --out even if it is another scene's, or no result"),
     "num_workers": (int | None, None, "processes that fit surfaces (default: one per core, but at most 4)"),
     "scheduler": (str | None, None, "work on a Dask cluster instead: the scheduler's address, or its file"),
-    "quiet": (None, False, "no progress bars"),
+    "quiet": (None, False, "no progress line"),
 }  # fmt: skip
 
 

@@ -84,7 +84,7 @@ def cluster_weights(W: Tensor, num_per_view: Tensor, config: MatchConfig) -> Clu
         return Clustering(labels, 0, {})
     candidates: dict[int, Tensor] = {}
     criterion: dict[int, float] = {}
-    with progress_bar(total=high - low + 1, name="number of instances", unit="k") as bar:
+    with progress_bar(total=high - low + 1, name="number of instances", unit="number") as bar:
         for ks in torch.arange(low, high + 1).split(KS_AT_ONCE):
             linked_W = W[is_linked][:, is_linked]
             factors = factorise(linked_W, ks.tolist(), num_restarts=config.num_restarts, seed=config.seed)

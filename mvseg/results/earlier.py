@@ -109,7 +109,8 @@ def _check_earlier(out: Path, place: Path, output: Output) -> None:
     said = _read_run(out, output)
     kind = _kind_of(said, output)
     if not output.overwrite:
-        mend = "expected another --out" if output.overwrite is None else "expected another --out, or --overwrite true"
+        option = "--output" if output.kind == "training" else "--out"
+        mend = f"expected another {option}" + ("" if output.overwrite is None else ", or --overwrite true")
         if kind != output.kind:
             raise InputError(f"{out}: holds {KINDS[kind][0]}, not {KINDS[output.kind][0]}; {mend}")
         if other := _made_of_others(said, place, output):

@@ -5,6 +5,7 @@ Stages ask here, so that no signature hands it on (as with `decimal.localcontext
 
 from __future__ import annotations
 
+import math
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -29,6 +30,7 @@ class Running:
         kept: {name of what it was computed from: what was computed}; None: nothing is kept.
         seconds: {stage: wall time}, see `timed`.
         is_cancelled: asked before each stage, see `timed`.
+        told: names of the progress bars that have a line already, where there is no terminal.
     """
 
     progress: bool = False
@@ -36,12 +38,14 @@ class Running:
     kept: dict[str, Any] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     is_cancelled: Callable[[], bool] = lambda: False
+    told: set[str] = field(default_factory=set, compare=False)
 
 
 class Cancelled(Exception):
     """The run is not wanted any more."""
 
 
+LINE_SECONDS = 60.0  # between two lines of one stage
 SILENT = Running()
 _NOW: ContextVar[Running] = ContextVar("mvseg_running")
 
@@ -76,7 +80,8 @@ def running(
         is_shown = outside.progress if progress is None else progress
         kept = {} if keep and outside.kept is None else outside.kept
         cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
-        now = Running(progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled)
+        told = outside.told if outside.progress else set()
+        now = Running(progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled, told=told)
         stack.callback(_NOW.reset, _NOW.set(now))
         yield now
 
@@ -102,6 +107,35 @@ def say(sentence: str) -> None:
         tqdm.write(f"mvseg: {sentence}", file=sys.stderr)
 
 
-def progress_bar(items: Iterable[Any] | None = None, name: str = "", total: int | None = None, **how: Any) -> Any:
-    """tqdm's bar with a name in front, hidden where the run is silent; `how` are more options of tqdm."""
-    return tqdm(items, name, total, disable=not now_running().progress, **how)
+def progress_bar(
+    items: Iterable[Any] | None = None, name: str = "", total: int | None = None, *, unit: str = "step"
+) -> Any:
+    """tqdm's bar with a name in front, hidden where the run is silent. On a terminal, each takes the line of the one
+    before; in a file or a pipe, each name has a line at its end, and one a minute until then."""
+    now = now_running()
+    if not now.progress or sys.stderr.isatty():
+        form = f"{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
+        return tqdm(items, name, total, unit=unit, bar_format=form, leave=False, disable=not now.progress)
+    is_told = name in now.told
+    now.told.add(name)
+    form = f"{{desc}}: {{percentage:.0f}}% of {{total_fmt}} {unit}s, {{elapsed}}{{postfix}}"
+    return _Lines(items, name, total, unit=unit, bar_format=form, leave=True, disable=is_told)
+
+
+class _Lines(tqdm):  # type: ignore[misc]  # it has no types
+    """A bar as lines."""
+
+    said_at = math.inf
+
+    def __init__(self, *what: Any, **how: Any) -> None:
+        super().__init__(*what, **how)
+        self.said_at = time.monotonic()
+
+    def display(self, msg: str | None = None, pos: int | None = None) -> bool:
+        """At the end, `pos` is 0, and tqdm ends the line."""
+        if pos == 0:
+            self.fp.write(str(self))
+        elif time.monotonic() - self.said_at > LINE_SECONDS:
+            self.fp.write(f"{self}\n")
+            self.said_at = time.monotonic()
+        return True

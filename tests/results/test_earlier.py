@@ -38,7 +38,7 @@ def test_a_command_replaces_its_own_kind_only(wrote: str, writes: str, tmp_path:
     if wrote == writes:
         check_out(out, Output(writes))
         return
-    with pytest.raises(InputError, match=r"out: holds .* expected (another --out|a new or empty folder)$"):
+    with pytest.raises(InputError, match=r"out: holds .* expected (another --out(put)?|a new or empty folder)$"):
         write_output(out, Output(writes))
     assert contents(out) == before
 

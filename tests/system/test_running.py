@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import io
+import re
+import sys
 import threading
 from contextvars import copy_context
 
@@ -48,5 +51,21 @@ def test_bars_are_silent_by_default(capsys: pytest.CaptureFixture[str]) -> None:
     assert list(progress_bar(range(3), "counting")) == [0, 1, 2]
     assert capsys.readouterr() == ("", "")
     with running(progress=True):
-        assert list(progress_bar(range(3), "counting")) == [0, 1, 2]
-    assert "counting: 100%" in capsys.readouterr().err
+        for _ in range(2):  # one line, in a file or a pipe
+            assert list(progress_bar(range(3), "counting", unit="sheep")) == [0, 1, 2]
+    assert re.fullmatch(r"counting: 100% of 3 sheeps, 00:0\d\n", capsys.readouterr().err)
+
+
+def test_on_a_terminal_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return True
+
+    monkeypatch.setattr(sys, "stderr", terminal := Terminal())
+    with running(progress=True):
+        for name in ("match", "pictures"):
+            assert list(progress_bar(range(3), name, unit="view")) == [0, 1, 2]
+    assert "match: view 0 of 3, ? left" in terminal.getvalue()
+    assert "pictures: view 0 of 3, ? left" in terminal.getvalue()
+    assert "\n" not in terminal.getvalue()
+    assert terminal.getvalue().endswith(" \r")

@@ -67,7 +67,7 @@ def refine(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = 
     order = view_order(scores.graph)
     for _ in range(MAX_SWEEPS):
         ids, coverages = clusters.ids.copy(), scores.coverages(clusters)
-        for view in progress_bar(order.tolist(), name="search", unit="view", leave=False):
+        for view in progress_bar(order.tolist(), name="search", unit="view"):
             movers = scores.graph.movers(view)
             if not movers.num:
                 continue
