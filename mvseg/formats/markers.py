@@ -10,14 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.formats.board import FAMILIES, BoardConfig, Family, marker_dictionary
+from mvseg.formats.marker_edges import fit_grid
 from mvseg.formats.photos import Photos
 from mvseg.system.running import progress_bar
-
-AROUND = 0.5  # of a marker's side: what is around it, and shows where its edges are
-LARGER = 2  # times: markers of 25 pixels are found more often
-CODED = np.arange(256) / 255
-# Light by the value of a pixel (IEC 61966-2-1, sRGB).
-LIGHT = np.where(CODED <= 0.04045, CODED / 12.92, ((CODED + 0.055) / 1.055) ** 2.4)
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
@@ -28,32 +23,17 @@ Seen = dict[Corner, list[tuple[int, Floats]]]  # {corner: (view, (2,) pixels) wh
 def find_markers(photo: Grey, family: Family) -> dict[int, Floats]:
     """Markers of a family in one photo (H, W) uint8 without lens distortion.
 
-    Their corners are where the edges of the black squares are in linear light: blur and pixels average light, and the
-    values of a photo (sRGB) are no light. Edges in these would lie inside the squares, whose sides came out 1 to 4 %
-    too short.
-
     Returns:
-        {number of the marker: (4, 2) corners in pixels, clockwise from its top left}; a marker that appears twice is
-        ambiguous and left out.
+        {number of the marker: (4, 2) corners in pixels, clockwise from its top left, see `fit_grid`}; a marker that
+        appears twice is ambiguous and left out.
     """
-    dictionary, parameters = marker_dictionary(family), cv2.aruco.DetectorParameters()
-    rough, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(photo)
-    numbers = [] if ids is None else [int(number) for number in ids.ravel()]
-    # The corner refinement without bias: the others find markers of 20 to 40 pixels 1 to 5 % too small.
-    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_APRILTAG
-    detector, found = cv2.aruco.ArucoDetector(dictionary, parameters), {}
-    for number, quad in zip(numbers, rough, strict=True):
+    dictionary = marker_dictionary(family)
+    quads, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(photo)
+    numbers, found = [] if ids is None else [int(number) for number in ids.ravel()], {}
+    for number, quad in zip(numbers, quads, strict=True):
         if numbers.count(number) == 1:
-            low, high = quad.reshape(4, 2).min(0), quad.reshape(4, 2).max(0)
-            margin = AROUND * (high - low).max()
-            x1, y1 = np.floor(low - margin).clip(0).astype(int)
-            x2, y2 = np.ceil(high + margin).astype(int)
-            light = LIGHT[photo[y1:y2, x1:x2]]
-            larger = cv2.resize(255 * light / light.max(), None, fx=LARGER, fy=LARGER, interpolation=cv2.INTER_CUBIC)
-            quads, again, _ = detector.detectMarkers(np.rint(larger).clip(0, 255).astype(np.uint8))
-            place = {} if again is None else {int(each): index for index, each in enumerate(again.ravel())}
-            if number in place:  # (0, 0) is the photo's corner here
-                found[number] = np.asarray(quads[place[number]], float).reshape(4, 2) / LARGER + (x1, y1)
+            modules = dictionary.generateImageMarker(number, dictionary.markerSize + 2, borderBits=1)
+            found[number] = fit_grid(photo, np.asarray(quad, float).reshape(4, 2) + 0.5, modules > 0)
     return found
 
 

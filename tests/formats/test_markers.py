@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import cv2
@@ -46,10 +47,26 @@ def test_sides_of_markers_have_no_bias() -> None:
     assert np.abs(np.mean(misses, axis=(0, 1))).max() < 0.1  # no half pixel
 
 
+def as_phone(light: np.ndarray) -> np.ndarray:
+    """Values of a phone with a contrasty curve and sharpening."""
+    coded = light ** (1 / 2.2)
+    curved = coded**2 * (3 - 2 * coded)
+    sharp = curved + 0.5 * (curved - cv2.GaussianBlur(curved, (0, 0), 1.2))
+    return np.clip(np.round(255 * sharp), 0, 255).astype(np.uint8)
+
+
+def as_linear(light: np.ndarray) -> np.ndarray:
+    return np.round(255 * light).astype(np.uint8)
+
+
 @pytest.mark.parametrize(("side", "blur_px"), [(40, 0.5), (40, 0.8), (80, 1.2)])
-@pytest.mark.parametrize("brightest", [1.0, 0.1])
-def test_blur_makes_markers_no_smaller(side: int, blur_px: float, brightest: float) -> None:
-    """A lens blurs light, not the values of a photo."""
+@pytest.mark.parametrize(
+    ("brightest", "develop"), [(1.0, as_coded), (0.1, as_coded), (1.0, as_phone), (1.0, as_linear)]
+)
+def test_neither_blur_nor_a_tone_curve_changes_the_size_of_a_marker(
+    side: int, blur_px: float, brightest: float, develop: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    """A lens blurs light, not the values of a photo; a camera bends it; the edge is where neither moves it."""
     fine = 8
     size = 2 * side * fine
     page = np.full((size, size), 0.85)
@@ -60,7 +77,7 @@ def test_blur_makes_markers_no_smaller(side: int, blur_px: float, brightest: flo
                           borderMode=cv2.BORDER_TRANSPARENT)  # fmt: skip
     page = cv2.GaussianBlur(page, (0, 0), blur_px * fine)
     light = page.reshape(2 * side, fine, 2 * side, fine).mean((1, 3))
-    quad = find_markers(as_coded(brightest * light), "APRILTAG_36H11")[7]
+    quad = find_markers(develop(brightest * light), "APRILTAG_36H11")[7]
     assert np.linalg.norm(quad - np.roll(quad, 1, 0), axis=1) == pytest.approx(side, rel=0.004)
 
 
