@@ -24,7 +24,10 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("--board", type=BoardConfig | None, help=help_board)
     help_marker = "scale from printed ArUco or AprilTag markers with sides (of the black squares) of this length"
     parser.add_argument("--marker", type=float | None, help=help_marker)
-    help_distance = "scale from the distance of two cameras (names of photos) or markers (as marker:7): A B LENGTH"
+    help_distance = (
+        "scale from the distance of two cameras (names of photos), markers (as marker:7) or spots that two photos show "
+        "(as a.jpg:812,455+b.jpg:790,470, pixels): A B LENGTH"
+    )
     parser.add_argument("--distance", nargs=3, type=str, metavar=("A", "B", "LENGTH"), help=help_distance)
     help_positions = "scale and axes from camera positions: CSV with photo,x,y,z, or JSON"
     parser.add_argument("--positions", type=Path | None, help=help_positions)

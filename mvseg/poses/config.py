@@ -62,7 +62,8 @@ class Known:
     Attributes:
         board: a printed ChArUco board, which then defines the axes of the world.
         marker: side of the printed markers (their black squares).
-        distance: two photos, or markers as marker:7, and how far apart they are.
+        distance: two photos, markers as marker:7, or spots as a.jpg:812,455+b.jpg:790,470 (pixels from the top left
+            corner of photos that show it), and how far apart they are.
         positions: file of the camera positions, see `formats/positions.py`.
         unit: name of the unit of these lengths.
     """

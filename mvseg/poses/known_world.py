@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -13,6 +14,7 @@ from numpy.typing import NDArray
 from mvseg.errors import InputError, faults_of, warn
 from mvseg.formats.board import BoardConfig
 from mvseg.formats.find_views import find_views, list_some
+from mvseg.formats.lens import pinhole_from_photo
 from mvseg.formats.markers import Corner, find_board, find_scene_markers, read_grey
 from mvseg.formats.photos import Photos
 from mvseg.formats.positions import read_positions
@@ -25,6 +27,7 @@ from mvseg.system.running import progress_bar
 Floats = NDArray[np.float64]
 
 MARKER = "marker:"  # in front of a marker's number, where a photo's name could stand
+PLACE = re.compile(r"(.+?):(\d+(?:\.\d+)?),(\d+(?:\.\d+)?)(\+|$)")  # photo:x,y+
 SPREAD = 0.05  # of the sides of markers, above which their size is doubtful
 MISFIT = 0.05  # residual of positions over their spread, above which they hardly fit
 
@@ -149,12 +152,12 @@ def _by_distance(scene: Scene, distance: tuple[str, str, float], unit: str) -> P
 
 
 def _point(scene: Scene, name: str, corners: dict[Corner, Floats]) -> Floats:
-    """The centre of a marker or of a photo's camera."""
+    """The centre of a marker or of a photo's camera, or a spot that photos show."""
+    places = PLACE.findall(name)
+    if places and "".join(f"{photo}:{x},{y}{more}" for photo, x, y, more in places) == name:
+        return _spot(scene, name, [(photo, np.array([float(x), float(y)])) for photo, x, y, _ in places])
     if not name.startswith(MARKER):
-        (view,) = find_views([name], scene, source=Path("--distance"))
-        if view is None:
-            raise InputError(f"--distance: {name} is neither a registered photo nor a marker (as in {MARKER}7)")
-        return np.asarray(scene.cameras.centers[view].cpu().numpy())
+        return np.asarray(scene.cameras.centers[_view(scene, name)].cpu().numpy())
     number = name.removeprefix(MARKER)
     keys = [(int(number), corner) for corner in range(4)] if number.isdecimal() else []
     quad = [corners[key] for key in keys if key in corners]
@@ -162,6 +165,32 @@ def _point(scene: Scene, name: str, corners: dict[Corner, Floats]) -> Floats:
         seen = list_some([f"{MARKER}{marker}" for marker in sorted({marker for marker, _ in corners})])
         raise InputError(f"--distance: {name} is not seen whole in two photos, found {seen}")
     return np.mean(quad, axis=0)
+
+
+def _view(scene: Scene, photo: str) -> int:
+    (view,) = find_views([photo], scene, source=Path("--distance"))
+    if view is None:
+        wanted = f"a marker ({MARKER}7) or a spot in two photos (a.jpg:812,455+b.jpg:790,470)"
+        raise InputError(f"--distance: {photo} is neither a registered photo nor {wanted}")
+    return view
+
+
+def _spot(scene: Scene, name: str, places: list[tuple[str, Floats]]) -> Floats:
+    """The point that is at these pixels (2,) of the photos as they are, with lens distortion."""
+    seen = []
+    for photo, px in places:
+        view = _view(scene, photo)
+        lens, camera = scene.views[view].lens, scene.cameras[[view]]
+        width, height = (lens.width, lens.height) if lens else camera.sizes[0].tolist()
+        if px[0] > width or px[1] > height:
+            raise InputError(f"--distance: {photo}:{px[0]:g},{px[1]:g} is outside of its {width} x {height} pixels")
+        K = camera.K[0].cpu().numpy()
+        seen.append((view, px if lens is None else pinhole_from_photo(lens, K, px[None])[0]))
+    points = triangulate_points(scene.cameras, {name: seen})
+    if not points:
+        wanted = "the same spot in two photos or more, right to 0.3 % of their width, seen from places that differ"
+        raise InputError(f"--distance: {name} is not one point, expected {wanted}")
+    return points[name]
 
 
 def _by_positions(scene: Scene, path: Path, unit: str) -> Placement:

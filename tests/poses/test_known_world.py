@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from mvseg.errors import InputError, InputWarning
+from mvseg.formats.lens import photo_from_pinhole
 from mvseg.poses import known_world
 from mvseg.poses.alignment import fit_similarity
 from mvseg.poses.config import Known
@@ -58,6 +59,29 @@ def test_the_distance_of_two_markers_or_photos_gives_the_scale(room) -> None:
     apart = float(np.linalg.norm(centers[0] - centers[6]))
     photos = place(room.scene, Known(distance=("0.png", "6", apart)))
     assert photos.similarity.scale == pytest.approx(true_scale(room), rel=0.01)
+
+
+def test_the_distance_of_two_spots_gives_the_scale(room) -> None:
+    """Two spots, each clicked in photos with lens distortion: here the corners of a marker on the board."""
+    seen = room.markers[BOARD.family]
+    names = []
+    for corner in (0, 2):
+        places = []
+        for view, px in seen[3, corner][:3]:
+            lens, K = room.scene.views[view].lens, room.scene.cameras.K[view].numpy()
+            x, y = px if lens is None else photo_from_pinhole(lens, K, px[None])[0]
+            places.append(f"{view}.png:{x:.2f},{y:.2f}")
+        names.append("+".join(places))
+    placement = place(room.scene, Known(distance=(*names, BOARD.marker * 2**0.5), unit="mm"))
+    assert placement.similarity.scale == pytest.approx(true_scale(room), rel=0.02)
+    for wrong, message in [
+        ("0.png:10,10", "0.png:10,10 is not one point, expected the same spot in two photos"),
+        ("0.png:10,10+1.png:470,350", "is not one point"),
+        ("0.png:10,1000+1.png:10,10", "0.png:10,1000 is outside of its 480 x 360 pixels"),
+        ("0.png:10,10+9.png:10,10", "9.png is neither a registered photo nor a marker"),
+    ]:
+        with pytest.raises(InputError, match=message):
+            place(room.scene, Known(distance=(wrong, names[0], 3.0)))
 
 
 def test_positions_that_were_left_out_are_predicted(room, tmp_path: Path) -> None:
