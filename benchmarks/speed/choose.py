@@ -25,6 +25,8 @@ def time_choice(folder: Path, cache: Path) -> dict[str, Any]:
     """CPU seconds, the ids of the chosen masks by view and box, and the probabilities of the leaves."""
     import torch
 
+    from mvseg.detection.cached_detections import CachedDetections
+    from mvseg.detection.config import MORE_SCORE
     from mvseg.detection.detect_scene import detect_scene
     from mvseg.formats.photos import Photos
     from mvseg.formats.scene_folder import load_scene
@@ -32,10 +34,10 @@ def time_choice(folder: Path, cache: Path) -> dict[str, Any]:
 
     torch.set_num_threads(1)
     scene = load_scene(folder)
-    found = detect_scene(Photos(scene), cache=cache)
-    matched, more = found.match(scene.cameras).masks, found.match_more(scene.cameras)
-    proposals, begun = found.proposals(scene.cameras), time.process_time()
-    leaves = choose_leaves(matched, proposals, cameras=scene.cameras, more=more)
+    look = detect_scene(Photos(scene), cache=CachedDetections(cache))
+    more = look.match(scene.cameras, MORE_SCORE).masks
+    proposals, begun = look.proposals(scene.cameras), time.process_time()
+    leaves = choose_leaves(look.sure.masks, proposals, cameras=scene.cameras, more=(more,))
     seconds, masks = time.process_time() - begun, leaves.masks
     rows = torch.cat((masks.view_index[:, None], masks.regions.boxes, masks.instance_ids[:, None]), 1)
     return {"seconds": seconds, "masks": rows.tolist(), "chances": list(leaves.probabilities.values())}
