@@ -89,7 +89,9 @@ def _warn_of_missing(known: Known, result: Result) -> None:
 
     if not known.opened.is_chosen or (known.edits and not len(result.masks)):  # a person says that there is none
         return
-    if said := describe_missing(result.masks, known.opened.photos, sure_score=SURE_SCORE):
+    may_learn = known.opened.config.learn != "off"
+    said = describe_missing(result.masks, known.opened.photos, sure_score=SURE_SCORE, may_learn=may_learn)
+    if said:
         warn(said)
 
 

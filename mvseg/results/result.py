@@ -71,7 +71,7 @@ class Instances:
         )
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Learned:
     """What came of it that the views taught the detector, see `mvseg.pipeline.learn`.
 

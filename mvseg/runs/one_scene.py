@@ -170,7 +170,7 @@ def describe_run(
     detector's weights, too), the options of the stages that ran, and the `messages` of the run."""
     options = asdict(config)
     if masks is not None:
-        del options["detect"]
+        del options["detect"], options["learn"]
     if config.reconstruct is None:
         for name in ("reconstruct", "traits", "scale", "unit", "up"):
             del options[name]

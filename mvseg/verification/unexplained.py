@@ -12,7 +12,8 @@ from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_co
 # Leaves were missed if more than this fraction of the pixels of leaf colour lies in no mask. On plants that were found
 # whole, 0.15 to 0.39 does (stems, soil and pots), where a quarter was found, 0.48 to 0.84 (docs/notes/detector.md).
 MUCH = 0.5
-HELP = "what helps most: correct a few leaves (mvseg correct), fine-tune on them (mvseg train), or give masks (--masks)"
+HELP = "what helps most: outline six leaves in two photos each, and let it learn them (mvseg correct); or --masks"
+LEARN = "what helps first: --learn auto; then: outline six leaves in two photos each (mvseg correct); or --masks"
 
 
 def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
@@ -47,22 +48,24 @@ def is_familiar(masks: Masks, *, sure_score: float) -> bool:
     return bool(found.any()) and (not len(scores) or float(scores.median()) >= sure_score)
 
 
-def describe_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float) -> str:
+def describe_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float, may_learn: bool = True) -> str:
     """A sentence where leaves were probably missed, "" elsewhere.
 
     Args:
         masks, photos: see `share_unexplained`.
         sure_score: detection score of what the detector is sure of.
+        may_learn: whether the detector was allowed to learn the plant (`RunConfig.learn`), and so has tried.
     """
     found = masks.instance_ids > 0
+    helps = HELP if may_learn else LEARN
     if not found.any():
-        return f"no leaf was found that two photos agree on; {HELP}"
+        return f"no leaf was found that two photos agree on; {helps}"
     if not is_familiar(masks, sure_score=sure_score):
         return (
             f"most leaves score less than {sure_score:g}: the detector does not know this species well, and has "
-            f"probably missed others; {HELP}"
+            f"probably missed others; {helps}"
         )
     share = share_unexplained(masks, photos)
     if share > MUCH:
-        return f"{share:.0%} of what has the colour of the leaves that were found is in none: some are missing; {HELP}"
+        return f"{share:.0%} of what has the colour of the leaves that were found is in none: some are missing; {helps}"
     return ""

@@ -90,7 +90,7 @@ def test_looks_that_are_thrown_away_are_not_spoken_of(monkeypatch: pytest.Monkey
         warn(f"at {config.image_size}")
         return look_of(squares(9), longest=64)
 
-    monkeypatch.setattr("mvseg.detection.detect_scene.detect_scene", detect)
+    monkeypatch.setattr("mvseg.pipeline.find_leaves.detect_scene", detect)
     with pytest.warns(UserWarning, match=f"at {size}") as caught:
         find_in_photos(open_photos(load_scene(demo_scene()), RunConfig(detect=DetectConfig(image_size=size))))
     assert asked == ([300] if size else [None, 45])

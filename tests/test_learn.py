@@ -1,0 +1,168 @@
+"""The views teach the detector: which weights stay, and that nothing is lost by trying."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+
+from found_masks import FoundMasks, open_photos, see_masks
+from leafy_scene import LeafyScene, write_leafy_scene
+from mvseg.config import RunConfig
+from mvseg.corrections.file import Corrections, Reject
+from mvseg.detection.cached_detections import CachedDetections
+from mvseg.detectors.zoo import weights_path
+from mvseg.errors import InputError, InputWarning
+from mvseg.masks import Masks, Origin
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline import learn as module
+from mvseg.pipeline.find_leaves import find_in_photos
+from mvseg.pipeline.finish import shape_leaves
+from mvseg.pipeline.known import Known
+from mvseg.pipeline.learn import learn
+from mvseg.results.folder import save_result
+from mvseg.results.result import Learned
+from mvseg.training.view_labels import ViewLabels
+
+
+@pytest.fixture(scope="module")
+def leafy(tmp_path_factory: pytest.TempPathFactory) -> LeafyScene:
+    return write_leafy_scene(tmp_path_factory.mktemp("leafy"), num_leaves=4, num_views=4, size=96, span_deg=180)
+
+
+def see(
+    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, *, score: float = 0.2, leaves: int = 4, **options: Any
+) -> Known:
+    """Leaves that a detector has found with these scores; the views chose all of them."""
+    regions = leafy.regions.select(leafy.regions.labels <= leaves)
+    ids = regions.labels
+    scores = torch.full((len(ids),), score)
+    masks = Masks.of(regions, ids, torch.ones(len(ids)), detection_scores=scores, origin=Origin.DETECTED)
+    see_masks(monkeypatch, FoundMasks.of(Matching(masks, MatchReport("nview", has_probabilities=True))))
+    return find_in_photos(open_photos(leafy.scene, RunConfig(reconstruct=None, **options)))
+
+
+def teach(monkeypatch: pytest.MonkeyPatch, *growth: float) -> list[ViewLabels]:
+    """Each round makes E so many times as large as it was; the labels that were learned."""
+    taught: list[ViewLabels] = []
+
+    def learn_once(known: Known, labels: ViewLabels, _: CachedDetections) -> Known:
+        taught.append(labels)
+        grown = 0.9 * torch.tensor(growth[: len(taught)]).prod()  # P was 1
+        chances = {each: float(grown) for each in known.instances.probabilities}
+        seen = replace(known, instances=replace(known.instances, probabilities=chances))
+        return replace(seen, learned=Learned(weights=f"weights {len(taught)}".encode()))
+
+    monkeypatch.setattr(module, "_learn_once", learn_once)
+    return taught
+
+
+def lower(known: Known, chance: float = 0.9) -> Known:
+    """So that E can grow."""
+    chances = dict.fromkeys(known.instances.probabilities, chance)
+    return replace(known, instances=replace(known.instances, probabilities=chances))
+
+
+@pytest.mark.parametrize(
+    ("rounds", "growth", "tried", "kept"),
+    [
+        (1, (1.2, 1.2), 1, 1),
+        (3, (1.2, 1.15, 1.05), 3, 2),  # the third grows by less than a tenth
+        (3, (1.05, 1.5), 1, 0),
+        (2, (0.5, 9.0), 1, 0),
+        ("off", (1.2,), 0, 0),
+        ("auto", (1.2, 1.2, 1.2), 2, 2),
+    ],
+)
+def test_weights_stay_where_the_expected_number_of_right_masks_grows(
+    leafy: LeafyScene,
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+    rounds: Any,
+    growth: tuple[float, ...],
+    tried: int,
+    kept: int,
+) -> None:
+    known = lower(see(leafy, monkeypatch, learn=rounds))
+    taught = teach(monkeypatch, *growth)
+    seen = learn(known, cache=CachedDetections(tmp_path))
+    assert len(taught) == tried
+    assert seen.learned.rounds == kept
+    assert seen.learned.weights == (f"weights {kept}".encode() if kept else None)
+    assert len(seen.learned.expected_right) == tried + 1
+    assert seen.expected_right == pytest.approx(max(seen.learned.expected_right[: kept + 1]))
+    if not kept:
+        assert torch.equal(seen.masks.instance_ids, known.masks.instance_ids)
+
+
+def test_a_known_species_is_not_learned_unless_somebody_asks(
+    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    taught = teach(monkeypatch, 1.0)
+    known = see(leafy, monkeypatch, score=0.6)
+    assert learn(known, cache=CachedDetections(tmp_path)).learned == Learned(expected_right=(known.expected_right,))
+    assert not taught
+    learn(see(leafy, monkeypatch, score=0.6, learn=1), cache=CachedDetections(tmp_path))
+    assert len(taught) == 1
+    with pytest.raises(InputError, match="learn is 0, expected 1 or more rounds, auto or off"):
+        RunConfig(learn=0)
+
+
+@pytest.mark.parametrize("reason", ["few", "interrupt", "fails"])
+def test_what_was_there_stays_and_one_sentence_says_why(
+    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path, reason: str
+) -> None:
+    def stop(*_: object) -> Known:
+        raise KeyboardInterrupt if reason == "interrupt" else InputError("it tells several kinds apart")
+
+    known = see(leafy, monkeypatch, leaves=2 if reason == "few" else 4, learn=2)
+    monkeypatch.setattr(module, "_learn_once", stop)
+    said = {
+        "few": "the views agree about 2 leaves, and it takes 3",
+        "interrupt": "interrupted after 0 rounds",
+        "fails": "has not learned this plant: it tells several kinds apart",
+    }
+    with pytest.warns(InputWarning, match=said[reason]):
+        seen = learn(known, cache=CachedDetections(tmp_path))
+    assert seen.expected_right == known.expected_right
+    assert seen.learned.weights is None
+
+
+def test_what_a_person_says_is_learned(leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    known = lower(see(leafy, monkeypatch, learn=1))
+    x1, y1, x2, y2 = known.masks.regions.boxes[0].tolist()
+    edit = Reject(view=leafy.scene.views[0].name, at=((x1 + x2) / 2, (y1 + y2) / 2), everywhere=True)
+    (without,) = (teach(monkeypatch, 1.0),)
+    learn(known, cache=CachedDetections(tmp_path), corrections=Corrections((edit,)))
+    assert [labels.num_leaves for labels in without] == [3]
+
+
+def test_a_result_keeps_its_detector_and_a_round_is_learned_once(
+    leafy: LeafyScene, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A run that was cut off goes on from the weights; the next plant can use them."""
+    made: list[int] = []
+    known = see(leafy, monkeypatch, learn=1)
+
+    def fine_tune(*_: object) -> bytes:
+        made.append(1)
+        return b"weights"
+
+    monkeypatch.setattr(module, "_fine_tune", fine_tune)
+    monkeypatch.setattr(module, "_describe", lambda *_: "the same")
+    monkeypatch.setattr(module, "look_once", lambda *_, **__: FoundMasks)
+    monkeypatch.setattr(module, "know", lambda *_, **__: known)
+    for _ in range(2):
+        seen = learn(lower(known, 0.5), cache=CachedDetections(tmp_path / "kept"))
+        assert seen.learned.weights == b"weights"
+    assert len(made) == 1
+    save_result(shape_leaves(seen), tmp_path / "out", report=False)
+    assert (tmp_path / "out" / "detector.safetensors").read_bytes() == b"weights"
+    assert weights_path(str(tmp_path / "out")) == tmp_path / "out" / "detector.safetensors"
+    said = json.loads((tmp_path / "out" / "run.json").read_text())["learned"]
+    assert said["rounds"] == 1
+    assert len(said["expected_right"]) == 2
