@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import warnings
 from collections.abc import Callable, Iterator
@@ -14,7 +15,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mvseg.checks.check_scene import check_scene
+from mvseg.checks.check_scene import check_scene, warn_of_contradictions
 from mvseg.checks.photo_matches import PhotoMatches, _match, find_features
 from mvseg.cli import main
 from mvseg.config import RunConfig
@@ -204,3 +205,17 @@ def test_a_result_says_what_the_check_finds(tmp_path: Path) -> None:
             findings = check_scene(scene, load_masks(scene, plant / "masks")).findings
             assert any("003" in finding.what for finding in findings)
             assert [each["what"] for each in run["checks"]] == [finding.what for finding in findings]
+
+
+def test_masks_of_turned_photos_are_an_error(plant: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """And in a run a warning; the photos are not told to be anything else than they are."""
+    for path in (plant / "masks").iterdir():
+        write_image(path, cv2.imread(str(path), cv2.IMREAD_UNCHANGED)[::-1, ::-1])
+    scene = load_scene(plant)
+    regions = load_masks(scene, plant / "masks")
+    (found,) = check_scene(scene, regions, features=False).findings
+    assert (found.where, found.level) == ("masks", "error")
+    said = r"[123]\d% of the masks fit those of other views, \d\d% if they are turned by 180 degrees: they must be"
+    assert re.match(said, found.what)
+    with pytest.warns(InputWarning, match=said):
+        warn_of_contradictions(scene, regions)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from mvseg.checks.cameras import Coverage, camera_findings, find_coverage
@@ -12,6 +13,7 @@ from mvseg.checks.masks import mask_findings
 from mvseg.checks.photo_matches import match_photos
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
+from mvseg.checks.turned_masks import low_fit_findings
 from mvseg.errors import warn
 from mvseg.formats.photos import Photos
 from mvseg.matching.match import check_views
@@ -42,7 +44,7 @@ class Check:
 
     @property
     def has_errors(self) -> bool:
-        return any(finding.level == "error" for finding in self.findings)
+        return _has_error(self.findings)
 
 
 def check_scene(
@@ -74,9 +76,13 @@ def check_scene(
         findings += mask_findings(regions, scene.cameras, names)
         if not bool(is_coincident(scene.cameras).all()):
             agreement = pairwise_agreement(regions, scene.cameras)
-            findings += pose_findings(agreement, names) + group_findings(agreement, names)
+            low_fit = low_fit_findings(regions, scene.cameras, agreement)
+            contradictions = pose_findings(agreement, names) + group_findings(agreement, names)
+            # masks that are turned explain what contradicts the poses, which explains masks that hardly fit
+            findings += low_fit if _has_error(low_fit) else contradictions
+            findings += [] if _has_error(low_fit + contradictions) else low_fit
     if features:
-        is_said = any(each.where == "poses" and each.level == "error" for each in findings)
+        is_said = _has_error([each for each in findings if each.where == "poses"])
         findings += _compare_photos(photos, scene, only_focal=is_said)
     return Check(
         scene=scene,
@@ -88,8 +94,13 @@ def check_scene(
     )
 
 
+def _has_error(findings: Sequence[Finding]) -> bool:
+    return any(finding.level == "error" for finding in findings)
+
+
 def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: Photos | None = None) -> None:
-    """Warn (InputWarning) of views that agree in groups only, and of focal lengths that the photos contradict.
+    """Warn (InputWarning) of masks of turned photos, of views that agree in groups only, and of focal lengths that the
+    photos contradict.
 
     Groups of views are found by masks, or else by photos. The matching warns of single views that disagree.
 
@@ -101,7 +112,9 @@ def warn_of_contradictions(scene: Scene, regions: Regions, *, photos: Photos | N
     """
     scene = replace(scene, cameras=scene.cameras.to("cpu"))
     agreement = pairwise_agreement(regions, scene.cameras)
-    findings = group_findings(agreement, tuple(view.name for view in scene.views))
+    low_fit = low_fit_findings(regions.to("cpu"), scene.cameras, agreement)
+    names = tuple(view.name for view in scene.views)
+    findings = low_fit if _has_error(low_fit) else group_findings(agreement, names)
     if photos is not None:
         findings += _compare_photos(photos, scene, only_focal=bool(findings))
     for finding in findings:

@@ -1,8 +1,8 @@
 """Image files: decoded whole or not at all, by Pillow.
 
 Pillow refuses truncated files. It does not detect a flipped bit in a PNG, so the checksums of PNG files are verified
-here. EXIF orientation is ignored: rows and columns are those that the file stores, to which cameras and masks refer.
-(The orientation tag of a TIFF file belongs to the format, and Pillow applies it.)
+here. Orientation tags are ignored in every format, TIFF's own included: rows and columns are those that the file
+stores, as COLMAP reads them, to which cameras and masks refer.
 """
 
 from __future__ import annotations
@@ -17,10 +17,11 @@ from functools import lru_cache
 from io import BytesIO
 from pathlib import Path
 from threading import Lock
+from typing import IO
 
 import cv2
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageOps
 from PIL.BmpImagePlugin import BmpImageFile
 from PIL.ImageFile import ImageFile
 from PIL.JpegImagePlugin import JpegImageFile
@@ -35,7 +36,8 @@ PHONE_SUFFIXES = (".heic", ".heif")  # known by name, to say what to do with the
 MAX_SIDE = 1 << 20  # pixels
 MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
 GREY = 2  # largest difference between the channels of a grey photo
-ORIENTATION = 0x0112  # EXIF tag
+ORIENTATION = 0x0112  # EXIF tag, and TIFF's
+BACK = {6: 8, 8: 6}  # the orientation that undoes another; the others undo themselves
 EXPOSURE_BLOCK, SECONDS, APERTURE, ISO = 0x8769, 0x829A, 0x829D, 0x8827  # EXIF tags
 BITS_PER_SAMPLE = 0x0102  # TIFF tag
 LARGE = 1 << 26  # pixels; Pillow's own limit lies above
@@ -86,7 +88,11 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
             raise WrongSize(image.width, image.height)
         if image.width * image.height > MAX_PIXELS:
             raise InputError(f"it is {image.width} x {image.height} pixels, expected at most {MAX_PIXELS} in all")
+        turn = _orientation_of(image) if isinstance(image, TiffImageFile) else 1
         _load(image)
+        if turn > 1:  # Pillow has turned it
+            image.getexif()[ORIENTATION] = BACK.get(turn, turn)
+            ImageOps.exif_transpose(image, in_place=True)
     return image
 
 
@@ -99,8 +105,9 @@ def read_image_size(path: Path) -> tuple[int, int]:
     with _any_fault(), path.open("rb") as file:
         reader = _find_reader(file.read(16))
         file.seek(0)
-        width, height = reader(file).size
-    return width, height
+        image = reader(file)
+        is_swapped = isinstance(image, TiffImageFile) and _orientation_of(image) >= 5  # as it will be turned
+    return image.size[::-1] if is_swapped else image.size
 
 
 @contextmanager
@@ -212,13 +219,54 @@ def is_grey(pixels: np.ndarray) -> bool:
     return bool((np.ptp(pixels, axis=2) <= GREY).all())
 
 
-def is_turned(path: Path) -> bool:
-    """Whether EXIF asks viewers to rotate or mirror a JPEG; other formats rarely do, and are not checked."""
+def read_orientation(path: Path) -> int:
+    """How viewers are asked to rotate or mirror an image, 1 to 8 as in EXIF; 1 (not at all) where nothing is said."""
     try:
         with _any_fault(), path.open("rb") as file:
-            return JpegImageFile(file).getexif().get(ORIENTATION, 1) != 1
-    except InputError:  # no JPEG, or a damaged EXIF block: it says nothing
-        return False
+            reader = _find_reader(file.read(16))
+            file.seek(0)
+            return _orientation_of(reader(file))
+    except InputError:  # no image, or a damaged EXIF block: it says nothing
+        return 1
+
+
+def is_turned(path: Path) -> bool:
+    """Whether viewers are asked to rotate or mirror an image."""
+    return read_orientation(path) != 1
+
+
+def _orientation_of(image: ImageFile) -> int:
+    """Of an image that has been opened, not decoded."""
+    if isinstance(image, TiffImageFile):
+        said = image.tag_v2.get(ORIENTATION)
+    elif isinstance(image, PngImageFile):  # whose own method decodes it, to find a chunk behind the pixels
+        exif = Image.Image.getexif(image)
+        if ORIENTATION not in exif and image.fp is not None:
+            at = image.fp.tell()
+            exif.load(_find_chunk(image.fp, b"eXIf"))
+            image.fp.seek(at)
+        said = exif.get(ORIENTATION)
+    else:
+        said = image.getexif().get(ORIENTATION)
+    return said if isinstance(said, int) and 1 <= said <= 8 else 1
+
+
+def _find_chunk(file: IO[bytes], kind: bytes) -> bytes:
+    """The content of a PNG file's first chunk of a kind; b"" without one."""
+    file.seek(len(PNG_START))
+    while len(head := file.read(8)) == 8:
+        length = int.from_bytes(head[:4])
+        if head[4:] == kind:
+            return file.read(length)
+        file.seek(length + 4, os.SEEK_CUR)
+    return b""
+
+
+def turn_upright(pixels: np.ndarray, orientation: int) -> np.ndarray:
+    """(H, W, 3) uint8 as viewers show it; see `read_orientation`."""
+    image = Image.fromarray(pixels)
+    image.getexif()[ORIENTATION] = orientation
+    return np.asarray(ImageOps.exif_transpose(image))
 
 
 def read_exposure(path: Path) -> float:
@@ -233,7 +281,7 @@ def read_exposure(path: Path) -> float:
 
 
 def describe_turn(path: Path) -> str:
-    """That EXIF turns a photo, as the end of a sentence about sizes that do not fit; "" if it does not."""
+    """That a tag turns a photo, as the end of a sentence about sizes that do not fit; "" if it does not."""
     return f"; EXIF turns {path.name} for display, its masks must be of the pixels as stored" if is_turned(path) else ""
 
 

@@ -193,15 +193,20 @@ def check_photos(scene: Scene) -> None:
         if beside:
             warn(f"{paths[0]}: this photo and all others are missing{beside}")
         return
-    turned = [path for path in paths if is_turned(path)]
-    if turned:
-        message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
-        warn(f"{turned[0]}: {message}")
+    warn_of_turned(paths)
     known = _bits_of_views(scene)
     if 8 < max(known) < 16:
         deep = [path for path, bits in zip(paths, known, strict=True) if bits > 8]
         message = f"{len(deep)} photos of 16 bits hold numbers of {max(known)} bits at most: they are brightened alike"
         warn(f"{deep[0]}: {message}")
+
+
+def warn_of_turned(paths: Sequence[Path]) -> None:
+    """Warn (InputWarning) of photos that an orientation tag (EXIF's, or TIFF's) asks viewers to turn."""
+    turned = [path for path in paths if is_turned(path)]
+    if turned:
+        message = f"EXIF turns {len(turned)} photos for display; cameras and masks must refer to the pixels as stored"
+        warn(f"{turned[0]}: {message}")
 
 
 def describe_folder(folder: Path) -> str:

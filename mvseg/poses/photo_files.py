@@ -16,10 +16,11 @@ from mvseg.formats.image_file import (
     ORIENTATION,
     PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
-    is_turned,
     read_image,
+    read_orientation,
     read_rgb,
     sensor_bits,
+    turn_upright,
     write_png,
 )
 from mvseg.formats.opencv_yaml import Calibration
@@ -116,8 +117,8 @@ def _are_photos(files: Sequence[Path]) -> bool:
 def copy_photos(folder: Path, names: Sequence[str], images: Path) -> list[PhotoFile]:
     """Copy photos, by their paths in `folder`, into a scene's new `images/`, as they are where that is possible.
 
-    Photos that EXIF turns are written anew, upright; so are WebP files and those of 10, 12 or 14 bits in 16, which
-    COLMAP cannot read, as 8-bit PNG, all brightened by the same factor.
+    Photos that EXIF turns are written anew, upright, as JPEG if they are JPEG; so are WebP files and those of 10, 12 or
+    14 bits in 16, which COLMAP cannot read. All others of these become 8-bit PNG, brightened by the same factor.
 
     Raises:
         InputError: a photo is broken or truncated; it is named.
@@ -134,17 +135,20 @@ def copy_photos(folder: Path, names: Sequence[str], images: Path) -> list[PhotoF
 
 
 def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
-    turned = is_turned(source)
+    orientation = read_orientation(source)
+    turned = orientation != 1
     image = read_image(source)  # decoded, so that a truncated file is found now
     optics = _describe_optics(image)
-    if turned:
+    if turned and image.format == "JPEG":
         exif = image.getexif()
         image = ImageOps.exif_transpose(image)
         exif[ORIENTATION] = 1
         image.convert("RGB").save(path, format="JPEG", quality=QUALITY, subsampling=0, exif=exif)
-    elif path.suffix.lower() == ".webp" or sensor_bits(source) not in (8, 16):
+    elif turned or path.suffix.lower() == ".webp" or sensor_bits(source) not in (8, 16):
         path = path.with_suffix(".png")
-        write_png(path, read_rgb(source, bits=bits))
+        pixels = turn_upright(read_rgb(source, bits=bits), orientation)
+        image = Image.fromarray(pixels)
+        write_png(path, pixels)
     else:
         shutil.copyfile(source, path)
     name = path.relative_to(images).as_posix()

@@ -9,12 +9,13 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 import pytest
+import tifffile
 import torch
 from PIL import Image
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats import photos as photos_module
-from mvseg.formats.image_file import read_rgb
+from mvseg.formats.image_file import read_image_size, read_rgb
 from mvseg.formats.photo_content import measure_content
 from mvseg.formats.photos import Photo, Photos, build_scene, check_photos, load_photos, read_photo, view_names
 from mvseg.formats.scene_folder import load_scene
@@ -198,21 +199,39 @@ def test_photos_for_a_detector_and_photos_that_are_missing(tmp_path: Path) -> No
     check_photos(scene)
 
 
+@pytest.mark.parametrize("suffix", ["jpg", "png", "late.png", "tif", "deep.tif", "webp"])
 @pytest.mark.parametrize("orientation", [1, 3, 6])
-def test_photos_that_exif_turns_are_read_as_stored_and_warned_of(tmp_path: Path, orientation: int) -> None:
+def test_photos_that_exif_turns_are_read_as_stored_and_warned_of(
+    tmp_path: Path, orientation: int, suffix: str
+) -> None:
+    """As COLMAP reads them, in every format."""
     folder = write_scene(tmp_path / "plant")
     rig = folder / "cameras.json"
-    rig.write_text(rig.read_text().replace("000.png", "000.jpg"))
+    rig.write_text(rig.read_text().replace("000.png", f"000.{suffix}"))
     pixels = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    pixels[: HEIGHT // 2] = 200
+    pixels[: HEIGHT // 2], pixels[:, : WIDTH // 3, 0] = 200, 80
     exif = Image.Exif()
     exif[0x0112] = orientation
-    Image.fromarray(pixels).save(folder / "images" / "000.jpg", exif=exif, quality=95)
+    path = folder / "images" / f"000.{suffix}"
+    if suffix == "deep.tif":
+        tags = [(0x0112, "H", 1, orientation, True)]
+        tifffile.imwrite(path, pixels.astype(np.uint16) * 257, photometric="rgb", extratags=tags)
+    else:
+        Image.fromarray(pixels).save(path, exif=exif, quality=95)
+    if suffix == "late.png":  # as exiftool writes it: the chunk stands behind the pixels
+        data = path.read_bytes()
+        at = data.index(b"eXIf") - 4
+        end = at + 12 + int.from_bytes(data[at : at + 4])
+        path.write_bytes(data[:at] + data[end:-12] + data[at:end] + data[-12:])
+    assert read_image_size(path) == (WIDTH, HEIGHT)
+    if suffix != "webp":
+        shown = pycolmap.Bitmap.read(str(path), as_rgb=True).to_array()
+        assert np.abs(shown.astype(int) - pixels).mean() < 5
     scene = load_scene(folder)
     if orientation == 1:
         check_photos(scene)  # warnings are errors
     else:
-        with pytest.warns(InputWarning, match=r"000\.jpg: EXIF turns 1 photos for display"):
+        with pytest.warns(InputWarning, match=rf"000\.{suffix}: EXIF turns 1 photos for display"):
             check_photos(scene)
     assert np.abs(read_photo(scene, 0).astype(int) - pixels).mean() < 5
 

@@ -84,6 +84,17 @@ def test_photos_are_copied_upright(tmp_path: Path, orientation: int) -> None:
     assert (exif[0x0112], exif.get_ifd(0x8769)[0x920A]) == (1, 4.0)  # the focal length stays
 
 
+@pytest.mark.parametrize("suffix", ["png", "tif"])
+def test_other_photos_that_are_turned_become_upright_png(tmp_path: Path, suffix: str) -> None:
+    exif = Image.Exif()
+    exif[0x0112] = 6
+    pixels = np.random.default_rng(0).integers(0, 255, (30, 50, 3), dtype=np.uint8)
+    Image.fromarray(pixels).save(tmp_path / f"a.{suffix}", exif=exif)
+    (photo,) = copy_photos(tmp_path, [f"a.{suffix}"], tmp_path / "images")
+    assert (photo.name, photo.size, photo.is_turned) == ("a.png", (30, 50), True)
+    np.testing.assert_array_equal(read_rgb(tmp_path / "images" / "a.png"), np.rot90(pixels, -1))
+
+
 def test_what_colmap_cannot_read_becomes_png(tmp_path: Path) -> None:
     save(tmp_path, "a.webp")
     cv2.imwrite(str(tmp_path / "b.png"), RAMP.astype(np.uint16) * 4)  # 10 bits in 16

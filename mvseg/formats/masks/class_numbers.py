@@ -20,7 +20,7 @@ PHOTO = 50  # numbers of a label image: with more, it may be a photo
 # Of the pixels at edges, those between their neighbours. Masks of 12 real plants and a simulated one have 0.06 at most
 # (0.08 in the worst photo, of a seedling); those that OpenCV scaled by 0.25 to 4 have 0.13 to 0.58.
 BETWEEN = 0.1
-FEWEST = 100  # pixels at edges, below which that share means nothing
+FEWEST = 500  # pixels at edges of all photos, below which that share means nothing
 BAND = 1024  # rows that are looked at together; neighbours across are not
 
 
