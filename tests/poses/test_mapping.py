@@ -6,6 +6,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pycolmap
 import pytest
@@ -21,7 +22,7 @@ from mvseg.poses.config import PoseConfig
 from mvseg.poses.mapping import find_structure
 from mvseg.poses.photo_files import PhotoFile, copy_photos, list_photos
 from mvseg.poses.scene_files import IMAGES, move_structure, write_cameras, write_structure
-from room_scene import FOCAL, HEIGHT, WIDTH
+from room_scene import FOCAL, HEIGHT, WIDTH, draw_room, room_cameras, texture
 from watched_stages import watch_stages
 
 
@@ -104,6 +105,30 @@ def test_too_few_matches_ask_for_more_features(room, monkeypatch: pytest.MonkeyP
     order = [int(Path(image.name).stem) for image in structure.model.images.values()]
     true_centers = room.truth.centers.numpy()[order]
     assert np.abs(fit_similarity(centers, true_centers) * centers - true_centers).max() < 2  # mm
+
+
+def test_a_backdrop_that_stays_matches_nothing(tmp_path: Path) -> None:
+    """As on a turntable before a poster: a third of each photo shows the same, at the same pixels."""
+    backdrop = cv2.resize(texture(9, grains=(8, 20, 60)), (WIDTH, HEIGHT), interpolation=cv2.INTER_AREA)
+    rng, photos, is_backdrop = np.random.default_rng(0), [], []
+    for photo in draw_room(room_cameras(9, focal=250)[[3, 4]]):
+        is_backdrop.append((photo == photo[0, 0]).all(2))
+        photo[is_backdrop[-1]] = backdrop[is_backdrop[-1]]
+        name = f"{len(photos)}.png"
+        write_png(tmp_path / name, np.clip(photo + rng.normal(size=photo.shape) * 2, 0, 255).astype(np.uint8))
+        photos.append(PhotoFile(name, WIDTH, HEIGHT))
+    database, numbered = tmp_path / "photos.db", features.number_photos(tmp_path, photos, tmp_path / "numbered")
+    features.make_database(database, tmp_path / "numbered", numbered, config=PoseConfig())
+    features.find_features(database, tmp_path / "numbered", list(numbered), image_size=WIDTH)
+    features.match_features(database, list(numbered), [(0, 1)])
+    with pycolmap.Database.open(database) as opened:
+        one, other = opened.read_two_view_geometry(1, 2).inlier_matches.T
+        px, other_px = opened.read_keypoints(1)[one, :2], opened.read_keypoints(2)[other, :2]
+    assert len(one) > 200
+    assert np.linalg.norm(px - other_px, axis=1).min() > 3
+    column, row = px.astype(int).T
+    assert np.mean(is_backdrop) > 0.3
+    assert is_backdrop[0][row, column].mean() < 0.02
 
 
 def test_too_few_photos_are_one_sentence(tmp_path: Path) -> None:
