@@ -114,6 +114,8 @@ def add_run_options(parser: ArgumentParser) -> None:
     add_matching_options(parser)
     help_views = "take so many views, evenly spread around the plant, or 'all' (default: all with --masks, or else 20)"
     parser.add_argument("--views", type=int | Literal["all"] | None, help=help_views)
+    help_learn = "rounds in which the views teach the detector; auto: where it does not know the species"
+    parser.add_argument("--learn", type=int | Literal["auto", "off"], default="auto", help=help_learn)
     parser.add_class_arguments(DetectConfig, "detect")
     parser.add_class_arguments(ReconstructConfig, "reconstruct")
     parser.add_class_arguments(TraitsConfig, "traits")

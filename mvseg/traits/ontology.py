@@ -75,7 +75,7 @@ COUNTED_TRAITS = (
 LEAF_TRAITS = (*SURFACE_TRAITS, *SEEN_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS)
 PLANT_TRAITS = (
     _counted("number_of_leaves", "instances that are not rejected", "TO:0000241"),
-    Definition("total_leaf_area", "area", "sum of the leaves' areas"),
+    Definition("total_leaf_area", "area", "of the leaves that have a surface; the method says how many have none"),
     Definition("height", "length", "from the lowest to the highest point of the leaves"),
     Definition("convex_hull_volume", "volume", "of the convex hull of the leaves"),
     Definition("projected_area", "area", "what the leaves cover, seen from above"),

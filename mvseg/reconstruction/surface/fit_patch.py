@@ -49,12 +49,14 @@ class PatchFit:
         covariance: (78, 78); NaN where the masks do not tell the coefficients: hardly any edge was met.
         residual_px: (S,) root mean square distance per view, robustly weighted.
         offsets_px: (S,) by how much the mask of each view is too large; NaN where none of its edges was met.
+        spread: how far the areas of other fits that are as good are from this one's, as a share of it.
     """
 
     coefficients: Floats
     covariance: Floats
     residual_px: Floats
     offsets_px: Floats
+    spread: float = 0.0
 
 
 def approach_patch(masks: MaskStack, start: Floats, *, steps: range) -> tuple[Floats, Floats]:
@@ -238,7 +240,8 @@ def _step(coefficients: Floats, equations: _Equations, damping_and_cap: tuple[fl
     damping, cap = damping_and_cap
     size = measure_patch(coefficients)
     matrix, right = _normal_matrix(coefficients, equations, size)
-    matrix[np.diag_indices_from(matrix)] *= 1 + damping
+    by_vector = np.diag(matrix).reshape(-1, 3).mean(1)  # the same along all axes, however the world is turned
+    matrix[np.diag_indices_from(matrix)] += damping * np.repeat(by_vector, 3)
     step = np.linalg.solve(matrix, right).reshape(-1, 3)
     longest = np.linalg.norm(patch_grid(*FIT_GRID).basis @ step, axis=1).max()
     limit = cap * max(size.half_width, NARROW * size.length)

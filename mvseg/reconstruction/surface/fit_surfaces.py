@@ -24,6 +24,7 @@ from mvseg.reconstruction.surface.fit_patch import (
     fit_patch,
 )
 from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
+from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
@@ -37,14 +38,13 @@ from mvseg.system.running import now_running, progress_bar
 from mvseg.system.worker_pool import map_in_order
 
 NUM_FIRST_STEPS = 3  # steps of the fit before the second one (a technical limit)
-GOOD_IOU = 0.93  # no less likely start is tried if the median IoU of a patch is more than this
+GOOD_IOU = 0.93  # the second hull is not asked if the median IoU of a patch is more than this
 # Share of the IoU that is given back where masks as a whole are too large or small: faulty masks reach less.
 FORGIVEN = 0.5
-LEAST_GAIN = 0.03  # another start is better if its score is more by this, in IoU
+MOST_FITS = 3  # so many of the starts are fitted (a technical limit)
+AS_GOOD = 0.03  # fits are as good as the best one, the less the more they score below it, down to so much, in IoU
 # A surface e times as large scores less by this, in IoU: bulges can hide behind the outlines of a level leaf.
 AREA_COST = 0.1
-# The likely start shows how the blade lies if its median IoU is at least this; else the others are looked at, too.
-CLEAR_IOU = 0.75
 WIDE_COST = 0.1  # a patch that is wider than long scores less by this, in IoU: some would run from edge to edge
 MOST_STARTS = 3  # so many starts are tried of each hull
 HOPELESS = 0.1  # a patch goes no farther than half way if it scores less than the best by more than this
@@ -156,18 +156,30 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
 
 
 def _fit_first(asked: tuple[MaskStack, Floats | None]) -> tuple[MaskStack, PatchFit | None]:
-    """The first fit of an instance, from a start that is nearly right or from one that is looked for, and its masks."""
+    """The first fit of an instance, from a start that is nearly right or from those that are found, and its masks.
+
+    Of several fits the best one, and how far the areas of those that are nearly as good are from its own.
+    """
     masks, start = asked
-    if start is None:
-        masks, start = _find_start(masks)
-    return masks, None if start is None else fit_patch(masks, start, num_steps=NUM_FIRST_STEPS)
+    masks, starts = (masks, [start]) if start is not None else _find_starts(masks)
+    fits = [fit_patch(masks, each, num_steps=NUM_FIRST_STEPS) for each in starts]
+    if len(fits) < 2:
+        return masks, fits[0] if fits else None
+    areas = np.array([measure_sizes(fit.coefficients)[0] for fit in fits])
+    scores = np.array([_fine_rank(masks, fit) - _area_cost(fit.coefficients) for fit in fits])
+    best = int(scores.argmax())
+    weights = np.maximum(0, 1 - (scores[best] - scores) / AS_GOOD)
+    spread = float(np.sqrt(weights @ (areas / areas[best] - 1) ** 2 / weights.sum()))
+    return masks, replace(fits[best], spread=spread)
 
 
-def _find_start(masks: MaskStack) -> tuple[MaskStack, Floats | None]:
-    """The best of several starts, which are moved to the masks until one explains them; and the masks that are right.
+def _find_starts(masks: MaskStack) -> tuple[MaskStack, list[Floats]]:
+    """The best of several starts, moved to the masks; and the masks that are right.
 
     The first hull asks that no view looks past the leaf; where faulty masks make that too strict, the majority counts.
     """
+    axes = masks.axes
+    masks = masks.turn_world(axes)
     hull = carve_hull(masks)
     seen = hull.points[hull.is_seen] if hull.is_seen.any() else hull.points
     if len(seen):
@@ -176,14 +188,14 @@ def _find_start(masks: MaskStack) -> tuple[MaskStack, Floats | None]:
             masks = masks.select(is_right)
             hull = carve_hull(masks)
     if not len(hull.points):
-        return masks, None
+        return masks.turn_world(axes.T), []
     few = _few_views(masks, hull.points.mean(0))
     found = _Found()
     for keep in (hull.is_seen, np.ones_like(hull.is_seen)):
         if not found.is_good:
-            for starts in _start_groups(few, replace(hull, voxels=hull.voxels[keep])):
-                found = found if found.is_good else _try_starts(few, starts, found)
-    return masks, found.patch
+            found = _try_starts(few, _likely_starts(few, replace(hull, voxels=hull.voxels[keep])), found)
+    order = sorted(range(len(found.patches)), key=lambda index: -found.scores[index])
+    return masks.turn_world(axes.T), [found.patches[index] @ axes for index in order[:MOST_FITS]]
 
 
 def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
@@ -196,28 +208,29 @@ def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
 
 @dataclass(frozen=True, eq=False)
 class _Found:
-    """The best patch so far, its score, and is it good enough; and the best score half way."""
+    """Patches that were moved to the masks, with their scores; does one explain the masks; the best score half way."""
 
-    patch: Floats | None = None
-    score: float = -np.inf
+    patches: tuple[Floats, ...] = ()
+    scores: tuple[float, ...] = ()
     is_good: bool = False
     half_way: float = -np.inf
 
 
 def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found:
     """Starts moved half the way to the masks, and those of them all of the way that may become the best."""
-    patches = [approach_patch(masks, start, steps=FIRST_HALF)[0] for start in starts]
-    scores = [_rank(masks, patch) - _area_cost(patch) for patch in patches]
-    most = max(found.half_way, *scores)
-    for score, patch in zip(scores, patches, strict=True):
+    halves = [approach_patch(masks, start, steps=FIRST_HALF)[0] for start in starts]
+    scores = [_rank(masks, patch) - _area_cost(patch) for patch in halves]
+    most = max([found.half_way, *scores])
+    patches, ends, is_good = list(found.patches), list(found.scores), found.is_good
+    for score, half in zip(scores, halves, strict=True):
         if score > most - HOPELESS:
-            moved, offsets = approach_patch(masks, patch, steps=SECOND_HALF)
-            rank = _rank(masks, moved, offsets)
-            better = rank - _area_cost(moved)
-            if better > found.score + LEAST_GAIN:
-                explained = max(0.0, rank - _rank(masks, moved))
-                found = _Found(moved, better, is_good=rank + FORGIVEN * explained > GOOD_IOU)
-    return replace(found, half_way=most)
+            patch, offsets = approach_patch(masks, half, steps=SECOND_HALF)
+            rank = _rank(masks, patch, offsets)
+            explained = max(0.0, rank - _rank(masks, patch))
+            is_good |= rank + FORGIVEN * explained > GOOD_IOU
+            patches.append(patch)
+            ends.append(rank - _area_cost(patch))
+    return _Found(tuple(patches), tuple(ends), is_good, most)
 
 
 def _area_cost(coefficients: Floats) -> float:
@@ -225,17 +238,11 @@ def _area_cost(coefficients: Floats) -> float:
     return AREA_COST * float(np.log(measure_sizes(coefficients)[0]))
 
 
-def _start_groups(masks: MaskStack, hull: Hull) -> list[list[Floats]]:
-    """The likeliest start, and others for where it ends badly.
-
-    How well a start explains the masks, before any fit, tells how likely it is.
-    """
+def _likely_starts(masks: MaskStack, hull: Hull) -> list[Floats]:
+    """How well a start explains the masks, before any fit, tells how likely it is."""
     starts = start_in(hull)
-    ranks = [_rank(masks, start) for start in starts[:1]]
-    if ranks and ranks[0] < CLEAR_IOU:
-        ranks += [_rank(masks, start) for start in starts[1:]]
-    order = sorted(range(len(ranks)), key=lambda index: -ranks[index])[:MOST_STARTS]
-    return [[starts[index] for index in group] for group in (order[:1], order[1:]) if group]
+    ranks = [_rank(masks, start) for start in starts]
+    return [starts[index] for index in sorted(range(len(ranks)), key=lambda index: -ranks[index])[:MOST_STARTS]]
 
 
 def start_in(hull: Hull) -> list[Floats]:
@@ -251,9 +258,19 @@ def start_in(hull: Hull) -> list[Floats]:
 def _rank(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None) -> float:
     """Median IoU over the views, coarsely; less for a patch that is wider than long."""
     covered = cover_crops(masks, project_points(masks.px_from_world, patch_grid(*FAR_GRID).points(coefficients))) > 0
+    return float(np.median(crop_ious(masks, covered, offsets=offsets))) - _wide_cost(coefficients)
+
+
+def _fine_rank(masks: MaskStack, fit: PatchFit) -> float:
+    """The same, finely, of the mean IoU: of fits that are nearly as good, medians pick one by chance."""
+    points = patch_grid(*FIT_GRID).points(fit.coefficients)
+    ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
+    return float(ious.mean()) - _wide_cost(fit.coefficients)
+
+
+def _wide_cost(coefficients: Floats) -> float:
     size = measure_patch(coefficients)
-    cost = WIDE_COST if 2 * size.half_width > size.length else 0.0
-    return float(np.median(crop_ious(masks, covered, offsets=offsets))) - cost
+    return WIDE_COST if 2 * size.half_width > size.length else 0.0
 
 
 def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
@@ -268,16 +285,23 @@ def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
 
 
 def _stack(members: Regions, cameras: Cameras, frames: list[np.ndarray], *, instance: int) -> MaskStack:
-    """The outlines of one instance; its masks of one view are united."""
+    """The outlines of one instance, in photos turned to a side of its own; its masks of one view are united."""
     views = members.view_index.unique().tolist()
     united = [members.union((members.view_index == view).nonzero()[:, 0].tolist()) for view in views]
+    px_from_world, boxes = cameras.px_from_world[views].numpy(), np.array([crop.box for crop in united])
+    middle = find_middle(px_from_world, (boxes[:, :2] + boxes[:, 2:]) / 2)
+    axes = find_axes(px_from_world, middle, np.array([int(crop.pixels.sum()) for crop in united]))
+    quarters = find_quarters(px_from_world, middle, axes)
+    turns = np.array([turn_matrix(each, frames[view].shape[::-1]) for each, view in zip(quarters, views, strict=True)])
+    ends = turns[:, :2, :2] @ boxes.reshape(-1, 2, 2).transpose(0, 2, 1) + turns[:, :2, 2:]
     return stack_masks(
-        [crop.pixels.numpy() for crop in united],
-        [frames[view] for view in views],
+        [turn_pixels(crop.pixels.numpy(), each) for crop, each in zip(united, quarters, strict=True)],
+        [turn_pixels(frames[view], each) for view, each in zip(views, quarters, strict=True)],
         views,
-        px_from_world=cameras.px_from_world[views].numpy(),
-        mask_corners=[crop.box[:2] for crop in united],
+        px_from_world=turns @ px_from_world,
+        mask_corners=[(round(x), round(y)) for x, y in ends.min(2).tolist()],
         own=instance,
+        axes=axes,
     )
 
 
@@ -291,7 +315,7 @@ def _fit_again(
     others = {other: grid for other, grid in points.items() if other != instance}
     hiding = hiding_pixels(masks, points[instance], others, margin=margin)
     masks = replace(masks, others=hiding)
-    return masks, fit_patch(masks, fit.coefficients, errors=errors)
+    return masks, replace(fit_patch(masks, fit.coefficients, errors=errors), spread=fit.spread)
 
 
 def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface:
@@ -308,6 +332,9 @@ def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface
         is_oriented=False,
         quality=Quality(),
     )
+    # Where other fits are as good, all deviations are larger by as much as that of the area is.
+    wider = 1 + (fit.spread * surface.area / surface.deviations[0]) ** 2
+    surface = replace(surface, covariance=wider * surface.covariance)
     return replace(surface, quality=_judge(surface)) if is_judged else surface
 
 

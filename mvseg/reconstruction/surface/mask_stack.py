@@ -40,6 +40,7 @@ class MaskStack:
         edge_px: (E, 2) samples of the edges of the masks.
         edge_normals: (E, 2), outwards.
         edge_stack: (E,) place in `views` of each.
+        axes: (3, 3) in rows, of the leaf itself (`find_axes`).
     """
 
     views: NDArray[np.int64]
@@ -51,6 +52,7 @@ class MaskStack:
     edge_px: Floats
     edge_normals: Floats
     edge_stack: NDArray[np.int64]
+    axes: Floats
 
     def __len__(self) -> int:
         return len(self.views)
@@ -109,6 +111,11 @@ class MaskStack:
             edge_stack=(np.cumsum(keep) - 1)[self.edge_stack[edges]],
         )
 
+    def turn_world(self, axes: Floats) -> MaskStack:
+        """The same masks for world coordinates along orthonormal axes (3, 3), in rows."""
+        matrices = np.concatenate([self.px_from_world[:, :, :3] @ axes.T, self.px_from_world[:, :, 3:]], 2)
+        return replace(self, px_from_world=matrices, axes=self.axes @ axes.T)
+
     def move_world(self, centre: Floats, scale: float) -> MaskStack:
         """The same masks for world coordinates (x - centre) / scale; depths are divided by `scale`, too."""
         shift = self.px_from_world[:, :, :3] @ centre + self.px_from_world[:, :, 3]
@@ -124,6 +131,7 @@ def stack_masks(
     px_from_world: Floats,
     mask_corners: Sequence[tuple[int, int]] | None = None,
     own: int = 0,
+    axes: Floats | None = None,
 ) -> MaskStack:
     """The outlines of one leaf.
 
@@ -134,6 +142,7 @@ def stack_masks(
         px_from_world: (S, 3, 4), pixel centres at half integers.
         mask_corners: x, y of the top-left pixel of each mask that is a part.
         own: the id of the leaf itself, which hides nothing, in `others`.
+        axes: of the leaf; None: those of the world.
     """
     mask_corners = [(0, 0)] * len(masks) if mask_corners is None else mask_corners
     places = [(np.flatnonzero(mask.any(0))[[0, -1]], np.flatnonzero(mask.any(1))[[0, -1]]) for mask in masks]
@@ -165,6 +174,7 @@ def stack_masks(
         edge_px=np.concatenate([px for px, _ in edges]),
         edge_normals=np.concatenate([normals for _, normals in edges]),
         edge_stack=np.repeat(np.arange(len(edges)), [len(px) for px, _ in edges]),
+        axes=np.eye(3) if axes is None else axes,
     )
 
 
