@@ -13,6 +13,7 @@ from pathlib import Path
 
 from mvseg.batch.status import STATE, TABLES
 from mvseg.errors import InputError
+from mvseg.formats.scene_folder import is_scene_folder
 from mvseg.system.atomic import resolve_place
 
 OWN_COLUMNS = ("scene", "name", "masks", "corrections")
@@ -76,7 +77,7 @@ def list_scenes(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene
 
 
 def _list_folders(source: Path, out: Path, masks: Path | None) -> tuple[BatchScene, ...]:
-    if (source / "cameras.json").is_file():
+    if is_scene_folder(source):
         raise InputError(f"{source}: is itself a scene, expected a folder of scenes; use mvseg infer for one scene")
     folders = [path for path in sorted(source.iterdir()) if path.is_dir() and not path.name.startswith(".")]
     folders = [path for path in folders if path.resolve() != resolve_place(out)]

@@ -42,6 +42,7 @@ class TrackedPlant:
 
     dates: int = 0
     tracks: int = 0
+    days: float = 0.0  # from the first date to the last
     warnings: tuple[str, ...] = ()
     sentence: str = ""
 
@@ -162,7 +163,8 @@ def _track_plant(
     if report:
         write_page(place, tracks, growth)
     warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.warnings, *lost))
-    return TrackedPlant(len(tracks.dates), tracks.num_tracks, warnings)
+    days = tracks.dates[-1].time - tracks.dates[0].time
+    return TrackedPlant(dates=len(tracks.dates), tracks=tracks.num_tracks, days=days, warnings=warnings)
 
 
 def _describe_run(

@@ -18,7 +18,7 @@ def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
     help_results = "output of mvseg batch (every plant with two dates or more), or the results of one plant"
     parser.add_argument("results", type=Path, nargs="+", help=help_results)
-    help_times = "of each result: numbers (days) or ISO dates"
+    help_times = "of each result: numbers (days) or ISO dates (2026-05-31 or 20260531)"
     parser.add_argument("--times", type=str, nargs="+", help=help_times)
     parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: that of --out)")
     parser.add_argument("--out", type=Path, required=True, help="folder for the tables and pages")
@@ -64,5 +64,8 @@ def run(args: Namespace) -> int:
         print(f"mvseg: {sentence}", file=sys.stderr)
     num_dates, num_tracks = sum(plant.dates for plant in tracked), sum(plant.tracks for plant in tracked)
     done = len(tracked) - len(failed)
-    print(f"{args.out}: {num_tracks} leaves of {done} {'plant' if done == 1 else 'plants'} on {num_dates} dates")
+    longest = max(plant.days for plant in tracked)
+    span = f"{longest:.3g} {'day' if longest == 1 else 'days'} apart{' at most' if num_dates > 2 else ''}"
+    what = f"{num_tracks} leaves of {done} {'plant' if done == 1 else 'plants'}"
+    print(f"{args.out}: {what} on {num_dates} dates, {span}")
     return SOME_FAILED if failed else 0

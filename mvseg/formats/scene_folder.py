@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
 
-from mvseg.errors import InputError, warn
+from mvseg.errors import InputError, InputWarning, warn
 from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
@@ -68,11 +69,21 @@ def _read_others(folder: Path) -> Scene | None:
     model = find_colmap_model(folder)
     if model is not None:
         return read_colmap(model, folder)
-    for name, read in READERS.items():
-        path = find_metashape(folder) if name == "*.xml" else folder / name
-        if path is not None and path.is_file():
-            return read(path)
-    return None
+    found = _find_others(folder)
+    return None if found is None else READERS[found[0]](found[1])
+
+
+def _find_others(folder: Path) -> tuple[str, Path] | None:
+    """The first key of `READERS` that a folder has, and its file."""
+    paths = ((name, find_metashape(folder) if name == "*.xml" else folder / name) for name in READERS)
+    return next(((name, path) for name, path in paths if path is not None and path.is_file()), None)
+
+
+def is_scene_folder(folder: Path) -> bool:
+    """Whether a folder holds cameras of any kind that `load_scene` reads; they need not be sound."""
+    with warnings.catch_warnings(action="ignore", category=InputWarning):  # of several models
+        has_model = find_colmap_model(folder) is not None
+    return has_model or (folder / "cameras.json").is_file() or _find_others(folder) is not None
 
 
 def _describe(folder: Path) -> str:

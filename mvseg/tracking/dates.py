@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import math
+import re
 import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -27,6 +28,8 @@ from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
 
 Floats = NDArray[np.float64]
+MOST_DAYS = 100_000  # five digits: more are dates, or seconds
+NUMBER = re.compile(r"[+-]?(0|[1-9]\d*|(?=\.\d))(\.\d*)?([eE][+-]?\d+)?")  # 0428 and 2026_04_28 are none
 STATIONS = 9  # points of a midrib, base and tip included (a definition)
 ROWS = 12  # rows of points from base to tip, of edge, midrib and edge (a definition)
 CLOUD = 3 * ROWS  # points that stand for a leaf (a definition)
@@ -151,23 +154,29 @@ def date_of(result: Result, time: str | float) -> PlantOnDate:
 
 
 def read_time(time: str | float) -> float:
-    """Days: the number itself, or days since year 1 of an ISO date (with a time of day and a time zone, if you like:
-    then it is counted in UTC).
+    """Days: the number itself, or days since year 1 of an ISO date (20260531, too; with a time of day and a time zone,
+    if you like: then it is counted in UTC).
 
     Raises:
-        InputError: it is neither.
+        InputError: it is neither; so are 0428 and numbers of `MOST_DAYS` or more, which are no days.
     """
-    text = str(time).strip()
-    try:
-        if math.isfinite(number := float(text)):
-            return number
-    except ValueError:
-        with suppress(ValueError):
-            moment = datetime.datetime.fromisoformat(text)
-            if moment.tzinfo is not None:
-                moment = moment.astimezone(datetime.UTC).replace(tzinfo=None)
-            return 1 + (moment - datetime.datetime.min) / datetime.timedelta(days=1)
-    raise InputError(f"time '{time}': expected a number (days) or an ISO date, as in 2026-05-31")
+    moment = _read_moment(str(time).strip())
+    if isinstance(moment, float):
+        return moment
+    if moment.tzinfo is not None:
+        moment = moment.astimezone(datetime.UTC).replace(tzinfo=None)
+    return 1 + (moment - datetime.datetime.min) / datetime.timedelta(days=1)
+
+
+def _read_moment(text: str) -> float | datetime.datetime:
+    """A number of days, or a date."""
+    if NUMBER.fullmatch(text) and abs(float(text)) < MOST_DAYS:
+        return float(text)
+    with suppress(ValueError):
+        if not text.isdecimal() or len(text) == 8:  # 13 digits would be a date of the year 1711
+            return datetime.datetime.fromisoformat(text)
+    expected = f"expected a number (days) or an ISO date, as in 2026-05-31; days are below {MOST_DAYS}"
+    raise InputError(f"time '{text}': {expected}")
 
 
 def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
@@ -191,14 +200,12 @@ def order_dates(dates: Sequence[PlantOnDate]) -> tuple[PlantOnDate, ...]:
 
 
 def _is_iso(text: str) -> bool:
-    try:
-        return not math.isfinite(float(text))
-    except ValueError:
-        return True
+    return isinstance(_read_moment(text), datetime.datetime)
 
 
 def _has_zone(text: str) -> bool:
-    return _is_iso(text) and datetime.datetime.fromisoformat(text).tzinfo is not None
+    moment = _read_moment(text)
+    return isinstance(moment, datetime.datetime) and moment.tzinfo is not None
 
 
 def name_apart(dates: Sequence[PlantOnDate]) -> list[PlantOnDate]:

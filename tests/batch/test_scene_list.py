@@ -98,9 +98,13 @@ def test_broken_tables_are_refused(text: str | bytes, message: str, tmp_path: Pa
 def test_folders_without_scenes_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="has no sub-folders, expected a scene in each"):
         list_scenes(tmp_path, OUT, None)
-    (tmp_path / "images").mkdir()
-    (tmp_path / "cameras.json").touch()
-    with pytest.raises(InputError, match="is itself a scene, expected a folder of scenes; use mvseg infer"):
-        list_scenes(tmp_path, OUT, None)
+    kinds = ("cameras.json", "transforms.json", "sparse/0/cameras.txt", "turntable.json", "scene_camera.json")
+    for number, cameras in enumerate(kinds):
+        path = tmp_path / str(number) / cameras
+        path.parent.mkdir(parents=True)
+        path.touch()
+        (tmp_path / str(number) / "images").mkdir()
+        with pytest.raises(InputError, match="is itself a scene, expected a folder of scenes; use mvseg infer"):
+            list_scenes(tmp_path / str(number), OUT, None)
     with pytest.raises(InputError, match="no such file or folder, expected a CSV table"):
         list_scenes(tmp_path / "nothing", OUT, None)

@@ -49,7 +49,7 @@ def test_results_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     times = ["--times", "2026-03-05", "2026-03-01"]
     arguments = ["track", *results, *times, "--plant", "=basil", "--out", str(out), "--quiet"]
     assert main(arguments) == 0
-    assert "7 leaves of 1 plant on 2 dates" in capsys.readouterr().out
+    assert "7 leaves of 1 plant on 2 dates, 4 days apart\n" in capsys.readouterr().out
     rows = read(out / "tracks.csv")
     assert list(rows[0]) == ["plant", "time", "scene", "leaf", "track", "probability", "state"]
     assert [(row["scene"], row["leaf"]) for row in rows if row["track"] == "3"] == [("a", "3"), ("b", "3")]

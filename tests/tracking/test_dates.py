@@ -24,6 +24,14 @@ def test_times_are_days() -> None:
     assert read_time("3.5") == 3.5
     assert read_time("2026-03-02") - read_time("2026-02-27") == 3
     assert read_time("2026-03-02T12:00") - read_time("2026-03-02") == 0.5
+    assert (read_time("1e2"), read_time(".5"), read_time(-1e-3), read_time(0)) == (100, 0.5, -0.001, 0)
+
+
+def test_eight_digits_are_a_date() -> None:
+    assert read_time("20260601") == read_time(20260601) == read_time("2026-06-01")
+    dates = [replace(see(grow_blades(4, 0), 0)[0], scene=text, written=text, time=read_time(text))
+             for text in ("20260531", "2026-06-06")]  # fmt: skip
+    assert [date.time for date in order_dates(dates)] == [0, 6]
 
 
 def test_times_with_a_zone_are_in_the_order_in_which_they_were() -> None:
@@ -54,7 +62,10 @@ def test_results_of_one_name_are_told_apart_by_their_folders(tmp_path: Path) -> 
     assert next(date.scene for date in name_apart([dates[0], dates[0]])).endswith("mon/plant")
 
 
-@pytest.mark.parametrize("text", ["", "noon", "nan", "2026-13-01"])
+NO_TIMES = ["", "noon", "nan", "2026-13-01", "20261301", "2026_04_28", "0428", "260531", "1780000000", "1711121500000"]
+
+
+@pytest.mark.parametrize("text", [*NO_TIMES, "1e9", "."])
 def test_times_that_are_none_are_refused(text: str) -> None:
     with pytest.raises(InputError, match="expected a number"):
         read_time(text)
