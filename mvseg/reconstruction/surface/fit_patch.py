@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, PatchSize, measure_patch, patch_grid, patch_prior
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
-from mvseg.reconstruction.surface.mask_stack import MaskStack
+from mvseg.reconstruction.surface.mask_stack import MaskStack, places_of_views
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
 # A patch is drawn at so many rows and columns; at the second where it is still far from the masks.
@@ -217,15 +217,13 @@ def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
 
 def per_view(values: Floats, stack: np.ndarray, num_views: int) -> Floats:
     """(S,) medians; NaN for a view without samples."""
-    order, counts = np.argsort(stack, kind="stable"), np.bincount(stack, minlength=num_views)
-    first = np.cumsum(counts) - counts
-    ordered = np.full((num_views, 1 + counts.max(initial=0)), np.inf)
-    own = stack[order]
-    ordered[own, np.arange(len(own)) - first[own]] = values[order]
-    ordered.sort(1)
-    view = np.arange(num_views)
+    places = places_of_views(stack, num_views)
+    counts, view = (places >= 0).sum(1), np.arange(num_views)
+    ordered = np.sort(np.append(values, np.nan)[places], 1)  # what is not a number comes last
+    if not ordered.size:
+        return np.full(num_views, np.nan)
     medians: Floats = (ordered[view, np.maximum(counts - 1, 0) // 2] + ordered[view, counts // 2]) / 2
-    return np.where(counts > 0, medians, np.nan)
+    return medians
 
 
 def _normal_matrix(coefficients: Floats, equations: _Equations, size: PatchSize) -> tuple[Floats, Floats]:

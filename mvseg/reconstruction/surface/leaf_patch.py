@@ -157,16 +157,13 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
     tangents = _unit(_speed_rows() @ coefficients)
     equations = [bend / (BEND_SD * length), side / (SIDE_SD * half), fold * (noise / (FOLD_STEP_SD * half))]
     shear, upright = noise / (SHEAR_SD * half), noise / (NORMAL_SD * half)
-    rows = np.eye(NUM_COEFFICIENTS)
-    for place, (along, across, normal) in zip((SIDE, FOLD, CURL), frames, strict=True):
-        equations.append(_along(rows[place], along) * shear)
-        if place != SIDE:
-            equations += [_along(rows[place], across) * shear, _along(rows[place], normal) * upright]
+    directions = [frames[0][0] * shear]
+    for along, across, normal in frames[1:]:
+        directions += [along * shear, across * shear, normal * upright]
     # The outline of a round blade does not tell where its midrib runs, which would wind and come out too long. That of
     # a narrow one does.
-    turns, sideways = np.diff(_speed_rows(), axis=0), pieces[1][1:-1]
-    equations.append(_along(turns, sideways) * (2 * half / (SWAY_SD * length**2)))
-    equations.append(_along(_speed_rows(), tangents) / (SPEED_SD * length))
+    directions += [pieces[1][1:-1] * (2 * half / (SWAY_SD * length**2)), tangents / (SPEED_SD * length)]
+    equations.append(_along(_directed_rows(), np.concatenate(directions)))
     target = np.zeros(sum(map(len, equations)))
     target[-len(tangents) :] = 1 / SPEED_SD
     return np.concatenate(equations), target
@@ -175,6 +172,14 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
 def _along(rows: Floats, directions: Floats) -> Floats:
     """(E, 78) rows (E, 26) along directions (E, 3)."""
     return (rows[:, :, None] * directions[:, None, :]).reshape(len(rows), -1)
+
+
+@cache
+def _directed_rows() -> Floats:
+    """(E, 26) what the prior holds along directions: Q along the midrib, R and S along it, across and along the normal,
+    turns of the midrib, and its speed."""
+    side, fold, curl = (np.eye(NUM_COEFFICIENTS)[part] for part in (SIDE, FOLD, CURL))
+    return np.concatenate([side, *[fold] * 3, *[curl] * 3, np.diff(_speed_rows(), axis=0), _speed_rows()])
 
 
 @cache

@@ -64,6 +64,11 @@ class MaskStack:
         away = [[cv2.distanceTransform(side, cv2.DIST_L2, 3) for side in (mask, 1 - mask)] for mask in inside]
         return np.array([np.maximum(within - 0.5, 0) - np.maximum(beyond - 0.5, 0) for within, beyond in away])
 
+    @cached_property
+    def edge_places(self) -> NDArray[np.int64]:
+        """(S, most) `places_of_views` of the samples of the edges."""
+        return places_of_views(self.edge_stack, len(self))
+
     @property
     def size(self) -> tuple[int, int]:
         """Rows and columns of a crop."""
@@ -176,6 +181,16 @@ def stack_masks(
         edge_stack=np.repeat(np.arange(len(edges)), [len(px) for px, _ in edges]),
         axes=np.eye(3) if axes is None else axes,
     )
+
+
+def places_of_views(stack: NDArray, num_views: int) -> NDArray[np.int64]:
+    """(S, most) the places in `stack` (N,) of the samples of each view, in order; -1 beyond the last one."""
+    order = np.argsort(stack, kind="stable")
+    counts = np.bincount(stack, minlength=num_views)
+    places = np.full((num_views, counts.max(initial=0)), -1)
+    ordered = stack[order]
+    places[ordered, np.arange(len(stack)) - (np.cumsum(counts) - counts)[ordered]] = order
+    return places
 
 
 def choose_pixel_size(num_pixels: Sequence[int], longest: int) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.reconstruction.surface.leaf_patch import Floats, PatchGrid
-from mvseg.reconstruction.surface.mask_stack import MaskStack
+from mvseg.reconstruction.surface.mask_stack import MaskStack, places_of_views
 from mvseg.reconstruction.surface.patch_image import (
     DRAWN_TOO_FAR,
     SUPERSAMPLED,
@@ -111,33 +111,32 @@ def _rim_places(rows: int, columns: int) -> tuple[NDArray[np.int64], NDArray[np.
 
 def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
     """Middles of the grid edges between quads that are seen from different sides."""
-    px = projection.px
-    is_front = grid_orientations(px) > 0
-    columns = grid.shape[1]
+    rows, columns = grid.shape
+    px, depth, is_front = projection.px.reshape(-1, 2), projection.depth.ravel(), grid_orientations(projection.px) > 0
 
-    def centres(stack: NDArray, row: NDArray, column: NDArray) -> Floats:
-        """Of quads."""
-        around = px[stack, row + 1, column + 1] + px[stack, row, column]
-        return (around + px[stack, row + 1, column] + px[stack, row, column + 1]) / 4
+    def middles(corner: NDArray) -> Floats:
+        """Of quads with this first corner."""
+        quad: Floats = px[corner + columns + 1] + px[corner] + px[corner + columns] + px[corner + 1]
+        return quad / 4
 
     parts = []
-    for along_rows, first in ((True, px[0, ..., 0].size), (False, 2 * px[0, ..., 0].size)):
-        if along_rows:  # edges from row to row, between quads side by side
-            stack, row, column = np.nonzero(is_front[:, :, 1:] != is_front[:, :, :-1])
-            a, b = (row, column + 1), (row + 1, column + 1)
-            inner = (centres(stack, row, column) + centres(stack, row, column + 1)) / 2
-        else:
-            stack, row, column = np.nonzero(is_front[:, 1:] != is_front[:, :-1])
-            a, b = (row + 1, column), (row + 1, column + 1)
-            inner = (centres(stack, row, column) + centres(stack, row + 1, column)) / 2
-        middle = (px[stack, *a] + px[stack, *b]) / 2
+    # Edges from row to row, between quads side by side, and from column to column.
+    for number, (to_next, differ) in enumerate(
+        ((1, is_front[:, :, 1:] != is_front[:, :, :-1]), (columns, is_front[:, 1:] != is_front[:, :-1]))
+    ):
+        stack, row, column = np.nonzero(differ)
+        corner = (stack * rows + row) * columns + column
+        a, b = corner + to_next, corner + columns + 1
+        first, second = px[a], px[b]
+        inner = (middles(corner) + middles(a)) / 2
+        middle = (first + second) / 2
         parts.append(
             OutlineSamples(
                 stack=stack,
                 px=middle,
-                normals=_outwards(px[stack, *b] - px[stack, *a], middle - inner),
-                place=first + a[0] * columns + a[1],
-                depth=projection.depth[stack, *a],
+                normals=_outwards(second - first, middle - inner),
+                place=(number + 1) * rows * columns + row * columns + column + to_next,
+                depth=depth[a],
             )
         )
     return _concatenate(*parts)
@@ -145,9 +144,10 @@ def _fold_samples(grid: PatchGrid, projection: Projection) -> OutlineSamples:
 
 def _outwards(tangent: Floats, away: Floats) -> Floats:
     """Unit normals of tangents (..., 2) on the side that `away` points to."""
-    normal = np.stack([tangent[..., 1], -tangent[..., 0]], -1)
-    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
-    return np.where((normal * away).sum(-1, keepdims=True) < 0, -normal, normal)
+    x, y = tangent[..., 1], -tangent[..., 0]
+    length = np.maximum(np.sqrt(x * x + y * y), 1e-9)
+    length = np.where(x * away[..., 0] + y * away[..., 1] < 0, -length, length)
+    return np.stack([x / length, y / length], -1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -304,7 +304,7 @@ def nearest_samples(
     Where the patch stops short of a tip there is none ahead: samples outside the patch and far from its outline pull
     the nearest sample straight towards them.
     """
-    edge, own = _places(masks.edge_stack, len(masks)), _places(samples.stack, len(masks))
+    edge, own = masks.edge_places, places_of_views(samples.stack, len(masks))
     there = _take(masks.edge_px, edge)
     here = _take(samples.px, own)
     from_edge, from_own = (np.where(at < 0, np.inf, (px**2).sum(2)) for at, px in ((edge, there), (own, here)))
@@ -325,16 +325,6 @@ def nearest_samples(
     ahead = ahead / np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     toward = np.where(pulls[view, place][:, None], ahead, normals[view, place])
     return own[view, nearest[view, place]], edge[view, place], toward
-
-
-def _places(stack: NDArray, num_views: int) -> NDArray:
-    """(S, most) the places in `stack` (N,) of the samples of each view, in order; -1 beyond the last one."""
-    order = np.argsort(stack, kind="stable")
-    counts = np.bincount(stack, minlength=num_views)
-    places = np.full((num_views, counts.max(initial=0)), -1)
-    ordered = stack[order]
-    places[ordered, np.arange(len(stack)) - (np.cumsum(counts) - counts)[ordered]] = order
-    return places
 
 
 def _take(values: NDArray, places: NDArray) -> NDArray:
