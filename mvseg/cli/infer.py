@@ -19,6 +19,8 @@ def add_options(parser: ArgumentParser) -> None:
     parser.add_argument("scene", nargs="?", type=Path | None, help=help_scene)
     help_again = "repeat the run that made this result, with its options and, if given, with other --corrections"
     parser.add_argument("--again", type=Path | None, help=help_again)
+    help_detector = "with --again: weights that have learned this plant, in place of those of the run"
+    parser.add_argument("--detector", type=Path | None, help=help_detector)
     add_run_options(parser)
     add_shared(parser, "corrections", "force_corrections", "overwrite", "num_workers")
 
@@ -33,6 +35,8 @@ def run(args: Namespace) -> int:
     if args.again is not None:
         _run_again(args, num_workers)
         return 0
+    if args.detector is not None:
+        raise InputError("--detector is of --again; the weights of a new run are --detect.weights")
     if args.scene is None:
         print("mvseg: no SCENE given: this is the plant that ships with mvseg", file=sys.stderr)
     scene = args.scene or demo_scene()
@@ -54,14 +58,18 @@ def _run_again(args: Namespace, num_workers: int) -> None:
     from mvseg.results.read import find_result
     from mvseg.runs.one_scene import run_again
 
-    if args.scene is not None or args.masks is not None or build_run(args) != RunConfig():
+    learn = build_run(args).learn
+    if args.scene is not None or args.masks is not None or build_run(args) != RunConfig(learn=learn):
         raise InputError(
             f"--again repeats the run of {args.again} with its options, expected no scene, no masks and no other "
-            "options than --corrections, --force_corrections, --out, --overwrite, --num_workers and --quiet"
+            "options than --learn, --detector, --corrections, --force_corrections, --out, --overwrite, --num_workers and "
+            "--quiet"
         )
     run_again(
         find_result(args.again),
         out=args.out,
+        learn=None if learn == "auto" else learn,
+        detector=args.detector,
         corrections=args.corrections,
         force_corrections=args.force_corrections,
         num_workers=num_workers,

@@ -115,7 +115,7 @@ def add_run_options(parser: ArgumentParser) -> None:
     help_views = "take so many views, evenly spread around the plant, or 'all' (default: all with --masks, or else 20)"
     parser.add_argument("--views", type=int | Literal["all"] | None, help=help_views)
     help_learn = "rounds in which the views teach the detector; auto: where it does not know the species"
-    parser.add_argument("--learn", type=int | Literal["auto", "off"], default="auto", help=help_learn)
+    parser.add_argument("--learn", type=int | bool | Literal["auto", "off"], default="auto", help=help_learn)
     parser.add_class_arguments(DetectConfig, "detect")
     parser.add_class_arguments(ReconstructConfig, "reconstruct")
     parser.add_class_arguments(TraitsConfig, "traits")
@@ -134,6 +134,7 @@ def build_run(args: Namespace) -> RunConfig:
         match=build_options(MatchConfig, args.match, "match."),
         reconstruct=build_options(ReconstructConfig, args.reconstruct, "reconstruct."),
         traits=build_options(TraitsConfig, args.traits, "traits."),
+        learn="off" if args.learn is False else args.learn,  # YAML takes off for false
         up=read_up(args.up),
         **{name: args[name] for name in plain},
     )

@@ -40,7 +40,9 @@ ROUNDS = 2  # where nobody says how many: a third one gained nothing on any plan
 GROWTH = 1.1  # of E, from which new weights stay: where there is nothing to learn, it does not grow (docs/detector.md)
 
 
-def learn(known: Known, *, cache: CachedDetections, corrections: Corrections | None = None) -> Known:
+def learn(
+    known: Known, *, cache: CachedDetections, corrections: Corrections | None = None, rounds: int | None = None
+) -> Known:
     """Let the detector learn the plant at hand, in the rounds that `RunConfig.learn` asks for.
 
     A round: labels from what the views chose, and from what a person corrected; the weights that the run began with
@@ -52,13 +54,15 @@ def learn(known: Known, *, cache: CachedDetections, corrections: Corrections | N
         known: of leaves that the views chose.
         cache: where the weights lie; rounds that are there already are not learned again.
         corrections: of a person; his masks are certain.
+        rounds: that a person asks for, who judges himself: so many are learned, and the last weights stay. None: as
+            many as `RunConfig.learn` says, and E judges.
 
     Returns:
         The same, seen with the best weights. Warns (InputWarning) where the views agree about too few leaves.
     """
     best, expected = known, [known.expected_right]
     try:
-        for number in range(1, _count_rounds(known) + 1):
+        for number in range(1, (_count_rounds(known) if rounds is None else rounds) + 1):
             with collect_warnings():  # what there is to say of edits, is said when they are applied
                 edited = apply_edits(best, corrections)
             chances = edited.instances.probabilities
@@ -71,7 +75,7 @@ def learn(known: Known, *, cache: CachedDetections, corrections: Corrections | N
             say(f"learning, round {number}: {labels.num_leaves} leaves in {len(labels.leaves)} masks")
             seen = _learn_once(known, labels, cache)
             expected.append(seen.expected_right)
-            if seen.expected_right < GROWTH * best.expected_right:
+            if rounds is None and seen.expected_right < GROWTH * best.expected_right:
                 break
             best = replace(seen, learned=replace(seen.learned, rounds=number))
     except KeyboardInterrupt:

@@ -20,6 +20,7 @@ from torch import Tensor
 from mvseg.corrections.file import FORMAT as EDITS_FORMAT
 from mvseg.corrections.file import parse_corrections
 from mvseg.crop import Crop
+from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import Rle, decode_crop, decode_rle
 from mvseg.formats.image_file import file_name_problem
@@ -33,7 +34,7 @@ from mvseg.regions import Regions, stack_regions
 from mvseg.results.earlier import RUN_FILE
 from mvseg.results.folder import CORRECTED
 from mvseg.results.photo_masks import regions_in_photos
-from mvseg.results.result import Instances, Result
+from mvseg.results.result import Instances, Learned, Result
 from mvseg.results.run_record import RunRecord, find_place, load_run
 from mvseg.scene import Cameras, Scene, View
 from mvseg.system.file_hash import hash_files
@@ -44,7 +45,7 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.traits.measure import Traits
 
 MOST_INSTANCES = 65534  # that 16 bits of a label image hold
-READ_FILES = ("instances.json", "traits.csv", "traits_wide.csv", "surfaces.npz", "voxels.npz")
+READ_FILES = (DETECTOR_FILE, "instances.json", "traits.csv", "traits_wide.csv", "surfaces.npz", "voxels.npz")
 Box = tuple[int, int, int, int]
 
 
@@ -99,6 +100,13 @@ class _Mask(BaseModel):
 class _Instances(BaseModel):
     images: Items[_Image]
     annotations: Items[_Mask]
+
+
+def load_learned(folder: Path, run: RunRecord) -> Learned:
+    """What the detector has learned from the scene of a result."""
+    path = folder / DETECTOR_FILE
+    weights = path.read_bytes() if path.is_file() else None
+    return Learned(weights=weights, rounds=run.learned.rounds, expected_right=run.learned.expected_right)
 
 
 def find_result(folder: Path) -> Path:
@@ -160,6 +168,7 @@ def load_result(folder: Path | str) -> Result:
         matching=Matching(masks, _report_of(run)),
         instances=instances,
         poses=poses,
+        learned=load_learned(folder, run),
         seconds=run.seconds,
         mask_kind=run.mask_kind or "",
         num_moved=run.counts.get("moved"),

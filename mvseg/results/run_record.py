@@ -42,6 +42,13 @@ class TraitsRecord(_Part):
     up: Vector3 | None = None
 
 
+class LearnedRecord(_Part):
+    """See `Learned`."""
+
+    rounds: int = 0
+    expected_right: tuple[float, ...] = ()
+
+
 class RunRecord(_Part):
     """What the run knew that made a result. Attributes are the fields of run.json, see docs/results.md; further fields
     of the file are kept, too."""
@@ -66,6 +73,7 @@ class RunRecord(_Part):
     traits: TraitsRecord | None = None
     edits: Items[Any] = []
     corrections: tuple[Fate, ...] = ()
+    learned: LearnedRecord = LearnedRecord()
     counts: dict[str, int] = {}
     seconds: dict[str, float] = {}
     files: dict[str, str] = {}

@@ -6,9 +6,10 @@ import platform
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
 
 import torch
 
@@ -17,13 +18,15 @@ from mvseg.checks.check_scene import check_scene
 from mvseg.config import RunConfig
 from mvseg.detection.cached_detections import claim_cache, delete_cached
 from mvseg.detection.config import DetectConfig
+from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.photos import Photos
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.results.earlier import Output, check_out
 from mvseg.results.folder import photos_folder, save_result
-from mvseg.results.result import Result
+from mvseg.results.read import load_learned
+from mvseg.results.result import NOTHING_LEARNED, Learned, Result
 from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.file_hash import hash_files
@@ -40,8 +43,11 @@ def run_one_scene(
     force_corrections: bool = False,
     num_workers: int = 1,
     overwrite: bool = False,
+    learned: Learned = NOTHING_LEARNED,
 ) -> None:
     """One scene from its folder to its result folder; InputWarnings go to stderr and to run.json.
+
+    `learned`: weights that have learned this scene before are used, and not learned again.
 
     Raises:
         InputError: bad input; corrections of another scene, unless `force_corrections` is set; `out` holds a result of
@@ -61,10 +67,11 @@ def run_one_scene(
         if masks is None and stack.enter_context(claim_cache(cache, scene, overwrite=overwrite)):
             print(f"mvseg: going on from the detections in {cache}, for equal photos and options", file=sys.stderr)
         with running(num_workers=num_workers):
+            place_of_weights = Path(stack.enter_context(TemporaryDirectory()))
             result, messages = solve_scene(
                 scene,
                 masks,
-                config,
+                _with_learned(config, learned, place_of_weights),
                 corrections=corrections,
                 force_corrections=force_corrections,
                 cache=cache,
@@ -74,6 +81,8 @@ def run_one_scene(
             print(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", file=sys.stderr)
         for message in messages:
             print(f"mvseg: warning: {message}", file=sys.stderr)
+        if learned.weights is not None:
+            result = replace(result, learned=learned)
         save_scene(result, scene, out, masks=masks, config=config, messages=messages, output=output)
         if masks is None:
             delete_cached(cache)
@@ -82,10 +91,21 @@ def run_one_scene(
     print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
 
 
+def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfig:
+    """The same with weights that have learned the scene before, in a file in this folder."""
+    if learned.weights is None:
+        return config
+    path = folder / DETECTOR_FILE
+    path.write_bytes(learned.weights)
+    return replace(config, detect=replace(config.detect, weights=str(path)), learn="off")
+
+
 def run_again(
     folder: Path,
     *,
     out: Path | None = None,
+    learn: int | Literal["auto", "off"] | None = None,
+    detector: Path | None = None,
     corrections: Path | None = None,
     force_corrections: bool = False,
     num_workers: int = 1,
@@ -96,6 +116,9 @@ def run_again(
     Args:
         folder: the result.
         out: where the new one goes; None: in its place.
+        learn: in how many rounds the views teach the detector, see `RunConfig.learn`; None: what the run has learned
+            before is used.
+        detector: file of weights that have learned this scene; None: that of the result, if it has one.
         corrections: file of a person's edits; None: that of the run, if it had one.
         force_corrections, num_workers, overwrite: as of `run_one_scene`.
 
@@ -105,11 +128,15 @@ def run_again(
     run = read_recorded(folder)
     for change in run.changes:
         print(f"mvseg: {change}", file=sys.stderr)
+    learned = load_learned(folder, run.said)
+    if detector is not None:
+        learned = replace(learned, weights=detector.read_bytes(), rounds=1)
     run_one_scene(
         run.scene,
         None if run.masks is None else run.masks.resolve(),
         folder if out is None else out,
-        config=run.config,
+        config=run.config if learn is None else replace(run.config, learn=learn),
+        learned=learned if learn is None else NOTHING_LEARNED,
         corrections=(corrections or run.corrections) and Path(corrections or run.corrections or "").resolve(),
         force_corrections=force_corrections,
         num_workers=num_workers,

@@ -10,11 +10,14 @@ from dataclasses import replace
 from functools import cached_property
 from itertools import count
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 from torch import Tensor
 
 from mvseg.corrections.file import Corrections, load_corrections
+from mvseg.detection.cached_detections import CachedDetections
+from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, collect_warnings
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
@@ -22,6 +25,7 @@ from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.find_leaves import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known, match_given
+from mvseg.pipeline.learn import learn
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.regions import stack_regions
@@ -57,11 +61,15 @@ class OpenResult:
         changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
         self.notice = " ".join(("What you see is computed anew.", *changes)) if changes else ""
         saved = self.saved_corrections()  # the views that they name are taken
-        self.opened = open_scene(self.run.scene, self.run.masks, self.run.config, corrections=saved)
+        config = self.run.config
+        if (folder / DETECTOR_FILE).is_file():  # it has learned this plant: nobody waits for that again
+            config = replace(config, detect=replace(config.detect, weights=str(folder)), learn="off")
+        self.opened = open_scene(self.run.scene, self.run.masks, config, corrections=saved)
         self.scene, self.photos = self.opened.scene, self.opened.photos
         if not self.photos.exist:
             raise InputError(f"{self.scene.views[0].path}: the photos of this result are gone, expected them there")
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
+        self.learned: tuple[Known, list[str]] | None = None  # what is known since the detector learned the plant
 
     def saved_corrections(self) -> Corrections:
         """What was saved into the result folder before; none without the file."""
@@ -92,7 +100,7 @@ class OpenResult:
             Cancelled: `is_old`, which is asked between the stages, said so.
             InputError: see the stages.
         """
-        known, messages = self._known
+        known, messages = self._known if self.learned is None else self.learned
         with running(is_cancelled=is_old), collect_warnings() as more:
             edited = apply_edits(known, corrections)
             result = shape_leaves(edited)
@@ -103,6 +111,28 @@ class OpenResult:
             [describe_fate(fate) for fate in shown.fates],
             [text for text in dict.fromkeys(messages + more) if text not in told],
         )
+
+    def learn(self, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]) -> None:
+        """Let the detector learn the leaves that the views agree about, and those that a person outlined, in one round;
+        `learned` is what is known then, and None undoes it. Each time begins with the weights of the run.
+
+        Args:
+            corrections: of the person.
+            is_old: whether nobody wants it any more; asked at every step.
+            report: is told what is done.
+
+        Raises:
+            Cancelled: `is_old` said so.
+            InputError: masks were given, so there is no detector.
+        """
+        if self.opened.given is not None:
+            raise InputError("The masks of this result were given, so there is no detector that could learn.")
+        known, _ = self._known
+        with running(is_cancelled=is_old, report=report), collect_warnings() as said, TemporaryDirectory() as place:
+            learned = learn(known, cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
+        if learned.learned.weights is None:
+            raise InputError(f"{' '.join(said)}.")
+        self.learned = learned, said
 
     @cached_property
     def _known(self) -> tuple[Known, list[str]]:

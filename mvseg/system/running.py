@@ -30,14 +30,16 @@ class Running:
         kept: {name of what it was computed from: what was computed}; None: nothing is kept.
         seconds: {stage: wall time}, see `timed`.
         is_cancelled: asked before each stage, see `timed`.
+        report: is told what is done, in words, as it goes on; None: nobody listens.
         told: names of the progress bars that have a line already, where there is no terminal.
     """
 
     progress: bool = False
     workers: ProcessPoolExecutor | None = None
     kept: dict[str, Any] | None = None
-    seconds: dict[str, float] = field(default_factory=dict)
-    is_cancelled: Callable[[], bool] = lambda: False
+    seconds: dict[str, float] = field(default_factory=dict, compare=False)
+    is_cancelled: Callable[[], bool] = field(default=lambda: False, compare=False)
+    report: Callable[[str], None] | None = field(default=None, compare=False)
     told: set[str] = field(default_factory=set, compare=False)
 
 
@@ -62,6 +64,7 @@ def running(
     num_workers: int | None = None,
     keep: bool = False,
     is_cancelled: Callable[[], bool] | None = None,
+    report: Callable[[str], None] | None = None,
 ) -> Iterator[Running]:
     """Let all of mvseg that is called inside the block work so. A thread that is started there does not know of it.
 
@@ -70,6 +73,8 @@ def running(
         num_workers: processes that surfaces are fitted in, stopped at the end, see `start_workers`; None: as outside.
         keep: what was computed inside, or outside where that is kept, too, is not computed again, see `fit_kept`.
         is_cancelled: asked before each stage; where it says so, that stage raises `Cancelled`. None: as outside.
+        report: is told what is done, as "learning: step 30 of 75"; then `is_cancelled` is asked at each step, too.
+            None: as outside.
 
     Raises:
         InputError: fewer than one process.
@@ -81,7 +86,10 @@ def running(
         kept = {} if keep and outside.kept is None else outside.kept
         cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
         told = outside.told if outside.progress else set()
-        now = Running(progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled, told=told)
+        report = outside.report if report is None else report
+        now = Running(
+            progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled, report=report, told=told
+        )
         stack.callback(_NOW.reset, _NOW.set(now))
         yield now
 
@@ -103,7 +111,9 @@ def timed(stage: str) -> Iterator[None]:
 
 def say(sentence: str) -> None:
     """A line that says what is done, beside the progress bars; nothing where the run is silent."""
-    if now_running().progress:
+    if (report := now_running().report) is not None:
+        report(sentence)
+    elif now_running().progress:
         tqdm.write(f"mvseg: {sentence}", file=sys.stderr)
 
 
@@ -113,6 +123,8 @@ def progress_bar(
     """tqdm's bar with a name in front, hidden where the run is silent. On a terminal, each takes the line of the one
     before; in a file or a pipe, each name has a line at its end, and one a minute until then."""
     now = now_running()
+    if now.report is not None:
+        return _Reported(items, name, total, unit=unit, disable=True)
     if not now.progress or sys.stderr.isatty():
         form = f"{{desc}}: {unit} {{n_fmt}} of {{total_fmt}}, {{remaining}} left{{postfix}}"
         return tqdm(items, name, total, unit=unit, bar_format=form, leave=False, disable=not now.progress)
@@ -120,6 +132,23 @@ def progress_bar(
     now.told.add(name)
     form = f"{{desc}}: {{percentage:.0f}}% of {{total_fmt}} {unit}s, {{elapsed}}{{postfix}}"
     return _Lines(items, name, total, unit=unit, bar_format=form, leave=True, disable=is_told)
+
+
+class _Reported(tqdm):  # type: ignore[misc]  # it has no types
+    """A bar that somebody else shows."""
+
+    def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, **how: Any) -> None:
+        super().__init__(items, name, total, **how)
+        self.words, self.count = (name, how["unit"]), total or len(items or ())  # type: ignore[arg-type]
+
+    def __iter__(self) -> Iterator[Any]:
+        now, (name, unit) = now_running(), self.words
+        for number, item in enumerate(self.iterable, start=1):
+            if now.is_cancelled():
+                raise Cancelled
+            if now.report is not None:
+                now.report(f"{name}: {unit} {number} of {self.count}")
+            yield item
 
 
 class _Lines(tqdm):  # type: ignore[misc]  # it has no types
