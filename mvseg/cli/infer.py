@@ -62,8 +62,8 @@ def _run_again(args: Namespace, num_workers: int) -> None:
     if args.scene is not None or args.masks is not None or build_run(args) != RunConfig(learn=learn):
         raise InputError(
             f"--again repeats the run of {args.again} with its options, expected no scene, no masks and no other "
-            "options than --learn, --detector, --corrections, --force_corrections, --out, --overwrite, --num_workers and "
-            "--quiet"
+            "options than --learn, --detector, --corrections, --force_corrections, --out, --overwrite, --num_workers "
+            "and --quiet"
         )
     run_again(
         find_result(args.again),
