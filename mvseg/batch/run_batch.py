@@ -12,7 +12,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from mvseg._version import made_by
-from mvseg.batch.scene_list import BatchScene, list_scenes
+from mvseg.batch.scene_list import BatchScene, list_scenes, with_teachers
 from mvseg.batch.status import STATE, TABLES, Status, scene_state, write_status
 from mvseg.batch.tables import write_tables
 from mvseg.batch.work import Finished, work_on_scene
@@ -52,7 +52,8 @@ def run_batch(
     Args:
         source: a table or a folder of scenes, see `list_scenes`.
         out: folder of the results; made when missing.
-        config: the options of all scenes.
+        config: the options of all scenes. With a number for `learn`, the detector learns the first plant of each
+            species (the table's column of that name; without one, all are of one), and all others are seen with it.
         masks: in each scene folder, or beside them; None: a detector finds them.
         resume: continue the batch that `out` holds: scenes that are done with the same inputs and options are kept.
         num_workers: processes, >= 1, where no scheduler is given.
@@ -65,6 +66,8 @@ def run_batch(
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
     scenes = list_scenes(source, out, masks)
+    if isinstance(config.learn, int):
+        scenes = with_teachers(scenes)
     if any(scene.masks is None for scene in scenes):
         config = _find_weights(config)
     place = resolve_place(out)
@@ -94,14 +97,14 @@ def _find_weights(config: RunConfig) -> RunConfig:
     Raises:
         InputError: there are no such weights.
     """
-    from mvseg.detectors.zoo import find_weights  # loads torchvision
+    from mvseg.detectors.zoo import find_weights, weights_path  # loads torchvision
 
     weights = config.detect.weights
     if find_weights(weights) is not None:
         return config
-    if not Path(weights).is_file():
+    if not weights_path(weights).is_file():
         raise InputError(f"'{weights}' is neither a shipped detector (mvseg models) nor a file of weights")
-    return replace(config, detect=replace(config.detect, weights=str(Path(weights).absolute())))
+    return replace(config, detect=replace(config.detect, weights=str(weights_path(weights).absolute())))
 
 
 def _claim(out: Path, *, resume: bool) -> None:
@@ -121,7 +124,8 @@ def _claim(out: Path, *, resume: bool) -> None:
 
 
 def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dict[int, Finished]:
-    """Run all scenes in parallel, then those whose worker died once more, one at a time, when memory is free again."""
+    """Run all scenes in parallel, first those that teach the detector; then those whose worker died once more, one at a
+    time, when memory is free again."""
     finished: dict[int, Finished] = {}
     again: list[int] = []
     running: dict[int, str] = {}  # in the order in which they began
@@ -135,7 +139,11 @@ def _work_on_all(scenes: Sequence[BatchScene], engine: Engine, out: Path) -> dic
         show()
 
     def rounds() -> Iterator[tuple[bool, dict[int, BatchScene]]]:
-        yield False, dict(enumerate(scenes))
+        numbered = dict(enumerate(scenes))
+        taught = {index: scene for index, scene in numbered.items() if scene.teacher is not None}
+        yield False, {index: scene for index, scene in numbered.items() if index not in taught}
+        if taught:
+            yield False, taught
         for index in again:
             yield True, {index: scenes[index]}
 

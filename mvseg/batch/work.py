@@ -7,7 +7,7 @@ import threading
 import time
 import traceback
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
@@ -17,6 +17,7 @@ from mvseg.batch.scene_key import scene_key
 from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status, scene_state, write_status
 from mvseg.config import RunConfig
+from mvseg.detectors.weights_file import DETECTOR_FILE
 from mvseg.errors import InputError, InputWarning
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, Output, check_out
@@ -50,6 +51,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
         earlier = read_status(folder)
         try:
             masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
+            config = _with_teacher(config, scene, out)
             edits = scene.corrections and find_masks(scene.folder, scene.corrections, what="corrections")
             with warnings.catch_warnings(action="ignore", category=InputWarning):  # the run itself gives them
                 key = scene_key(load_scene(scene.folder), masks, config, corrections=edits)
@@ -64,6 +66,14 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
         status = status.model_copy(update={"key": key, "seconds": seconds, "peak_mb": _peak_mb()})
         write_status(folder, status)
     return Finished(status)
+
+
+def _with_teacher(config: RunConfig, scene: BatchScene, out: Path) -> RunConfig:
+    """The same with the weights that have learned the scene's species, if these are better than those before."""
+    learned = None if scene.teacher is None else out / scene.teacher / DETECTOR_FILE
+    if learned is None or not learned.is_file():
+        return config if scene.teacher is None else replace(config, learn="off")
+    return replace(config, detect=replace(config.detect, weights=str(learned)), learn="off")
 
 
 def _is_done(status: Status, result: Path) -> bool:

@@ -16,7 +16,7 @@ import torch
 from PIL import Image, ImageOps
 
 from mvseg.batch import work as batch_work
-from mvseg.batch.scene_list import BatchScene
+from mvseg.batch.scene_list import BatchScene, with_teachers
 from mvseg.batch.status import Status, read_status, scene_state
 from mvseg.batch.work import Finished, work_on_scene
 from mvseg.config import RunConfig
@@ -218,3 +218,24 @@ def test_a_status_of_another_kind_counts_as_none(tmp_path: Path) -> None:
     assert read_status(tmp_path) is None
     assert read_status(tmp_path / "nothing") is None
     assert Status(state="done", scene="x").peak_mb is None
+
+
+def test_the_first_plant_of_a_species_teaches_the_others(scene: BatchScene, tmp_path: Path) -> None:
+    plain = replace(scene, masks=None)
+    table = [
+        replace(plain, name=name, carried={"species": species}, masks=masks)
+        for name, species, masks in (
+            ("a", "fig", Path("masks")), ("b", "fig", None), ("c", "ivy", None), ("d", "fig", None), ("e", "ivy", None)
+        )
+    ]  # fmt: skip
+    taught = with_teachers(table)
+    assert [each.teacher for each in taught] == [None, None, None, "b", "c"]
+    assert [each.teacher for each in with_teachers([replace(plain, name=name) for name in "xy"])] == [None, "x"]
+    config = replace(CONFIG, learn=2)
+    assert batch_work._with_teacher(config, taught[1], tmp_path) == config
+    assert batch_work._with_teacher(config, taught[3], tmp_path) == replace(config, learn="off")  # nothing was learned
+    (tmp_path / "b").mkdir()
+    (tmp_path / "b" / "detector.safetensors").touch()
+    learned = batch_work._with_teacher(config, taught[3], tmp_path)
+    assert learned.detect.weights == str(tmp_path / "b" / "detector.safetensors")
+    assert learned.learn == "off"
