@@ -142,7 +142,7 @@ def test_leaves_are_chosen_on_the_cpu(
         assert {each.device.type for each in (given["cameras"].K, matched.view_index, proposals.view_index)} == {"cpu"}
         return Leaves(proposals, {}, {}, ())
 
-    monkeypatch.setattr("mvseg.detection.mask_rcnn.choose_leaves", choose)
+    monkeypatch.setattr("mvseg.detection.find_leaves.choose_leaves", choose)
     answers = there(wrapped, device)([photo.to(device) for photo in photos], cameras=CAMERAS.to(device))
     for answer, expected in zip(answers, wrapped(photos, cameras=CAMERAS), strict=True):
         check(answer, expected, device)
