@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from collections import OrderedDict
 from dataclasses import replace
 
 import numpy as np
@@ -25,13 +26,16 @@ BOXES = torch.tensor([[0, 0, SIZE, SIZE]] * 2)
 
 
 class BodiedBackbone(nn.Module):
-    """A body with a frozen norm, and a layer on top of it."""
+    """A body whose first layers have a frozen norm, and a layer on top of it."""
 
     out_channels = 16
 
     def __init__(self) -> None:
         super().__init__()
-        self.body = nn.Sequential(nn.Conv2d(3, 16, 5, 4, 2), FrozenBatchNorm2d(16, eps=0.0), nn.ReLU())
+        stem = nn.Sequential(nn.Conv2d(3, 16, 5, 4, 2), FrozenBatchNorm2d(16, eps=0.0), nn.ReLU())
+        stage1 = nn.Conv2d(16, 16, 1)
+        nn.init.dirac_(stage1.weight)
+        self.body = nn.Sequential(OrderedDict(stem=stem, stage1=stage1))
         self.fpn = nn.Conv2d(16, 16, 3, 2, 1)
 
     def forward(self, photos: Tensor) -> Tensor:
@@ -45,7 +49,7 @@ def detector() -> MaskRCNN:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
         model.backbone = BodiedBackbone()
-    model.backbone.body[1].bias += 0.1
+    model.backbone.body.stem[1].bias += 0.1
     model.transform.min_size, model.transform.max_size = (SIZE,), SIZE
     return model.eval()
 
@@ -69,7 +73,7 @@ def label(boxes: list[tuple[int, int, int, int]], views: list[int]) -> ViewLabel
 LABELS = label([(10, 10, 30, 30), (36, 40, 60, 54)] * 2, [0, 0, 1, 1])
 
 
-def test_weights_are_those_of_the_seed_and_the_backbone_stays(detector: MaskRCNN, photos: list[np.ndarray]) -> None:
+def test_weights_are_those_of_the_seed_and_the_first_layers_stay(detector: MaskRCNN, photos: list[np.ndarray]) -> None:
     before, random = copy.deepcopy(detector.state_dict()), torch.get_rng_state()
     learned, again, other = (
         fine_tune(detector, photos.__getitem__, LABELS, boxes=BOXES, num_steps=3, seed=seed).state_dict()
@@ -79,7 +83,7 @@ def test_weights_are_those_of_the_seed_and_the_backbone_stays(detector: MaskRCNN
     assert all(torch.equal(value, before[name]) for name, value in detector.state_dict().items())
     assert all(torch.equal(value, learned[name]) for name, value in again.items())
     is_same = {name for name, value in learned.items() if torch.equal(value, before[name])}
-    assert is_same == {name for name in before if name.startswith("backbone.body.")}
+    assert is_same == {name for name in before if name.startswith("backbone.body.stem.")}
     assert not torch.equal(learned["backbone.fpn.weight"], other["backbone.fpn.weight"])
 
 
@@ -87,7 +91,7 @@ def test_leaves_are_learned_and_ignored_ones_are_no_background(
     detector: MaskRCNN, photos: list[np.ndarray], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The second leaf of each photo has no label: ignored in one case, background in the other."""
-    monkeypatch.setattr(module, "RECIPE", replace(module.RECIPE, lr=0.02, scale_range=(1.0, 1.0)))
+    monkeypatch.setattr(module, "RECIPE", replace(module.RECIPE, lr=0.05, batch_size=1, scale_range=(1.0, 1.0)))
     first = label([(10, 10, 30, 30)] * 2, [0, 1])
     ignoring = replace(first, doubtful=label([(34, 38, 62, 56)] * 2, [0, 1]).leaves)
 
@@ -100,12 +104,12 @@ def test_leaves_are_learned_and_ignored_ones_are_no_background(
     with torch.no_grad():
         before = objectness(detector)
         ignored, background = (
-            objectness(fine_tune(detector, photos.__getitem__, labels, boxes=BOXES, num_steps=15))
+            objectness(fine_tune(detector, photos.__getitem__, labels, boxes=BOXES, num_steps=16))
             for labels in (ignoring, first)
         )
     assert before[0] - before[1] < 0.01
-    assert background[0] - background[1] > 0.1
-    assert ignored[1] - background[1] > 0.03
+    assert background[0] - background[1] > 0.2
+    assert ignored[1] - background[1] > 0.2
 
 
 def test_it_learns_the_parts_that_it_looks_at_at_their_size(detector: MaskRCNN, photos: list[np.ndarray]) -> None:
