@@ -17,7 +17,7 @@ from pycocotools import mask as coco_mask
 from pydantic import BaseModel, FiniteFloat, NonNegativeInt, RootModel, TypeAdapter, ValidationError
 
 from mvseg.errors import InputError, faults_of, warn
-from mvseg.formats.find_views import base_name, find_views, list_some
+from mvseg.formats.find_views import PhotoSet, base_name, find_views, list_some
 from mvseg.formats.image_file import describe_turn
 from mvseg.formats.json_file import Int64, Items, check_content, load_json, read_json
 from mvseg.formats.masks.found_mask import check_categories
@@ -56,7 +56,9 @@ class _Category(BaseModel):
     name: str
 
 
-class _MaskFile(CocoFile):
+class CocoMasks(CocoFile):
+    """What is read of it; `categories` may be missing."""
+
     categories: Items[_Category] = []
 
 
@@ -107,7 +109,7 @@ def read_coco(
             none has a mask; all polygons lie between 0 and 1; or a category is not there. From the iterators: a
             segmentation cannot be decoded.
     """
-    coco = _merge([(part, _read_file(part, scene)) for part in parts]) if len(parts) > 1 else _read_file(path, scene)
+    coco = read_files(parts or [path], scene)
     view_of = _find_images(path, coco, scene)
     names = {str(category.id): category.name for category in coco.categories}
     has_ids = all(isinstance(annotation.id, int) for annotation in coco.annotations)
@@ -142,28 +144,34 @@ def read_coco(
     return [_decode_all(path, each, size, has_ids=has_ids) for each, size in zip(chosen, sizes, strict=True)]
 
 
-def _read_file(path: Path, scene: Scene) -> _MaskFile:
+def read_files(parts: Sequence[Path], scene: PhotoSet) -> CocoMasks:
+    """The content of a COCO file, or of the parts of one, in any dialect; see `read_coco`."""
+    files = [(part, _read_file(part, scene)) for part in parts]
+    return _merge(files) if len(files) > 1 else files[0][1]
+
+
+def _read_file(path: Path, scene: PhotoSet) -> CocoMasks:
     """The file; a list of results gets the images that it refers to."""
     content = load_json(path)
     if not isinstance(content, list):
         try:
-            return check_content(path, content, _MaskFile)
+            return check_content(path, content, CocoMasks)
         except InputError:
             refuse_other(path, path.read_bytes())
             raise
     results = check_content(path, content, _Results, expected="COCO").root
     listed = _find_data_set(path, results)
     if listed is None:
-        return _MaskFile(images=_guess_images(path, results, scene), annotations=results)
-    return _MaskFile(images=listed.images, annotations=results, categories=listed.categories)
+        return CocoMasks(images=_guess_images(path, results, scene), annotations=results)
+    return CocoMasks(images=listed.images, annotations=results, categories=listed.categories)
 
 
-def _find_data_set(path: Path, results: list[CocoAnnotation]) -> _MaskFile | None:
+def _find_data_set(path: Path, results: list[CocoAnnotation]) -> CocoMasks | None:
     """The COCO file beside a list of results that lists all images of its ids; None if there is none, or several."""
     ids, found = {str(result.image_id) for result in results}, []
     for other in sorted(path.parent.glob("*.json")):
         try:
-            listed = read_json(other, _MaskFile)
+            listed = read_json(other, CocoMasks)
         except InputError:  # no COCO file, which includes the results
             continue
         if ids and ids <= {str(image.id) for image in listed.images}:
@@ -171,7 +179,7 @@ def _find_data_set(path: Path, results: list[CocoAnnotation]) -> _MaskFile | Non
     return found[0] if len(found) == 1 else None
 
 
-def _guess_images(path: Path, results: list[CocoAnnotation], scene: Scene) -> list[CocoImage]:
+def _guess_images(path: Path, results: list[CocoAnnotation], scene: PhotoSet) -> list[CocoImage]:
     """The images of a list of results by their ids alone: the name of a photo, or the number that its name is, which is
     a guess, and said.
 
@@ -197,9 +205,9 @@ def _guess_images(path: Path, results: list[CocoAnnotation], scene: Scene) -> li
     return [CocoImage(id=each, file_name=name, width=0, height=0) for each, name in zip(ids, names, strict=True)]
 
 
-def _merge(parts: list[tuple[Path, _MaskFile]]) -> _MaskFile:
+def _merge(parts: list[tuple[Path, CocoMasks]]) -> CocoMasks:
     """Merge several files with independent ids: categories are identified by name, annotations by their place."""
-    merged, part_of = _MaskFile(images=[], annotations=[]), dict[str, Path]()
+    merged, part_of = CocoMasks(images=[], annotations=[]), dict[str, Path]()
     for number, (path, part) in enumerate(parts):
         names = {str(category.id): category.name for category in part.categories}
         merged.categories += [_Category(id=name, name=name) for name in names.values()]
@@ -235,18 +243,24 @@ def _find_images(path: Path, coco: CocoFile, scene: Scene) -> dict[str, int | No
         first_view = f"view {missing[0]} ({scene.views[missing[0]].name})"
         message = f"{len(missing)} views have no entry among the images and no masks, the first is {first_view}"
         warn(f"{path}: {message}; the file holds {list_some(names)}")
-    annotated = {str(annotation.image_id) for annotation in coco.annotations}
-    first_of: dict[int, CocoImage] = {}
+    check_images_once(path, coco, views)
     for image, view in zip(coco.images, views, strict=True):
-        if view is not None and str(image.id) in annotated and first_of.setdefault(view, image) is not image:
-            first, photo = first_of[view], scene.views[view].path.name
-            what = f"images {first.id} ({first.file_name}) and {image.id} ({image.file_name}) are both {photo}"
-            raise InputError(f"{path}: {what}, and both have annotations: is the data set in the file twice?")
         width, height = (0, 0) if view is None else scene.cameras.sizes[view].tolist()
         if view is not None and (image.width, image.height) not in ((0, 0), (width, height)):  # 0 x 0: not known
             found = f"image {image.file_name} is {image.width} x {image.height}, its camera says {width} x {height}"
             raise InputError(f"{path}: {found}{describe_turn(scene.views[view].path)}")
     return {str(image.id): view for image, view in zip(coco.images, views, strict=True)}
+
+
+def check_images_once(path: Path, coco: CocoFile, views: Sequence[int | None]) -> None:
+    """Raises InputError: two images with annotations are of one view (or photo); `views` are those of the images."""
+    annotated = {str(annotation.image_id) for annotation in coco.annotations}
+    first_of: dict[int, CocoImage] = {}
+    for image, view in zip(coco.images, views, strict=True):
+        if view is not None and str(image.id) in annotated and first_of.setdefault(view, image) is not image:
+            first = first_of[view]
+            what = f"images {first.id} ({first.file_name}) and {image.id} ({image.file_name}) are of one photo"
+            raise InputError(f"{path}: {what}, and both have annotations: is the data set in the file twice?")
 
 
 def _decode_all(

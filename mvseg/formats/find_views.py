@@ -6,10 +6,11 @@ import re
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Protocol
 
 from mvseg.errors import InputError, warn
 from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
-from mvseg.scene import Scene
+from mvseg.scene import View
 
 SHOWN = 3  # names in a message
 # Roboflow calls the export of 000.jpg "000_jpg.rf.<hash>.jpg".
@@ -17,7 +18,17 @@ ROBOFLOW = re.compile(r"_(jpe?g|png|tiff?|bmp|webp|heic)\.rf\.\w+$", re.IGNORECA
 LABEL_STUDIO = re.compile(r"^[0-9a-f]{8}-", re.IGNORECASE)  # its upload of 000.jpg is "5f1c0e7a-000.jpg"
 
 
-def find_views(names: Sequence[str], scene: Scene, *, source: Path, warn_of_loose: bool = False) -> list[int | None]:
+class PhotoSet(Protocol):
+    """A `Scene`, or photos without cameras."""
+
+    @property
+    def views(self) -> tuple[View, ...]: ...
+
+    @property
+    def source(self) -> Path | None: ...
+
+
+def find_views(names: Sequence[str], scene: PhotoSet, *, source: Path, warn_of_loose: bool = False) -> list[int | None]:
     """The view that each file name refers to, None for a photo that is not in the scene.
 
     A name refers to a view if it is the path of the view's photo, the last part of that path, either of them with one
@@ -83,7 +94,7 @@ def natural_order(name: str) -> list[tuple[int, int | str]]:
     return [(0, int(part)) if part.isdecimal() else (1, part) for part in parts]
 
 
-def _exact_views(names: Sequence[str], scene: Scene, source: Path) -> list[int | None]:
+def _exact_views(names: Sequence[str], scene: PhotoSet, source: Path) -> list[int | None]:
     """The view of each name by its path or its name, None if neither matches."""
     by_name = {view.name: index for index, view in enumerate(scene.views)}
     by_path: dict[str, list[int]] = defaultdict(list)

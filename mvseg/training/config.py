@@ -29,7 +29,8 @@ class TrainConfig:
     Attributes:
         output: folder for everything the run writes; made when missing.
         photos: folder of the training photos, together with labels.
-        labels: folder of label PNGs with the stems of the photos (0 background, 65535 ignored), or a COCO JSON file.
+        labels: masks of any kind that `--masks` takes: a folder of label PNGs with the stems of the photos (0
+            background, 65535 ignored), for example, or a COCO JSON file.
         from_results: a result folder of `mvseg infer`, or a folder of results: learn from their certain and corrected
             masks, instead of or in addition to `photos`; doubtful masks are ignored. Use `new_plants` with it, so that
             the detector does not forget what it knew.
@@ -37,6 +38,8 @@ class TrainConfig:
         val_labels: labels of the validation photos.
         hold_out_every: without val_photos: hold every n-th photo (sorted by name, from the first) out of the training
             for validation; 0 for no validation. All views of a plant belong on one side: use val_photos for scenes.
+        coco_crowd: how COCO annotations with `iscrowd` are treated: "mask": learned as all others; "ignore": their
+            pixels are ignored.
         skip_broken: train without broken samples (they are counted and listed in broken_samples.txt) instead of
             stopping.
         arch: resnet18_fpn, mobilenet_v3_large_fpn, efficientnet_lite0, efficientnet_lite2, maskrcnn_resnet50_fpn,
@@ -95,6 +98,7 @@ class TrainConfig:
     val_photos: Path | None = None
     val_labels: Path | None = None
     hold_out_every: int = 0
+    coco_crowd: Literal["mask", "ignore"] = "mask"
     skip_broken: bool = False
     arch: str = "resnet18_fpn"
     weights: str | None = None

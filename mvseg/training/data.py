@@ -1,8 +1,8 @@
 """Photos with instance masks as training samples: finding, checking and reading them.
 
-Two layouts: a folder of photos with a folder of label PNGs (same path and stem; 0 is background, 65535 is ignored; a
-scene's `images/` and `masks/` are such a pair), or a folder of photos with one COCO JSON file. A photo without any
-instance is a sample like any other, provided that its label PNG or its COCO entry exists.
+Masks are of every kind that scenes have, and read by the same readers: label images (0 is background, 65535 is ignored)
+and other files that are named after the photos (`recognise_masks`), or COCO. A photo without any instance is a sample
+like any other, provided that its label image or its COCO entry exists.
 All broken samples are reported by name; nothing is dropped silently.
 """
 
@@ -16,15 +16,29 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel
 from tqdm import tqdm
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, faults_of, warn
 from mvseg.evaluation.labelled_photo import LabelledPhoto, label_photo, mask_photo
-from mvseg.formats.coco import CocoAnnotation, CocoFile, decode_segmentation
+from mvseg.formats.coco import (
+    CocoAnnotation,
+    Crowd,
+    check_corners,
+    check_images_once,
+    decode_segmentation,
+    read_files,
+)
+from mvseg.formats.find_views import find_views
 from mvseg.formats.image_file import PHOTO_SUFFIXES, file_name_problem, read_rgb
-from mvseg.formats.json_file import Items, read_json
-from mvseg.formats.label_png import read_labels
+from mvseg.formats.label_png import ignore_border
+from mvseg.formats.masks.class_numbers import INTERPOLATED, count_between, is_interpolated
+from mvseg.formats.masks.faults import COVERS
+from mvseg.formats.masks.read_views import read_photo_masks
+from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
+from mvseg.formats.photos import warn_of_turned
+from mvseg.scene import View
+
+CATEGORY = "leaf"  # of masks in files that are named after their photo
 
 
 @dataclass(frozen=True)
@@ -34,18 +48,28 @@ class Sample:
     Attributes:
         name: the photo's path below its folder; what reports and logs call it.
         photo: the image file.
-        label_map: a single-channel PNG, or None when the instances come from `annotations`.
-        annotations: COCO annotations of this photo.
+        kind: of its files of masks, see `MaskFiles`; "" when the instances come from `annotations`.
+        files: of its masks; none for a photo without instances.
+        annotations: COCO annotations of this photo; pixels of those with `iscrowd` are ignored.
         size: (width, height) in pixels that the COCO file states, or None.
-        class_of: COCO category id -> class, from 1 on.
+        class_of: COCO category id, as text -> class, from 1 on.
     """
 
     name: str
     photo: Path
-    label_map: Path | None = None
+    kind: str = ""
+    files: tuple[Path, ...] = ()
     annotations: tuple[CocoAnnotation, ...] = ()
     size: tuple[int, int] | None = None
-    class_of: Mapping[int, int] = field(default_factory=dict)
+    class_of: Mapping[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class _Photos:
+    """Photos without cameras, as the readers of masks take them; named as the views of a scene are."""
+
+    views: tuple[View, ...]
+    source: Path | None = None
 
 
 @dataclass(frozen=True)
@@ -65,123 +89,131 @@ class SampleList:
 # --- which samples there are
 
 
-def list_samples(photos: Path, labels: Path) -> SampleList:
-    """Find the samples of a folder of photos with a folder of label PNGs or with a COCO JSON file.
+def list_samples(photos: Path, labels: Path, *, crowd: Crowd = "mask") -> SampleList:
+    """Find the samples of a folder of photos with their masks, of any kind that `load_masks` reads.
 
     Args:
-        photos: folder, searched with its subfolders; with a COCO file the folder that `file_name` starts from.
-        labels: folder with `<path of the photo>.png` for every photo, or a .json file.
+        photos: folder, searched with its subfolders.
+        labels: as `masks` of `load_masks`: a folder with `<path of the photo>.png` for every photo, for example, or a
+            COCO .json file.
+        crowd: how COCO annotations with `iscrowd` are treated, see `read_coco`; if they are left out, their pixels are
+            ignored.
 
     Returns:
-        Samples in the order of their names. The files are not opened; see `check_samples`. Label PNGs have one
-        category, "leaf".
+        Samples in the order of their names. Photos are not opened; see `check_samples`. Masks that are no COCO have one
+        category, "leaf". Warns (InputWarning) as `load_masks` does.
 
     Raises:
-        InputError: a missing folder or file, no photo at all, two photos with one stem, a JSON file that is not COCO,
-            an image whose file name leads out of the folder, an annotation of an image that is not listed.
+        InputError: a missing folder or file, no photo at all, two photos with one stem, no masks that fit, a broken
+            COCO file, an image whose file name leads out of the folder, an annotation of an image that is not listed.
     """
     if not photos.is_dir():
         raise InputError(f"{photos} is not a folder, expected the folder of the photos")
-    if labels.is_dir():
-        return list_label_maps(photos, labels)
-    if labels.suffix == ".json" and labels.is_file():
-        return list_coco(photos, labels)
-    raise InputError(f"{labels} is neither a folder of label PNGs nor a COCO .json file")
-
-
-def list_label_maps(photos: Path, labels: Path) -> SampleList:
-    """The samples of a folder of label PNGs; see `list_samples`."""
     paths = sorted(path for path in photos.rglob("*") if path.suffix.lower() in PHOTO_SUFFIXES)
     if not paths:
         raise InputError(f"{photos} holds no photo ({', '.join(PHOTO_SUFFIXES)})")
-    by_stem: dict[Path, Path] = {}
+    by_stem: dict[str, Path] = {}
     for path in paths:
-        stem = path.relative_to(photos).with_suffix("")
-        if stem in by_stem:
-            raise InputError(f"{by_stem[stem]} and {path} would share one label PNG, expected one photo per stem")
-        by_stem[stem] = path
-    # a label map without a photo is listed too, so that the check reports it
-    for label_map in sorted(labels.rglob("*.png")):
-        stem = label_map.relative_to(labels).with_suffix("")
-        by_stem.setdefault(stem, (photos / stem).with_suffix(".*"))
-    samples = (
-        Sample(name=path.relative_to(photos).as_posix(), photo=path, label_map=labels / f"{stem.as_posix()}.png")
-        for stem, path in sorted(by_stem.items())
-    )
-    return SampleList(tuple(samples), ("leaf",))
+        other = by_stem.setdefault(path.relative_to(photos).with_suffix("").as_posix(), path)
+        if other is not path:
+            raise InputError(f"{other} and {path} would share one label image, expected one photo per stem")
+    found = _Photos(tuple(View(stem, path) for stem, path in by_stem.items()))
+    masks = recognise_masks(found, labels)
+    if masks.kind == "COCO":
+        return _list_coco(photos, found, masks, crowd=crowd)
+    samples = [
+        Sample(name=view.path.relative_to(photos).as_posix(), photo=view.path, kind=masks.kind, files=files)
+        for view, files in zip(found.views, masks.files, strict=True)
+    ]
+    samples += _list_lone(photos, labels, masks)
+    return SampleList(tuple(sorted(samples, key=lambda sample: sample.name)), (CATEGORY,))
 
 
-class _Category(BaseModel):
-    id: int
-    name: str
+def _list_lone(photos: Path, labels: Path, masks: MaskFiles) -> list[Sample]:
+    """Files of masks without a photo, as samples, so that the check reports them."""
+    known = {path for files in masks.files for path in files}
+    suffixes = {path.suffix for path in known}
+    lone = [path for path in sorted(labels.rglob("*")) if path.suffix in suffixes - {".txt"} and path not in known]
+    stems = [path.relative_to(labels).with_suffix(".*") for path in lone if path.is_file()]
+    return [Sample(name=stem.as_posix(), photo=photos / stem, kind=masks.kind) for stem in stems]
 
 
-class _TrainingFile(CocoFile):
-    categories: Items[_Category]
-
-
-def list_coco(photos: Path, labels: Path) -> SampleList:
-    """The samples of a COCO file; see `list_samples`. Classes 1, 2, ... are the categories, ordered by their ids."""
-    content = read_json(labels, _TrainingFile)
-    images = sorted(content.images, key=lambda image: image.file_name)
-    categories = sorted((category.id, category.name) for category in content.categories)
-    if not images or not categories:
-        raise InputError(f"{labels} lists {len(images)} images and {len(categories)} categories, expected some of each")
-    for image in images:
-        problem = file_name_problem(image.file_name, folder="the folder of the photos")
-        if problem:
-            raise InputError(f"{labels}: image {image.file_name}: {problem}")
-    annotations_of: dict[int | str, list[CocoAnnotation]] = defaultdict(list)
+def _list_coco(photos: Path, found: _Photos, masks: MaskFiles, *, crowd: Crowd) -> SampleList:
+    """Those that a COCO file lists. Classes 1, 2, ... are the categories, ordered by their ids."""
+    labels, content = masks.source, read_files(masks.files[0], found)
+    categories = sorted(content.categories, key=lambda category: (isinstance(category.id, str), category.id))
+    if not content.images or not categories:
+        counts = f"{len(content.images)} images and {len(categories)} categories"
+        raise InputError(f"{labels} lists {counts}, expected some of each")
+    views = find_views([image.file_name for image in content.images], found, source=labels, warn_of_loose=True)
+    check_images_once(labels, content, views)
+    annotations_of: dict[str, list[CocoAnnotation]] = defaultdict(list)
     for annotation in content.annotations:
-        annotations_of[annotation.image_id].append(annotation)
-    unlisted = sorted(annotations_of.keys() - {image.id for image in images}, key=str)
+        annotations_of[str(annotation.image_id)].append(annotation)
+    unlisted = sorted(annotations_of.keys() - {str(image.id) for image in content.images})
     if unlisted:
         raise InputError(f"{labels} has annotations of image {unlisted[0]}, which it does not list")
-    class_of = {category: number for number, (category, _) in enumerate(categories, start=1)}
-    samples = (
-        Sample(name=image.file_name, photo=photos / image.file_name, annotations=tuple(annotations_of[image.id]),
-               size=(image.width, image.height), class_of=class_of)
-        for image in images
-    )  # fmt: skip
-    return SampleList(tuple(samples), tuple(name for _, name in categories))
+    with faults_of(labels):
+        check_corners(annotation.segmentation for annotation in content.annotations)
+    num_crowds = sum(bool(annotation.iscrowd) for annotation in content.annotations)
+    if num_crowds:
+        what = "taken as masks (coco_crowd ignore ignores their pixels)" if crowd == "mask" else "ignored"
+        warn(f"{labels}: {num_crowds} annotations with iscrowd are {what}")
+    class_of = {str(category.id): number for number, category in enumerate(categories, start=1)}
+    samples = []
+    for image, view in zip(content.images, views, strict=True):
+        problem = file_name_problem(image.file_name, folder="the folder of the photos") if view is None else None
+        if problem:
+            raise InputError(f"{labels}: image {image.file_name}: {problem}")
+        photo = photos / image.file_name if view is None else found.views[view].path
+        own = annotations_of[str(image.id)]
+        taken = [each.model_copy(update={"iscrowd": 0}) for each in own] if crowd == "mask" else own
+        size = (image.width, image.height) if image.width or image.height else None  # 0 x 0: not known
+        name = photo.relative_to(photos).as_posix()
+        samples.append(Sample(name=name, photo=photo, annotations=tuple(taken), size=size, class_of=class_of))
+    names = tuple(category.name for category in categories)
+    return SampleList(tuple(sorted(samples, key=lambda sample: sample.name)), names)
 
 
 # --- reading and checking
 
 
 def read_sample(sample: Sample) -> LabelledPhoto:
-    """Read a photo and its instances. Does not use OpenCV, whose threads do not survive the fork of a data loader.
+    """Read a photo and its instances. Does not use OpenCV's threads, which do not survive the fork of a data loader.
 
     Raises:
-        InputError: the photo or its label map is missing or cannot be read, sizes differ, or an annotation has an
+        InputError: the photo or a file of its masks is missing or cannot be read, sizes differ, or an annotation has an
             unknown category, no pixels, or a malformed mask. The message starts with the sample's name.
     """
-    try:
+    return _read(sample)[0]
+
+
+def _read(sample: Sample) -> tuple[LabelledPhoto, int]:
+    """And how many entries of its masks are boxes, lines and points, which are left out."""
+    with faults_of(sample.name):
         if not sample.photo.is_file():
             raise InputError(f"the photo {sample.photo} is missing")
         try:
             photo = read_rgb(sample.photo)
         except InputError as error:
             raise InputError(f"the photo cannot be read, expected a whole image file: {error}") from None
-        if sample.label_map is not None:
-            return label_photo(photo, read_label_map(sample.label_map, photo.shape[:2]))
-        return read_annotations(sample, photo)
-    except InputError as error:
-        raise InputError(f"{sample.name}: {error}") from None
+        if not sample.kind:
+            return _read_annotations(sample, photo), 0
+        try:
+            content = read_photo_masks(sample.files, sample.kind, photo.shape[1::-1])
+        except InputError as error:  # here, the size that masks must have is that of the photo
+            raise InputError(str(error).replace("its camera says", "its photo is")) from None
+        if isinstance(content, np.ndarray):
+            ignore_border(content)
+            return label_photo(photo, content), 0
+        masks = [each.mask for each in content if each.mask is not None]
+        if not all(mask.any() for mask in masks):
+            raise InputError("one of its masks covers no pixel")
+        nothing = np.zeros(photo.shape[:2], bool)
+        return mask_photo(photo, masks, classes=[1] * len(masks), ignore=nothing), len(content) - len(masks)
 
 
-def read_label_map(path: Path, size: tuple[int, ...]) -> np.ndarray:
-    """A label map, checked against the (height, width) of its photo."""
-    if not path.is_file():
-        raise InputError(f"its label map {path} is missing (a photo without instances needs an all-zero one)")
-    labels = read_labels(path)
-    if labels.shape != size:
-        found = f"{labels.shape[1]} x {labels.shape[0]} pixels, the photo {size[1]} x {size[0]}"
-        raise InputError(f"its label map is {found}")
-    return labels
-
-
-def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
+def _read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
     """A photo with its COCO annotations; crowds become ignored pixels, but for those of other annotations."""
     height, width = photo.shape[:2]
     if sample.size is not None and sample.size != (width, height):
@@ -189,21 +221,18 @@ def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
         raise InputError(f"the photo is {width} x {height} pixels, its COCO entry says {stated}")
     masks, classes, ignore = [], [], np.zeros((height, width), bool)
     for annotation in sample.annotations:
-        where = f"annotation {annotation.id}"
-        try:
+        with faults_of(f"annotation {annotation.id}"):
             mask = decode_segmentation(annotation.segmentation, width, height)
-        except InputError as error:
-            raise InputError(f"{where}: {error}") from None
-        if not mask.any():
-            raise InputError(f"{where}: its mask covers no pixel")
-        category = annotation.category_id
-        if annotation.iscrowd:
-            ignore |= mask
-        elif category in list(sample.class_of):  # a list: the file may hold anything, unhashable values included
-            masks.append(mask)
-            classes.append(sample.class_of[category])
-        else:
-            raise InputError(f"{where}: its category {category} is not listed")
+            if not mask.any():
+                raise InputError("its mask covers no pixel")
+            category = str(annotation.category_id)
+            if annotation.iscrowd:
+                ignore |= mask
+            elif category in sample.class_of:
+                masks.append(mask)
+                classes.append(sample.class_of[category])
+            else:
+                raise InputError(f"its category {category} is not listed")
     for mask in masks:
         ignore &= ~mask  # a labelled instance is known, whatever covers part of it
     return mask_photo(photo, masks, classes=classes, ignore=ignore)
@@ -211,13 +240,25 @@ def read_annotations(sample: Sample, photo: np.ndarray) -> LabelledPhoto:
 
 def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]:
     """Read every sample once, in threads, with a progress bar: the number of instances of each (0 for a broken one),
-    and {index: what is wrong with it}."""
+    and {index: what is wrong with it}.
 
-    def inspect(sample: Sample) -> int | str:
+    Warns (InputWarning) of entries that are no masks, and of instances that are the background of their photo.
+
+    Raises:
+        InputError: the label images were scaled with interpolation.
+    """
+
+    def inspect(sample: Sample) -> tuple[int, int, bool, np.ndarray] | str:
+        """Instances, entries that are no masks, whether one is the background, and what `is_interpolated` asks for."""
         try:
-            return len(read_sample(sample).classes)
+            labelled, num_boxes = _read(sample)
         except InputError as error:
             return str(error)
+        areas = np.bincount(labelled.layers.numpy().ravel())[1:]
+        is_label_map = sample.kind and len(labelled.layers) == 1
+        between = count_between(labelled.layers[0].numpy().astype(np.uint16)) if is_label_map else np.zeros(2, np.int64)
+        is_covered = bool(areas.max(initial=0) > COVERS * labelled.ignore.numel())
+        return len(labelled.classes), num_boxes, is_covered, between
 
     pool = ThreadPoolExecutor(min(8, os.cpu_count() or 1))
     try:
@@ -225,7 +266,16 @@ def check_samples(samples: Sequence[Sample]) -> tuple[list[int], dict[int, str]]
     finally:
         pool.shutdown(cancel_futures=True)  # an interrupted run does not check the others first
     broken = {index: answer for index, answer in enumerate(answers) if isinstance(answer, str)}
-    return [answer if isinstance(answer, int) else 0 for answer in answers], broken
+    sound = [answer for answer in answers if not isinstance(answer, str)]
+    if is_interpolated(sum((between for *_, between in sound), np.zeros(2, np.int64))):
+        raise InputError(INTERPOLATED)
+    num_boxes, num_covered = sum(each[1] for each in sound), sum(each[2] for each in sound)
+    if num_boxes:
+        warn(f"{num_boxes} entries of masks are boxes, lines, points or to be ignored, and are left out")
+    if num_covered:
+        what = f"a mask covers more than {COVERS:.0%} of {num_covered} photos"
+        warn(f"{what}: if it is the background, make it 0")
+    return [0 if isinstance(answer, str) else answer[0] for answer in answers], broken
 
 
 def keep_sound(samples: SampleList, what: str, *, skip_broken: bool) -> tuple[SampleList, dict[int, str]]:
@@ -235,7 +285,9 @@ def keep_sound(samples: SampleList, what: str, *, skip_broken: bool) -> tuple[Sa
         InputError: a sample is broken and `skip_broken` is off (the message counts them and describes the first three);
             or no sample is left with an instance.
     """
-    counts, broken = check_samples(samples.samples)
+    warn_of_turned([sample.photo for sample in samples.samples])
+    with faults_of(f"{what} samples"):
+        counts, broken = check_samples(samples.samples)
     if broken and not skip_broken:
         first = "; ".join(list(broken.values())[:3])
         raise InputError(

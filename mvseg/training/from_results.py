@@ -54,5 +54,5 @@ def _list_photos(folder: Path) -> list[Sample]:
             for row in rows
         )
         name = f"{folder.name}/{result.scene.views[view].name}{photo.suffix}"
-        samples.append(Sample(name=name, photo=photo, annotations=masks, size=(width, height), class_of={1: 1}))
+        samples.append(Sample(name=name, photo=photo, annotations=masks, size=(width, height), class_of={"1": 1}))
     return sorted(samples, key=lambda sample: sample.name)

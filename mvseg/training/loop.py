@@ -129,7 +129,9 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
     """
     if not is_earlier_run(config.output):
         check_out(config.output, OUTPUT)
-    parts = [] if config.photos is None or config.labels is None else [list_samples(config.photos, config.labels)]
+    parts, crowd = [], config.coco_crowd
+    if config.photos is not None and config.labels is not None:
+        parts.append(list_samples(config.photos, config.labels, crowd=crowd))
     parts += [] if config.from_results is None else [list_results(config.from_results)]
     if len({part.categories for part in parts}) > 1:
         raise InputError(
@@ -137,7 +139,7 @@ def find_samples(config: TrainConfig) -> tuple[SampleList, SampleList | None]:
         )
     samples, held_out = SampleList(sum((part.samples for part in parts), ()), parts[0].categories), None
     if config.val_photos is not None and config.val_labels is not None:
-        held_out = list_samples(config.val_photos, config.val_labels)
+        held_out = list_samples(config.val_photos, config.val_labels, crowd=crowd)
         if held_out.categories != samples.categories:
             raise InputError(f"{config.val_labels} has categories {held_out.categories}, expected {samples.categories}")
     elif config.hold_out_every:

@@ -336,7 +336,7 @@ def test_what_stands_twice(scene: Scene, tmp_path: Path) -> None:
     assert "1 of 3 masks stand twice, pixel for pixel in one photo, and are taken once" in str(said[0].message)
     assert "only one view has masks, so that there is nothing to match" in str(said[1].message)
     write(tmp_path, [{"segmentation": [POLYGON], "image_id": each} for each in (10, 12)], ("a.jpg", "b.jpg", "a.jpg"))
-    with pytest.raises(InputError, match=r"images 10 \(a.jpg\) and 12 \(a.jpg\) are both a.jpg, and both have annotat"):
+    with pytest.raises(InputError, match=r"images 10 \(a.jpg\) and 12 \(a.jpg\) are of one photo, and both have annot"):
         read_all(path, scene)
 
 

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 import torch
 from numpy.typing import NDArray
+from PIL import Image
 from pycocotools import mask as coco_mask
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, InputWarning
 from mvseg.evaluation.labelled_photo import LabelledPhoto
 from mvseg.training.data import Sample, check_samples, keep_sound, list_samples, read_sample
 
@@ -132,7 +133,7 @@ def test_every_encoding_gives_the_same_instance(tmp_path: Path) -> None:
 def test_overlaps_classes_and_crowds(tmp_path: Path) -> None:
     crowd = np.zeros_like(SQUARE)
     crowd[10:] = True
-    labelled = read_coco(
+    path = write_coco(
         tmp_path,
         [
             {"segmentation": compressed(SQUARE)},
@@ -140,10 +141,65 @@ def test_overlaps_classes_and_crowds(tmp_path: Path) -> None:
             {"segmentation": compressed(BAR), "category_id": 9},
         ],
     )
+    with pytest.warns(InputWarning, match=r"instances.json: 1 annotations with iscrowd are ignored"):
+        labelled = read_sample(list_samples(tmp_path / "photos", path, crowd="ignore").samples[0])
     assert labelled.classes.tolist() == [1, 2]  # by category id: leaf 4, stem 9
     np.testing.assert_array_equal(masks_of(labelled), [SQUARE, BAR])
     assert len(labelled.layers) == 2
     np.testing.assert_array_equal(labelled.ignore.numpy(), crowd & ~SQUARE & ~BAR)
+    with pytest.warns(InputWarning, match=r"1 annotations with iscrowd are taken as masks"):  # as a run takes them
+        labelled = read_sample(list_samples(tmp_path / "photos", path).samples[0])
+    np.testing.assert_array_equal(masks_of(labelled), [SQUARE, crowd, BAR])
+
+
+def test_coco_is_read_as_for_a_scene(tmp_path: Path) -> None:
+    """Ids as text, names of another program, an image without a size; and what stands twice or reads as nothing."""
+    image = IMAGE | {"id": "7", "file_name": "images/5f1c0e7a-A.png", "height": 0, "width": 0}
+    square = {"segmentation": compressed(SQUARE), "category_id": "4"}
+    with pytest.warns(InputWarning, match="1 names fit a photo by the base name only, the first is images/5f1c0e7a-A"):
+        labelled = read_coco(tmp_path, [square], {"images": [image]})
+    np.testing.assert_array_equal(masks_of(labelled), [SQUARE])
+    with pytest.raises(InputError, match=r"images 7 \(a.png\) and 8 \(a.png\) are of one photo"):
+        read_coco(tmp_path, [square, square | {"image_id": 8}], {"images": [IMAGE, IMAGE | {"id": 8}]})
+    with pytest.raises(InputError, match=r"instances.json: all corners lie between 0 and 1"):
+        read_coco(tmp_path, [{"segmentation": [[0.1, 0.2, 0.9, 0.2, 0.5, 0.9]]}])
+
+
+def test_masks_of_other_kinds_are_read_as_for_a_scene(tmp_path: Path) -> None:
+    write_pair(tmp_path, "a", None)
+    (tmp_path / "labels").mkdir()
+    square = "0 0.1875 0.16666 0.5625 0.16666 0.5625 0.5 0.1875 0.5"
+    (tmp_path / "labels" / "a.txt").write_text(f"{square}\n0 0.5 0.5 0.1 0.1\n")
+    found = list_samples(tmp_path / "photos", tmp_path / "labels")
+    np.testing.assert_array_equal(masks_of(read_sample(found.samples[0])), [SQUARE])
+    with pytest.warns(InputWarning, match="1 entries of masks are boxes, lines, points or to be ignored, and are left"):
+        assert check_samples(found.samples) == ([1], {})
+    (tmp_path / "labels" / "a.txt").unlink()
+    np.save(tmp_path / "labels" / "a.npy", np.stack([SQUARE, BAR]))
+    found = list_samples(tmp_path / "photos", tmp_path / "labels")
+    np.testing.assert_array_equal(masks_of(read_sample(found.samples[0])), [SQUARE, BAR])
+
+
+def test_labels_that_read_as_something_else(tmp_path: Path) -> None:
+    labels = np.kron(np.arange(30).reshape(5, 6) * 11 % 31 * 8, np.ones((21, 21))).astype(np.uint8)
+    write_image(tmp_path / "photos" / "a.png", np.zeros((*labels.shape, 3), np.uint8))
+    write_image(tmp_path / "labels" / "a.png", cv2.resize(labels, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_LINEAR))
+    with pytest.raises(InputError, match=r"its photo is 126 x 105"):
+        read_sample(list_samples(tmp_path / "photos", tmp_path / "labels").samples[0])
+    small = cv2.resize(labels, None, fx=0.7, fy=0.7, interpolation=cv2.INTER_LINEAR)
+    write_image(tmp_path / "labels" / "a.png", small)
+    exif = Image.Exif()
+    exif[0x0112] = 3
+    Image.new("RGB", small.shape[::-1]).save(tmp_path / "photos" / "a.png", exif=exif)
+    found = list_samples(tmp_path / "photos", tmp_path / "labels")
+    with (
+        pytest.warns(InputWarning, match=r"a.png: EXIF turns 1 photos for display"),
+        pytest.raises(InputError, match=r"training samples: numbers lie along the edges of others"),
+    ):
+        keep_sound(found, "training", skip_broken=True)
+    write_image(tmp_path / "labels" / "a.png", np.ones_like(small))
+    with pytest.warns(InputWarning, match="a mask covers more than 80% of 1 photos: if it is the background"):
+        check_samples(found.samples)
 
 
 def test_an_image_without_annotations_is_a_sample(tmp_path: Path) -> None:
@@ -192,8 +248,8 @@ def test_broken_annotations(tmp_path: Path, annotation: dict[str, Any], message:
         ({"images": [IMAGE | {"id": 8}]}, "annotations of image 7"),
         ({"images": [], "annotations": []}, "lists 0 images"),
         ({"categories": []}, "0 categories"),
-        ({"images": [IMAGE | {"file_name": "../a.png"}]}, "image ../a.png: the file name leads out of the folder"),
-        ({"images": [IMAGE | {"file_name": "/a.png"}]}, "image /a.png: the file name leads out of the folder"),
+        ({"images": [IMAGE | {"file_name": "../b.png"}]}, "image ../b.png: the file name leads out of the folder"),
+        ({"images": [IMAGE | {"file_name": "/b.png"}]}, "image /b.png: the file name leads out of the folder"),
         ({"images": [IMAGE | {"file_name": 3}]}, r"images\[0\].file_name: Input should be a valid string"),
         ({"images": [IMAGE | {"height": {}}]}, r"images\[0\].height: Input should be a valid integer"),
         ({"categories": [{"id": 4}]}, r"categories\[0\].name: Field required"),
@@ -242,7 +298,7 @@ def test_broken_label_maps(tmp_path: Path) -> None:
     write_pair(tmp_path, "a_sound", sound)
     write_pair(tmp_path, "b_no_mask", None)
     write_pair(tmp_path, "c_size", sound[:5])
-    write_pair(tmp_path, "d_colour", np.zeros((HEIGHT, WIDTH, 3), np.uint8))
+    write_pair(tmp_path, "d_colour", np.zeros((HEIGHT, WIDTH, 3), np.uint8))  # sound: a colour would be an instance
     write_pair(tmp_path, "e_torn", sound)
     (tmp_path / "labels" / "e_torn.png").write_bytes(b"torn")
     write_pair(tmp_path, "f_photo", sound)
@@ -252,9 +308,8 @@ def test_broken_label_maps(tmp_path: Path) -> None:
     counts, broken = check_samples(found.samples)
     assert counts == [1, 0, 0, 0, 0, 0, 0]
     expected = (
-        "b_no_mask.png: its label map .* is missing",
-        "c_size.png: its label map is 16 x 5 pixels, the photo 16 x 12",
-        "d_colour.png: .* has 3 colour channels, expected a label PNG with a single channel",
+        "b_no_mask.png: .*b_no_mask.png: the mask file is missing",
+        "c_size.png: .*c_size.png: the mask is 16 x 5, its photo is 16 x 12",
         "e_torn.png: .* cannot be read, expected a whole label PNG",
         "f_photo.png: the photo cannot be read",
         "g_no_photo.*: the photo .* is missing",
@@ -262,10 +317,10 @@ def test_broken_label_maps(tmp_path: Path) -> None:
     assert len(broken) == len(expected)
     for sentence, pattern in zip(broken.values(), expected, strict=True):
         assert re.match(pattern, sentence)
-    with pytest.raises(InputError, match=r"6 of 7 training samples are broken \(b_no_mask.png: .*; \.\.\.\)"):
+    with pytest.raises(InputError, match=r"5 of 7 training samples are broken \(b_no_mask.png: .*; \.\.\.\)"):
         keep_sound(found, "training", skip_broken=False)
     kept, left_out = keep_sound(found, "training", skip_broken=True)
-    assert [sample.name for sample in kept.samples] == ["a_sound.png"]
+    assert [sample.name for sample in kept.samples] == ["a_sound.png", "d_colour.png"]
     assert left_out == broken
 
 
@@ -275,14 +330,14 @@ def test_folders_that_hold_nothing(tmp_path: Path) -> None:
         list_samples(tmp_path / "none", tmp_path)
     with pytest.raises(InputError, match="holds no photo"):
         list_samples(tmp_path / "empty", tmp_path / "empty")
-    with pytest.raises(InputError, match="neither a folder of label PNGs nor a COCO"):
-        list_samples(tmp_path, tmp_path / "labels.txt")
     write_pair(tmp_path, "a", np.zeros((HEIGHT, WIDTH), np.uint8))
+    with pytest.raises(InputError, match=r"labels.txt: no such masks, expected a folder of label PNGs or a COCO"):
+        list_samples(tmp_path, tmp_path / "labels.txt")
     empty = list_samples(tmp_path / "photos", tmp_path / "labels")
     with pytest.raises(InputError, match="none of the 1 validation samples holds an instance"):
         keep_sound(empty, "validation", skip_broken=True)
     write_pair(tmp_path, "a", None, ".jpg")
-    with pytest.raises(InputError, match="would share one label PNG"):
+    with pytest.raises(InputError, match="would share one label image"):
         list_samples(tmp_path / "photos", tmp_path / "labels")
 
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -36,7 +37,7 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
         warn(f"{found.source}: the last two numbers of each line are taken for a confidence and a track, and left out")
     for view in range(len(found.files)):
         try:
-            content = _read_view(scene, view, found)
+            content = read_photo_masks(found.files[view], found.kind, scene.cameras.sizes[view].tolist())
         except InputError as error:
             turn = describe_turn(scene.views[view].path)
             raise InputError(f"{error} (view {view}{turn})") from None
@@ -60,12 +61,16 @@ def read_views(scene: Scene, found: MaskFiles, *, wanted: Collection[str]) -> It
         check_categories(counts, wanted, source=found.source)
 
 
-def _read_view(scene: Scene, view: int, found: MaskFiles) -> np.ndarray | list[FoundMask]:
-    paths = found.files[view]
-    width, height = scene.cameras.sizes[view].tolist()
+def read_photo_masks(paths: Sequence[Path], kind: str, size: Sequence[int]) -> np.ndarray | list[FoundMask]:
+    """The masks of one photo of this size (width, height): a label map (H, W) uint16, or a list; see `MaskFiles`.
+
+    Raises:
+        InputError: a file is missing, broken, or of another size.
+    """
+    width, height = size
     if not paths:
         return []
-    match found.kind:
+    match kind:
         case "label images":
             return read_label_image(paths[0], width, height)
         case "NumPy arrays":
@@ -79,6 +84,6 @@ def _read_view(scene: Scene, view: int, found: MaskFiles) -> np.ndarray | list[F
             return read_sam(paths[0], width, height)
         case "YOLO" | "YOLO tracks":
             names = read_class_names(paths[0].parent)
-            return read_yolo(paths[0], width, height, names=names, tracks=found.kind == YOLO_TRACKS)
+            return read_yolo(paths[0], width, height, names=names, tracks=kind == YOLO_TRACKS)
         case _:
             return read_mask_images(paths, width, height)

@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mvseg.errors import InputError, warn
-from mvseg.formats.find_views import base_name, find_views, list_some
+from mvseg.formats.find_views import PhotoSet, base_name, find_views, list_some
 from mvseg.formats.masks.other_json import refuse_other
 from mvseg.formats.masks.yolo import YOLO_TRACKS, has_tracks
-from mvseg.scene import Scene
 
 # Endings of files that are named after their photo; longer ones first, since `_seg.npy` ends on `.npy`.
 CELLPOSE = "cellpose's label images"
@@ -54,7 +53,7 @@ class MaskFiles:
     files: Files
 
 
-def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
+def recognise_masks(scene: PhotoSet, masks: Path) -> MaskFiles:
     """The kind of masks that fits most photos of a scene, and its files.
 
     Warns (InputWarning) where there is more than one kind, of photos without a file, and of files that fit a photo by
@@ -93,7 +92,7 @@ def recognise_masks(scene: Scene, masks: Path) -> MaskFiles:
     return MaskFiles(masks, _name_kind(kind, by_kind[kind]), files)
 
 
-def _list_files(folder: Path, scene: Scene) -> list[Path]:
+def _list_files(folder: Path, scene: PhotoSet) -> list[Path]:
     """The files below a folder that are neither the scene's cameras nor its photos, nor copies of these."""
     photos = [view.path for view in scene.views if view.path.is_file()]
     known = {path.resolve() for path in (*photos, scene.source) if path is not None}
@@ -129,7 +128,7 @@ def _group(folder: Path, paths: list[Path]) -> dict[str, dict[str, list[Path]]]:
     return groups
 
 
-def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str) -> Files:
+def _fit(names: dict[str, list[Path]], scene: PhotoSet, folder: Path, *, kind: str) -> Files:
     """The files of each view.
 
     Raises:
@@ -158,7 +157,7 @@ def _fit(names: dict[str, list[Path]], scene: Scene, folder: Path, *, kind: str)
     return tuple(map(tuple, files))
 
 
-def _complete(scene: Scene, folder: Path, *, kind: str, files: Files) -> Files:
+def _complete(scene: PhotoSet, folder: Path, *, kind: str, files: Files) -> Files:
     """Complete photos without a file: where each photo must have one, the reader will report it; elsewhere they have no
     masks."""
     if kind in COMPLETE:
@@ -189,7 +188,7 @@ def _name_kind(kind: str, files: Files) -> str:
     return "labelme" if b'"shapes"' in data else "SAM"
 
 
-def _lone_coco(scene: Scene, masks: Path, paths: list[Path], *, unclear: tuple[str, ...]) -> MaskFiles:
+def _lone_coco(scene: PhotoSet, masks: Path, paths: list[Path], *, unclear: tuple[str, ...]) -> MaskFiles:
     """A folder that fits no photo may hold one COCO file, as exports of CVAT do, or one in each of its folders, as
     Roboflow's (train, valid, test)."""
     jsons = [path for path in paths if path.suffix.lower() == ".json"]
