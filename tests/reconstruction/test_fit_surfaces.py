@@ -167,6 +167,15 @@ def test_masks_too_large_in_one_view_and_too_small_in_another_cancel() -> None:
     assert np.abs(errors(fit(masks), BENT)).max() < 0.03
 
 
+def test_one_view_that_shows_more_than_the_others_is_a_reason(bent: LeafSurface) -> None:
+    assert bent.quality.is_good
+    masks = blade_masks(BENT, CAMERAS)
+    masks[2] |= np.roll(masks[2], 8, 0)
+    surface = fit(masks)
+    assert np.abs(errors(surface, BENT)).max() < 0.03
+    assert any("one view shows more than its surface" in reason for reason in surface.quality.reasons)
+
+
 def test_masks_that_no_blade_explains_give_no_credible_surface() -> None:
     """Two stars of four arms about one point in space: of their masks the patch covers little."""
     rng = np.random.default_rng(0)

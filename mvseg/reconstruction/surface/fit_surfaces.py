@@ -30,7 +30,14 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, meas
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
-from mvseg.reconstruction.surface.patch_image import cover_crops, crop_ious, hiding_pixels, project_points, view_ious
+from mvseg.reconstruction.surface.patch_image import (
+    cover_crops,
+    crop_ious,
+    draw_patch,
+    hiding_pixels,
+    project_points,
+    view_ious,
+)
 from mvseg.reconstruction.surface.patch_start import start_patches
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -55,6 +62,9 @@ BEHIND = 0.03  # a neighbour lies behind if it is farther away by more than this
 
 # A surface is doubted if its median IoU is less, or the deviation of its area more than this share of it.
 LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
+# Or if its median IoU is more than the first, but it lacks more than the second of a single mask, as a share of the
+# median mask: a deep cup that most views look into shows in one view what it is. (Ovate leaves lack 0.02 at most.)
+CLEAN_IOU, MOST_LACKING = 0.95, 0.05
 
 FEW_MASKS = 60  # fewer masks are fitted in this process: others would take longer to start (a technical limit)
 MOST_VIEWS = 20  # a fit looks at so many views of an instance at most: more add time, and next to nothing else
@@ -322,7 +332,10 @@ def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "its masks do not tell its shape")
     points = patch_grid(*FIT_GRID).points(fit.coefficients)
-    iou = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
+    offsets = np.nan_to_num(fit.offsets_px)
+    drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, blur_px=0.0) >= 0.5
+    iou, inside = crop_ious(masks, drawn), masks.inside.sum((1, 2))
+    lacking = float(((masks.inside & ~drawn).sum((1, 2)) / np.median(inside)).max())
     surface = LeafSurface(
         coefficients=torch.from_numpy(fit.coefficients),
         covariance=torch.from_numpy(fit.covariance),
@@ -335,11 +348,11 @@ def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface
     # Where other fits are as good, all deviations are larger by as much as that of the area is.
     wider = 1 + (fit.spread * surface.area / surface.deviations[0]) ** 2
     surface = replace(surface, covariance=wider * surface.covariance)
-    return replace(surface, quality=_judge(surface)) if is_judged else surface
+    return replace(surface, quality=_judge(surface, lacking)) if is_judged else surface
 
 
-def _judge(surface: LeafSurface) -> Quality:
-    """The reasons to doubt a fit."""
+def _judge(surface: LeafSurface, lacking: float) -> Quality:
+    """The reasons to doubt a fit; what it lacks of one of its masks is `lacking`, as a share of the median mask."""
     reasons = []
     if not surface.is_credible:
         reasons.append("no leaf, or its masks contradict each other: no single blade explains them")
@@ -348,6 +361,8 @@ def _judge(surface: LeafSurface) -> Quality:
     iou = float(surface.iou.median())
     if iou < LEAST_IOU:
         reasons.append(f"the surface explains its masks badly (median IoU {iou:.2f})")
+    if iou > CLEAN_IOU and lacking > MOST_LACKING:
+        reasons.append(f"one view shows more than its surface, by {100 * lacking:.0f} % of a mask")
     share = surface.deviations[0] / surface.area
     if share > MOST_AREA_SHARE:
         reasons.append(f"its area is uncertain by {100 * share:.0f} %")
