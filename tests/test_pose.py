@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -177,26 +178,31 @@ def test_a_video_gives_photos(tmp_path: Path, quick: list, capsys: pytest.Captur
 def test_a_signal_ends_it_with_one_sentence(
     photos: Path, tmp_path: Path, number: int, step: str, code: int, said: str
 ) -> None:
-    """The signal comes when the bar of a step shows up, while COLMAP works."""
+    """The signal comes when the bar of a step shows up on a terminal, while COLMAP works."""
+    import termios
+
     command = [sys.executable, "-m", "mvseg.cli", "pose", str(photos), "--out", str(tmp_path / "out")]
     root = Path(__file__).parent.parent
+    terminal, stderr = os.openpty()
+    termios.tcsetwinsize(stderr, (24, 80))
     run = subprocess.Popen(
         command,
-        stderr=subprocess.PIPE,
+        stderr=stderr,
         cwd=root,
         env=os.environ | {"PYTHONPATH": str(root)},
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # background jobs of a shell ignore it
     )
+    os.close(stderr)
     heard = b""
-    assert run.stderr is not None
     while f"{step}:".encode() not in heard:
-        byte = run.stderr.read(1)
-        assert byte, heard.decode()
-        heard += byte
+        heard += os.read(terminal, 1024)
     time.sleep(0.1)
     run.send_signal(number)
-    rest = run.stderr.read().decode()
-    run.stderr.close()
+    rest = ""
+    with suppress(OSError):  # the terminal has nobody left who writes
+        while data := os.read(terminal, 1024):
+            rest += data.decode()
+    os.close(terminal)
     assert run.wait() == code, rest
     assert rest.splitlines()[-1].endswith(said)
     assert "Traceback" not in rest

@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
@@ -61,16 +62,17 @@ def read_table(path: Path) -> list[dict[str, str]]:
 
 @pytest.mark.slow
 def test_a_broken_scene_does_not_stop_the_others(
-    plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    plants: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """With real workers."""
+    """With real workers, on a terminal."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
     out = tmp_path / "out"
     assert main(arguments(plants, out, "--num_workers", "2")) == 3
     said = capsys.readouterr()
     assert said.out == f"{out}: 2 of 3 scenes are done\n"
     reason = f"{plants / 'cactus' / 'cameras.json'}: not a whole JSON file"
     assert f"\rmvseg: cactus: {reason}" in said.err
-    assert "batch: 100%" in said.err
+    assert "batch: scene 1 of 3" in said.err
     assert ", basil" in said.err
     assert f"mvseg: 1 of 3 scenes failed, see {out / 'tables' / 'failures.csv'}\n" in said.err
     assert sorted(path.name for path in out.iterdir()) == ["_batch", "basil", "mint", "tables"]

@@ -119,18 +119,18 @@ def test_detections_are_kept_for_other_options_of_later_stages(
 
     monkeypatch.setattr(mask_rcnn, "run_heads", count)
     out, scene = tmp_path / "out", replace(scene, masks=None)
-    config = replace(CONFIG, detect=DetectConfig(min_score=0.05))
+    config = replace(CONFIG, detect=DetectConfig(min_score=0.05, image_size=800))  # looks at no other size
     assert not work_on_scene(out, config, scene).is_kept
     assert work_on_scene(out, config, scene).is_kept
     assert len(looked) == 3
     assert not work_on_scene(out, replace(config, match=MatchConfig(seed=3)), scene).is_kept
-    more = replace(config, detect=DetectConfig(min_score=0.05, num_iterations=0))
+    more = replace(config, detect=DetectConfig(min_score=0.05, image_size=800, num_iterations=0))
     assert not work_on_scene(out, more, scene).is_kept
     assert len(looked) == 3
     repaint(scene)
     assert not work_on_scene(out, config, scene).is_kept
     assert len(looked) == 3 + 1
-    assert not work_on_scene(out, replace(CONFIG, detect=DetectConfig(min_score=0.04)), scene).is_kept
+    assert not work_on_scene(out, replace(CONFIG, detect=DetectConfig(min_score=0.04, image_size=800)), scene).is_kept
     assert len(looked) == 3 + 1 + 3
     kept = sorted((scene_state(out, "p") / "detections").iterdir())
     assert len(kept) == 3  # what other options left is gone
