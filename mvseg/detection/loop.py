@@ -42,7 +42,7 @@ def match_proposals(
 
     Returns:
         The S proposals kept, best score first, matched; `labels` of their regions are those of the proposals. Warns of
-        what `match_regions` says of it; what that said of earlier rounds is forgotten.
+        what `match_masks` says of it; what that said of earlier rounds is forgotten.
     """
     if not len(proposals):
         return Matching(proposals, MatchReport(match.resolved_method))

@@ -14,9 +14,10 @@ from mvseg.detection.find_leaves import Look, find_leaves
 from mvseg.detection.loop import match_proposals
 from mvseg.detection.proposals import gather_proposals
 from mvseg.detectors.run import run_heads
-from mvseg.errors import InputError
+from mvseg.errors import InputError, warn
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
+from mvseg.matching.match import describe_disagreement
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
 from mvseg.verification.snap_edges import snap_masks
@@ -116,7 +117,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
             detections = [self._propose(image) for image in images]
-            matching = self._match(detections, cameras.to(images[0].device))
+            matching = _said_of(self._match(detections, cameras.to(images[0].device)))
             return self._collect(detections, sizes, masks=matching.masks)
 
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> Matching:
@@ -142,11 +143,11 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             sizes.append([image.shape[-1], image.shape[-2]])
         _check_cameras(cameras, sizes)
         if not self.verify:
-            return self.match_detections(detections, cameras)
+            return _said_of(self.match_detections(detections, cameras))
         config, posed = DetectConfig(min_score=max(SURE_SCORE, self.roi_heads.score_thresh)), cameras.to("cpu")
         look = Look.of(self, detections, posed, min_score=config.min_score)
         leaves = find_leaves([look], posed, config=config).leaves
-        return look.sure.with_masks(snap_masks(leaves.masks, photos.__getitem__))
+        return _said_of(look.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__))
 
     @torch.no_grad()
     def detect(self, image: Tensor) -> dict[str, Tensor]:
@@ -206,6 +207,13 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             results.append(result | {"instance_ids": here.instance_ids, "match_scores": here.match_scores})
             start += len(proposals["boxes"])
         return results
+
+
+def _said_of(matching: Matching) -> Matching:
+    """The same; warns (InputWarning) where the views hardly agree, see `describe_disagreement`."""
+    if said := describe_disagreement(matching):
+        warn(said)
+    return matching
 
 
 def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device) -> list[dict[str, Tensor]]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from types import MappingProxyType
@@ -30,6 +30,7 @@ MATCHED = "instance_ids", "match_scores", "second_ids", "second_parts"  # column
 # warned of: its detector finds a third of the leaves (`benchmarks/confidence.py`).
 TRUSTED = 0.75  # ids are taken for right if their mean match score is at least this
 ALIKE = 0.7  # a view is odd if it explains less than this share of what the median view explains
+SHOWN = 3  # views that a sentence names
 MIN_VIEWS = 4  # limit: with fewer views there is no telling which one is odd
 
 
@@ -64,7 +65,15 @@ def match_regions(
             one place, a region that reaches beyond the image of its camera, another `residual_px`, or links that
             contradict each other.
     """
-    links = NO_LINKS if links is None else links
+    matching = _match(regions, cameras, config, residual_px=residual_px, links=NO_LINKS if links is None else links)
+    if said := describe_disagreement(matching):
+        warn(said)
+    return matching
+
+
+def _match(
+    regions: Regions, cameras: Cameras, config: MatchConfig, *, residual_px: int | None, links: Links
+) -> Matching:
     links.components(len(regions))
     if residual_px is not None and residual_px not in DILATIONS:
         raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, DILATIONS))}")
@@ -76,10 +85,7 @@ def match_regions(
     affinity = region_affinity(regions, cameras, num_points=config.num_points, seed=config.seed)
     graph = ViewGraph.of(affinity, regions, links)
     if config.resolved_method == "nview":
-        matching = match_nview(regions, cameras, graph, residual_px=residual_px)
-        if len(cameras) > 2 and len(regions):
-            _warn_of_disagreement(matching)
-        return matching
+        return match_nview(regions, cameras, graph, residual_px=residual_px)
     if config.resolved_method == "one-per-view":
         clusters = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph)).drop_singletons()
     else:
@@ -108,12 +114,13 @@ def match_masks(
 
     Returns:
         The matching; instances of different classes have different ids. Its method is that of the config where it is
-        not the same for all classes.
+        not the same for all classes. Warns as `match_regions` does, but not of views that do not agree: that is left to
+        who knows whether this matching stays, see `describe_disagreement`.
     """
     parts, rows = [], []
     for label in masks.classes.unique().tolist() or [1]:
         members = (masks.classes == label).nonzero()[:, 0]
-        part = match_regions(
+        part = _match(
             masks.regions.select(members),
             cameras,
             replace(config, num_instances=num_instances.get(label) or config.num_instances),
@@ -203,35 +210,42 @@ def _warn_of_gaps(regions: Regions, cameras: Cameras) -> None:
         warn(f"{first}: {skipped}")
 
 
-def _warn_of_disagreement(matching: Matching) -> None:
-    """Poses are wrong where ids are likely to be wrong, where no reprojection error that is tried is large enough, or
-    where some views explain far less than the others (`benchmarks/confidence.py` counts how often this is so)."""
-    assert matching.report.explained is not None
-    assert matching.report.view_explained is not None
-    is_matched = matching.instance_ids > 0
+def describe_disagreement(matching: Matching, names: Sequence[str] = ()) -> str:
+    """A sentence where the views hardly agree, "" elsewhere, and with fewer than three views.
+
+    Something is wrong where ids are likely to be wrong, where no reprojection error that is tried is large enough, or
+    where some views explain far less than the others (`benchmarks/confidence.py` counts how often this is so).
+
+    Args:
+        matching: of "nview"; of other methods nothing is said.
+        names: of the views; (): their indices.
+    """
+    report, regions, is_matched = matching.report, matching.masks.regions, matching.instance_ids > 0
+    if report.explained is None or report.view_explained is None or regions.num_views < 3 or not len(regions):
+        return ""
     sure = float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
-    is_capped, odd = matching.report.residual_px == DILATIONS[-1], odd_views(matching.report.view_explained)
+    is_capped, odd = report.residual_px == DILATIONS[-1], odd_views(report.view_explained)
     if sure >= TRUSTED and not is_capped and not odd:
-        return
-    facts = f"{sure:.0%} of the ids are expected to be right, rays explain {matching.report.explained:.0%} of the masks"
+        return ""
+    facts = f"{sure:.0%} of the ids are expected to be right"
+    called = [names[view] if names else f"view {view}" for view in range(regions.num_views)]
     if odd:
-        facts += f", least in view{'s' if len(odd) > 1 else ''} {', '.join(map(str, odd))}"
+        more = f" and {len(odd) - SHOWN} more" if len(odd) > SHOWN else ""
+        facts += f", least in {', '.join(called[view] for view in odd[:SHOWN])}{more}"
     if is_capped:
-        facts += f", at a reprojection error of {matching.report.residual_px} pixels or more"
-    if matching.report.method != "nview":
-        facts += f"; '{matching.report.method}' matched them"
-    question = "do R and t map world points to the camera, and does each mask belong to its photo?"
-    num_per_view = matching.masks.regions.num_per_view
+        facts += f", at a reprojection error of {report.residual_px} pixels or more"
+    question = "does each mask, and each camera, belong to its photo? mvseg check compares them"
+    num_per_view = regions.num_per_view
     richest, sparse = int(num_per_view.max()), num_per_view <= num_per_view.max() / 2
     if int(sparse.sum()) > len(sparse) / 2:  # then rays find nothing whatever the poses are
-        view = int(num_per_view.argmax())
-        counts = f"{int(sparse.sum())} of {len(sparse)} views have at most half of the {richest} masks of view {view}"
+        most = called[int(num_per_view.argmax())]
+        counts = f"{int(sparse.sum())} of {len(sparse)} views have at most half of the {richest} masks of {most}"
         question = f"{counts}: are masks missing there?"
     elif few := [view for view in odd if num_per_view[view] <= num_per_view.median() / 2]:
         view = few[0]
         count = f"{num_per_view[view]} against {num_per_view.median()} as a rule"
-        question = f"view {view} has few masks ({count}): are some missing, or does one cover several instances?"
-    warn(f"the views hardly agree ({facts}), and ids may be wrong: {question}")
+        question = f"{called[view]} has few masks ({count}): are some missing, or does one cover several instances?"
+    return f"the views hardly agree ({facts}), and ids may be wrong: {question}"
 
 
 def odd_views(view_explained: Tensor) -> list[int]:

@@ -10,7 +10,7 @@ from mvseg.corrections.apply import apply, apply_everywhere
 from mvseg.corrections.file import Corrections
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
-from mvseg.matching.match import match_masks
+from mvseg.matching.match import describe_disagreement, match_masks
 from mvseg.pipeline.known import Known
 from mvseg.results.result import Instances
 from mvseg.system.running import timed
@@ -40,7 +40,13 @@ def apply_edits(known: Known, corrections: Corrections | None) -> Known:
     if len(shown) and not len(masks):
         warn(NOTHING_LEFT)
     edited = replace(
-        known, matching=matching, instances=Instances(), left=(), edits=corrected.fates, refused=corrected.refused
+        known,
+        matching=matching,
+        instances=Instances(),
+        left=(),
+        edits=corrected.fates,
+        refused=corrected.refused,
+        disagreement=describe_disagreement(matching, opened.names),
     ).with_masks(masks)
     if opened.is_chosen or config.reconstruct is not None:
         with timed("follow"):

@@ -13,6 +13,7 @@ from mvseg.detection.config import DetectConfig
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.detection.find_leaves import Found, Look, find_leaves
 from mvseg.errors import collect_warnings, warn
+from mvseg.matching.match import describe_disagreement
 from mvseg.matching.result import Matching
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.open_scene import Opened
@@ -86,15 +87,17 @@ def know(opened: Opened, found: Found, *, scene: Scene, poses: RefinedPoses | No
         warn(sentence)
     if not len(found.looks[0].sure):
         warn(f"the detector finds nothing that scores {opened.config.detect.min_score:g} or more")
+    matching = Matching(found.matched[0], found.report)
     known = Known(
         opened=opened,
         scene=scene,
-        matching=Matching(found.matched[0], found.report),
+        matching=matching,
         instances=Instances(),
         proposals=found.proposals,
         matched=found.matched,
         looks=found.looks,
         left=(),
         poses=poses,
+        disagreement=describe_disagreement(matching, opened.names),
     )
     return known.with_leaves(found.leaves) if opened.is_chosen else known

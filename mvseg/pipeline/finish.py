@@ -18,6 +18,7 @@ from mvseg.system.running import timed
 if TYPE_CHECKING:
     from mvseg.reconstruction.config import ReconstructConfig
     from mvseg.reconstruction.surface.leaf_surface import LeafSurface
+    from mvseg.verification.unexplained import Missing
 
 # What needs torchvision, trimesh or scikit-image is imported where it is used: they take longer to load than small
 # scenes to match.
@@ -26,7 +27,11 @@ if TYPE_CHECKING:
 def finish(known: Known) -> Result:
     """The final masks and ids, shapes and traits; and what there is to say of them."""
     result, config = shape_leaves(known), known.opened.config
-    _warn_of_missing(known, result)
+    if known.disagreement:
+        warn(known.disagreement)
+    if (missing := _find_missing(known, result)) is not None:
+        warn(f"{missing.why}; what helps: {missing.helps}")
+    result = replace(result, missing=missing, disagreement=known.disagreement)
     with timed("check"):
         has_photos = config.reconstruct is not None and known.opened.photos.exist
         warn_of_contradictions(result.scene, result.regions, photos=known.opened.photos if has_photos else None)
@@ -82,17 +87,15 @@ def _fit_surfaces(known: Known) -> Mapping[int, LeafSurface]:
         return fit_kept(masks.regions, masks.instance_ids, known.scene.cameras, starts=starts)
 
 
-def _warn_of_missing(known: Known, result: Result) -> None:
-    """Warns (InputWarning) where leaves were probably missed, see `describe_missing`."""
+def _find_missing(known: Known, result: Result) -> Missing | None:
+    """Whether leaves were probably missed, where a detector found them, see `find_missing`."""
     from mvseg.detection.config import SURE_SCORE
-    from mvseg.verification.unexplained import describe_missing
+    from mvseg.verification.unexplained import find_missing
 
     if not known.opened.is_chosen or (known.edits and not len(result.masks)):  # a person says that there is none
-        return
+        return None
     may_learn = known.opened.config.learn != "off"
-    said = describe_missing(result.masks, known.opened.photos, sure_score=SURE_SCORE, may_learn=may_learn)
-    if said:
-        warn(said)
+    return find_missing(result.masks, known.opened.photos, sure_score=SURE_SCORE, may_learn=may_learn)
 
 
 def _measure(result: Result, config: RunConfig, shapes: ReconstructConfig) -> Result:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mvseg.corrections.apply import Fate, Refused
 from mvseg.masks import Masks
-from mvseg.matching.match import match_masks
+from mvseg.matching.match import describe_disagreement, match_masks
 from mvseg.matching.result import Matching
 from mvseg.matching.split import split_merged
 from mvseg.pipeline.open_scene import Opened
@@ -44,6 +44,7 @@ class Known:
         edits: what came of a person's edits; () without any.
         refused: pixels where a person says that no leaf is, and where no mask is.
         learned: by the detector from this scene.
+        disagreement: a sentence, where the views hardly agree about the masks, see `describe_disagreement`.
     """
 
     opened: Opened
@@ -58,6 +59,7 @@ class Known:
     edits: tuple[Fate, ...] = ()
     refused: tuple[Refused, ...] = ()
     learned: Learned = NOTHING_LEARNED
+    disagreement: str = ""
 
     @property
     def masks(self) -> Masks:
@@ -113,5 +115,6 @@ def match_given(opened: Opened) -> Known:
         looks=(),
         left=(),
         poses=poses,
+        disagreement=describe_disagreement(matching, opened.names),
     )
     return known.cut_merged()

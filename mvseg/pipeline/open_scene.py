@@ -46,6 +46,11 @@ class Opened:
     config: RunConfig
 
     @property
+    def names(self) -> list[str]:
+        """Of the views."""
+        return [view.name for view in self.scene.views]
+
+    @property
     def is_checked(self) -> bool:
         """Whether surfaces check the ids: those of masks that the views do not choose."""
         shapes = self.config.reconstruct

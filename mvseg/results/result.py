@@ -21,6 +21,7 @@ if TYPE_CHECKING:  # loads trimesh and scikit-image
     from mvseg.results.run_record import RunRecord
     from mvseg.traits.measure import Traits
     from mvseg.verification.choose import LeftOut
+    from mvseg.verification.unexplained import Missing
 
 T = TypeVar("T")
 
@@ -101,6 +102,8 @@ class Result:
         instances: the table of its instances; `surfaces`, `voxels` and `traits` are its columns.
         photos: of the scene; None: they are read when they are needed.
         left: candidates that the views did not choose, the most likely leaf first.
+        missing: leaves that the detector probably missed.
+        disagreement: a sentence, where the views hardly agree and ids may be wrong; "" elsewhere.
         poses: outcome of their refinement; None if it was not requested.
         seconds: {stage: wall time}.
         mask_kind: what the masks were read from ("COCO", "label images", ...); "" where a detector found them.
@@ -118,6 +121,8 @@ class Result:
     instances: Instances = Instances()
     photos: Photos | None = None
     left: tuple[LeftOut, ...] = ()
+    missing: Missing | None = None
+    disagreement: str = ""
     poses: RefinedPoses | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     mask_kind: str = ""

@@ -23,14 +23,15 @@ from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.photos import Photos
 from mvseg.pipeline.run_scene import run_scene
+from mvseg.results.card import make_card
 from mvseg.results.earlier import Output, check_out
-from mvseg.results.folder import photos_folder, save_result
+from mvseg.results.folder import REPORT_FILE, photos_folder, save_result
 from mvseg.results.read import load_learned
 from mvseg.results.result import NOTHING_LEARNED, Learned, Result
 from mvseg.runs.recorded_run import read_recorded, record_places
 from mvseg.system.atomic import resolve_place, sweep_abandoned
 from mvseg.system.file_hash import hash_files
-from mvseg.system.running import running
+from mvseg.system.running import now_running, running
 
 
 def run_one_scene(
@@ -79,8 +80,10 @@ def run_one_scene(
         if left_out := len(result.views_left_out):
             num_taken, more = len(result.scene.views), "" if config.views else "; --views all takes all"
             print(f"mvseg: {num_taken} of {num_taken + left_out} views are taken, evenly spread{more}", file=sys.stderr)
+        card, is_shown = make_card(result, out, scene=scene), now_running().progress
         for message in messages:
-            print(f"mvseg: warning: {message}", file=sys.stderr)
+            if not (is_shown and card.doubt and card.doubt in message):
+                print(f"mvseg: warning: {message}", file=sys.stderr)
         if learned.weights is not None:
             result = replace(result, learned=learned)
         save_scene(result, scene, out, masks=masks, config=config, messages=messages, output=output)
@@ -89,6 +92,12 @@ def run_one_scene(
     num_masks, num_views = len(result.regions), len(result.scene.views)
     masks_of_kind = f"{num_masks} masks ({result.mask_kind})" if result.mask_kind else f"{num_masks} masks"
     print(f"{out}: {result.matching.num_instances} instances from {masks_of_kind} in {num_views} views{replaces}")
+    if is_shown:
+        lines = {"found": card.found, "in doubt": card.doubt, "next": card.next_step}
+        lines |= {"look at": str(out / REPORT_FILE)} if config.report else {}
+        for word, sentence in lines.items():
+            if sentence:
+                print(f"mvseg: {word}: {sentence}", file=sys.stderr)
 
 
 def _with_learned(config: RunConfig, learned: Learned, folder: Path) -> RunConfig:
@@ -182,6 +191,7 @@ def save_scene(
     masks. `output`: what may be replaced."""
     run = describe_run(result, masks, config, messages=messages)
     corrections = None if result.corrections is None else result.corrections.source
+    run["card"] = asdict(make_card(result, out, scene=scene))
     run["config"] |= record_places(scene, out, masks, corrections)
     if config.report:
         # of what features say the run has warned

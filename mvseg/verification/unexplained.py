@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from mvseg.formats.photos import ReadPhoto
@@ -12,8 +14,16 @@ from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_co
 # Leaves were missed if more than this fraction of the pixels of leaf colour lies in no mask. On plants that were found
 # whole, 0.15 to 0.39 does (stems, soil and pots), where a quarter was found, 0.48 to 0.84 (docs/notes/detector.md).
 MUCH = 0.5
-HELP = "what helps most: outline six leaves in two photos each, and let it learn them (mvseg correct); or --masks"
-LEARN = "what helps first: --learn auto; then: outline six leaves in two photos each (mvseg correct); or --masks"
+HELP = "outline six leaves in two photos each, and let the detector learn them (mvseg correct); or give masks (--masks)"
+LEARN = f"let the views teach the detector (--learn auto); then {HELP}"
+
+
+@dataclass(frozen=True)
+class Missing:
+    """Leaves that were probably missed: why that is likely, and what helps most."""
+
+    why: str
+    helps: str
 
 
 def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
@@ -48,8 +58,8 @@ def is_familiar(masks: Masks, *, sure_score: float) -> bool:
     return bool(found.any()) and (not len(scores) or float(scores.median()) >= sure_score)
 
 
-def describe_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float, may_learn: bool = True) -> str:
-    """A sentence where leaves were probably missed, "" elsewhere.
+def find_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float, may_learn: bool = True) -> Missing | None:
+    """Whether leaves were probably missed.
 
     Args:
         masks, photos: see `share_unexplained`.
@@ -59,13 +69,14 @@ def describe_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float, may_
     found = masks.instance_ids > 0
     helps = HELP if may_learn else LEARN
     if not found.any():
-        return f"no leaf was found that two photos agree on; {helps}"
+        return Missing("no leaf was found that two photos agree on", helps)
     if not is_familiar(masks, sure_score=sure_score):
-        return (
+        return Missing(
             f"most leaves score less than {sure_score:g}: the detector does not know this species well, and has "
-            f"probably missed others; {helps}"
+            "probably missed others",
+            helps,
         )
     share = share_unexplained(masks, photos)
     if share > MUCH:
-        return f"{share:.0%} of what has the colour of the leaves that were found is in none: some are missing; {helps}"
-    return ""
+        return Missing(f"{share:.0%} of what has the colour of the leaves that were found is in none", helps)
+    return None

@@ -20,7 +20,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.find_leaves import find_in_photos
 from mvseg.pipeline.finish import finish
-from mvseg.verification.unexplained import describe_missing, share_unexplained
+from mvseg.verification.unexplained import find_missing, share_unexplained
 from three_leaves import true_maps
 
 MAPS = true_maps()
@@ -53,20 +53,25 @@ def test_thinned_photos_say_nearly_the_same(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_plant_that_is_found_whole_is_not_spoken_of() -> None:
-    assert describe_missing(found((1, 2, 3)), photo, sure_score=0.3) == ""
+    assert find_missing(found((1, 2, 3)), photo, sure_score=0.3) is None
 
 
 def test_what_is_missing_is_said_once() -> None:
     share = share_unexplained(found((2,)), photo)
     assert share > 0.5
-    said = describe_missing(found((2,)), photo, sure_score=0.3)
-    assert said.startswith(f"{share:.0%} of what has the colour")
-    assert "mvseg correct" in said
-    assert "does not know this species" in describe_missing(found((1, 2, 3), score=0.2), photo, sure_score=0.3)
+    said = find_missing(found((2,)), photo, sure_score=0.3)
+    assert said is not None
+    assert said.why.startswith(f"{share:.0%} of what has the colour")
+    assert "mvseg correct" in said.helps
+    unknown = find_missing(found((1, 2, 3), score=0.2), photo, sure_score=0.3)
+    assert unknown is not None
+    assert "does not know this species" in unknown.why
     nothing = replace(found((1,)), instance_ids=torch.full((len(found((1,))),), -1))
-    assert "no leaf" in describe_missing(nothing, photo, sure_score=0.3)
+    missing = find_missing(nothing, photo, sure_score=0.3)
+    assert missing is not None
+    assert "no leaf" in missing.why
     by_hand = replace(found((1, 2, 3)), detection_scores=torch.full((len(IDS),), torch.nan))
-    assert describe_missing(by_hand, photo, sure_score=0.3) == ""
+    assert find_missing(by_hand, photo, sure_score=0.3) is None
 
 
 def test_a_run_that_finds_no_leaf_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -6,6 +6,15 @@ function summarise(data) {
     `${leaves}, ${count(data.views.length, "photo")}, ${count(data.numMasks, "mask")}; lengths in ${data.unit}`;
 }
 
+function buildCard(card) {
+  const place = document.getElementById("card");
+  const lines = card ? [["found", card.found], ["in doubt", card.doubt], ["next", card.next_step]] : [];
+  const terms = lines.filter(([, text]) => text)
+    .flatMap(([name, text]) => [element("dt", {}, name), element("dd", {}, text)]);
+  place.append(element("dl", {}, ...terms));
+  place.hidden = terms.length === 0;
+}
+
 function buildRun(data) {
   const { run } = data;
   const warnings = run.warnings ?? [];
@@ -14,6 +23,8 @@ function buildRun(data) {
   const link = document.getElementById("warnings-link");
   link.textContent = count(warnings.length, "warning");
   link.hidden = warnings.length === 0;
+
+  buildCard(run.card);
 
   const list = warnings.length
     ? element("ul", {}, ...warnings.map((text) => element("li", {}, text)))
