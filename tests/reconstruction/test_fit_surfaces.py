@@ -176,6 +176,27 @@ def test_one_view_that_shows_more_than_the_others_is_a_reason(bent: LeafSurface)
     assert any("one view shows more than its surface" in reason for reason in surface.quality.reasons)
 
 
+class Star(EllipticBlade):
+    """Five lobes."""
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        angle = np.arctan2(points[..., 1], points[..., 0])
+        return np.hypot(points[..., 0], points[..., 1]) <= 1 - 0.45 * (1 - np.abs(np.cos(2.5 * angle)))
+
+
+class Rectangle(EllipticBlade):
+    """Three times as long as wide."""
+
+    def contains(self, points: np.ndarray) -> np.ndarray:
+        return (np.abs(points[..., 0]) <= 1) & (np.abs(points[..., 1]) <= 0.33)
+
+
+@pytest.mark.parametrize(("blade", "reason"), [(Star(), "lobes or holes"), (Rectangle(), "one end is blunt")])
+def test_a_shape_that_is_none_of_a_patch_is_doubted(blade: EllipticBlade, reason: str) -> None:
+    (said,) = fit(blade_masks(blade, CAMERAS)).quality.reasons
+    assert reason in said
+
+
 def test_masks_that_no_blade_explains_give_no_credible_surface() -> None:
     """Two stars of four arms about one point in space: of their masks the patch covers little."""
     rng = np.random.default_rng(0)

@@ -71,9 +71,7 @@ def test_parts_are_what_whole_frames_show() -> None:
     for at in ((-0.5, 0.1, 0.0), (0.6, 0.8, 0.3), (30.0, 0.0, 0.0), (0.0, 0.0, 12.0)):
         leaf = flat_leaf(length=1.3, half_width=0.4, at=at)
         px, depth = cameras.project(leaf.points().reshape(-1, 3))
-        for view, (mask, part) in enumerate(
-            zip(leaf.project(cameras), leaf.project_parts(cameras), strict=True)
-        ):
+        for view, (mask, part) in enumerate(zip(leaf.project(cameras), leaf.project_parts(cameras), strict=True)):
             is_ahead = (grid_quads(depth[view].reshape(*MESH_SHAPE, 1).numpy()) > 0).all((1, 2))
             quads = grid_quads(px[view].reshape(*MESH_SHAPE, 2).numpy())[is_ahead]
             whole = draw_polygons(quads, (SIZE, SIZE), np.zeros(2)) >= 0.5

@@ -26,7 +26,7 @@ from mvseg.reconstruction.surface.fit_patch import (
 from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
 from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, measure_sizes
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, cell_normals, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
 from mvseg.reconstruction.surface.orientation import orient_surfaces
@@ -65,6 +65,12 @@ LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
 # Or if its median IoU is more than the first, but it lacks more than the second of a single mask, as a share of the
 # median mask: a deep cup that most views look into shows in one view what it is. (Ovate leaves lack 0.02 at most.)
 CLEAN_IOU, MOST_LACKING = 0.95, 0.05
+# Or if more than the second of its area lies where fewer of the masks than the first have it: a patch fills the bays
+# of a star. (It fills 2.5 % there, 0.5 % at most of leaves, hearts and rectangles.)
+SHOWN, MOST_UNSHOWN = 0.2, 0.02
+# Or if, the first of its length before an end, it is wider than the second of its greatest width: then the midrib ends
+# in a corner. (Rectangles have 0.9 there, discs and hearts 0.4, leaves 0.3.)
+NEAR_END, BLUNT = 0.02, 0.7
 
 FEW_MASKS = 60  # fewer masks are fitted in this process: others would take longer to start (a technical limit)
 MOST_VIEWS = 20  # a fit looks at so many views of an instance at most: more add time, and next to nothing else
@@ -348,10 +354,33 @@ def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface
     # Where other fits are as good, all deviations are larger by as much as that of the area is.
     wider = 1 + (fit.spread * surface.area / surface.deviations[0]) ** 2
     surface = replace(surface, covariance=wider * surface.covariance)
-    return replace(surface, quality=_judge(surface, lacking)) if is_judged else surface
+    if not is_judged:
+        return surface
+    return replace(surface, quality=Quality((*_judge(surface, lacking), *_judge_shape(masks, points))))
 
 
-def _judge(surface: LeafSurface, lacking: float) -> Quality:
+def _judge_shape(masks: MaskStack, points: Floats) -> list[str]:
+    """The reasons why a shape may be none that a patch can have; `points` (rows, columns, 3) of its grid."""
+    reasons, areas = [], np.linalg.norm(cell_normals(points), axis=-1).ravel()
+    centres = (points[1:, 1:] + points[1:, :-1] + points[:-1, 1:] + points[:-1, :-1]) / 4
+    px = project_points(masks.px_from_world, centres).px.reshape(-1, 2)
+    stack = np.arange(len(masks)).repeat(len(areas))
+    is_open = (masks.look_up(masks.others, stack, px) == 0).reshape(len(masks), -1)
+    is_inside = masks.look_up(masks.inside, stack, px).reshape(len(masks), -1)
+    shown = (is_inside & is_open).sum(0) / np.maximum(is_open.sum(0), 1)
+    unshown = float(areas[shown < SHOWN].sum() / areas.sum())
+    if unshown > MOST_UNSHOWN:
+        reasons.append(f"{100 * unshown:.0f} % of the surface is in hardly any mask: the leaf has lobes or holes")
+    along = np.linalg.norm(np.diff(points[:, points.shape[1] // 2], axis=0), axis=-1).cumsum()
+    widths = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
+    places = np.append(0, along) / along[-1]
+    ends = np.interp((NEAR_END, 1 - NEAR_END), places, widths) / widths.max()
+    if ends.max() > BLUNT:
+        reasons.append("one end is blunt: where the midrib ends, and so the length, is a guess")
+    return reasons
+
+
+def _judge(surface: LeafSurface, lacking: float) -> list[str]:
     """The reasons to doubt a fit; what it lacks of one of its masks is `lacking`, as a share of the median mask."""
     reasons = []
     if not surface.is_credible:
@@ -366,4 +395,4 @@ def _judge(surface: LeafSurface, lacking: float) -> Quality:
     share = surface.deviations[0] / surface.area
     if share > MOST_AREA_SHARE:
         reasons.append(f"its area is uncertain by {100 * share:.0f} %")
-    return Quality(tuple(reasons))
+    return reasons
