@@ -35,7 +35,7 @@ from mvseg.results.earlier import RUN_FILE
 from mvseg.results.folder import CORRECTED
 from mvseg.results.photo_masks import regions_in_photos
 from mvseg.results.result import Instances, Learned, Result
-from mvseg.results.run_record import RunRecord, find_place, load_run
+from mvseg.results.run_record import FORMAT, RunRecord, find_place, load_run
 from mvseg.scene import Cameras, Scene, View
 from mvseg.system.file_hash import hash_files
 
@@ -67,7 +67,7 @@ class _Image(BaseModel):
     file_name: str
     width: Pixels
     height: Pixels
-    camera: _Camera | None = None
+    camera: _Camera
 
 
 class _Mask(BaseModel):
@@ -132,10 +132,6 @@ def load_result(folder: Path | str) -> Result:
     of the instances, and the candidates `left` out. `Scene.views` name the photos where they are now, if they moved
     together with the result.
 
-    A result of an earlier version, which says no format, is read, too. It holds no cameras, so the scene folder is
-    opened; its surfaces are rebuilt from the meshes in leaves/, without covariance; leaves that have voxels only come
-    without them.
-
     Args:
         folder: of one scene, as `mvseg infer`, `mvseg match` and `mvseg batch` write it.
 
@@ -143,14 +139,17 @@ def load_result(folder: Path | str) -> Result:
         The result, on the CPU; `Result.run` is what its run.json says.
 
     Raises:
-        InputError: this is no result; it has a newer format than this version knows; a file is missing, broken,
-            or another one than run.json lists.
+        InputError: this is no result; it has another format than this version reads; a file is missing, broken, or
+            another one than run.json lists.
     """
     folder = Path(folder)
     path = folder / "instances.json"
     if not path.is_file():
         raise InputError(f"{path}: is missing, expected a result folder")
-    run, content = load_run(folder), read_json(path, _Instances)
+    run = load_run(folder)
+    if run.format < FORMAT:
+        raise InputError(f"{folder}: has the format of an earlier version; mvseg infer --again {folder} makes it anew")
+    content = read_json(path, _Instances)
     with faults_of(path):
         scene = _scene_of(folder, run, content.images)
         masks = _table_of(content, scene)
@@ -161,7 +160,7 @@ def load_result(folder: Path | str) -> Result:
         poses = RefinedPoses(cameras=scene.cameras, is_refined=run.poses.refined, residual_px=(before, after))
     source = run.config.get("corrections")
     edits = {"format": EDITS_FORMAT, "edits": run.edits}
-    instances = _instances_of(folder, run, content, masks=masks, traits=traits)
+    instances = _instances_of(folder, run, content, traits=traits)
     check_unchanged(folder, run)
     return Result(
         scene=scene,
@@ -219,11 +218,7 @@ def _scene_of(folder: Path, run: RunRecord, images: Sequence[_Image]) -> Scene:
         for name in (image.name, image.file_name):
             if problem := file_name_problem(name, folder="the folder of the photos"):
                 raise InputError(f"image {name}: {problem}")
-    cameras = [image.camera for image in images if image.camera is not None]
-    if len(cameras) < len(images):
-        from mvseg.results.format_1 import rebuild_scene
-
-        return rebuild_scene(folder, run, [(each.name, each.file_name, each.width, each.height) for each in images])
+    cameras = [image.camera for image in images]
     photos = find_place(folder, run, run.photos or folder)
     views = []
     for image, camera in zip(images, cameras, strict=True):
@@ -295,10 +290,9 @@ def _decode(mask: _Mask, scene: Scene, view: int) -> tuple[Box, np.ndarray]:
 
 def _report_of(run: RunRecord) -> MatchReport:
     matching, shares = run.matching, run.matching.view_explained
-    is_known = matching.has_probabilities is not None
     return MatchReport(
         method=run.matched_by,
-        has_probabilities=bool(matching.has_probabilities) if is_known else run.matched_by == "nview",
+        has_probabilities=matching.has_probabilities,
         residual_px=run.residual_px,
         explained=matching.explained,
         view_explained=None if shares is None else torch.tensor([math.nan if n is None else n for n in shares]),
@@ -314,9 +308,7 @@ def _traits_of(folder: Path, run: RunRecord, scene: Scene) -> Traits | None:
     return read_traits(*paths, plant=scene.name, unit=world.unit or "", up=world.up)
 
 
-def _instances_of(
-    folder: Path, run: RunRecord, content: _Instances, *, masks: Masks, traits: Traits | None
-) -> Instances:
+def _instances_of(folder: Path, run: RunRecord, content: _Instances, *, traits: Traits | None) -> Instances:
     chances = {each.instance_id: each.probability for each in content.annotations if each.probability is not None}
     surfaces: dict[int, LeafSurface] | None = None
     voxels: dict[int, VoxelGrid] | None = None
@@ -324,10 +316,6 @@ def _instances_of(
         from mvseg.results.shapes_file import read_surfaces
 
         surfaces, voxels = read_surfaces(path), {}
-    elif run.format == 1 and traits is not None:
-        from mvseg.results.format_1 import rebuild_surfaces
-
-        surfaces, voxels = rebuild_surfaces(folder, traits.leaves, masks), {}
     if (path := _find_file(folder, run, "voxels.npz")) is not None:
         from mvseg.results.shapes_file import read_voxels
 

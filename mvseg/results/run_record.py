@@ -13,7 +13,7 @@ from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, Vector3, check_content, load_json
 from mvseg.results.earlier import RUN_FILE
 
-FORMAT = 2  # of the folder; 1, of earlier versions, says no "format" and holds neither cameras nor surfaces.npz
+FORMAT = 2  # of the folder; 1, which says no "format", was of versions before 0.2.0
 
 
 class _Part(BaseModel):
@@ -21,9 +21,9 @@ class _Part(BaseModel):
 
 
 class MatchingRecord(_Part):
-    """What else `MatchReport` holds; `has_probabilities` is None where a result of format 1 does not say."""
+    """What else `MatchReport` holds."""
 
-    has_probabilities: bool | None = None
+    has_probabilities: bool = False
     explained: float | None = None
     view_explained: tuple[float | None, ...] | None = None
 

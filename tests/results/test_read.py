@@ -18,12 +18,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from known_leaves import bent_blade, make_surface
-from mvseg import assert_same_result, load_result, load_scene
+from mvseg import assert_same_result, load_result
 from mvseg.config import RunConfig
 from mvseg.corrections.apply import Fate
 from mvseg.corrections.file import Corrections, Reject
-from mvseg.demo import demo_scene
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError
 from mvseg.formats.coco import decode_crop, decode_rle, encode_mask
 from mvseg.formats.label_png import read_label_png
 from mvseg.formats.lens import distort, opencv_lens
@@ -41,7 +40,6 @@ from mvseg.traits.config import TraitsConfig
 from mvseg.traits.measure import measure_plant
 from scene_folders import HEIGHT, WIDTH, K, edit_rig, write_image, write_scene
 
-FORMAT_1 = Path(__file__).parent / "format_1"  # of the shipped plant with masks of two leaves, by an earlier version
 LAWFUL = ("instances.json", "traits.csv", "surfaces.npz", "voxels.npz")  # the same bytes again
 
 
@@ -194,62 +192,6 @@ def test_photos_that_moved_with_the_result_are_found(plant: Path, tmp_path: Path
     views = load_result(tmp_path / "after" / "out").scene.views
     assert [view.path.parent for view in views] == [tmp_path / "after" / "plant" / "images"] * 4
     assert all(view.path.is_file() for view in views)
-
-
-class TestFormat1:
-    """The files as an earlier version wrote them, without those that nothing reads."""
-
-    @pytest.fixture
-    def old(self, tmp_path: Path) -> Path:
-        return shutil.copytree(FORMAT_1, tmp_path / "plant-result")
-
-    def test_beside_its_scene(self, old: Path) -> None:
-        (old.parent / "plant").mkdir()
-        shutil.copy(demo_scene() / "cameras.json", old.parent / "plant")
-        result, scene = load_result(old), load_scene(demo_scene())
-        assert torch.equal(result.scene.cameras.R, scene.cameras.R)
-        assert (result.scene.name, result.scene.unit, result.scene.up) == ("plant", "mm", (0, 0, 1))
-        assert len(result.masks) == 18
-        assert result.masks.origin.unique().tolist() == [Origin.GIVEN]
-        assert result.matching.support is not None
-        assert result.matching.support.tolist() == [9, 9]
-        assert result.run is not None
-        assert (result.run.format, result.run.mvseg) == (1, "0.2.0")
-        self.check_surfaces(result)
-
-    def test_where_its_scene_is_gone(self, old: Path) -> None:
-        with pytest.warns(InputWarning, match="holds no cameras, and its scene /plants/plant is gone"):
-            result = load_result(old)
-        assert [view.name for view in result.scene.views] == [f"{view:03d}" for view in range(9)]
-        self.check_surfaces(result)
-
-    def check_surfaces(self, result: Result) -> None:
-        """What was measured on the surfaces then is measured on those that were rebuilt."""
-        assert result.surfaces is not None
-        assert result.traits is not None
-        for leaf in result.traits.leaves:
-            surface = result.surfaces[leaf.leaf]
-            assert surface.is_credible
-            assert not surface.is_oriented
-            for name in ("area", "length", "width"):
-                assert getattr(surface, name) == pytest.approx(leaf.numbers[name].value, rel=1e-5)
-        assert result.traits.whole["number_of_leaves"].value == 2
-
-    def test_saved_again_it_is_of_todays_format(self, old: Path, tmp_path: Path) -> None:
-        with pytest.warns(InputWarning, match="holds no cameras"):
-            result = load_result(old)
-        save_result(result, tmp_path / "new", report=False)
-        again = load_result(tmp_path / "new")
-        assert_same_result(result, again)
-        assert (tmp_path / "new" / "traits.csv").read_bytes() == (old / "traits.csv").read_bytes()
-
-    def test_a_leaf_that_is_gone(self, old: Path) -> None:
-        (old / "leaves" / "leaf_002.ply").unlink()
-        with pytest.warns(InputWarning), pytest.raises(InputError, match=r"leaf_002\.ply: is missing, expected"):
-            load_result(old)
-        (old / "leaves" / "leaf_002.ply").write_text("ply")
-        with pytest.warns(InputWarning), pytest.raises(InputError, match=r"leaf_002\.ply: is no mesh"):
-            load_result(old)
 
 
 @pytest.fixture
@@ -428,3 +370,11 @@ def test_other_numbers_for_the_same_leaves(rich: Result, balls: Result) -> None:
     for pair in ((balls, joined), (joined, balls)):
         with pytest.raises(AssertionError, match="instance"):
             assert_same_result(*pair, ids="renumbered")
+
+
+def test_a_result_of_an_earlier_format_is_refused_with_what_to_do(saved: Path) -> None:
+    run = json.loads((saved / "run.json").read_text())
+    del run["format"]
+    (saved / "run.json").write_text(json.dumps(run))
+    with pytest.raises(InputError, match="has the format of an earlier version; mvseg infer --again"):
+        load_result(saved)

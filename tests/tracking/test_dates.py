@@ -117,12 +117,6 @@ def test_a_date_read_back_is_that_of_the_result_in_memory(tmp_path: Path) -> Non
         np.testing.assert_array_equal(one.points, other.points)
 
 
-def test_a_result_of_an_earlier_version_is_read_without_a_word_of_its_cameras() -> None:
-    date = read_date(Path(__file__).parents[1] / "results" / "format_1", 0, pictures=True)  # a warning is an error
-    assert len(date.shaped) == 2
-    assert date.pictures.keys() == {leaf.leaf for leaf in date.leaves}
-
-
 def test_leaves_without_a_shape_and_rejected_ones(tmp_path: Path) -> None:
     write_result(tmp_path / "day", grow_blades(3, 1), shapeless=[2], rejected={3: "looks like the floor: flat"})
     date = read_date(tmp_path / "day", 0)
