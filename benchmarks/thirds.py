@@ -257,7 +257,7 @@ class Trial:
     truth: Any
 
 
-CHECKING = ("checked_ids", "rematched_masks", "evidence")
+CHECKING = "checked_ids", "join_halves", "shown_leaves", "match_again", "evidence"
 CHOOSING = ("choose", "leaf_scores", "rough_surfaces", "evidence", "snap_edges")
 DRAWING = ("drawn_leaves", "leaf_color")
 
