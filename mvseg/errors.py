@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+import inspect
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
+from typing import Literal, ParamSpec, TypeVar, get_args, get_origin, get_type_hints
+
+P = ParamSpec("P")
+T = TypeVar("T")
+# Classes that users mix up, with what makes one.
+OWN = {
+    "Cameras": "of a scene: scene.cameras",
+    "Regions": "regions_from_masks and load_masks make them",
+    "Masks": "Masks.of makes them of regions and ids",
+    "Scene": "load_scene reads one",
+    "Matching": "match_regions gives one",
+    "Tensor": "torch.as_tensor makes one of an array",
+}
 
 
 class InputError(ValueError):
@@ -49,3 +64,35 @@ def faults_of(where: object) -> Iterator[None]:
         yield
     except InputError as error:
         raise InputError(f"{where}: {error}") from None
+
+
+def check_arguments(function: Callable[P, T]) -> Callable[P, T]:
+    """Decorates a public function: an argument that the signature says is one of `OWN`, and that is none, is refused
+    with one sentence (InputError), in place of an AttributeError from somewhere inside."""
+    signature = inspect.signature(function)
+    named = {name: str(each.annotation) for name, each in signature.parameters.items() if str(each.annotation) in OWN}
+
+    @wraps(function)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+        given = signature.bind(*args, **kwargs).arguments
+        for name in named.keys() & given.keys():
+            classes = [each.__name__ for each in type(given[name]).__mro__]
+            if named[name] not in classes:
+                raise InputError(f"{name} is a {classes[0]}, expected {named[name]} ({OWN[named[name]]})")
+        return function(*args, **kwargs)
+
+    return checked
+
+
+def check_choices(config: object, place: str) -> None:
+    """Refuse a value of a field of a frozen config that is none of its `Literal`; `place` is the name of its group of
+    options.
+
+    Raises:
+        InputError: names the field, the value, and what there is to choose from.
+    """
+    for name, hint in get_type_hints(type(config)).items():
+        value = getattr(config, name)
+        if get_origin(hint) is Literal and value not in get_args(hint):
+            choices = ", ".join(map(str, get_args(hint)))
+            raise InputError(f"{place}.{name} is {value!r}, expected one of {choices}")

@@ -61,7 +61,7 @@ class MergedMask:
     part: Tensor
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Masks:
     """D masks in V views.
 
@@ -89,6 +89,9 @@ class Masks:
     is_linked: Tensor
     second_ids: Tensor
     second_parts: tuple[Tensor | None, ...]
+
+    def __repr__(self) -> str:
+        return f"Masks({len(self)} in {self.regions.num_views} views, of {self.num_instances} instances)"
 
     def __post_init__(self) -> None:
         lengths = [len(getattr(self, name)) for name in (*COLUMNS, "second_parts")]

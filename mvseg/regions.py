@@ -18,7 +18,7 @@ BAND = 256  # rows of a label map that are looked at together
 IGNORE_LABEL = 65535  # in label maps: pixels that belong to no region and are left out of every score
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Regions:
     """D instance masks in V views: the nodes of the paper's graph (Sec. 3.1).
 
@@ -41,6 +41,9 @@ class Regions:
     crops: Tensor
     num_views: int
     labels: Tensor
+
+    def __repr__(self) -> str:
+        return f"Regions({len(self.view_index)} masks in {self.num_views} views)"
 
     def __post_init__(self) -> None:
         num_regions = len(self.view_index)

@@ -43,7 +43,7 @@ LEVEL, UPSIDE_DOWN = 0.17, -0.7  # means: sine of the pitch of level cameras, co
 MAX_WORLD = 1e12  # of t, world units: millimetres on a map of the whole earth fit
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Cameras:
     """V pinhole cameras with known poses.
 
@@ -63,6 +63,11 @@ class Cameras:
     R: Tensor
     t: Tensor
     sizes: Tensor
+
+    def __repr__(self) -> str:
+        sizes = sorted({(width, height) for width, height in self.sizes.tolist()})
+        shown = ", ".join(f"{width} x {height}" for width, height in sizes[:3]) + (", ..." if len(sizes) > 3 else "")
+        return f"Cameras({len(self.K)} views: {shown})"
 
     def __post_init__(self) -> None:
         num_views = len(self.K)
@@ -199,7 +204,7 @@ class View:
     lens: pycolmap.Camera | None = None
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Scene:
     """Photos of one plant from V known cameras (two or more, when read from a folder).
 
@@ -221,6 +226,9 @@ class Scene:
     unit: str = ""
     source: Path | None = None
     up: tuple[float, float, float] | None = None
+
+    def __repr__(self) -> str:
+        return f"Scene({self.name!r}, {len(self.views)} views, unit {self.unit or 'unknown'})"
 
     def __post_init__(self) -> None:
         if self.up is not None:

@@ -14,7 +14,7 @@ from mvseg.checks.photo_matches import match_photos
 from mvseg.checks.photos import PhotoFacts, photo_findings, read_photo_facts
 from mvseg.checks.poses import PoseAgreement, pairwise_agreement, pose_findings
 from mvseg.checks.turned_masks import low_fit_findings
-from mvseg.errors import warn
+from mvseg.errors import check_arguments, warn
 from mvseg.formats.photos import Photos
 from mvseg.matching.match import check_views
 from mvseg.matching.pencil import is_coincident
@@ -47,6 +47,7 @@ class Check:
         return _has_error(self.findings)
 
 
+@check_arguments
 def check_scene(
     scene: Scene, regions: Regions | None = None, *, photos: Photos | None = None, features: bool = True
 ) -> Check:

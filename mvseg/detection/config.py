@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_choices
 
 # pixels, as in a file of weights; this module is imported for --help, and loads no torch
 MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384
@@ -48,6 +48,7 @@ class DetectConfig:
     min_views: int = 2
 
     def __post_init__(self) -> None:
+        check_choices(self, "detect")
         if not 0 <= self.min_score <= 1:
             raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
         if self.min_probability is not None and not 0 <= self.min_probability <= 1:

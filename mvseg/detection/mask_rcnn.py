@@ -22,6 +22,8 @@ from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
 from mvseg.verification.snap_edges import snap_masks
 
+BRIGHTEST = 1.5  # values above it are no share of white (resampling may exceed 1 by a little)
+
 
 class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
     """Wraps any torchvision Mask R-CNN: same modules, same state dict, and ids across views when given the cameras.
@@ -109,10 +111,10 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         """
         if self.training or cameras is None:
             return super().forward(images, targets)
-        sizes = [[image.shape[-1], image.shape[-2]] for image in images]
-        _check_cameras(cameras, sizes)
         for view, image in enumerate(images):
             _check_image(image, f"image {view}")
+        sizes = [[image.shape[-1], image.shape[-2]] for image in images]
+        _check_cameras(cameras, sizes)
         if self.verify:
             return _result_dicts(self.find_regions(images, cameras).masks, sizes=sizes, device=images[0].device)
         with torch.no_grad():
@@ -237,9 +239,15 @@ def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device)
 
 
 def _check_image(image: Tensor, name: str) -> None:
+    if not isinstance(image, Tensor):
+        raise InputError(f"{name} is a {type(image).__name__}, expected a Tensor: torch.from_numpy(image)")
+    if image.ndim != 3 or len(image) != 3:
+        raise InputError(f"{name} has shape {tuple(image.shape)}, expected (3, height, width), of red, green and blue")
     if not image.is_floating_point():
         kind = str(image.dtype).removeprefix("torch.")
         raise InputError(f"{name} is {kind}, expected floats in [0, 1]: image.float() / 255")
+    if float(image.max()) > BRIGHTEST:
+        raise InputError(f"{name} has values up to {float(image.max()):g}, expected floats in [0, 1]: image / 255")
 
 
 def _check_cameras(cameras: Cameras, sizes: list[list[int]]) -> None:

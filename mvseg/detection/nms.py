@@ -6,10 +6,11 @@ import torch
 import torchvision
 from torch import Tensor
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_arguments
 from mvseg.masks import SURE
 
 
+@check_arguments
 def cluster_aware_nms(boxes: Tensor, scores: Tensor, groups: Tensor, iou_threshold: float = 0.3) -> Tensor:
     """Non-maximum suppression in which boxes of different groups never suppress each other.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from torch import Tensor
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_arguments
 from mvseg.matching.partition import separate_unmatched
 
 
@@ -42,6 +42,7 @@ class MatchingMetrics:
     num_true: int
 
 
+@check_arguments
 def matching_metrics(instance_ids: Tensor, true_ids: Tensor) -> MatchingMetrics:
     """Compare two int64 (D,) id vectors of any device; -1 in the estimate is a cluster of its own.
 

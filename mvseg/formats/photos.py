@@ -13,7 +13,7 @@ import pycolmap
 import torch
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError, faults_of, warn
+from mvseg.errors import InputError, check_arguments, faults_of, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.image_file import (
     MAX_PIXELS,
@@ -242,6 +242,7 @@ def _bits_of_views(scene: Scene) -> list[int]:
     return [sensor_bits(view.path, size) for view, size in zip(scene.views, sizes, strict=True)]
 
 
+@check_arguments
 def load_photos(scene: Scene) -> list[torch.Tensor]:
     """V tensors (3, H, W) float32 in [0, 1], RGB, undistorted: what torchvision's detectors take.
 

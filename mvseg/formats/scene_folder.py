@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mvseg.errors import InputError, InputWarning, warn
+from mvseg.errors import InputError, InputWarning, check_arguments, warn
 from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
@@ -99,6 +99,7 @@ def _describe(folder: Path) -> str:
     return f"found {list_some(sorted(path.name for path in folder.iterdir()))}"
 
 
+@check_arguments
 def load_masks(scene: Scene, masks: Path | str, *, crowd: Crowd = "mask", categories: Collection[str] = ()) -> Regions:
     """Load the masks of every view, with the lens distortion of the scene removed.
 

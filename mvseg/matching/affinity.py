@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mvseg.errors import check_arguments
 from mvseg.matching.epipolar import Bins, binned_pairs, dilate
 from mvseg.matching.samples import draw_points, view_runs, view_samples
 from mvseg.regions import Regions
@@ -36,6 +37,7 @@ class Affinity:
         return dense
 
 
+@check_arguments
 def region_affinity(regions: Regions, cameras: Cameras, *, num_points: int | None = None, seed: int = 0) -> Affinity:
     """Affinity of all pairs of regions in different views (Eq. 3), symmetrised.
 

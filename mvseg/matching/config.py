@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_choices
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,7 @@ class MatchConfig:
     seed: int = 0
 
     def __post_init__(self) -> None:
+        check_choices(self, "match")
         for name in ("num_points", "num_instances", "num_restarts"):
             value = getattr(self, name)
             if value is not None and value < 1:

@@ -18,6 +18,7 @@ from math import ceil
 import torch
 from torch import Tensor
 
+from mvseg.errors import check_arguments
 from mvseg.matching.pencil import Pencil, epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
 from mvseg.matching.samples import Samples, view_samples
 from mvseg.regions import Regions
@@ -264,6 +265,7 @@ def epipolar_bands(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor)
     return bands
 
 
+@check_arguments
 def epipolar_map(regions: Regions, cameras: Cameras, *, view: int, xy: Tensor) -> Tensor:
     """The epipolar map of one cluster (Eq. 4): the mean of its bands.
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from mvseg.errors import InputError, warn
+from mvseg.errors import InputError, check_arguments, warn
 from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
@@ -34,6 +34,7 @@ SHOWN = 3  # views that a sentence names
 MIN_VIEWS = 4  # limit: with fewer views there is no telling which one is odd
 
 
+@check_arguments
 def match_regions(
     regions: Regions,
     cameras: Cameras,

@@ -7,9 +7,11 @@ from dataclasses import replace
 import torch
 
 from mvseg.crop import Crop
+from mvseg.errors import check_arguments
 from mvseg.masks import Masks, replace_crops
 
 
+@check_arguments
 def split_merged(masks: Masks) -> Masks:
     """Cut each mask that shows two instances in two, one part per instance.
 

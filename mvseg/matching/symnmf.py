@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from mvseg.errors import check_arguments
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.partition import Clusters
@@ -39,6 +40,7 @@ class Clustering:
     criterion: dict[int, float]
 
 
+@check_arguments
 def cluster_affinity(
     affinity: Affinity,
     num_per_view: Tensor,

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from mvseg.errors import warn
+from mvseg.errors import check_arguments, warn
 from mvseg.formats.lens import opencv_distortion
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching
@@ -58,6 +58,7 @@ class RefinedPoses:
     residual_px: tuple[float, float]
 
 
+@check_arguments
 def refine_poses(cameras: Cameras, match: Match) -> RefinedPoses:
     """Match, refine the poses, match with these, and so on until no id changes.
 

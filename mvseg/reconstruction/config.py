@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_choices
 
 
 @dataclass(frozen=True)
@@ -37,6 +37,7 @@ class ReconstructConfig:
     check_ids: bool = True
 
     def __post_init__(self) -> None:
+        check_choices(self, "reconstruct")
         if not 0 <= self.threshold < 1:
             raise InputError(f"reconstruct.threshold is {self.threshold:g}, expected a number in [0, 1)")
         if not 0 <= self.seen_share < 1:

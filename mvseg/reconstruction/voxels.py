@@ -12,7 +12,7 @@ from scipy import ndimage
 from skimage.measure import marching_cubes
 from torch import Tensor
 
-from mvseg.errors import InputError, warn
+from mvseg.errors import InputError, check_arguments, warn
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells
 from mvseg.regions import Regions
@@ -99,6 +99,7 @@ class VoxelGrid:
         return trimesh.Trimesh(world, faces, process=False)
 
 
+@check_arguments
 def reconstruct_instances(
     regions: Regions,
     instance_ids: Tensor,

@@ -92,7 +92,7 @@ class Learned:
 NOTHING_LEARNED = Learned()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class Result:
     """Everything known about one scene.
 
@@ -132,6 +132,18 @@ class Result:
     fates: tuple[Fate, ...] = ()
     learned: Learned = NOTHING_LEARNED
     run: RunRecord | None = None
+
+    def __repr__(self) -> str:
+        """A line for each table."""
+        surfaces = () if self.surfaces is None else self.surfaces.values()
+        rows = 0 if self.traits is None else len(self.traits.leaves)
+        lines = [
+            f"Result of {self.scene!r}",
+            f"  masks: {self.masks!r}",
+            f"  instances: {self.matching.num_instances}, {sum(each.exists for each in surfaces)} with a surface",
+            f"  traits: {rows} leaves" if self.traits is not None else "  traits: not measured",
+        ]
+        return "\n".join(lines)
 
     @property
     def masks(self) -> Masks:

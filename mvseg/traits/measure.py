@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import torch
 
+from mvseg.errors import check_arguments
 from mvseg.formats.photos import Photos
 from mvseg.matching.result import Matching
 from mvseg.reconstruction.shapes import Surfaces, Voxels, best_shape
@@ -70,6 +71,7 @@ class Traits:
         return dict(Counter(leaf.rejection.kind for leaf in self.leaves if leaf.rejection is not None))
 
 
+@check_arguments
 def measure_plant(
     scene: Scene,
     matching: Matching,

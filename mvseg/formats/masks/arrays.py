@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from mvseg.errors import InputError, faults_of
+from mvseg.errors import InputError, check_arguments, faults_of
 from mvseg.formats.coco import decode_segmentation
 from mvseg.formats.masks.view_regions import ViewMasks, stack_views
 from mvseg.regions import IGNORE_LABEL, Regions
@@ -57,6 +57,7 @@ def regions_from_masks(views: Sequence[Any], scene: Scene | None = None) -> Regi
     return stack_views(contents(), scene, num_views=len(views), source="masks in memory")
 
 
+@check_arguments
 def with_instance_ids(views: Sequence[Any], regions: Regions, instance_ids: Tensor) -> list[Any]:
     """Give the ids of regions back to the masks that they came from.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from types import MappingProxyType
@@ -12,7 +12,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from mvseg.errors import InputError
+from mvseg.errors import InputError, check_arguments
 from mvseg.reconstruction.spread_views import spread_directions, spread_views
 from mvseg.reconstruction.surface.fit_patch import (
     FAR_GRID,
@@ -76,6 +76,7 @@ FEW_MASKS = 60  # fewer masks are fitted in this process: others would take long
 MOST_VIEWS = 20  # a fit looks at so many views of an instance at most: more add time, and next to nothing else
 
 
+@check_arguments
 def fit_surfaces(
     regions: Regions,
     instance_ids: Tensor,
@@ -135,7 +136,7 @@ def fit_surfaces(
         start = starts.get(instance)
         rough = start.coefficients.numpy() if start is not None and start.exists else None
         unfitted[instance] = stacks[instance], rough
-    answers = map_in_order(_fit_first, unfitted.values(), workers)
+    answers = map_in_order(partial(_fit_first, is_rough=is_rough), unfitted.values(), workers)
     shown = progress_bar(answers, "surfaces", len(unfitted), unit="instance")
     for instance, (masks, fit) in zip(unfitted, shown, strict=True):
         stacks[instance] = masks
@@ -171,10 +172,11 @@ def _instance_frames(regions: Regions, instance_ids: Tensor, cameras: Cameras) -
     return [regions.label_map(view, values, size).numpy().astype(np.int32) for view, size in enumerate(sizes)]
 
 
-def _fit_first(asked: tuple[MaskStack, Floats | None]) -> tuple[MaskStack, PatchFit | None]:
+def _fit_first(asked: tuple[MaskStack, Floats | None], *, is_rough: bool) -> tuple[MaskStack, PatchFit | None]:
     """The first fit of an instance, from a start that is nearly right or from those that are found, and its masks.
 
-    Of several fits the best one, and how far the areas of those that are nearly as good are from its own.
+    Of several fits the best one, and how far the areas of those that are nearly as good are from its own. Rough fits
+    are of masks some of which are another leaf's, so that medians over the views choose among them.
     """
     masks, start = asked
     masks, starts = (masks, [start]) if start is not None else _find_starts(masks)
@@ -182,7 +184,9 @@ def _fit_first(asked: tuple[MaskStack, Floats | None]) -> tuple[MaskStack, Patch
     if len(fits) < 2:
         return masks, fits[0] if fits else None
     areas = np.array([measure_sizes(fit.coefficients)[0] for fit in fits])
-    scores = np.array([_fine_rank(masks, fit) - _area_cost(fit.coefficients) for fit in fits])
+    scores = np.array(
+        [_fine_rank(masks, fit, np.median if is_rough else np.mean) - _area_cost(fit.coefficients) for fit in fits]
+    )
     best = int(scores.argmax())
     weights = np.maximum(0, 1 - (scores[best] - scores) / AS_GOOD)
     spread = float(np.sqrt(weights @ (areas / areas[best] - 1) ** 2 / weights.sum()))
@@ -277,11 +281,12 @@ def _rank(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None)
     return float(np.median(crop_ious(masks, covered, offsets=offsets))) - _wide_cost(coefficients)
 
 
-def _fine_rank(masks: MaskStack, fit: PatchFit) -> float:
-    """The same, finely, of the mean IoU: of fits that are nearly as good, medians pick one by chance."""
+def _fine_rank(masks: MaskStack, fit: PatchFit, average: Callable[[Floats], np.floating]) -> float:
+    """The same, finely; with the mean IoU for its average: of fits that are nearly as good, medians pick one by
+    chance."""
     points = patch_grid(*FIT_GRID).points(fit.coefficients)
     ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
-    return float(ious.mean()) - _wide_cost(fit.coefficients)
+    return float(average(ious)) - _wide_cost(fit.coefficients)
 
 
 def _wide_cost(coefficients: Floats) -> float:

@@ -1,0 +1,55 @@
+"""What users mix up in Python is one sentence; what they print is one line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import torch
+
+from mvseg import DetectConfig, MatchConfig, ReconstructConfig, epipolar_map, fit_surfaces, match_regions
+from mvseg.errors import InputError
+from mvseg.masks import Masks
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.regions import Regions
+from mvseg.results.result import Result
+from mvseg.scene import Scene
+
+
+@pytest.mark.parametrize(
+    ("call", "sentence"),
+    [
+        (lambda r, s: match_regions(s.cameras, r), "regions is a Cameras, expected Regions|cameras is a Regions"),
+        (lambda r, s: match_regions(r, s), r"cameras is a Scene, expected Cameras \(of a scene: scene.cameras\)"),
+        (lambda r, s: fit_surfaces(r, r.labels.numpy(), s.cameras), "instance_ids is a ndarray, expected Tensor"),
+        (lambda r, s: epipolar_map(r, s.cameras, view=0, xy=[1, 2]), "xy is a list, expected Tensor"),
+    ],
+)
+def test_arguments_of_another_class_are_refused(
+    call: Callable[[Any, Any], object], sentence: str, demo_scene: Scene, demo_regions: Regions
+) -> None:
+    with pytest.raises(InputError, match=sentence):
+        call(demo_regions, demo_scene)
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: MatchConfig(method="nviews"), "match.method is 'nviews', expected one of auto, nview, one-per-view"),  # type: ignore[arg-type]
+        (lambda: DetectConfig(crop="on"), "detect.crop is 'on', expected one of auto, off"),  # type: ignore[arg-type]
+        (lambda: ReconstructConfig(shape="mesh"), "reconstruct.shape is 'mesh', expected one of surface"),  # type: ignore[arg-type]
+    ],
+)
+def test_a_choice_that_there_is_not_is_refused(make: Callable[[], object], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        make()
+
+
+def test_printed_a_table_is_a_line(demo_scene: Scene, demo_regions: Regions, demo_truth: torch.Tensor) -> None:
+    masks = Masks.of(demo_regions, demo_truth)
+    assert repr(demo_scene) == "Scene('demo_plant', 9 views, unit mm)"
+    assert repr(demo_scene.cameras) == "Cameras(9 views: 640 x 480)"
+    assert repr(demo_regions) == "Regions(108 masks in 9 views)"
+    assert repr(masks) == "Masks(108 in 9 views, of 12 instances)"
+    assert len(str(Result(demo_scene, Matching(masks, MatchReport("nview")))).splitlines()) == 4
