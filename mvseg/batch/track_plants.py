@@ -13,8 +13,8 @@ from typing import Any
 from mvseg._version import made_by
 from mvseg.batch.tables import read_table
 from mvseg.batch.workers import Engine, Lost, open_workers
-from mvseg.corrections.file import TrackLink
-from mvseg.corrections.track_links import find_links, read_track_links
+from mvseg.corrections.file import Edit, load_corrections
+from mvseg.corrections.track_links import find_links
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, Output, replace_result
 from mvseg.system.file_hash import hash_files
@@ -23,6 +23,7 @@ from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import name_apart, read_date
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
+from mvseg.tracking.pictures import SIDE
 from mvseg.tracking.tables import join_tables, write_tables
 from mvseg.tracking.track import track_leaves
 
@@ -98,7 +99,7 @@ def track_plants(
     """
     if num_workers < 1:
         raise InputError(f"num_workers is {num_workers}, expected at least 1")
-    edits = [] if corrections is None else read_track_links(corrections)
+    edits = () if corrections is None else load_corrections(corrections).edits
     said: dict[str, Any] = {}
     folders = tuple(folder for plant in plants for folder in plant.folders)
     output = Output("tracks", of=folders, reads=() if corrections is None else (corrections,))
@@ -140,9 +141,7 @@ def _or_failed(answer: TrackedPlant | Lost, plant: PlantResults) -> TrackedPlant
     return answer
 
 
-def _track_plant(
-    edits: Sequence[TrackLink], item: tuple[PlantResults, Path], *, pots: Pots, report: bool
-) -> TrackedPlant:
+def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots: Pots, report: bool) -> TrackedPlant:
     """Track one plant and write its tables, and its page, into its place."""
     plant, place = item
     try:
@@ -150,7 +149,7 @@ def _track_plant(
         if missing:
             raise InputError(f"{missing[0]} has no time, expected a number (days) or an ISO date (column time)")
         dates = name_apart([
-            read_date(where, time, pictures=report)
+            read_date(where, time, pictures=SIDE if report else 0)
             for where, time in zip(plant.folders, plant.times, strict=True)
         ])  # fmt: skip
         links, lost = find_links(edits, {date.scene: date.folder for date in dates if date.folder is not None})
@@ -162,7 +161,7 @@ def _track_plant(
     write_tables(place, tracks, growth)
     if report:
         write_page(place, tracks, growth)
-    warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.warnings, *lost))
+    warnings = tuple(f"plant {plant.plant}: {sentence}" for sentence in (*tracks.warnings, *lost.values()))
     days = tracks.dates[-1].time - tracks.dates[0].time
     return TrackedPlant(dates=len(tracks.dates), tracks=tracks.num_tracks, days=days, warnings=warnings)
 

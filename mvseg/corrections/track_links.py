@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 from pathlib import Path
 
-from mvseg.corrections.file import TrackLink, load_corrections
+from mvseg.corrections.file import Edit, TrackLink
 from mvseg.formats.find_views import base_name
 from mvseg.formats.label_png import read_labels
 
@@ -19,36 +20,69 @@ class LeafLink:
     leaves: tuple[tuple[str, int], ...]
 
 
-def read_track_links(path: Path) -> list[TrackLink]:
-    """The edits of a file of corrections that link leaves of different dates; others are for single scenes.
+def find_links(edits: Sequence[Edit], folders: Mapping[str, Path]) -> tuple[list[LeafLink], dict[int, str]]:
+    """The links between leaves of a plant, and {place of an edit: what hinders it}: it points at no leaf, or
+    contradicts later ones, which win.
 
-    Raises:
-        InputError: see `load_corrections`.
+    `folders` are {scene: result folder} of its dates. Edits of single scenes, and those that name none of these, which
+    are another plant's, are passed over. A scene may be named by the end of its path, if no other one ends so.
     """
-    return [edit for edit in load_corrections(path).edits if isinstance(edit, TrackLink)]
-
-
-def find_links(edits: Sequence[TrackLink], folders: Mapping[str, Path]) -> tuple[list[LeafLink], list[str]]:
-    """The links between leaves of a plant, and a sentence for each edit that points at no leaf.
-
-    `folders` are {scene: result folder} of its dates. Edits that name none of these scenes are another plant's: they
-    are passed over. A scene may be named by the end of its path, if no other one ends so.
-    """
-    links, lost = [], []
-    for original in edits:
-        edit, unclear = _with_full_names(original, list(folders))
-        lost += [f"{edit.op}: {name} fits {' and '.join(fitting)}, expected one of them" for name, fitting in unclear]
-        if unclear or not any(scene in folders for scene, *_ in edit.at):
+    links: dict[int, LeafLink] = {}
+    problems: dict[int, str] = {}
+    for index, original in enumerate(edits):
+        if not isinstance(original, TrackLink):
             continue
-        leaves = []
-        for scene, view, x, y in edit.at:
-            leaf = leaf_at(folders[scene], view, x, y) if scene in folders else 0
-            leaves.append((scene, leaf))
-            if not leaf:
-                lost.append(f"{edit.op}: there is no leaf at ({x:g}, {y:g}) in view {view} of {scene}")
-        if all(leaf for _, leaf in leaves):
-            links.append(LeafLink(edit.op == "same_track", tuple(leaves)))
-    return links, lost
+        edit, unclear = _with_full_names(original, list(folders))
+        if unclear:
+            said = "; ".join(f"{name} fits {' and '.join(fitting)}" for name, fitting in unclear)
+            problems[index] = f"{edit.op}: {said}, expected one of them"
+        elif any(scene in folders for scene, *_ in edit.at):
+            leaves = [
+                (scene, leaf_at(folders[scene], view, x, y) if scene in folders else 0) for scene, view, x, y in edit.at
+            ]
+            nowhere = [
+                f"({x:g}, {y:g}) in view {view} of {scene}"
+                for (scene, view, x, y), (_, leaf) in zip(edit.at, leaves, strict=True)
+                if not leaf
+            ]
+            if nowhere:
+                problems[index] = f"{edit.op}: there is no leaf at {', '.join(nowhere)}"
+            else:
+                links[index] = LeafLink(edit.op == "same_track", tuple(leaves))
+    kept = _without_contradicted(links, problems)
+    return [links[index] for index in sorted(kept)], problems
+
+
+def _without_contradicted(links: Mapping[int, LeafLink], problems: dict[int, str]) -> list[int]:
+    """The places of the links that hold together, the last one first; `problems` learns the others."""
+    kept: list[int] = []
+    for index in sorted(links, reverse=True):
+        link = links[index]
+        if not _is_contradiction([link, *(links[other] for other in kept)]):
+            kept.append(index)
+        elif _is_contradiction([link]):
+            problems[index] = f"{_op(link)}: two leaves of one date, which are never the same"
+        else:
+            count = next(n for n in range(len(kept)) if _is_contradiction([link, *(links[k] for k in kept[: n + 1])]))
+            problems[index] = f"{_op(link)}: contradicted by edit {kept[count] + 1}"
+    return kept
+
+
+def _op(link: LeafLink) -> str:
+    return "same_track" if link.is_same else "different_track"
+
+
+def _is_contradiction(links: Sequence[LeafLink]) -> bool:
+    """Whether two leaves of a date would be one, or two that are said to be different."""
+    part_of: dict[tuple[str, int], set[tuple[str, int]]] = {}
+    for link in links:
+        if link.is_same:
+            part = set(link.leaves).union(*(part_of.get(leaf, ()) for leaf in link.leaves))
+            part_of |= dict.fromkeys(part, part)
+            if len({scene for scene, _ in part}) < len(part):
+                return True
+    apart = (pair for link in links if not link.is_same for pair in combinations(link.leaves, 2))
+    return any(other in part_of.get(one, {one}) for one, other in apart if one != other)
 
 
 def leaf_at(folder: Path, view: str, x: float, y: float) -> int:

@@ -5,7 +5,9 @@ Stages ask here, so that no signature hands it on (as with `decimal.localcontext
 
 from __future__ import annotations
 
+import hashlib
 import math
+import pickle
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
@@ -13,7 +15,8 @@ from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass, field
-from typing import Any
+from functools import wraps
+from typing import Any, ParamSpec, TypeVar
 
 from tqdm import tqdm
 
@@ -41,6 +44,10 @@ class Running:
     is_cancelled: Callable[[], bool] = field(default=lambda: False, compare=False)
     report: Callable[[str], None] | None = field(default=None, compare=False)
     told: set[str] = field(default_factory=set, compare=False)
+
+
+Args = ParamSpec("Args")
+Found = TypeVar("Found")
 
 
 class Cancelled(Exception):
@@ -71,7 +78,8 @@ def running(
     Args:
         progress: show progress bars; None: as outside.
         num_workers: processes that surfaces are fitted in, stopped at the end, see `start_workers`; None: as outside.
-        keep: what was computed inside, or outside where that is kept, too, is not computed again, see `fit_kept`.
+        keep: what was computed inside, or outside where that is kept, too, is not computed again, see `fit_kept` and
+            `kept`.
         is_cancelled: asked before each stage; where it says so, that stage raises `Cancelled`. None: as outside.
         report: is told what is done, as "learning: step 30 of 75"; then `is_cancelled` is asked at each step, too.
             None: as outside.
@@ -87,9 +95,7 @@ def running(
         cancelled = outside.is_cancelled if is_cancelled is None else is_cancelled
         told = outside.told if outside.progress else set()
         report = outside.report if report is None else report
-        now = Running(
-            progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled, report=report, told=told
-        )
+        now = Running(progress=is_shown, workers=workers, kept=kept, is_cancelled=cancelled, report=report, told=told)
         stack.callback(_NOW.reset, _NOW.set(now))
         yield now
 
@@ -107,6 +113,24 @@ def timed(stage: str) -> Iterator[None]:
     begun = time.perf_counter()
     yield
     now.seconds[stage] = now.seconds.get(stage, 0.0) + time.perf_counter() - begun
+
+
+def kept(compute: Callable[Args, Found]) -> Callable[Args, Found]:
+    """The function; where the run keeps what it computed, see `running`, it is computed once for equal arguments (which
+    must pickle), and nobody may change what it returns."""
+
+    @wraps(compute)
+    def find(*args: Args.args, **options: Args.kwargs) -> Found:
+        known = now_running().kept
+        if known is None:
+            return compute(*args, **options)
+        name = f"{compute.__qualname__} {hashlib.sha256(pickle.dumps((args, options))).hexdigest()}"
+        if name not in known:
+            known[name] = compute(*args, **options)
+        found: Found = known[name]
+        return found
+
+    return find
 
 
 def say(sentence: str) -> None:

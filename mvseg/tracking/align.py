@@ -17,6 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial.transform import Rotation
 from scipy.special import expit
 
+from mvseg.system.running import kept
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, POSES, fitted_costs
@@ -112,14 +113,19 @@ class Poses:
         return guess_chance(link_gain(self.pair, pose), self.pair.fewer)
 
 
+@kept
 def list_poses(pair: Pair) -> Poses:
-    """The poses of two dates, each in its own frame, that look best, each refined; where up is not known, of any
-    rotation. Without leaves on one of them, only that it stood as it stood."""
+    """The poses of two dates, each in its own frame, that look best, and those that leaves suggest which a person says
+    are one, each refined; where up is not known, of any rotation. Without leaves on one of them, only that it stood as
+    it stood."""
     if not pair.fewer:
         return Poses(pair, (Alignment(np.eye(4), np.zeros((0, 2), int)),), np.zeros(1), np.ones(1))
-    poses = np.concatenate([np.eye(4)[None], draw_poses(pair)])
+    asked = [draw_poses(pair.take(row, column)) for row, column in np.argwhere(pair.said < 0)[..., None]]
+    looked_at = np.concatenate([np.eye(4)[None], *asked])
+    poses = np.concatenate([looked_at, draw_poses(pair)])
     scores = alikeness(pair, poses).sum(1)
-    scores[0] += 1e6  # always looked at
+    scores[0] += 2e6
+    scores[: len(looked_at)] += 1e6  # always looked at
     found: list[Alignment] = [_as_it_stood(pair)]
     left = np.argsort(-scores, kind="stable")
     while len(left) and len(found) < NUM_REFINED:
@@ -151,6 +157,7 @@ def guess_chance(gain: float, leaves: int) -> float:
     return float(expit(offset + (own * gain / leaves - strange) * math.sqrt(leaves)))
 
 
+@kept
 def link_gain(pair: Pair, pose: Floats) -> float:
     """How much likelier the pairs under a pose (4, 4) are the same leaves than strangers, by all that links count."""
     costs = fitted_costs(pair.moved(pose), LINKS)
@@ -241,6 +248,7 @@ def alikeness(pair: Pair, poses: Floats) -> Floats:
     return np.concatenate(found)
 
 
+@kept
 def refine(pair: Pair, pose: Floats) -> Alignment:
     """From a pose (4, 4) that is nearly right: pair the leaves and fit it to the pairs, until these stay."""
     pairs = np.zeros((0, 2), int)

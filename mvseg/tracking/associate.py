@@ -16,10 +16,9 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.compare import MOST_ODDS, UNLINKED, Comparison
+from mvseg.tracking.compare import MOST_ODDS, UNLINKED, Comparison, Sight
 from mvseg.tracking.dates import Floats
 
-Sight = tuple[int, int]  # index of the date, row of its `Leaves`
 ASKED = 1e4  # gain of what a person says: above all that leaves can say (a technical limit)
 CALIBRATION = (0.33, 4.08)  # slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them
 ROUNDS = 10  # rounds of joining anew: at most this many, two or three are enough (a technical limit)
@@ -89,6 +88,18 @@ def sum_over_poses(links: Sequence[Association], compared: Comparison) -> list[A
         sure, others = float(compared.trust[earlier, later]), compared.otherwise.get((earlier, later))
         chance = sure * link.probability + (1 - sure) * (0.0 if others is None else float(others[row, column]))
         found.append(link if link.is_asked else replace(link, probability=chance))
+    return found
+
+
+def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
+    """{(earlier, later): (N, M) probability that leaves of these two dates are the same, summed over poses}, whatever
+    other dates and what a person say; for asking about those that are not linked."""
+    found = {}
+    for pair, costs in compared.costs.items():
+        odds = np.exp(np.clip(UNLINKED - costs, -MOST_ODDS, MOST_ODDS))
+        under_this = odds / (1 + odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds)
+        trust = compared.trust[pair]
+        found[pair] = trust * under_this + (1 - trust) * compared.otherwise.get(pair, 0.0)
     return found
 
 

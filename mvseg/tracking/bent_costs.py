@@ -11,6 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mvseg.system.running import kept
 from mvseg.tracking.align import Alignment
 from mvseg.tracking.dates import STATIONS, Floats
 from mvseg.tracking.fitted_costs import FLIPPED, LINKS, POSES, length_costs, student_tail
@@ -26,6 +27,7 @@ IN_PART = 0.3  # difference of log lengths: above this, a surface may show a par
 LIKE_RIGID = 0.3  # one motion of all leaves, where a plant is bent: it weighs as much as this many leaves
 
 
+@kept
 def bent_costs(pair: Pair, alignment: Alignment) -> Floats:
     """Costs after the plant was let bend and stretch: each leaf moves as the other pairs say, not as its own does."""
     first, second, scale, pairs = pair.first, pair.second, pair.scale, alignment.pairs

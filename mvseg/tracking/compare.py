@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from mvseg.system.running import kept
 from mvseg.tracking.align import (
     DIGITS,
     Alignment,
@@ -25,11 +26,13 @@ from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 from mvseg.tracking.leaves import Leaves, Pair
 from mvseg.tracking.motions import Motion, find_motion
-from mvseg.tracking.place_dates import place_dates
+from mvseg.tracking.place_dates import place_dates, step_between
 
 MOST_GAP = 3  # dates from one sight to another: they are compared up to this many, so that two may hide a leaf
+Sight = tuple[int, int]  # index of the date, row of its `Leaves`
 UNLINKED = 2.0  # cost of a pair of leaves: up to this, one track is cheaper than two
 ENOUGH = 6  # leaves that are paired: from this many on they tell how a plant bent
+SAID = 20.0  # log odds of what a person says, where poses are weighed: more than any leaf's own (a definition)
 MOST_ODDS = 40.0  # log odds: cut off here, so that their exponentials are numbers (a technical limit)
 
 
@@ -57,16 +60,27 @@ class Comparison:
 
 
 def compare_dates(
-    dates: Sequence[Leaves], times: Sequence[float], *, knows_up: bool, pots: Pots = "auto"
+    dates: Sequence[Leaves],
+    times: Sequence[float],
+    *,
+    knows_up: bool,
+    pots: Pots = "auto",
+    same: Collection[tuple[Sight, Sight]] = (),
+    different: Collection[tuple[Sight, Sight]] = (),
 ) -> Comparison:
     """Dates at most MOST_GAP apart are compared.
 
-    `place_dates` says how they stand to each other, before anything is linked.
+    `place_dates` says how they stand to each other, before anything is linked. Of `same` and `different`, pairs of
+    sights that a person says are one leaf, or are not, the earlier one first, the poses take note.
     """
     pairs = {
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)
         for later in range(len(dates)) for n in range(max(later - MOST_GAP, 0), later)
     }  # fmt: skip
+    for said, cost in ((same, -SAID), (different, SAID)):
+        for (earlier, row), (later, column) in said:
+            if (earlier, later) in pairs:
+                pairs[earlier, later].said[row, column] = cost
     looked = {place: list_poses(pair) for place, pair in pairs.items()}
     habit = Habit.of([judge(poses, Habit.of([], pots)) for poses in looked.values()], pots)
     poses, roots, steady = place_dates(len(dates), looked, habit)
@@ -75,7 +89,7 @@ def compare_dates(
     otherwise: dict[tuple[int, int], Floats] = {}
     motions: dict[tuple[int, int], Motion] = {}
     for earlier, later in sorted((place for place in pairs if roots[place[0]] == roots[place[1]]), key=np.ptp):
-        pair, pose = pairs[earlier, later], np.linalg.inv(poses[later]) @ poses[earlier]
+        pair, pose = pairs[earlier, later], step_between(poses, (earlier, later))
         alignment = refine(pair, pose) if pair.fewer else Alignment(pose, np.zeros((0, 2), int))
         trust[earlier, later] = steady[earlier:later].min() * looked[earlier, later].chance(alignment.pose, habit)
         if not len(alignment.pairs):
@@ -99,6 +113,7 @@ def compare_dates(
     )  # fmt: skip
 
 
+@kept
 def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats:
     """(N, M) probability that leaves of two dates are the same if not this pose (4, 4) but another one is right; 0 if
     there is none."""

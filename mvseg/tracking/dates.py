@@ -22,7 +22,7 @@ from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, c
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
-from mvseg.tracking.pictures import picture_leaves
+from mvseg.tracking.pictures import LeafPicture, picture_leaves
 from mvseg.traits.leaf import Measurement
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
@@ -89,7 +89,7 @@ class PlantOnDate:
         leaves: those that count as leaves, or may do so, by id.
         whole: {trait: number} of the plant.
         folder: of the result; None in memory.
-        pictures: {leaf: JPEG} for a page; empty where nobody asked for them.
+        pictures: {leaf: picture} for a page; empty where nobody asked for them.
     """
 
     scene: str
@@ -100,7 +100,7 @@ class PlantOnDate:
     leaves: tuple[SeenLeaf, ...]
     whole: Mapping[str, Number]
     folder: Path | None = None
-    pictures: Mapping[int, bytes] = field(default_factory=dict)
+    pictures: Mapping[int, LeafPicture] = field(default_factory=dict)
 
     @property
     def shaped(self) -> list[int]:
@@ -108,10 +108,10 @@ class PlantOnDate:
         return [index for index, leaf in enumerate(self.leaves) if leaf.midrib is not None]
 
 
-def read_date(folder: Path, time: str | float, *, pictures: bool = False) -> PlantOnDate:
+def read_date(folder: Path, time: str | float, *, pictures: int = 0) -> PlantOnDate:
     """One date from a result folder of `mvseg infer` or `mvseg batch`; `time` as in `read_time`.
 
-    With `pictures` of its leaves, if asked for.
+    With pictures of its leaves, so many pixels wide or high; 0: without.
 
     Raises:
         InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
@@ -124,7 +124,7 @@ def read_date(folder: Path, time: str | float, *, pictures: bool = False) -> Pla
     date = replace(date_of(result, time), scene=folder.name, folder=folder)
     if not pictures:
         return date
-    return replace(date, pictures=picture_leaves(result, [leaf.leaf for leaf in date.leaves]))
+    return replace(date, pictures=picture_leaves(result, [leaf.leaf for leaf in date.leaves], side=pictures))
 
 
 def date_of(result: Result, time: str | float) -> PlantOnDate:

@@ -59,12 +59,12 @@ LINKS = Scales(across=0.640, along=0.044, stretch=0.742, turn=0.420, growth=0.30
 
 def fitted_costs(pair: Pair, scales: Scales = POSES) -> Floats:
     """(N, M) costs of leaf i of the earlier and leaf j of the later date, in one frame, being the same; below 0: it is
-    likelier than not."""
+    likelier than not. What a person says of them counts, too."""
     turned = replace(pair, first=replace(pair.first, midribs=pair.first.midribs[:, ::-1]))
     costs = np.minimum(_base_costs(pair, scales), _base_costs(turned, scales) + FLIPPED) + length_costs(pair, scales)
     if scales.lines:
         costs += scales.lines * _line_costs(pair, scales)
-    return costs + np.log(max(len(pair.first), len(pair.second), 1)) - scales.parting
+    return costs + np.log(max(len(pair.first), len(pair.second), 1)) - scales.parting + pair.said
 
 
 def _base_costs(pair: Pair, scales: Scales) -> Floats:

@@ -98,6 +98,7 @@ class Pair:
         days: between the dates, > 0.
         knows_up: +z is up in both frames.
         scale: what places are measured in, see `Pair.of`.
+        said: (N, M) what a person says of two leaves, as a cost: below 0 they are one, above 0 they are not.
     """
 
     first: Leaves
@@ -105,9 +106,10 @@ class Pair:
     days: float
     knows_up: bool
     scale: float
+    said: Floats
 
     @classmethod
-    def of(cls, first: Leaves, second: Leaves, *, days: float, knows_up: bool) -> Pair:
+    def of(cls, first: Leaves, second: Leaves, *, days: float, knows_up: bool, said: Floats | None = None) -> Pair:
         """A pair whose scale is the median length of the leaves of the date with the longest ones; for plants of many
         small leaflets, a share of how far their bases are spread."""
         found = [1e-9]
@@ -115,7 +117,8 @@ class Pair:
             if len(leaves):
                 spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
                 found += [float(np.median(leaves.lengths)), SPREAD * float(np.sqrt(np.mean(spread**2)))]
-        return cls(first, second, days, knows_up, scale=max(found))
+        nothing = np.zeros((len(first), len(second)))
+        return cls(first, second, days, knows_up, scale=max(found), said=nothing if said is None else said)
 
     @property
     def fewer(self) -> int:
@@ -128,4 +131,5 @@ class Pair:
 
     def take(self, rows: np.ndarray, columns: np.ndarray) -> Pair:
         """Some leaves of either date, with a scale of their own."""
-        return Pair.of(self.first.take(rows), self.second.take(columns), days=self.days, knows_up=self.knows_up)
+        first, second, said = self.first.take(rows), self.second.take(columns), self.said[np.ix_(rows, columns)]
+        return Pair.of(first, second, days=self.days, knows_up=self.knows_up, said=said)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mvseg.system.running import kept
 from mvseg.tracking.align import NUM_REFINED, alikeness, best_pairs, draw_poses, pose_distances, refine
 from mvseg.tracking.bent_costs import pair_costs
 from mvseg.tracking.dates import Floats
@@ -41,6 +42,7 @@ class Motion:
         return self.margin >= SURE_MARGIN
 
 
+@kept
 def find_motion(pair: Pair, pose: Floats) -> Motion | None:
     """The best second motion of dates that are aligned by a pose (4, 4); None where one is enough."""
     if not pair.fewer:

@@ -65,7 +65,7 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         rows = {row.leaf: row for row in tracks.rows if row.date == index and row.leaf is not None}
         pose, middle = tracks.poses[index], middles.get(tracks.roots[index], np.zeros(3))
         for leaf in date.leaves:
-            row, shape = rows[leaf.leaf], np.zeros((0, 3))
+            row, shape, picture = rows[leaf.leaf], np.zeros((0, 3)), date.pictures.get(leaf.leaf)
             if leaf.points is not None and leaf.midrib is not None:
                 grid = leaf.points.reshape(ROWS, 3, 3)  # of a surface: once around it, from base to tip and back
                 shape = np.concatenate([grid[:, 0], grid[::-1, 2]]) if "length" in leaf.numbers else leaf.midrib
@@ -73,7 +73,8 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
             leaves.append(
                 {"date": index, "leaf": leaf.leaf, "track": row.track, "p": _round(row.probability, 3),
                  "state": row.state, "flat": "length" in leaf.numbers,
-                 "crop": base64.b64encode(date.pictures.get(leaf.leaf, b"")).decode("ascii"),
+                 "crop": base64.b64encode(picture.jpeg).decode("ascii") if picture else "",
+                 "place": [picture.view, *picture.at] if picture else None,
                  "shape": np.round(placed).astype(int).ravel().tolist()}
             )  # fmt: skip
     return {

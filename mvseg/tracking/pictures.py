@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from contextlib import suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
@@ -15,22 +16,46 @@ from mvseg.formats.image_file import encode_jpeg, read_rgb
 from mvseg.results.photo_masks import labels_in_photo
 from mvseg.results.result import Result
 
-SIDE, QUALITY = 72, 70  # pixels and JPEG quality of a picture (a definition)
+SIDE, LARGE_SIDE, QUALITY = 72, 160, 70  # pixels and JPEG quality of a picture (a definition)
 LIT, DARK = np.uint8(200), np.uint8(24)  # greys of a mask and around it without a photo (a definition)
 
 
-def picture_leaves(result: Result, leaves: Collection[int]) -> dict[int, bytes]:
-    """{leaf: JPEG} of where each of the leaves is largest: of the photo if it is still there, else of its mask; none of
-    a leaf without a mask."""
+@dataclass(frozen=True)
+class LeafPicture:
+    """A leaf in the photo in which it is largest.
+
+    Attributes:
+        jpeg: of the photo around it if it is still there, else of its mask.
+        view: name of the photo.
+        at: x, y of a pixel of the leaf far from its edge, in pixels of the photo.
+    """
+
+    jpeg: bytes
+    view: str
+    at: tuple[float, float]
+
+
+def picture_leaves(result: Result, leaves: Collection[int], *, side: int = SIDE) -> dict[int, LeafPicture]:
+    """{leaf: its picture, `side` pixels wide or high}; none of a leaf without a mask."""
     labels = [labels_in_photo(result, view) for view in range(len(result.scene.views))]
     count = max(leaves, default=0) + 1
     sizes = np.array([np.bincount(np.minimum(view, count).ravel(), minlength=count + 1) for view in labels])
-    pictures: dict[int, bytes] = {}
+    pictures: dict[int, LeafPicture] = {}
     for view, about in enumerate(result.scene.views):
         shown = [leaf for leaf in leaves if sizes[:, leaf].argmax() == view and sizes[view, leaf]]
         photo = _photo(about.path, labels[view].shape) if shown else None
-        pictures |= {leaf: cut_picture(photo, labels[view] == leaf) for leaf in shown}
+        for leaf in shown:
+            mask = labels[view] == leaf
+            jpeg = cut_picture(photo, mask, side=side)
+            pictures[leaf] = LeafPicture(jpeg, about.name, _inner_point(mask))
     return pictures
+
+
+def _inner_point(mask: np.ndarray) -> tuple[float, float]:
+    """x, y of the middle of the pixel of a mask (H, W) that is farthest from its edge."""
+    depth = cv2.distanceTransform(np.pad(mask.astype(np.uint8), 1), cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[1:-1, 1:-1]
+    row, column = np.unravel_index(int(depth.argmax()), depth.shape)
+    return float(column) + 0.5, float(row) + 0.5
 
 
 def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
@@ -41,12 +66,12 @@ def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
     return None
 
 
-def cut_picture(photo: np.ndarray | None, mask: np.ndarray) -> bytes:
+def cut_picture(photo: np.ndarray | None, mask: np.ndarray, *, side: int = SIDE) -> bytes:
     """A square around a mask (H, W) in its photo (H, W, 3), the rest of it dark."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     half, row, column = max(width, height) // 2 + 4, y + height // 2, x + width // 2
     box = np.s_[max(row - half, 0) : row + half, max(column - half, 0) : column + half]
     is_leaf = mask[box][..., None].repeat(3, axis=2)
     shown = np.where(is_leaf, LIT, DARK) if photo is None else np.where(is_leaf, photo[box], photo[box] // 2)
-    image = ImageOps.contain(Image.fromarray(np.ascontiguousarray(shown)), (SIDE, SIDE), Image.Resampling.BOX)
+    image = ImageOps.contain(Image.fromarray(np.ascontiguousarray(shown)), (side, side), Image.Resampling.BOX)
     return encode_jpeg(np.asarray(image), quality=QUALITY)

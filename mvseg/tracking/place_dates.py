@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 from scipy.special import expit
 
+from mvseg.system.running import kept
 from mvseg.tracking.align import (
     DIGITS,
     TEMPER,
@@ -28,7 +29,9 @@ from mvseg.tracking.align import (
 )
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import fitted_costs
+from mvseg.tracking.leaves import Pair
 
+PLACES = 9  # decimals of a pose: what differs in later ones is rounding (a technical limit)
 ROUNDS = 6  # rounds of placing all dates anew: at most this many, two or three are enough (a technical limit)
 Looked = Mapping[tuple[int, int], Poses]
 Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
@@ -126,15 +129,24 @@ def _remembered(looked: Looked, habit: Habit) -> Likeliness:
     @cache
     def of_step(pair: tuple[int, int], step: bytes) -> float:
         of_pair, pose = looked[pair].pair, np.frombuffer(step).reshape(4, 4)
-        gain = 0.0
-        if of_pair.fewer:
-            costs = fitted_costs(of_pair.moved(pose))
-            pairs = best_pairs(costs)
-            gain = float(-costs[pairs[:, 0], pairs[:, 1]].sum()) - large_new(of_pair, pairs)
-        return TEMPER * gain + habit.world_prior * float(near_world(of_pair, pose[None])[0])
+        return TEMPER * _gain(of_pair, pose) + habit.world_prior * float(near_world(of_pair, pose[None])[0])
 
     def likeliness(poses: Floats, pair: tuple[int, int]) -> float:
-        step = np.linalg.inv(poses[pair[1]]) @ poses[pair[0]]
-        return of_step(pair, step.tobytes())
+        return of_step(pair, step_between(poses, pair).tobytes())
 
     return likeliness
+
+
+def step_between(poses: Floats, pair: tuple[int, int]) -> Floats:
+    """(4, 4) later_from_earlier; by way of whichever dates its poses (T, 4, 4) were found, it has the same digits."""
+    return np.round(np.linalg.inv(poses[pair[1]]) @ poses[pair[0]], PLACES)
+
+
+@kept
+def _gain(pair: Pair, pose: Floats) -> float:
+    """Of a pose (4, 4) of two dates, less what large new leaves cost."""
+    if not pair.fewer:
+        return 0.0
+    costs = fitted_costs(pair.moved(pose))
+    pairs = best_pairs(costs)
+    return float(-costs[pairs[:, 0], pairs[:, 1]].sum()) - large_new(pair, pairs)

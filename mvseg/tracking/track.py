@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import combinations, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -13,8 +13,8 @@ import numpy as np
 
 from mvseg.corrections.track_links import LeafLink
 from mvseg.errors import InputError
-from mvseg.tracking.associate import Association, Sight, link_leaves, sum_over_poses
-from mvseg.tracking.compare import Comparison, compare_dates
+from mvseg.tracking.associate import Association, link_leaves, pairwise_chances, sum_over_poses
+from mvseg.tracking.compare import Comparison, Sight, compare_dates
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
 from mvseg.tracking.leaves import leaves_of
@@ -59,6 +59,7 @@ class Tracks:
             aligned with, by way of others.
         roots: (T,) index of that earliest date.
         warnings: dates whose alignment is a guess, leaves that moved by themselves, leaves without a shape.
+        chances: see `pairwise_chances`; rows and columns are those of `PlantOnDate.shaped`.
     """
 
     plant: str
@@ -67,6 +68,7 @@ class Tracks:
     poses: Floats
     roots: tuple[int, ...]
     warnings: tuple[str, ...]
+    chances: Mapping[tuple[int, int], Floats] = field(default_factory=dict)
 
     @property
     def num_tracks(self) -> int:
@@ -115,14 +117,14 @@ def track_leaves(
         for result, time in zip(results, written, strict=True)
     ]))  # fmt: skip
     compared, found = _link_dates(dates, links, pots)
-    believed = _without_stems(dates, found)
+    believed = _without_stems(dates, found, {leaf for link in links for leaf in link.leaves})
     if believed != dates:
         dates = believed
         compared, found = _link_dates(dates, links, pots)
     return Tracks(
         plant=plant, dates=dates, rows=_rows(dates, found, compared.roots),
         poses=compared.poses, roots=tuple(compared.roots.tolist()),
-        warnings=tuple(_warnings(dates, compared)),
+        warnings=tuple(_warnings(dates, compared)), chances=pairwise_chances(compared),
     )  # fmt: skip
 
 
@@ -131,15 +133,17 @@ def _link_dates(
 ) -> tuple[Comparison, list[Association]]:
     leaves = [leaves_of(date) for date in dates]
     knows_up = all(date.knows_up for date in dates)
-    compared = compare_dates(leaves, [date.time for date in dates], knows_up=knows_up, pots=pots)
     same, different = _sights_of(links, dates)
-    counts = [len(each) for each in leaves]
+    times, counts = [date.time for date in dates], [len(each) for each in leaves]
+    compared = compare_dates(leaves, times, knows_up=knows_up, pots=pots, same=same, different=different)
     linked = link_leaves(counts, compared.costs, same=same, different=different)
     return compared, sum_over_poses(linked, compared)
 
 
-def _without_stems(dates: tuple[PlantOnDate, ...], links: Sequence[Association]) -> tuple[PlantOnDate, ...]:
-    """The dates without what looks like a stem wherever it is seen."""
+def _without_stems(
+    dates: tuple[PlantOnDate, ...], links: Sequence[Association], named: Collection[tuple[str, int]]
+) -> tuple[PlantOnDate, ...]:
+    """The dates without what looks like a stem wherever it is seen; those (scene, leaf) that a person names stay."""
     sights = [(n, row) for n, date in enumerate(dates) for row in range(len(date.shaped))]
     track = {sight: sight for sight in sights}
     for link in links:  # by their earlier sight
@@ -148,6 +152,7 @@ def _without_stems(dates: tuple[PlantOnDate, ...], links: Sequence[Association])
     believed = []
     for n, date in enumerate(dates):
         in_tracks = {date.leaves[place].leaf for row, place in enumerate(date.shaped) if track[n, row] in sure}
+        in_tracks |= {leaf for scene, leaf in named if scene == date.scene}
         left = tuple(leaf for leaf in date.leaves if not leaf.is_doubted or leaf.leaf in in_tracks)
         believed.append(date if len(left) == len(date.leaves) else replace(date, leaves=left))
     return tuple(believed)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mvseg.corrections.track_links import LeafLink, find_links, read_track_links
+from mvseg.corrections.file import load_corrections
+from mvseg.corrections.track_links import LeafLink, find_links
 from mvseg.errors import InputError
 from mvseg.formats.label_png import write_label_png
 from tests.plants_over_days import grow_blades, write_result
@@ -31,9 +32,9 @@ def test_points_become_leaves(tmp_path: Path) -> None:
         {"op": "different_track", "at": [["a", "000", 5.5, 20], ["b", "000", 0.5, 0.5]]},  # no leaf is there
         {"op": "same_track", "at": [["x", "000", 5, 5], ["y", "000", 5, 5]]},  # another plant
     )
-    links, lost = find_links(read_track_links(path), folders)
+    links, lost = find_links(load_corrections(path).edits, folders)
     assert links == [LeafLink(True, (("a", 1), ("b", 2)))]
-    assert lost == ["different_track: there is no leaf at (0.5, 0.5) in view 000 of b"]
+    assert lost == {2: "different_track: there is no leaf at (0.5, 0.5) in view 000 of b"}
 
 
 def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
@@ -45,9 +46,9 @@ def test_results_of_one_folder_name_keep_their_links(tmp_path: Path) -> None:
         {"op": "same_track", "at": [["mon/plant", "000", 5.5, 20], ["fri/plant", "000", 30.2, 20]]},
         {"op": "same_track", "at": [["plant", "000", 5.5, 20], ["fri/plant", "000", 30.2, 20]]},
     )
-    links, lost = find_links(read_track_links(path), folders)
+    links, lost = find_links(load_corrections(path).edits, folders)
     assert links == [LeafLink(True, (("mon/plant", 1), ("fri/plant", 2)))]
-    assert lost == ["same_track: plant fits mon/plant and fri/plant, expected one of them"]
+    assert lost == {1: "same_track: plant fits mon/plant and fri/plant, expected one of them"}
 
 
 def test_views_in_folders_are_found_by_any_name_that_fits_one(tmp_path: Path) -> None:
@@ -57,11 +58,41 @@ def test_views_in_folders_are_found_by_any_name_that_fits_one(tmp_path: Path) ->
     folders = {name: tmp_path / name for name in ("a", "b")}
     for view in ("left/000", "left/000.jpg", "left\\000.png"):
         edit = {"op": "same_track", "at": [["a", "000", 5.5, 20], ["b", view, 30.2, 20]]}
-        links, lost = find_links(read_track_links(write(tmp_path / "corrections.json", edit)), folders)
-        assert (links, lost) == ([LeafLink(True, (("a", 1), ("b", 2)))], [])
+        links, lost = find_links(load_corrections(write(tmp_path / "corrections.json", edit)).edits, folders)
+        assert (links, lost) == ([LeafLink(True, (("a", 1), ("b", 2)))], {})
     edit = {"op": "same_track", "at": [["a", "000", 5.5, 20], ["b", "000", 30.2, 20]]}
-    links, lost = find_links(read_track_links(write(tmp_path / "corrections.json", edit)), folders)
-    assert (links, lost) == ([], ["same_track: there is no leaf at (30.2, 20) in view 000 of b"])
+    links, lost = find_links(load_corrections(write(tmp_path / "corrections.json", edit)).edits, folders)
+    assert (links, lost) == ([], {0: "same_track: there is no leaf at (30.2, 20) in view 000 of b"})
+
+
+def test_a_later_link_wins(tmp_path: Path) -> None:
+    for name in ("a", "b", "c"):
+        write_result(tmp_path / name, grow_blades(3, 1))
+    x = {1: 5.5, 2: 30.2, 3: 50.0}
+
+    def edit(op: str, *leaves: tuple[str, int]) -> dict[str, Any]:
+        return {"op": op, "at": [[scene, "000", x[leaf], 20] for scene, leaf in leaves]}
+
+    path = write(
+        tmp_path / "corrections.json",
+        edit("same_track", ("a", 1), ("b", 1)),  # both with leaf 2 of c, by edits 2 and 3; so edit 4 is against one
+        edit("same_track", ("a", 1), ("c", 2)),
+        edit("same_track", ("b", 1), ("c", 2)),
+        edit("different_track", ("a", 1), ("b", 1)),
+        edit("same_track", ("a", 3), ("a", 2)),
+        edit("same_track", ("a", 3), ("b", 2)),
+    )
+    links, lost = find_links(load_corrections(path).edits, {name: tmp_path / name for name in ("a", "b", "c")})
+    assert links == [
+        LeafLink(True, (("b", 1), ("c", 2))),
+        LeafLink(False, (("a", 1), ("b", 1))),
+        LeafLink(True, (("a", 3), ("b", 2))),
+    ]
+    assert lost == {
+        0: "same_track: contradicted by edit 4",
+        1: "same_track: contradicted by edit 3",
+        4: "same_track: two leaves of one date, which are never the same",
+    }
 
 
 @pytest.mark.parametrize("view", ["nothing", "../labels/000", "/etc/x"])
@@ -70,10 +101,10 @@ def test_views_that_are_not_there(tmp_path: Path, view: str) -> None:
         write_result(tmp_path / name, grow_blades(3, 1))
     folders = {name: tmp_path / name for name in ("a", "b")}
     path = write(tmp_path / "c.json", {"op": "same_track", "at": [["a", view, 900, 900], ["b", "000", 5.5, 20]]})
-    assert find_links(read_track_links(path), folders)[0] == []
+    assert find_links(load_corrections(path).edits, folders)[0] == []
 
 
 @pytest.mark.parametrize("at", [None, [["a", "000", 1, 2]], [["a", 1], ["b", 2]]])
 def test_broken_links_are_refused(tmp_path: Path, at: Any) -> None:
     with pytest.raises(InputError, match=r"edit 1 \(same_track\)"):
-        read_track_links(write(tmp_path / "c.json", {"op": "same_track", "at": at}))
+        load_corrections(write(tmp_path / "c.json", {"op": "same_track", "at": at}))

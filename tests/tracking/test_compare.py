@@ -39,6 +39,29 @@ def test_leaves_of_a_plant_that_looks_the_same_from_behind_are_linked_with_half_
     assert min(link.probability for link in links) > 0.9  # under the pose that was taken
 
 
+def test_one_link_of_a_person_settles_how_the_pot_stands() -> None:
+    """Whichever way the plant was taken to stand: all other leaves follow."""
+    blades = opposite_leaves(3)
+    (one, truth), (other, later) = (see(blades, day, turn=40 * day) for day in (0, 1))
+    leaves = [leaves_of(one), leaves_of(other)]
+    for behind in (0, 3):
+        asked = [((0, truth.index(1)), (1, later.index(1 + behind)))]
+        compared = compare_dates(leaves, [0.0, 1.0], knows_up=True, pots="turned", same=asked)
+        links = sum_over_poses(link_leaves([6, 6], compared.costs, same=asked), compared)
+        linked = {truth[link.before[1]]: later[link.after[1]] for link in links}
+        assert linked == {leaf: 1 + (leaf - 1 + behind) % 6 for leaf in range(1, 7)}
+        assert min(link.probability for link in links) > 0.9
+    (link,) = (link for link in links if link.before == asked[0][0])
+    unlike = [(link.before, link.after)]
+    compared = compare_dates(leaves, [0.0, 1.0], knows_up=True, pots="turned", different=unlike)
+    assert truth[link.before[1]] == later[link_of(compared, link.before)]  # then it is as in the other pose
+
+
+def link_of(compared: Comparison, before: tuple[int, int]) -> int:
+    """The row of the leaf that follows one."""
+    return next(link.after[1] for link in link_leaves([6, 6], compared.costs) if link.before == before)
+
+
 def test_one_leaf_that_breaks_the_symmetry_makes_them_sure() -> None:
     links, compared = link_two({leaf: blade for leaf, blade in opposite_leaves(3).items() if leaf != 6})
     assert min(link.probability for link in sum_over_poses(links, compared)) > 0.8

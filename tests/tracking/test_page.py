@@ -11,20 +11,21 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from mvseg.corrections.track_links import leaf_at
 from mvseg.results.read import load_result
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import describe_tracks, write_page
-from mvseg.tracking.pictures import cut_picture, picture_leaves
+from mvseg.tracking.pictures import LeafPicture, cut_picture, picture_leaves
 from mvseg.tracking.track import TrackRow, Tracks
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
 from tests.plants_over_days import grow_blades, grown, see, write_result
 
 
-def noisy_picture() -> bytes:
+def noisy_picture() -> LeafPicture:
     """One that compresses worst."""
     photo, mask = np.random.default_rng(0).integers(0, 256, (90, 90, 3), np.uint8), np.zeros((90, 90), bool)
     mask[5:85, 5:85] = True
-    return cut_picture(photo, mask)
+    return LeafPicture(cut_picture(photo, mask), "000", (45.5, 45.5))
 
 
 @pytest.mark.parametrize("orientation", [1, 3])
@@ -37,8 +38,9 @@ def test_pictures_follow_the_stored_rows(tmp_path: Path, orientation: int) -> No
     photo[:, :20, 0], photo[:, 20:, 2] = 255, 255  # leaf 1 is red, leaf 2 is blue
     Image.fromarray(photo).save(tmp_path / "000.png", exif=exif)
     pictures = picture_leaves(load_result(tmp_path / "a"), [1, 2])
-    middles = [np.asarray(Image.open(BytesIO(pictures[leaf])))[36, 36] for leaf in (1, 2)]
+    middles = [np.asarray(Image.open(BytesIO(pictures[leaf].jpeg)))[36, 36] for leaf in (1, 2)]
     assert [int(middle.argmax()) for middle in middles] == [0, 2]
+    assert [leaf_at(tmp_path / "a", picture.view, *picture.at) for _, picture in sorted(pictures.items())] == [1, 2]
 
 
 def many_dates(num_dates: int, num_leaves: int) -> Tracks:

@@ -1,0 +1,112 @@
+"""What a person is asked about a plant's tracks: the most doubtful links, and what another answer would change."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from mvseg.corrections.track_links import LeafLink
+from mvseg.tracking.align import TURNS
+from mvseg.tracking.dates import NUMBER
+from mvseg.tracking.track import Tracks
+
+MOST_QUESTIONS = 10  # a person answers so many (a definition)
+LEAST_DOUBT = 0.1  # probability that a link, or that there is none, is wrong: below this nobody is asked
+Sight = tuple[int, int]  # index of the date, id of the leaf in its result
+
+
+@dataclass(frozen=True)
+class Question:
+    """Are two leaves of different dates the same?
+
+    Attributes:
+        before, after: the leaves.
+        is_linked: they are, as the tracks say; otherwise the one has no later sight, and the other no earlier one.
+        doubt: probability that the tracks are wrong there.
+    """
+
+    before: Sight
+    after: Sight
+    is_linked: bool
+    doubt: float
+
+    def link(self, tracks: Tracks, *, is_same: bool) -> LeafLink:
+        """A person's answer."""
+        leaves = tuple((tracks.dates[date].scene, leaf) for date, leaf in (self.before, self.after))
+        return LeafLink(is_same, leaves)
+
+
+def list_questions(tracks: Tracks) -> list[Question]:
+    """The most doubtful first; each leaf is asked about once as the earlier one, and once as the later one."""
+    every = sorted((*_of_links(tracks), *_of_ends(tracks)), key=lambda each: (-each.doubt, each.before, each.after))
+    asked: list[Question] = []
+    for each in every:
+        is_new = all(each.before != other.before and each.after != other.after for other in asked)
+        if is_new and each.doubt >= LEAST_DOUBT and len(asked) < MOST_QUESTIONS:
+            asked.append(each)
+    return asked
+
+
+def _of_links(tracks: Tracks) -> Iterator[Question]:
+    for sights in _sights(tracks).values():
+        for (before, _), (after, chance) in pairwise(sights):
+            yield Question(before, after, True, round(1 - chance, 6))
+
+
+def _of_ends(tracks: Tracks) -> Iterator[Question]:
+    """Of leaves that are gone, with those that appear afterwards."""
+    shaped = [{date.leaves[place].leaf: row for row, place in enumerate(date.shaped)} for date in tracks.dates]
+    sights = list(_sights(tracks).values())
+    for (earlier, leaf), (later, other) in ((one[-1][0], two[0][0]) for one in sights for two in sights):
+        chances = tracks.chances.get((earlier, later))
+        if chances is not None and leaf in shaped[earlier] and other in shaped[later]:
+            chance = float(chances[shaped[earlier][leaf], shaped[later][other]])
+            yield Question((earlier, leaf), (later, other), False, round(chance, 6))
+
+
+def describe_changes(now: Tracks, then: Tracks) -> list[str]:
+    """What is different in other tracks of the same plant, a sentence each; leaves are called as they are now."""
+    names = {sight: track for track, sights in _sights(now).items() for sight, _ in sights}
+    before, after = _earlier_sights(now), _earlier_sights(then)
+    changes = []
+    for sight in sorted(before.keys() | after.keys()):
+        if before.get(sight) != (source := after.get(sight)) and sight in names:
+            leaf = f"leaf {names[sight]} of {_name_day(now, sight[0])}"
+            if source is None:
+                changes.append(f"{leaf} is a new one")
+            elif source in names:
+                changes.append(f"{leaf} is leaf {names[source]}")
+    return [*_describe_turns(now, then), *changes]
+
+
+def _describe_turns(now: Tracks, then: Tracks) -> Iterator[str]:
+    """Of the dates on which the plant stands otherwise to the one before."""
+    for later in range(1, len(now.dates)):
+        one, other = (np.linalg.inv(each.poses[later - 1]) @ each.poses[later] for each in (now, then))
+        turn = np.degrees(Rotation.from_matrix(other[:3, :3] @ one[:3, :3].T).magnitude())
+        if turn > 360 / TURNS:
+            yield f"the plant of {_name_day(now, later)} is turned by {turn:.0f} degrees"
+
+
+def _name_day(tracks: Tracks, date: int) -> str:
+    written = tracks.dates[date].written
+    return f"day {written}" if NUMBER.fullmatch(written) else written
+
+
+def _sights(tracks: Tracks) -> dict[int, list[tuple[Sight, float]]]:
+    """{track: its leaves in the order of time, each with the probability of its link to the one before}."""
+    found: dict[int, list[tuple[Sight, float]]] = {}
+    for row in tracks.rows:
+        if row.leaf is not None:
+            found.setdefault(row.track, []).append(((row.date, row.leaf), row.probability))
+    return found
+
+
+def _earlier_sights(tracks: Tracks) -> dict[Sight, Sight]:
+    """{sight: the one before it in its track}."""
+    every = (pairwise(sights) for sights in _sights(tracks).values())
+    return {after: before for pairs in every for (before, _), (after, _) in pairs}
