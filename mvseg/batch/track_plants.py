@@ -20,21 +20,12 @@ from mvseg.results.earlier import RUN_FILE, Output, replace_result
 from mvseg.system.file_hash import hash_files
 from mvseg.system.running import progress_bar
 from mvseg.tracking.config import Pots
-from mvseg.tracking.dates import name_apart, read_date
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
 from mvseg.tracking.pictures import SIDE
+from mvseg.tracking.recorded import PlantResults, record_plants
 from mvseg.tracking.tables import join_tables, write_tables
 from mvseg.tracking.track import track_leaves
-
-
-@dataclass(frozen=True)
-class PlantResults:
-    """One plant to track: its name, its result folders and their times as the user gave them."""
-
-    plant: str
-    folders: tuple[Path, ...]
-    times: tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -145,13 +136,7 @@ def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots
     """Track one plant and write its tables, and its page, into its place."""
     plant, place = item
     try:
-        missing = [where.name for where, time in zip(plant.folders, plant.times, strict=True) if not time]
-        if missing:
-            raise InputError(f"{missing[0]} has no time, expected a number (days) or an ISO date (column time)")
-        dates = name_apart([
-            read_date(where, time, pictures=SIDE if report else 0)
-            for where, time in zip(plant.folders, plant.times, strict=True)
-        ])  # fmt: skip
+        dates = plant.read(pictures=SIDE if report else 0)
         links, lost = find_links(edits, {date.scene: date.folder for date in dates if date.folder is not None})
         tracks = track_leaves(dates, links=links, pots=pots, plant=plant.plant)
     except InputError as error:
@@ -175,7 +160,8 @@ def _describe_run(
     return {
         **made_by(),
         "inputs": {str(path): hash_files(path) if path.is_file() else None for path in inputs},
-        "config": {"corrections": None if corrections is None else str(corrections), "pots": pots},
+        "config": {"corrections": None if corrections is None else str(corrections.resolve()), "pots": pots,
+                   "plants": record_plants(plants)},
         "warnings": [sentence for plant in tracked for sentence in plant.warnings],
         "failures": [plant.sentence for plant in tracked if plant.sentence],
         "counts": {"plants": len(plants), "dates": sum(plant.dates for plant in tracked),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sys
+from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from jsonargparse import ArgumentParser, Namespace
 
@@ -11,17 +13,22 @@ from mvseg.cli.options import add_shared, read_workers
 from mvseg.errors import InputError
 from mvseg.tracking.config import Pots
 
+if TYPE_CHECKING:
+    from mvseg.tracking.recorded import RecordedTracks
+
 SOME_FAILED = 3
 
 
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
     help_results = "output of mvseg batch (every plant with two dates or more), or the results of one plant"
-    parser.add_argument("results", type=Path, nargs="+", help=help_results)
+    parser.add_argument("results", type=Path, nargs="*", help=help_results)
+    help_again = "repeat the run that made these tracks, with its options and, if given, with other --corrections"
+    parser.add_argument("--again", type=Path | None, help=help_again)
     help_times = "of each result: numbers (days) or ISO dates (2026-05-31 or 20260531)"
     parser.add_argument("--times", type=str, nargs="+", help=help_times)
     parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: that of --out)")
-    parser.add_argument("--out", type=Path, required=True, help="folder for the tables and pages")
+    parser.add_argument("--out", type=Path | None, help="folder for the tables and pages (of --again: where they are)")
     help_pots = "fixed (they stand as they stood), turned, or auto: learned from the dates of each plant"
     parser.add_argument("--pots", type=Pots, default="auto", help=help_pots)
     help_corrections = "file of corrections with same_track and different_track, see docs/tracking.md"
@@ -33,25 +40,15 @@ def add_options(parser: ArgumentParser) -> None:
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
-    from mvseg.batch.track_plants import PlantResults, list_plants, track_plants  # keeps --help quick
+    from mvseg.batch.track_plants import track_plants  # keeps --help quick
 
     num_workers = read_workers(args)
-    results, times = args.results, args.times
-    if times is None:
-        if len(results) > 1:
-            raise InputError(f"{len(results)} results are given without --times, expected one time for each")
-        plants, num_single = list_plants(results[0])
-        if num_single:
-            print(f"mvseg: {num_single} plants have one date and are left out", file=sys.stderr)
-    else:
-        if len(times) != len(results):
-            raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")
-        plants = [PlantResults(args.plant or args.out.resolve().name, tuple(results), tuple(times))]
+    asked = _read_again(args) if args.again is not None else _read_results(args)
     tracked = track_plants(
-        plants,
-        args.out,
-        corrections=args.corrections,
-        pots=args.pots,
+        asked.plants,
+        asked.folder,
+        corrections=args.corrections or asked.corrections,
+        pots=asked.pots,
         num_workers=num_workers,
         scheduler=args.scheduler,
         report=args.report,
@@ -67,5 +64,39 @@ def run(args: Namespace) -> int:
     longest = max(plant.days for plant in tracked)
     span = f"{longest:.3g} {'day' if longest == 1 else 'days'} apart{' at most' if num_dates > 2 else ''}"
     what = f"{num_tracks} leaves of {done} {'plant' if done == 1 else 'plants'}"
-    print(f"{args.out}: {what} on {num_dates} dates, {span}")
+    print(f"{asked.folder}: {what} on {num_dates} dates, {span}")
     return SOME_FAILED if failed else 0
+
+
+def _read_again(args: Namespace) -> RecordedTracks:
+    """The run that --again names."""
+    from mvseg.tracking.recorded import read_recorded_tracks
+
+    if args.results or args.times or args.plant or args.pots != "auto":
+        message = f"--again repeats the run of {args.again} with its results, times and pots"
+        raise InputError(f"{message}, expected no others")
+    found = read_recorded_tracks(args.again)
+    return replace(found, folder=args.out or args.again)
+
+
+def _read_results(args: Namespace) -> RecordedTracks:
+    """What the results on the command line are to be."""
+    from mvseg.batch.track_plants import list_plants
+    from mvseg.tracking.recorded import PlantResults, RecordedTracks
+
+    results, times, out = args.results, args.times, args.out
+    if not results:
+        raise InputError("no results are given, expected an output of mvseg batch, or results with --times")
+    if out is None:
+        raise InputError("--out is not given, expected a folder for the tables and pages")
+    if times is None:
+        if len(results) > 1:
+            raise InputError(f"{len(results)} results are given without --times, expected one time for each")
+        plants, num_single = list_plants(results[0])
+        if num_single:
+            print(f"mvseg: {num_single} plants have one date and are left out", file=sys.stderr)
+    else:
+        if len(times) != len(results):
+            raise InputError(f"{len(results)} results have {len(times)} times, expected one for each")
+        plants = [PlantResults(args.plant or out.resolve().name, tuple(results), tuple(times))]
+    return RecordedTracks(out, tuple(plants), args.pots, corrections=None)

@@ -66,8 +66,19 @@ def test_results_of_one_plant(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     page = (out / "tracks.html").read_text(encoding="utf-8")
     assert not re.findall(r"(?:src|href)=[\"']?https?:", page)
     (out / "notes.txt").write_text("mine")
-    assert main(arguments) == 0  # once more: replaced, and the user's file stays
-    assert (out / "notes.txt").read_text() == "mine"
+    (tmp_path / "moved").mkdir()
+    for name in ("a", "b", "out"):
+        (tmp_path / name).rename(tmp_path / "moved" / name)
+    again = tmp_path / "moved" / "out"
+    edit = {"op": "different_track", "at": [["a", "000", 5.5, 20], ["b", "000", 5.5, 20]]}
+    (again / "corrections.json").write_text(json.dumps({"format": "mvseg-corrections/1", "edits": [edit]}))
+    assert main(["track", "--again", str(again), "--corrections", str(again / "corrections.json"), "--quiet"]) == 0
+    assert (again / "notes.txt").read_text() == "mine"  # replaced, and the user's files stay
+    assert (again / "corrections.json").is_file()
+    assert len({row["track"] for row in read(again / "tracks.csv")}) == 8
+    assert main(["track", "--again", str(again), "--quiet"]) == 0  # with what was said before
+    assert len({row["track"] for row in read(again / "tracks.csv")}) == 8
+    assert {row["time"] for row in read(again / "tracks.csv")} == {"2026-03-01", "2026-03-05"}
 
 
 def test_each_result_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -166,6 +177,9 @@ def results(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (["a", "a"], "2 results are given without --times"),
         (["a", "--times", "1", "2"], "1 results have 2 times"),
         (["a", "b", "--times", "1", "1"], "have the same time 1"),
+        ([], "no results are given"),
+        (["--again", "a"], "holds no tracks.csv and run.json"),
+        (["--again", "a", "--pots", "fixed"], "with its results, times and pots"),
         (["a", "b", "--times", "1", "soon"], "expected a number .days. or an ISO date"),
         (["a"], "is not an output of mvseg batch"),
         (["a", "ids", "--times", "1", "2"], "has ids but no surfaces, run mvseg infer"),
