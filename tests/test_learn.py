@@ -14,6 +14,7 @@ from found_masks import FoundMasks, open_photos, see_masks
 from leafy_scene import LeafyScene, write_leafy_scene
 from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, Reject
+from mvseg.demo import demo_scene
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detectors.zoo import weights_path
 from mvseg.errors import InputError, InputWarning
@@ -24,6 +25,7 @@ from mvseg.pipeline.find_leaves import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known
 from mvseg.pipeline.learn import learn
+from mvseg.pipeline.open_scene import open_scene
 from mvseg.results.folder import save_result
 from mvseg.results.result import Learned
 from mvseg.training.view_labels import ViewLabels
@@ -75,7 +77,7 @@ def lower(known: Known, chance: float = 0.9) -> Known:
         (3, (1.05, 1.5), 1, 0),
         (2, (0.5, 9.0), 1, 0),
         ("off", (1.2,), 0, 0),
-        ("auto", (1.2, 1.2, 1.2), 2, 2),
+        ("auto", (1.2, 1.2, 1.2, 1.2), 3, 3),
     ],
 )
 def test_weights_stay_where_the_expected_number_of_right_masks_grows(
@@ -110,6 +112,16 @@ def test_a_known_species_is_not_learned_unless_somebody_asks(
     assert len(taught) == 1
     with pytest.raises(InputError, match="learn is 0, expected 1 or more rounds, auto or off"):
         RunConfig(learn=0)
+
+
+@pytest.mark.slow
+@pytest.mark.shared_data
+@pytest.mark.parametrize("plant", ["demo_plant", "basil-0729", "basil-dense"])
+def test_plants_that_the_shipped_detector_knows_are_not_learned(plant: str, shared_data: Path, tmp_path: Path) -> None:
+    folder = demo_scene() if plant == "demo_plant" else shared_data / plant
+    cache = CachedDetections(tmp_path)
+    known = find_in_photos(open_scene(folder, None, RunConfig(reconstruct=None)), cache=cache)
+    assert len(learn(known, cache=cache).learned.expected_right) == 1
 
 
 @pytest.mark.parametrize("reason", ["few", "interrupt", "fails"])
