@@ -20,7 +20,7 @@ import sys
 import time
 import warnings
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -49,11 +49,11 @@ from mvseg.scene import Cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.verification.checked_ids import check_ids, join_parts, move_pieces
 from mvseg.verification.evidence import Shown, see
-from mvseg.verification.leaf_scores import log_odds
 from mvseg.verification.shown_leaves import (
     GIVEN,
     GivenScores,
     Question,
+    ask,
     assign,
     gained,
     settle,
@@ -129,8 +129,7 @@ class Study:
         pieced = move_pieces(matched, Shown.of(given.regions, surfaces, given.cameras), is_held=nothing)
         joined, known = join_parts(pieced, surfaces, cameras=given.cameras, is_held=nothing)
         is_held = (pieced.instance_ids != matched.instance_ids).numpy()
-        first = Question.of(joined, known, given.cameras, is_held=is_held)
-        question = first.with_more(joined, given.cameras, config=MatchConfig())
+        question = ask(joined, known, cameras=given.cameras, config=MatchConfig(), is_held=is_held)
         members = ~np.isnan(question.candidates.matched)
         own = question.leaf[:, None] == np.arange(members.shape[1])
         members = np.where(question.is_known, own, members)  # not those that joined later
@@ -150,30 +149,23 @@ class Study:
 
 def fit(studies: Sequence[Study]) -> GivenScores:
     """The numbers of greatest likelihood."""
-    shows, matched = zip(*(mask_samples(each) for each in studies), strict=True)
-    numbers = [
-        regress(np.concatenate([x for x, _ in group]), np.concatenate([y for _, y in group]))
-        for group in (shows, matched)
-    ]
-    fitted = GivenScores(shows=numbers[0], matched=numbers[1], price=GIVEN.price)
+    features, is_right = (np.concatenate(each) for each in zip(*map(mask_samples, studies), strict=True))
+    fitted = GivenScores(shows=regress(features, is_right), price=GIVEN.price)
     gains = np.array([sample for each in studies for sample in leaf_samples(each, fitted)]).reshape(-1, 2)
     if not 0 < gains[:, 1].sum() < len(gains):
         return fitted
     constant, slope = regress(np.column_stack((np.ones(len(gains)), gains[:, 0])), gains[:, 1])
-    return GivenScores(shows=numbers[0], matched=numbers[1], price=round(-constant / slope, 1))
+    return replace(fitted, price=round(-constant / slope, 1))
 
 
-def mask_samples(each: Study) -> tuple[tuple[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-    """Features of masks and the first candidates, and whether they are right: with a surface, and without."""
+def mask_samples(each: Study) -> tuple[np.ndarray, np.ndarray]:
+    """Features of masks and the first candidates, and whether they are right."""
     question, candidates = each.question, each.question.candidates
     evidence = see(question.drawn, len(question.leaf), question.is_known & candidates.is_credible)
-    is_member = ~np.isnan(candidates.matched)
     is_asked = question.is_known & (each.of_candidate > 0) & ~np.asarray(candidates.certain.any(1))[:, None]
-    near = np.asarray(is_asked & candidates.is_credible & ((evidence.claimed > NEAR) | is_member))
-    own = np.asarray(is_asked & is_member)
-    scores = log_odds(candidates.matched[own])
-    by_score = np.column_stack((np.ones_like(scores), scores))
-    return (shows_features(candidates, evidence)[near], each.is_right[near]), (by_score, each.is_right[own])
+    is_near = candidates.is_credible & (evidence.claimed > NEAR)
+    rows = np.asarray(is_asked & (is_near | ~np.isnan(candidates.matched)))
+    return shows_features(candidates, evidence)[rows], each.is_right[rows]
 
 
 def leaf_samples(each: Study, fitted: GivenScores) -> Iterator[tuple[float, bool]]:
@@ -181,15 +173,15 @@ def leaf_samples(each: Study, fitted: GivenScores) -> Iterator[tuple[float, bool
     question, odds = each.question, show_odds(each.question, fitted)
     first = assign(question, odds, question.is_known)
     for leaf in np.flatnonzero(~question.is_known).tolist():
-        found = assign(question, odds, question.is_known | (np.arange(odds.shape[1]) == leaf))
-        won = int(each.right_ids(found.leaf).sum()) - int(each.right_ids(first.leaf).sum())
+        found = assign(question, odds, question.is_known | (np.arange(len(question.is_known)) == leaf))
+        won = int(each.right_ids(found[0]).sum()) - int(each.right_ids(first[0]).sum())
         if (gain := gained(question, first, found, leaf)) and won:
             yield gain, won > 0
 
 
 def judge(each: Study, fitted: GivenScores) -> str:
     """ARI with these numbers, and how many ids become wrong and right."""
-    found = settle(each.question, fitted).leaf
+    found, _ = settle(each.question, fitted)
     ids = torch.from_numpy(np.where(found >= 0, found + 1, -1))
     before = has_right_id(each.before.numpy(), each.given.leaf.numpy())
     after = each.right_ids(found)

@@ -5,13 +5,13 @@ multiplied by 1.33, whole numbers change by 1 at least. The scenes are developme
 
 Of matching, with degraded masks: a line says of each scene how many ids of "nview" and of "one-per-view" change, by how
 much their pair F1, and how far match scores move. Of verification: how many masks change their instance or their
-pixels, and by how much pair F1 and MV-PQ change, where surfaces check the ids of degraded masks and of straps in pieces
-and masks are cut; where the views choose what the shipped detector found, also in the folders of `--scenes`; and where
-up to `MOST_DRAWN` of these leaves were missed, and a person drew them in two photos, or in three (half of their other
-masks are still there, matched to nothing). Of reconstruction, with the masks of `--masks`: of all leaves together, how
-far area and its standard deviation move (median and largest change in percent), of how many it changes whether they
-are credible, doubted or oriented, and how far the volume of voxels moves; ids are true but for one scene, where they
-are those of "nview".
+pixels, and by how much pair F1 and MV-PQ change, where surfaces check the ids of the masks of `--given`, of degraded
+masks and of straps in pieces, and masks are cut; where the views choose what the shipped detector found, also in the
+folders of `--scenes`; and where up to `MOST_DRAWN` of these leaves were missed, and a person drew them in two photos,
+or in three (half of their other masks are still there, matched to nothing). Of reconstruction, with the masks of
+`--masks`: of all leaves together, how far area and its standard deviation move (median and largest change in percent),
+of how many it changes whether they are credible, doubted or oriented, and how far the volume of voxels moves; ids are
+true but for one scene, where they are those of "nview".
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ import inspect
 import pkgutil
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields, replace
 from functools import partial
@@ -51,6 +51,8 @@ from mvseg.demo import demo_scene
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.evaluation.panoptic import LeafMetrics, leaf_metrics
+from mvseg.formats.label_png import read_label_png
+from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.masks import Masks, Origin
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.config import MatchConfig
@@ -262,7 +264,15 @@ CHOOSING = ("choose", "leaf_scores", "rough_surfaces", "evidence", "snap_edges")
 DRAWING = ("drawn_leaves", "leaf_color")
 
 
-def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
+def check_given(args: argparse.Namespace) -> Iterator[Trial]:
+    for folder in args.given:
+        scene = load_scene(folder)
+        sizes = zip(scene.views, scene.cameras.sizes.tolist(), strict=True)
+        truth = [read_label_png(folder / "truth" / f"{view.name}.png", *size) for view, size in sizes]
+        yield check_trial(folder.name, load_masks(scene, folder / "masks"), scene.cameras, truth)
+
+
+def check_simulated(args: argparse.Namespace) -> Iterator[Trial]:
     for cell in CHECKED:
         maps = load_maps(spec_of(*cell), args.cache)
         name, regions = f"{cell[1]} leaves in {cell[0]} views", maps.masks("degraded")[0]
@@ -273,6 +283,9 @@ def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
         true = visible_ids(plant, cameras)
         pieces = regions_from_label_maps([cut_pieces(labels) for labels in true])
         yield check_trial(f"pieces of straps {number}", pieces, cameras, true)
+
+
+def choose_found(args: argparse.Namespace) -> Iterator[Trial]:
     for folder in (demo_scene(), *(render(spec_of(*cell), args.cache) for cell in FOUND), *args.scenes):
         config = RunConfig(reconstruct=None)
         case = detect_case(folder, config, cache=args.cache / "kept" / folder.name)
@@ -283,7 +296,10 @@ def list_trials(args: argparse.Namespace) -> Iterator[Trial]:
             yield Trial(f"draw {number} {folder.name}", DRAWING, partial(follow_anew, case.known, drawn), case.truth)
 
 
-def check_trial(name: str, regions: Regions, cameras: Cameras, truth: np.ndarray) -> Trial:
+TRIALS = {"given": check_given, "simulated": check_simulated, "found": choose_found}
+
+
+def check_trial(name: str, regions: Regions, cameras: Cameras, truth: Iterable[np.ndarray]) -> Trial:
     """Surfaces check the ids of given masks, and those that show two leaves are cut."""
     masks = match_masks(Masks.of(regions), cameras).masks
     surfaces = fit_surfaces(masks.regions, masks.instance_ids, cameras)
@@ -337,14 +353,14 @@ def count_changed(before: Masks, after: Masks) -> int:
 
 def thirds_of_verification(args: argparse.Namespace) -> None:
     numbers = [each for each in list_numbers(mvseg.verification) if args.numbers is None or each[1] in args.numbers]
-    trials = list(list_trials(args))
+    trials = [trial for name in args.trials for trial in TRIALS[name](args)]
     before = [(masks := trial.run().to("cpu"), judge(masks, trial)) for trial in trials]
     for trial, (masks, metrics) in zip(trials, before, strict=True):
         scores = f"pair F1 {metrics.all_pair_f1:.3f}, MV-PQ {metrics.mv_pq:.3f}"
         print(f"{trial.name}: {len(masks)} masks, {scores}", flush=True)
     for module, name in numbers:
         room = module.__name__.rpartition(".")[2]
-        for factor in (1 / FACTOR, FACTOR):
+        for factor in (1 / FACTOR, FACTOR) if any(room in trial.modules for trial in trials) else ():
             said = []
             for trial, (masks, metrics) in zip(trials, before, strict=True):
                 if room not in trial.modules:
@@ -423,6 +439,8 @@ def main() -> None:
     parser.add_argument("--room", choices=ROOMS, default="matching")
     parser.add_argument("--numbers", nargs="+", help="only these")
     parser.add_argument("--masks", choices=KINDS, default="degraded", help="that leaves are reconstructed from")
+    parser.add_argument("--trials", choices=TRIALS, nargs="+", default=list(TRIALS), help="of verification")
+    parser.add_argument("--given", type=Path, nargs="*", default=[], help="plants to check, with masks/ and truth/")
     parser.add_argument("--scenes", type=Path, nargs="*", default=[], help="more to verify, with photos and truth/")
     args = parser.parse_args()
     torch.set_num_threads(1)

@@ -25,7 +25,7 @@ from mvseg.simulation.cameras import arc_cameras
 from mvseg.simulation.growth import grow_plant
 from mvseg.verification.checked_ids import check_ids
 
-LEAST_ARI = {"basil-0729": 1.0, "basil-dense": 0.93, "maize-series/D54.9": 1.0}  # the second measured: 0.953
+LEAST_ARI = {"basil-0729": 1.0, "basil-dense": 0.93, "maize-series/D54.9": 1.0}  # the second measured: 0.974
 REAL = "basil-0729", *(pytest.param(name, marks=pytest.mark.slow) for name in ("basil-dense", "maize-series/D54.9"))
 
 Given = tuple[Cameras, Regions, Tensor]  # and the true leaf of each region
@@ -90,13 +90,14 @@ def stand_otherwise(cameras: Cameras, regions: Regions, order: Tensor) -> tuple[
 
 @pytest.mark.slow
 @pytest.mark.shared_data
-@pytest.mark.parametrize("name", ["basil-0729"])
-def test_ids_do_not_depend_on_how_the_world_stands(name: str, shared_data: Path) -> None:
+@pytest.mark.parametrize(("name", "is_alone_the_same"), [("basil-0729", True), ("basil-dense", False)])
+def test_ids_do_not_depend_on_how_the_world_stands(name: str, is_alone_the_same: bool, shared_data: Path) -> None:
+    """Of the dense plant, those of the matcher alone do, in masks that it is not sure of: it casts few rays of each."""
     cameras, regions, _ = read(shared_data / name)
     order = torch.randperm(len(cameras), generator=torch.Generator().manual_seed(4))
     moved, turned = stand_otherwise(cameras, regions, order)
     row = turned.labels - 1  # of the same mask
-    both = ids_with_and_without(cameras, regions), ids_with_and_without(moved, turned)
-    for expected, other in zip(*both, strict=True):
+    found, alone = zip(ids_with_and_without(cameras, regions), ids_with_and_without(moved, turned), strict=True)
+    for expected, other in (found, alone) if is_alone_the_same else (found,):
         one = expected[row]
         assert torch.equal(one[:, None] == one, other[:, None] == other)

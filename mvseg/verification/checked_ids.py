@@ -24,11 +24,11 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.evidence import Bools, Floats, Ints, Shown, paint_view
 from mvseg.verification.join_halves import join_halves, seen_rarely
-from mvseg.verification.shown_leaves import Question, settle
+from mvseg.verification.match_again import VIEWS_TO_CHECK
+from mvseg.verification.shown_leaves import ask, settle
 
 Surfaces = Mapping[int, LeafSurface]
 
-VIEWS_TO_CHECK = 5  # sure ids stay where there are fewer views: surfaces fit wrong masks about as well as right ones
 PIECE_INSIDE = 0.8  # a mask may be a piece of a leaf if at least this fraction of it lies in what is seen of the leaf
 EACH, BOTH = 0.2, 0.7  # a mask shows two leaves if at least these fractions of it show each of them, and both together
 
@@ -76,13 +76,12 @@ def check_ids(
 def ask_surfaces(masks: Masks, surfaces: Surfaces, *, cameras: Cameras, config: MatchConfig, is_held: Bools) -> Masks:
     """Each mask gets the id of the instance that it shows, see `shown_leaves.py`; with another id it has q as its match
     score. Those that are held (D,) stay."""
-    question = Question.of(masks, surfaces, cameras, is_held=is_held)
-    if masks.regions.num_views >= VIEWS_TO_CHECK:  # two masks always agree on some surface
-        question = question.with_more(masks, cameras, config=config)
-    found, names = settle(question), masks.instance_ids[masks.instance_ids > 0].unique().numpy()
+    question = ask(masks, surfaces, cameras=cameras, config=config, is_held=is_held)
+    leaf, odds = settle(question)
+    names = masks.instance_ids[masks.instance_ids > 0].unique().numpy()
     num_new = len(question.candidates) - len(names)
     names = np.concatenate((names, masks.num_instances + 1 + np.arange(num_new), [-1]))
-    return _with_ids(masks, names[found.leaf], expit(found.odds))
+    return _with_ids(masks, names[leaf], expit(odds))
 
 
 def join_parts(masks: Masks, surfaces: Surfaces, *, cameras: Cameras, is_held: Bools) -> tuple[Masks, Surfaces]:

@@ -178,7 +178,12 @@ def _without(proposals: Masks, gone: Masks | None) -> Bools:
 
 
 def gather_candidates(
-    found: Sequence[tuple[Masks, Tensor]], cameras: Cameras | None, *, table: Masks, is_held: Tensor
+    found: Sequence[tuple[Masks, Tensor]],
+    cameras: Cameras | None,
+    *,
+    table: Masks,
+    is_held: Tensor,
+    surfaces: Mapping[int, LeafSurface] | None = None,
 ) -> Candidates:
     """The instances of each matching; those that an earlier one has, too, once.
 
@@ -187,9 +192,10 @@ def gather_candidates(
         cameras: that surfaces are fitted with; None: no surfaces.
         table: R' masks.
         is_held: (D,) bool, of the masks of the first matching.
+        surfaces: {instance id: surface} of the first matching; None: they are fitted here.
     """
     areas = table.regions.areas.double()
-    surfaces: list[LeafSurface | None] = []
+    shapes: list[LeafSurface | None] = []
     members: list[Tensor] = []  # rows of the table, of each candidate
     columns, certain = [], []
     for number, (masks, rows) in enumerate(found):
@@ -197,12 +203,16 @@ def gather_candidates(
         instances = ids[ids > 0].unique().tolist()
         new = [each for each in instances if not _is_there(rows[ids == each], members, areas)]
         is_new = torch.isin(ids, torch.tensor(new, dtype=torch.int64))
-        fitted = {} if cameras is None else fit_roughly(replace(masks, instance_ids=ids.where(is_new, -1)), cameras)
+        fitted: Mapping[int, LeafSurface] = {}
+        if number == 0 and surfaces is not None:
+            fitted = surfaces
+        elif cameras is not None:
+            fitted = fit_roughly(replace(masks, instance_ids=ids.where(is_new, -1)), cameras)
         for each in new:
             own = ids == each
             members.append(rows[own])
             surface = fitted.get(each)
-            surfaces.append(surface if surface is not None and surface.exists else None)
+            shapes.append(surface if surface is not None and surface.exists else None)
             columns.append(torch.full((len(table),), torch.nan, dtype=torch.float64))
             columns[-1][rows[own]] = masks.match_scores[own].double()
             certain.append(torch.zeros(len(table), dtype=torch.bool))
@@ -211,7 +221,7 @@ def gather_candidates(
     if not columns:
         nothing = np.zeros((len(table), 0))
         return Candidates((), nothing, nothing.astype(bool))
-    return Candidates(tuple(surfaces), torch.stack(columns, 1).numpy(), torch.stack(certain, 1).numpy())
+    return Candidates(tuple(shapes), torch.stack(columns, 1).numpy(), torch.stack(certain, 1).numpy())
 
 
 def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
@@ -278,7 +288,7 @@ def choose(
     for _ in range(ROUNDS):
         evidence = see(drawn, len(table), hides)
         q = np.round(show_chances(candidates, evidence, scores, fitted), DIGITS)
-        q[~_same_class(candidates, table)] = 0
+        q[~same_class(candidates, table)] = 0
         if usable is not None:
             q[~usable] = 0
         steps = rank(candidates, q, drawn=drawn, share=evidence.share, scores=scores, fitted=fitted)
@@ -305,7 +315,7 @@ def choose(
     return Chosen(chosen[stays], chances[stays] if len(chosen) else chances, leaf, shown * (leaf >= 0), tuple(steps))
 
 
-def _same_class(candidates: Candidates, table: Masks) -> Bools:
+def same_class(candidates: Candidates, table: Masks) -> Bools:
     """(D, K) whether a mask has the class of the masks that were matched to a candidate."""
     classes, is_member = table.classes.numpy(), ~np.isnan(candidates.matched)
     if not len(candidates):

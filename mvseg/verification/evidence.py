@@ -71,12 +71,14 @@ class Evidence:
         claimed: (D, K) the same, where of the hidden part that counts as visible which the mask itself shows: photos
             know better what lies in front.
         inside: (D, K) share of the mask that lies in the part that nothing nearer hides.
+        within: (D, K) share of the mask that lies in the surface as if nothing hid that.
         share: (V, K) of what the view shows of the surface, that nothing hides; 0 where it shows nothing.
     """
 
     visible: Floats
     claimed: Floats
     inside: Floats
+    within: Floats
     share: Floats
 
 
@@ -133,7 +135,7 @@ def _columns(crops: Sequence[Crop], size: tuple[int, int], step: int) -> csc_arr
 def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
     """The evidence, where the surfaces `hides` (K,) hide what lies behind them, each as a whole, by its middle."""
     shape = num_masks, len(hides)
-    visible, claimed, inside = np.zeros((3, *shape))
+    visible, claimed, inside, within = np.zeros((4, *shape))
     share = np.zeros((len(drawn), len(hides)))
     for view, each in enumerate(drawn):
         seen = _unhidden(each, hides)
@@ -141,9 +143,9 @@ def see(drawn: Sequence[Drawn], num_masks: int, hides: Bools) -> Evidence:
         with_seen = (each.masks.T @ seen).toarray()
         either = np.maximum(areas + sizes - with_seen, 1)
         visible[each.rows], claimed[each.rows] = with_seen / either, each.common / either
-        inside[each.rows] = with_seen / np.maximum(areas, 1)
+        inside[each.rows], within[each.rows] = (common / np.maximum(areas, 1) for common in (with_seen, each.common))
         share[view] = sizes / np.maximum(each.parts.sum(0), 1)
-    return Evidence(visible=visible, claimed=claimed, inside=inside, share=share)
+    return Evidence(visible=visible, claimed=claimed, inside=inside, within=within, share=share)
 
 
 def _unhidden(drawn: Drawn, hides: Bools) -> csc_array:
@@ -178,18 +180,17 @@ class Shown:
         is_credible = np.array([each.is_credible for each in there.values()], bool)
         return Shown(draw_views(regions, list(there.values()), cameras), np.array(list(there), np.int64), is_credible)
 
-    def compare(self, among: Iterable[int], *, hide: bool = True) -> Evidence:
+    def compare(self, among: Iterable[int]) -> Evidence:
         """The evidence if there were only the surfaces of some instances.
 
         Args:
             among: their ids; those without a surface do not matter.
-            hide: nearer ones hide others, and those that are not credible count for nothing; False: nothing is hidden.
 
         Returns:
             The columns are instance ids, from 0 on; 0 where there is nothing, and in column 0.
         """
-        chosen = np.isin(self.instances, list(among)) & (self.is_credible | (not hide))
-        seen = see(self.drawn, sum(len(each.rows) for each in self.drawn), chosen & hide)
+        chosen = np.isin(self.instances, list(among)) & self.is_credible
+        seen = see(self.drawn, sum(len(each.rows) for each in self.drawn), chosen)
         by_id = {}
         for name, values in vars(seen).items():
             by_id[name] = np.zeros((len(values), 1 + int(self.instances.max(initial=0))))

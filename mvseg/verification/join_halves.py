@@ -9,8 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from scipy.cluster.hierarchy import DisjointSet
 from scipy.spatial import cKDTree
 
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
@@ -47,39 +46,30 @@ def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     shown = {instance: each for instance, each in surfaces.items() if each.exists and (ids == instance).any()}
     few = [part for part in seen_rarely(regions, ids) if part in shown and shown[part].is_credible]
     touching = {(part, whole) for part in few if (whole := touched_surface(part, shown))}
-    most = regions.num_views if _share_split(regions, ids) >= OFTEN_SPLIT else MOST_SPLIT
-    pairs = [
-        pair for pair in sorted({(min(pair), max(pair)) for pair in touching})
-        if _num_shared_views(regions, ids, pair) <= most
-        and _is_one_leaf(regions, ids, pair, surfaces=shown, cameras=cameras)
-    ]  # fmt: skip
-    if not pairs:
-        return ids
-    part, whole = np.array(pairs).T
-    size = int(ids.max()) + 1
-    _, leaf = connected_components(coo_array((np.ones(len(part)), (part, whole)), shape=(size, size)), directed=False)
-    num_masks = np.bincount(ids[ids > 0], minlength=size)
-    largest = np.array([np.where(leaf == number, num_masks, -1).argmax() for number in range(leaf.max() + 1)])
-    return np.where(ids > 0, largest[leaf[ids]], ids)
+    counts, leaves = _count_masks(regions, ids), DisjointSet(np.unique(ids).tolist())
+    is_often_split = (counts > 1).sum() >= OFTEN_SPLIT * (counts > 0).sum()
+    for pair in sorted({(min(pair), max(pair)) for pair in touching}):
+        may_be = is_often_split or (counts[list(pair)] > 0).all(0).sum() <= MOST_SPLIT
+        if may_be and _is_one_leaf(regions, ids, pair, surfaces=shown, cameras=cameras):
+            leaves.merge(*pair)
+    joined = ids.copy()
+    for parts in leaves.subsets():
+        joined[np.isin(ids, list(parts))] = max(sorted(parts), key=lambda part: (ids == part).sum())
+    return joined
 
 
 def seen_rarely(regions: Regions, ids: Ints) -> list[int]:
     """The instances that at most `FEW_VIEWS` of the views show, in ascending order."""
-    views, most = regions.view_index.numpy(), FEW_VIEWS * regions.num_views
-    return [number for number in np.unique(ids[ids > 0]).tolist() if len(np.unique(views[ids == number])) <= most]
+    num_views = (_count_masks(regions, ids) > 0).sum(1)
+    rarely: list[int] = np.flatnonzero((num_views > 0) & (num_views <= FEW_VIEWS * regions.num_views)).tolist()
+    return rarely
 
 
-def _share_split(regions: Regions, ids: Ints) -> float:
-    """Of all instances in all views that show them, how many have several masks there."""
-    is_matched = ids > 0
-    places = np.stack((ids[is_matched], regions.view_index.numpy()[is_matched]))
-    _, counts = np.unique(places, axis=1, return_counts=True)
-    return float((counts > 1).mean()) if len(counts) else 0.0
-
-
-def _num_shared_views(regions: Regions, ids: Ints, pair: tuple[int, int]) -> int:
-    one, other = (regions.view_index.numpy()[ids == instance] for instance in pair)
-    return len(np.intersect1d(one, other))
+def _count_masks(regions: Regions, ids: Ints) -> Ints:
+    """(N + 1, V) how many masks of each instance each view shows."""
+    counts = np.zeros((1 + max(0, int(ids.max(initial=0))), regions.num_views), np.int64)
+    np.add.at(counts, (ids[ids > 0], regions.view_index.numpy()[ids > 0]), 1)
+    return counts
 
 
 def touched_surface(part: int, surfaces: Surfaces) -> int | None:

@@ -1,8 +1,8 @@
 """Which leaf does each given mask show? Asked of surfaces, as `choose.py` asks it of what a detector found.
 
 That a given mask shows a leaf is certain. So there is one question, of every mask and every candidate: does this mask
-show that surface (q)? Each mask goes where the answer is the surest, if it is likelier than where it was matched to.
-Candidates are the matcher's instances, and those that it finds among the masks that do not show their own
+show that surface (q)? Each mask goes where the answer is the surest, if that is likelier than where it was
+matched to. Candidates are the matcher's instances, and those that it finds among the masks that do not show their own
 (`match_again.py`): these explain their few masks easily, since they were fitted to nothing else, and have a price. Two
 masks of one photo may show one leaf in pieces, unless they share pixels. Not in the paper.
 """
@@ -10,15 +10,16 @@ masks of one photo may show one leaf in pieces, unless they share pixels. Not in
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.choose import DIGITS, LEAST_VIEWS
+from mvseg.verification.choose import DIGITS, LEAST_VIEWS, gather_candidates, same_class
 from mvseg.verification.evidence import Bools, Drawn, Evidence, Floats, Ints, draw_views, see
 from mvseg.verification.leaf_scores import Candidates, log_odds
 from mvseg.verification.match_again import match_again
@@ -26,33 +27,18 @@ from mvseg.verification.match_again import match_again
 
 @dataclass(frozen=True)
 class GivenScores:
-    """Log odds are sums of these times features; `python benchmarks/checked_ids.py --fit` fits them.
+    """`python -m benchmarks.checked_ids --fit` fits them.
 
     Attributes:
-        shows: of a mask, to show a candidate with a credible surface: see `shows_features`.
-        matched: of one that was matched to a candidate without: times 1, and the log odds of the match score.
+        shows: log odds that a mask shows a candidate are the sum of these times `shows_features`.
         price: log odds that masks must gain in all by a leaf that the first matching does not know.
     """
 
     shows: tuple[float, ...]
-    matched: tuple[float, ...]
     price: float
 
 
-GIVEN = GivenScores(shows=(1.503, 0.481, -1.538, 0.7, -0.137, 0.899), matched=(1.256, 1.057), price=6.2)
-
-
-@dataclass(frozen=True, eq=False)
-class Assigned:
-    """What each of D given masks shows.
-
-    Attributes:
-        leaf: (D,) int64, the candidate; -1 for none.
-        odds: (D,) log odds that it shows that one; 0 for none.
-    """
-
-    leaf: Ints
-    odds: Floats
+GIVEN = GivenScores(shows=(1.962, 0.359, -1.66, 1.214, 0.764, 1.007, 0.866), price=6.1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,102 +46,102 @@ class Question:
     """Which of K candidates does each of D given masks show?
 
     Attributes:
-        candidates: first the instances of the first matching; `certain` are the masks that stay what they are.
+        masks: on the CPU.
+        candidates: first the instances of the first matching, by id; `certain` are the masks that stay what they are.
         leaf: (D,) int64, the candidate that each mask was matched to first, -1 for none.
         is_known: (K,) bool, the candidates of the first matching: these hide what lies behind them.
         drawn: V views of masks and surfaces.
-        classes: (D,) int64; masks of one instance have one.
     """
 
+    masks: Masks
     candidates: Candidates
     leaf: Ints
     is_known: Bools
     drawn: Sequence[Drawn]
-    classes: Ints
 
     @staticmethod
-    def of(masks: Masks, surfaces: Mapping[int, LeafSurface], cameras: Cameras, *, is_held: Bools) -> Question:
-        """About D masks on the CPU that are matched; the candidates are their instances, by ascending id."""
-        ids, scores = masks.instance_ids.numpy(), masks.match_scores.double().numpy()
+    def of(
+        masks: Masks,
+        surfaces: Mapping[int, LeafSurface],
+        cameras: Cameras,
+        *,
+        is_held: Bools,
+        more: Sequence[Masks] = (),
+    ) -> Question:
+        """About the instances of masks with their surfaces, and those of `more`, the same masks with other ids."""
+        found = [(each, torch.arange(len(masks))) for each in (masks, *more)]
+        held = torch.from_numpy(is_held)
+        candidates = gather_candidates(found, cameras, table=masks, is_held=held, surfaces=surfaces)
+        ids = masks.instance_ids.numpy()
         names = np.unique(ids[ids > 0])
-        is_member = ids[:, None] == names
-        fitted = [surfaces.get(name) for name in names.tolist()]
-        shapes = tuple(each if each is not None and each.exists else None for each in fitted)
-        candidates = Candidates(
-            surfaces=shapes,
-            matched=np.where(is_member, scores[:, None], np.nan),
-            certain=is_member & is_held[:, None],
-        )
         return Question(
+            masks=masks,
             candidates=candidates,
             leaf=np.where(ids > 0, np.searchsorted(names, ids), -1),
-            is_known=np.ones(len(names), bool),
-            drawn=draw_views(masks.regions, shapes, cameras),
-            classes=masks.classes.numpy(),
+            is_known=np.arange(len(candidates)) < len(names),
+            drawn=draw_views(masks.regions, candidates.surfaces, cameras),
         )
 
-    def with_more(
-        self, masks: Masks, cameras: Cameras, *, config: MatchConfig, fitted: GivenScores = GIVEN
-    ) -> Question:
-        """The same with what the matcher finds once more, see `match_again`."""
-        own = _own(show_odds(self, fitted), self.leaf)
-        more = match_again(masks, self.candidates, self.leaf, odds=own, cameras=cameras, config=config)
-        num_more = len(more) - len(self.candidates)
-        return replace(
-            self,
-            candidates=more,
-            is_known=np.append(self.is_known, np.zeros(num_more, bool)),
-            drawn=draw_views(masks.regions, more.surfaces, cameras) if num_more else self.drawn,
-        )
+
+def ask(
+    masks: Masks,
+    surfaces: Mapping[int, LeafSurface],
+    *,
+    cameras: Cameras,
+    config: MatchConfig,
+    is_held: Bools,
+    fitted: GivenScores = GIVEN,
+) -> Question:
+    """What to ask of D matched masks on the CPU, also of the instances that the matcher finds once more."""
+    first = Question.of(masks, surfaces, cameras, is_held=is_held)
+    odds = show_odds(first, fitted)[np.arange(len(masks)), first.leaf]
+    more = match_again(masks, first.leaf, odds=odds, cameras=cameras, config=config)
+    return Question.of(masks, surfaces, cameras, is_held=is_held, more=more) if more else first
 
 
 def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:
-    """(D, K) log odds that each mask shows each candidate; inf where that is held, -inf where it cannot.
+    """(D, K + 1) log odds that each mask shows each candidate, and 0, of none; inf where that is held, -inf where it
+    cannot.
 
     It cannot show one of another class, nor one that it shares no pixel with and was not matched to; of those without a
     credible surface, none that it was not matched to.
     """
-    candidates, classes, num_masks = question.candidates, question.classes, len(question.leaf)
-    if not len(candidates):
-        return np.zeros((num_masks, 0))
-    evidence = see(question.drawn, num_masks, question.is_known & candidates.is_credible)
-    by_surface = shows_features(candidates, evidence) @ np.array(fitted.shows)
-    by_score = fitted.matched[0] + fitted.matched[1] * log_odds(candidates.matched)
-    odds: Floats = np.where(candidates.is_credible, by_surface, by_score).round(DIGITS)
-    is_member = ~np.isnan(candidates.matched)
-    touches = candidates.is_credible & (evidence.claimed > 0)
-    odds[~(is_member | touches) | (classes[:, None] != classes[is_member.argmax(0)])] = -np.inf
+    candidates, masks = question.candidates, question.masks
+    evidence = see(question.drawn, len(masks), question.is_known & candidates.is_credible)
+    odds = np.round(shows_features(candidates, evidence) @ np.array(fitted.shows), DIGITS)
+    is_near = ~np.isnan(candidates.matched) | (candidates.is_credible & (evidence.claimed > 0))
+    odds[~is_near | ~same_class(candidates, masks)] = -np.inf
     odds[candidates.certain.any(1)] = -np.inf
     odds[candidates.certain] = np.inf
-    return odds
+    return np.column_stack((odds, np.zeros(len(masks))))
 
 
 def shows_features(candidates: Candidates, evidence: Evidence) -> Floats:
-    """(D, K, 6): 1; the log odds of the match score, 0 where a mask was matched to another candidate; whether it was;
-    and the log odds of `Evidence.claimed`, `visible` and `inside`."""
-    is_member = ~np.isnan(candidates.matched)
-    columns = np.ones_like(evidence.claimed), log_odds(candidates.matched) * is_member, ~is_member
-    return np.stack((*columns, *(log_odds(each) for each in (evidence.claimed, evidence.visible, evidence.inside))), 2)
+    """(D, K, 7). Of a credible surface, 0 for others: 1; the log odds of the match score, 0 where a mask was matched to
+    another candidate; whether it was; and the log odds of `Evidence.visible` and `within`. Of a candidate without: 1,
+    and the log odds of the match score.
+
+    What hides a surface may be drawn wrong: a mask that lies within it as a whole may well show it.
+    """
+    has_shape, score = candidates.is_credible, log_odds(candidates.matched)
+    ones, shares = np.ones_like(score), (log_odds(evidence.visible), log_odds(evidence.within))
+    by_surface = (each * has_shape for each in (ones, score, np.isnan(candidates.matched), *shares))
+    return np.stack((*by_surface, ones * ~has_shape, score * ~has_shape), 2)
 
 
-def _own(odds: Floats, leaf: Ints) -> Floats:
-    """(D,) of the candidate that each mask was matched to; even ones for none."""
-    return np.where(leaf >= 0, odds[np.arange(len(leaf)), leaf], 0.0) if odds.shape[1] else np.zeros(len(leaf))
+def assign(question: Question, odds: Floats, is_open: Bools) -> tuple[Ints, Floats]:
+    """(D,) the candidate that each mask shows, -1 for none, and (D,) the log odds that it does.
 
-
-def assign(question: Question, odds: Floats, is_open: Bools) -> Assigned:
-    """Each mask shows the candidate of the largest log odds, but none for which they are negative, nor one that another
-    mask of the view was matched to, which shares pixels with it and fits at least as well; otherwise it stays.
+    That of the largest log odds, but none for which they are negative, nor one that another mask of the view was
+    matched to, which shares pixels with it and fits at least as well; otherwise it stays.
 
     Args:
         question: of D masks and K candidates.
-        odds: (D, K) see `show_odds`.
+        odds: (D, K + 1) see `show_odds`.
         is_open: (K,) the candidates that masks may go to.
     """
-    leaf, own = question.leaf, _own(odds, question.leaf)
-    if not odds.shape[1]:
-        return Assigned(leaf, own)
-    every, elsewhere = np.arange(len(leaf)), np.where(is_open & (odds >= 0), odds, -np.inf)
+    every, leaf = np.arange(len(question.leaf)), question.leaf
+    own, elsewhere = odds[every, leaf], np.where(np.append(is_open, False) & (odds >= 0), odds, -np.inf)
     for view in question.drawn:
         shares = view.is_shared & ~np.eye(len(view.rows), dtype=bool)
         for mask, other in zip(*(view.rows[place] for place in np.nonzero(shares)), strict=True):
@@ -163,17 +149,18 @@ def assign(question: Question, odds: Floats, is_open: Bools) -> Assigned:
                 elsewhere[mask, leaf[other]] = -np.inf
     best = elsewhere.argmax(1)
     moves = elsewhere[every, best] > own
-    return Assigned(np.where(moves, best, leaf), np.where(moves, elsewhere[every, best], own))
+    return np.where(moves, best, leaf), np.where(moves, elsewhere[every, best], own)
 
 
-def settle(question: Question, fitted: GivenScores = GIVEN) -> Assigned:
+def settle(question: Question, fitted: GivenScores = GIVEN) -> tuple[Ints, Floats]:
     """The assignment to the leaves of the first matching, and to others that are worth their price, the one that gains
     most first."""
     odds, is_open = show_odds(question, fitted), question.is_known.copy()
     is_leaf = np.eye(len(is_open), dtype=bool)
     found = assign(question, odds, is_open)
     while True:
-        trials = [(leaf, assign(question, odds, is_open | is_leaf[leaf])) for leaf in np.flatnonzero(~is_open).tolist()]
+        later = np.flatnonzero(~is_open & question.candidates.is_credible).tolist()
+        trials = [(leaf, assign(question, odds, is_open | is_leaf[leaf])) for leaf in later]
         gains = [gained(question, found, tried, leaf) for leaf, tried in trials]
         if max(gains, default=0.0) <= fitted.price:
             return found
@@ -181,9 +168,9 @@ def settle(question: Question, fitted: GivenScores = GIVEN) -> Assigned:
         is_open[leaf] = True
 
 
-def gained(question: Question, before: Assigned, after: Assigned, leaf: int) -> float:
+def gained(question: Question, before: tuple[Ints, Floats], after: tuple[Ints, Floats], leaf: int) -> float:
     """Log odds that the masks gain in all by a leaf; 0 if fewer than `LEAST_VIEWS` show it."""
-    is_other, rows = before.leaf != after.leaf, np.flatnonzero(after.leaf == leaf)
-    if sum(bool(np.isin(view.rows, rows).any()) for view in question.drawn) < LEAST_VIEWS:
+    is_other = before[0] != after[0]
+    if len(np.unique(question.masks.view_index.numpy()[after[0] == leaf])) < LEAST_VIEWS:
         return 0.0
-    return float(np.round((after.odds[is_other] - before.odds[is_other]).sum(), DIGITS))
+    return float(np.round((after[1][is_other] - before[1][is_other]).sum(), DIGITS))

@@ -17,7 +17,7 @@ from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.verification.checked_ids import check_ids
-from mvseg.verification.shown_leaves import GIVEN, Question, assign, settle, show_odds
+from mvseg.verification.shown_leaves import GIVEN, Question, ask, assign, settle, show_odds
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 SURFACES = {1: LEAVES[1], 3: LEAVES[3]}
@@ -39,9 +39,8 @@ def unsure(regions: Regions, ids: Tensor, rows: Tensor) -> Masks:
     return matched(regions, ids, torch.where(rows, 0.5, 0.95)).masks
 
 
-def ask(masks: Masks, surfaces: dict[int, LeafSurface], *, held: Tensor | None = None) -> Question:
-    is_held = np.zeros(len(masks), bool) if held is None else held.numpy()
-    return Question.of(masks, surfaces, CAMERAS, is_held=is_held)
+def question_of(masks: Masks, surfaces: dict[int, LeafSurface]) -> Question:
+    return Question.of(masks, surfaces, CAMERAS, is_held=np.zeros(len(masks), bool))
 
 
 def test_the_masks_of_a_scattered_leaf_find_each_other(scattered: tuple[Regions, Tensor, Tensor]) -> None:
@@ -75,10 +74,11 @@ def test_other_masks_stay(scattered: tuple[Regions, Tensor, Tensor], reason: str
 def test_a_leaf_that_is_not_worth_its_price_is_not_there(scattered: tuple[Regions, Tensor, Tensor]) -> None:
     regions, leaves, ids = scattered
     masks = unsure(regions, ids, leaves == 2)
-    question = ask(masks, SURFACES).with_more(masks, CAMERAS, config=MatchConfig())
+    nothing = np.zeros(len(masks), bool)
+    question = ask(masks, SURFACES, cameras=CAMERAS, config=MatchConfig(), is_held=nothing)
     assert question.is_known.tolist() == [True, True, False]
-    assert (settle(question).leaf == 2).tolist() == (leaves == 2).tolist()
-    assert (settle(question, replace(GIVEN, price=1000.0)).leaf == question.leaf).all()
+    assert (settle(question)[0] == 2).tolist() == (leaves == 2).tolist()
+    assert (settle(question, replace(GIVEN, price=1000.0))[0] == question.leaf).all()
 
 
 def test_a_mask_joins_the_leaf_that_it_shows_or_stays() -> None:
@@ -99,10 +99,13 @@ def test_log_odds_are_those_of_features_counted_on_whole_frames() -> None:
     maps = true_maps()
     regions, ids = as_regions(maps)
     masks = matched(regions, ids, 0.8).masks
-    odds = show_odds(ask(masks, LEAVES))
-    of_two_classes = show_odds(ask(replace(masks, classes=1 + (ids == 2).long()), LEAVES))
+    odds = show_odds(question_of(masks, LEAVES))
+    of_two_classes = show_odds(question_of(replace(masks, classes=1 + (ids == 2).long()), LEAVES))
     assert np.isneginf(of_two_classes[(ids == 2).numpy()][:, [0, 2]]).all()
     assert (of_two_classes[:, 1] == np.where(ids == 2, odds[:, 1], -np.inf)).all()
+    without = show_odds(question_of(masks, {1: LEAVES[1], 2: LEAVES[2]}))[:, 2]  # of leaf 3, which has no surface
+    assert without[(ids == 3).numpy()] == pytest.approx(np.dot(GIVEN.shows[5:], [1, logit(0.8)]), abs=1e-6)
+    assert np.isneginf(without[(ids != 3).numpy()]).all()
     for row in range(0, len(ids), 3):
         view = int(regions.view_index[row])
         mask = regions.mask(row, SIZE, SIZE).numpy()
@@ -111,20 +114,19 @@ def test_log_odds_are_those_of_features_counted_on_whole_frames() -> None:
             if not (mask & whole).any() and leaf != ids[row]:
                 assert odds[row, column] == -np.inf
                 continue
-            shares = [(mask & part).sum() / (mask | part).sum() for part in (whole, seen)]
-            shares.append((mask & seen).sum() / mask.sum())
+            shares = [(mask & seen).sum() / (mask | seen).sum(), (mask & whole).sum() / mask.sum()]
             is_own = leaf == int(ids[row])
             features = [1, logit(0.8) * is_own, not is_own, *logit(np.clip(shares, 0.01, 0.99))]
-            assert odds[row, column] == pytest.approx(np.dot(GIVEN.shows, features), abs=1e-6)
+            assert odds[row, column] == pytest.approx(np.dot(GIVEN.shows[:5], features), abs=1e-6)
 
 
 def test_of_two_masks_with_the_same_pixels_one_stays() -> None:
     """It was matched to another leaf; without common pixels, it would be a piece."""
     regions, ids = as_regions(true_maps())
     twice = regions.select(torch.cat((torch.arange(len(ids)), torch.tensor([0]))))
-    question = ask(matched(twice, torch.cat((ids, torch.tensor([3])))).masks, LEAVES)
+    question = question_of(matched(twice, torch.cat((ids, torch.tensor([3])))).masks, LEAVES)
     odds = show_odds(question)
     assert odds[-1, 0] > 0 > odds[-1, 2]
-    assert (assign(question, odds, question.is_known).leaf == question.leaf).all()
+    assert (assign(question, odds, question.is_known)[0] == question.leaf).all()
     apart = replace(question, drawn=[replace(each, masks=0 * each.masks) for each in question.drawn])
-    assert assign(apart, odds, question.is_known).leaf.tolist() == [*question.leaf[:-1].tolist(), 0]
+    assert assign(apart, odds, question.is_known)[0].tolist() == [*question.leaf[:-1].tolist(), 0]
