@@ -1,6 +1,6 @@
-"""How often is a pose right, and how often a link? `python benchmarks/fit_chances.py SERIES.csv RESULTS`
+"""How often is a pose right, and how often a link? `python benchmarks/fit_chances.py TABLE RESULTS [...]`
 
-The table and the results of real seedlings are those of `benchmarks/tracking.py results`; beside them, simulated plants
+Tables and results of real plants are those of `benchmarks/tracking.py results`; beside them, simulated plants
 of few leaves and of 12 to 30. Of two dates at most three apart, a pose is right where more than half of the leaves that
 it pairs are the same. Prints, each of greatest likelihood,
 
@@ -24,7 +24,7 @@ from scipy.special import expit, logit, logsumexp
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.fit_costs import small_specs
-from benchmarks.tracking import read_series, see_series
+from benchmarks.tracking import read_places, see_series
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import Alignment, Habit, Poses, judge, link_gain, list_poses, refine
 from mvseg.tracking.associate import link_leaves
@@ -37,21 +37,21 @@ NUM_OTHER, RIDGE, EPS = 60, 0.01, 1e-6
 Dated = tuple[PlantOnDate, list[int]]
 Looked = dict[tuple[int, int], Poses]
 Placed = tuple[float, int, bool]  # gain of links, number of leaves, whether the pose is right
-Seen = tuple[list[Leaves], list[np.ndarray], list[float]]  # by date: leaves, their true ids (0: unknown), days
+Seen = tuple[list[Leaves], list[np.ndarray], list[float], bool]  # by date: leaves, true ids (0: none), days; knows up
 
 
 def see(plant: list[Dated]) -> Seen:
     leaves = [leaves_of(date) for date, _ in plant]
     true = [np.array(ids, int)[each.index] for (_, ids), each in zip(plant, leaves, strict=True)]
-    return leaves, true, [date.time for date, _ in plant]
+    return leaves, true, [date.time for date, _ in plant], all(date.knows_up for date, _ in plant)
 
 
 def look(seen: Seen) -> Looked:
     """The poses of each two dates that have leaves."""
-    leaves, _, times = seen
+    leaves, _, times, knows_up = seen
     pairs = {
         (earlier, later): Pair.of(leaves[earlier], leaves[later], days=abs(times[later] - times[earlier]) or 2.0,
-                                  knows_up=True)
+                                  knows_up=knows_up)
         for later in range(len(leaves)) for earlier in range(max(0, later - MOST_GAP), later)
     }  # fmt: skip
     return {place: list_poses(pair) for place, pair in pairs.items() if pair.fewer}
@@ -123,8 +123,8 @@ def _list_links(plants: list[Seen]) -> np.ndarray:
     """(L, 5) log odds under the pose that was taken, its chance, that of the link under the others, whether the link is
     right, and one over their number."""
     rows = []
-    for leaves, true, times in plants:
-        compared = compare_dates(leaves, times, knows_up=True)
+    for leaves, true, times, knows_up in plants:
+        compared = compare_dates(leaves, times, knows_up=knows_up)
         with patch("mvseg.tracking.associate.CALIBRATION", (1.0, 0.0)):
             links = link_leaves([len(each) for each in leaves], compared.costs)
         for link in links:
@@ -140,16 +140,15 @@ def _list_links(plants: list[Seen]) -> np.ndarray:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", type=Path)
-    parser.add_argument("results", type=Path)
+    parser.add_argument("places", type=Path, nargs="+", help="TABLE RESULTS ...")
     args = parser.parse_args()
-    groups = [list(read_series(args.table, args.results).values())]
+    groups = [list(series.values()) for series in read_places(args.places).values()]
     groups += [[see_series(spec) for spec in specs] for specs in (small_specs(), draw_specs(4, seed=3))]
     dated: list[list[list[Dated]]] = [[list(zip(*each, strict=True)) for each in group] for group in groups]
     plants = [(seen, look(seen)) for group in dated for seen in map(see, group)]
     print("TEMPER =", round(fit_temper(plants), 2), flush=True)
     rng, others = np.random.default_rng(0), []
-    for group in dated * NUM_OTHER:
+    for group in [group for group in dated if len(group) > 1] * NUM_OTHER:
         one, other = (group[index] for index in rng.choice(len(group), 2, replace=False))
         seen = see([one[rng.integers(len(one))], other[rng.integers(len(other))]])
         others.append((seen, look(seen)))

@@ -1,19 +1,21 @@
-"""How much do leaves change between dates? `python benchmarks/fit_costs.py SERIES.csv RESULTS`
+"""How much do leaves change between dates? `python benchmarks/fit_costs.py TABLE RESULTS [TABLE RESULTS ...]`
 
-The table and the results of real seedlings are those of `benchmarks/tracking.py results`; beside them, simulated plants
-of 2 to 9 leaves (SMALL) and two of 12 to 30. Dates at most three apart are put into the pose that fits their true
-pairs.
+Tables and results of real plants are those of `benchmarks/tracking.py results`, that with the most leaves first; beside
+them, simulated plants of 2 to 9 leaves (SMALL) and two of 12 to 30. Dates at most three apart are put into the pose
+that fits their true pairs.
 Of each leaf, that it goes with its like on the other date, or with none, against all others, is made likeliest:
-exp(-cost) against 1 and the sum of exp(-cost) over the others. Prints `POSES` and `LINKS` of
-`mvseg/tracking/fitted_costs.py`; and for each species of SERIES.csv (plant names begin with it) the loss per leaf, and
-short and long of its plants as `benchmarks/tracking.py` has them, with scales that were fitted without it.
+exp(-cost) against 1 and the sum of exp(-cost) over the others. Each table, and either kind of simulated plants, counts
+by the root of how many leaves it has. Scales of places stay as they are but with --places-too. Prints `POSES` and
+`LINKS` of `mvseg/tracking/fitted_costs.py`; and for each species of the first table (plant names begin with it) and
+each other table the loss per leaf, and short and long of its plants as `benchmarks/tracking.py` has them, with scales
+that were fitted without it.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, fields
 from functools import partial
 from pathlib import Path
 from unittest.mock import patch
@@ -23,17 +25,19 @@ from scipy.optimize import minimize
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.tracking import Labels, labels_of, measure, read_series, see_series
+from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.series import SeriesSpec, draw_specs
 from mvseg.tracking.align import _fit
 from mvseg.tracking.compare import MOST_GAP
 from mvseg.tracking.dates import PlantOnDate
-from mvseg.tracking.fitted_costs import LINKS, POSES, Scales, fitted_costs
+from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, Scales, costs_of, fitted_costs
 from mvseg.tracking.leaves import Pair, leaves_of
 from mvseg.tracking.track import track_leaves
 
 SMALL, RIDGE = 16, 3e-3
+SIZES, LINES = ("growth", "grown", "size", "spurt", "loose", "parting"), ("lines", "near")
+Series = dict[str, tuple[list[PlantOnDate], Labels]]
 Known = tuple[Pair, np.ndarray, np.ndarray]  # in one frame, and the true ids of either date
 
 
@@ -52,13 +56,13 @@ def known_pairs(dates: list[PlantOnDate], truth: Labels) -> list[Known]:
     """All pairs of dates that share leaves, of leaves whose true id is known, where they truly stand."""
     leaves = [leaves_of(date) for date in dates]
     true = [np.array(ids, int)[each.index] for ids, each in zip(truth, leaves, strict=True)]
-    found = []
+    knows_up, found = all(date.knows_up for date in dates), []
     for later in range(len(dates)):
         for earlier in range(max(0, later - MOST_GAP), later):
             one, other = (np.flatnonzero(true[date] > 0) for date in (earlier, later))
             ids = true[earlier][one], true[later][other]
             days = dates[later].time - dates[earlier].time
-            pair = Pair.of(leaves[earlier].take(one), leaves[later].take(other), days=days, knows_up=True)
+            pair = Pair.of(leaves[earlier].take(one), leaves[later].take(other), days=days, knows_up=knows_up)
             pairs = np.argwhere(ids[0][:, None] == ids[1])
             if len(pairs):
                 found.append((pair.moved(_true_pose(pair, pairs)), *ids))
@@ -75,28 +79,56 @@ def _true_pose(pair: Pair, pairs: np.ndarray) -> np.ndarray:
     return np.eye(4) if len(pairs) < 3 and stood else pose
 
 
-def loss(known: list[Known], scales: Scales) -> tuple[float, int]:
-    """Of all leaves, and their number."""
-    total, count = 0.0, 0
-    for pair, one, other in known:
-        odds = -np.clip(fitted_costs(pair, scales), -50, 50)
-        total += np.log1p(np.exp(odds).sum(0)).sum() + np.log1p(np.exp(odds).sum(1)).sum()
-        total -= 2 * odds[one[:, None] == other].sum()
-        count += len(one) + len(other)
-    return total, count
+@dataclass(frozen=True, eq=False)
+class Joined:
+    """Pairs of leaves of many pairs of dates, one after another.
+
+    Attributes:
+        found: of each pair.
+        rows, columns: of each pair, the earlier and the later leaf, counted through all dates.
+        is_same: of each pair.
+        count: leaves.
+    """
+
+    found: Differences
+    rows: np.ndarray
+    columns: np.ndarray
+    is_same: np.ndarray
+    count: int
 
 
-def fit(groups: list[tuple[float, list[Known]]], start: Scales) -> Scales:
-    """Scales of the least sum of weighted losses per leaf; a weak prior keeps their logarithms near the start."""
-    names = [name for name in asdict(start) if start.lines or name not in ("lines", "near")]
+def join(known: list[Known]) -> Joined:
+    each = [Differences.of(pair, lines=True) for pair, _, _ in known]
+    parts = {field.name: [getattr(one, field.name) for one in each] for field in fields(Differences)}
+    flat = {name: np.concatenate([part.reshape(*part.shape[:-2], -1) for part in of], -1) for name, of in parts.items()}
+    starts = np.cumsum([(0, 0), *((len(one), len(other)) for _, one, other in known)], axis=0)
+    places = [np.indices((len(one), len(other))).reshape(2, -1) + start[:, None]
+              for (_, one, other), start in zip(known, starts[:-1], strict=True)]  # fmt: skip
+    rows, columns = np.concatenate(places, axis=1)
+    same = np.concatenate([(one[:, None] == other).ravel() for _, one, other in known])
+    return Joined(Differences(**flat), rows, columns, same, int(starts[-1].sum()))
+
+
+def loss(known: Joined, scales: Scales) -> float:
+    """Per leaf."""
+    odds = -np.clip(costs_of(known.found, scales), -50, 50)
+    total = sum(np.log1p(np.bincount(side, np.exp(odds))).sum() for side in (known.rows, known.columns))
+    return float(total - 2 * odds[known.is_same].sum()) / known.count
+
+
+def fit(groups: list[Joined], start: Scales, *, places: bool = False) -> Scales:
+    """Scales of the least sum of weighted losses per leaf; a weak prior keeps their logarithms near the start.
+    `places`: those of places, too."""
+    most = max(each.count for each in groups)
+    weighted = [((each.count / most) ** 0.5, each) for each in groups]
+    names = [name for name in asdict(start) if name in SIZES or (places and (start.lines or name not in LINES))]
     first = np.log([getattr(start, name) for name in names])
 
     def unpack(x: np.ndarray) -> Scales:
         return Scales(**{**asdict(start), **dict(zip(names, np.exp(x).tolist(), strict=True))})
 
     def objective(x: np.ndarray) -> float:
-        sums = ((weight, loss(known, unpack(x))) for weight, known in groups)
-        return sum(weight * total / count for weight, (total, count) in sums) + RIDGE * float(((x - first) ** 2).sum())
+        return sum(w * loss(each, unpack(x)) for w, each in weighted) + RIDGE * float(((x - first) ** 2).sum())
 
     return unpack(minimize(objective, first, method="L-BFGS-B", options={"maxiter": 60}).x)
 
@@ -120,27 +152,31 @@ def _other_costs(pair: Pair, scales: Scales = POSES, *, poses: Scales, links: Sc
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("table", type=Path)
-    parser.add_argument("results", type=Path)
+    parser.add_argument("places", type=Path, nargs="+", help="TABLE RESULTS ...")
+    parser.add_argument("--places-too", action="store_true", help="fit the scales of places and directions, too")
     args = parser.parse_args()
-    series = read_series(args.table, args.results)
-    real = {plant: known_pairs(*each) for plant, each in series.items()}
-    simulated = [[pair for spec in specs for pair in known_pairs(*see_series(spec))]
+    first, *rest = (series for series in read_places(args.places).values())
+    parts: dict[str, Series] = {}  # what is left out in turn
+    for plant, seen in first.items():
+        parts.setdefault(plant.split("_")[0], {})[plant] = seen
+    num_species = len(parts)
+    parts |= {" ".join(series): series for series in rest}
+    known = {name: [pair for seen in series.values() for pair in known_pairs(*seen)] for name, series in parts.items()}
+    simulated = [join([pair for spec in specs for pair in known_pairs(*see_series(spec))])
                  for specs in (draw_specs(2, seed=0), small_specs())]  # fmt: skip
-    species = sorted({plant.split("_")[0] for plant in real})
-    for left_out in ("", *species):
-        own = [plant for plant in real if plant.split("_")[0] == left_out]
-        known = [pair for plant, pairs in real.items() if plant not in own for pair in pairs]
-        groups = [(1.0, known), *((0.5, each) for each in simulated)]
-        poses, links = fit(groups, POSES), fit(groups, LINKS)
-        if not own:
+    species, others = list(parts)[:num_species], {name: join(known[name]) for name in list(parts)[num_species:]}
+    for left_out in ("", *parts):
+        seedlings = join([pair for name in species if name != left_out for pair in known[name]])
+        groups = [seedlings, *simulated, *(each for name, each in others.items() if name != left_out)]
+        poses, links = (fit(groups, start, places=args.places_too) for start in (POSES, LINKS))
+        if not left_out:
             for name, scales in (("POSES", poses), ("LINKS", links)):
                 print(name, "=", {key: round(value, 3) for key, value in asdict(scales).items()}, flush=True)
             continue
-        losses = [loss([pair for plant in own for pair in real[plant]], scales) for scales in (poses, links)]
-        said = ", ".join(f"{total / count:.3f}" for total, count in losses)
-        short, long = np.mean([track_with(series[plant], poses, links) for plant in own], 0)
-        print(f"without {left_out}: loss per leaf {said}; {len(own)} plants, {short:.3f} / {long:.3f}", flush=True)
+        said = ", ".join(f"{loss(join(known[left_out]), scales):.3f}" for scales in (poses, links))
+        short, long = np.mean([track_with(seen, poses, links) for seen in parts[left_out].values()], 0)
+        plants = f"{len(parts[left_out])} plants, {short:.3f} / {long:.3f}"
+        print(f"without {left_out}: loss per leaf {said}; {plants}", flush=True)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ import torch
 
 import mvseg.tracking
 from benchmarks.thirds import FACTOR, changed, list_numbers, scaled
-from benchmarks.tracking import Labels, labels_of, measure, read_series, see_series, see_two_plants
+from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series, see_two_plants
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.track import track_leaves
@@ -78,10 +78,7 @@ def main() -> None:
     parser.add_argument("--numbers", nargs="+", help="only these")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    places = zip(args.places[::2], args.places[1::2], strict=True)
-    every = {table.parent.name: read_series(table, results) for table, results in places}
-    every |= simulated_series()
-    print_changes(every, args.numbers)
+    print_changes(read_places(args.places) | simulated_series(), args.numbers)
 
 
 def print_changes(every: Mapping[str, Series], numbers: list[str] | None = None) -> None:

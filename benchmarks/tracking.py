@@ -2,11 +2,12 @@
 
     python -m benchmarks.tracking simulated --num_plants 12            leaves as seen: meshes with noise, no photos
     python -m benchmarks.tracking two --num_plants 8 --turn 60         two of them in one pot, one turned by itself
-    python -m benchmarks.tracking results TABLE RESULTS                results of mvseg batch, or of `prepare`
+    python -m benchmarks.tracking results TABLE RESULTS [...]          results of mvseg batch, or of `prepare`
     python -m benchmarks.tracking prepare TABLE RESULTS                surfaces from true masks with true ids
     python -m benchmarks.tracking prepare TABLE RESULTS --masks degraded    from degraded masks, matched by mvseg
 
-TABLE has the columns scene, name, plant, time; RESULTS/NAME is the result of a scene, whose truth is scene/truth. The
+TABLE has the columns scene, name, plant, time; RESULTS/NAME is the result of a scene, whose truth is scene/truth. Or it
+is a pair.json of two dates six days apart whose true ids differ, see `read_pair`. The
 baselines get the alignment of dates that mvseg finds, or find their own (cpd); pycpd is only needed for that one. In
 the end it prints how often links of each probability are right.
 
@@ -19,6 +20,7 @@ from __future__ import annotations
 
 import argparse
 import csv
+import json
 from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -296,6 +298,8 @@ def true_ids(date: PlantOnDate, truth: Path) -> list[int]:
 
 def read_series(table: Path, results: Path) -> dict[str, tuple[list[PlantOnDate], Labels]]:
     """{plant: (dates, true ids)} of the rows whose results are there."""
+    if table.suffix == ".json":
+        return {table.parent.name: read_pair(table, results)}
     series: dict[str, tuple[list[PlantOnDate], Labels]] = {}
     for row in csv.DictReader(table.open(encoding="utf-8")):
         if (results / row["name"] / "run.json").is_file():
@@ -304,6 +308,25 @@ def read_series(table: Path, results: Path) -> dict[str, tuple[list[PlantOnDate]
             dates.append(date)
             truth.append(true_ids(date, table.parent / row["scene"] / "truth"))
     return series
+
+
+def read_pair(pair: Path, results: Path) -> tuple[list[PlantOnDate], Labels]:
+    """Two dates and their true ids, those of the first; its leaves that are no more on the second are in `gone`.
+
+    The second is the scene beside it that the results have, too.
+    """
+    first, scenes = pair.parent.name, pair.parents[1]
+    (second,) = (path.name for path in results.iterdir() if path.name != first and (scenes / path.name).is_dir())
+    same = {new: int(old) for old, new in json.loads(pair.read_text(encoding="utf-8"))["same"].items()}
+    dates = [read_date(results / name, time) for name, time in ((first, 0), (second, 6))]
+    before, after = (true_ids(date, pair.parents[1] / date.scene / "truth") for date in dates)
+    return dates, [before, [same.get(leaf, leaf and leaf + 1000) for leaf in after]]
+
+
+def read_places(places: Sequence[Path]) -> dict[str, dict[str, tuple[list[PlantOnDate], Labels]]]:
+    """{name: series} of TABLE RESULTS TABLE RESULTS ..., as the command line has them."""
+    return {table.parent.name: read_series(table, results)
+            for table, results in zip(places[::2], places[1::2], strict=True)}  # fmt: skip
 
 
 # --- tables
@@ -377,7 +400,8 @@ def main() -> None:
     if args.what == "prepare":
         prepare(*args.places, masks=args.masks)
     elif args.what == "results":
-        compare(read_series(*args.places), args.methods)
+        for series in read_places(args.places).values():
+            compare(series, args.methods)
     elif args.what == "simulated":
         specs = draw_specs(args.num_plants, seed=args.seed)
         compare({spec.name: see_series(spec) for spec in specs}, args.methods)

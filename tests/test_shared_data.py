@@ -10,7 +10,9 @@ import pycolmap
 import pytest
 import torch
 
+from benchmarks.tracking import read_pair
 from conftest import true_ids
+from mvseg.cli import main
 from mvseg.errors import InputWarning
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.formats.photos import read_photo
@@ -21,6 +23,7 @@ from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.tracking.track import track_leaves
 
 pytestmark = pytest.mark.shared_data
 
@@ -45,6 +48,23 @@ def test_basil_gets_its_leaves(
     assert metrics.e_k == 0
     assert metrics.s_match >= least[0]
     assert metrics.ari >= least[1]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore")
+def test_leaves_of_a_basil_go_on_over_six_days(shared_data: Path, tmp_path: Path) -> None:
+    """Of the nine that both dates have, eight go on at least, and no link that is believed in is wrong. Measured: 9."""
+    for name in ("basil-pair", "basil-0729"):
+        folder = shared_data / name
+        assert main(["infer", str(folder), "--masks", str(folder / "masks"), "--out", str(tmp_path / name)]) == 0
+    dates, truth = read_pair(shared_data / "basil-pair" / "pair.json", tmp_path)
+    shown = {(n, leaf.leaf): true for n in (0, 1) for leaf, true in zip(dates[n].leaves, truth[n], strict=True)}
+    rows = [row for row in track_leaves(dates).rows if row.leaf is not None]
+    before = {row.track: shown[0, row.leaf] for row in rows if row.date == 0}
+    links = [(row.probability, shown[1, row.leaf] == before[row.track])
+             for row in rows if row.date == 1 and row.track in before]  # fmt: skip
+    assert sum(is_right for _, is_right in links) >= 8
+    assert all(is_right for chance, is_right in links if chance > 0.9)
 
 
 def test_maize_is_one_plant_of_its_height(shared_data: Path) -> None:

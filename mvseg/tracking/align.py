@@ -126,7 +126,7 @@ def list_poses(pair: Pair) -> Poses:
     scores = alikeness(pair, poses).sum(1)
     scores[0] += 2e6
     scores[: len(looked_at)] += 1e6  # always looked at
-    found: list[Alignment] = [_as_it_stood(pair)]
+    found: list[Alignment] = [_as_it_stood(pair), refine(pair, np.eye(4))]
     left = np.argsort(-scores, kind="stable")
     while len(left) and len(found) < NUM_REFINED:
         found.append(refine(pair, poses[left[0]]))

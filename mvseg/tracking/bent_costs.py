@@ -14,7 +14,7 @@ import numpy as np
 from mvseg.system.running import kept
 from mvseg.tracking.align import Alignment
 from mvseg.tracking.dates import STATIONS, Floats
-from mvseg.tracking.fitted_costs import FLIPPED, LINKS, POSES, length_costs, student_tail
+from mvseg.tracking.fitted_costs import FLIPPED, LINKS, POSES, size_costs, student_tail
 from mvseg.tracking.leaves import Leaves, Pair
 
 PLACE = 0.07  # distance of bases, or of points, of two sights of one leaf: its scale, in `Pair.scale`
@@ -51,7 +51,7 @@ def bent_costs(pair: Pair, alignment: Alignment) -> Floats:
     costs, clouds = pair_costs(in_place, widening=widening), cloud_costs(in_place, widening=widening)
     both = first.is_surface[:, None] & second.is_surface[None]
     by_midrib = costs + CLOUD_COUNTS * np.minimum(clouds, 0.0)
-    by_cloud = clouds + CLOUD_COUNTS * np.minimum(costs, PARTING)  # which is above -PARTING
+    by_cloud = clouds + CLOUD_COUNTS * np.minimum(costs, PARTING)
     in_part = np.abs(np.log(second.lengths[None] / first.lengths[:, None])) > IN_PART
     return np.where(both, np.where(in_part, np.minimum(by_midrib, by_cloud), by_midrib), by_cloud)
 
@@ -61,7 +61,7 @@ def pair_costs(pair: Pair, *, widening: float = 1.0) -> Floats:
     likelier than not. `widening` widens the scales of places and directions, for dates that differ more than usual."""
     turned = replace(pair, first=replace(pair.first, midribs=pair.first.midribs[:, ::-1]))
     directed = np.minimum(_directed_costs(pair, widening), _directed_costs(turned, widening) + FLIPPED)
-    return directed + length_costs(pair, LINKS)
+    return directed + size_costs(pair, LINKS)
 
 
 def cloud_costs(pair: Pair, *, widening: float = 1.0) -> Floats:

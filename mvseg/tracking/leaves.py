@@ -22,6 +22,7 @@ class Leaves:
         normals: (N, 3).
         points: (N, CLOUD, 3).
         lengths: (N,).
+        areas: (N,) one-sided; NaN where none is measured.
         base_sd, turn_sd: (N,) standard deviations of the base, in lengths, and of the azimuth, in radians.
         is_oriented, is_surface: (N,) bool.
     """
@@ -31,6 +32,7 @@ class Leaves:
     normals: Floats
     points: Floats
     lengths: Floats
+    areas: Floats
     base_sd: Floats
     turn_sd: Floats
     is_oriented: np.ndarray
@@ -82,6 +84,7 @@ def leaves_of(date: PlantOnDate) -> Leaves:
         normals=np.array([leaf.normal for leaf in shaped]).reshape(-1, 3),
         points=np.array([leaf.points for leaf in shaped]).reshape(-1, CLOUD, 3),
         lengths=np.array([leaf.length for leaf in shaped]),
+        areas=np.array([leaf.numbers["area"].value if "area" in leaf.numbers else np.nan for leaf in shaped], float),
         base_sd=np.array([sd(leaf, "insertion_height") for leaf in shaped]),
         turn_sd=np.radians(np.array([sd(leaf, "azimuth") for leaf in shaped])),
         is_oriented=np.array([leaf.is_oriented for leaf in shaped], bool),

@@ -55,7 +55,8 @@ def place_dates(num_dates: int, looked: Looked, habit: Habit) -> tuple[Floats, n
     alignments = {pair: judge(poses, habit) for pair, poses in looked.items()}
     chained, roots = chain_dates(num_dates, alignments)
     likeliness = _remembered(looked, habit)
-    poses = _search(chained, roots, alignments, likeliness)
+    poses = _search(chained, alignments, likeliness)
+    poses = np.linalg.inv(poses[roots]) @ poses
     return poses, roots, weigh_turns(poses, looked, likeliness)
 
 
@@ -97,30 +98,36 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
     return poses, roots
 
 
-def _search(
-    poses: Floats, roots: np.ndarray, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness
-) -> Floats:
-    """One date after the other takes the pose that agrees best with the others, of those that its pairs suggest; the
-    first one, too: where it is the odd one, all others would have to move."""
-    poses = poses.copy()
+def _search(poses: Floats, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness) -> Floats:
+    """One date after the other, alone or with all later ones, moves so that two dates stand as their alignment says, if
+    all then agree better; the first one, too: where it is the odd one, all others would have to move."""
     for _ in range(ROUNDS):
-        before = poses.copy()
+        before = poses
         for date in range(len(poses)):
-            pairs = [pair for pair in alignments if date in pair]
-            options = [poses[date], *(
-                poses[earlier] @ np.linalg.inv(alignments[earlier, later].pose) if date == later
-                else poses[later] @ alignments[earlier, later].pose
-                for earlier, later in pairs
-            )]  # fmt: skip
-            totals = []
-            for option in options:
-                moved = poses.copy()
-                moved[date] = option
-                totals.append(sum(likeliness(moved, pair) for pair in pairs))
-            poses[date] = options[int(np.argmax(np.round(totals, DIGITS)))]
-        if np.array_equal(poses, before):
+            for moving in (slice(date, date + 1), slice(date, None)):
+                poses = _move(poses, moving, alignments, likeliness)
+        if poses is before:
             break
-    return np.linalg.inv(poses[roots]) @ poses
+    return poses
+
+
+def _move(
+    poses: Floats, moving: slice, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness
+) -> Floats:
+    """The poses (T, 4, 4) themselves, or those with some dates moved as one that agree best."""
+    is_moving = np.zeros(len(poses), bool)
+    is_moving[moving] = True
+    best, most = poses, 0.0
+    apart = [pair for pair in alignments if is_moving[pair[0]] != is_moving[pair[1]]]
+    now = sum(likeliness(poses, pair) for pair in apart)
+    for earlier, later in apart:
+        step = poses[later] @ alignments[earlier, later].pose @ np.linalg.inv(poses[earlier])
+        moved = poses.copy()
+        moved[moving] = (step if is_moving[earlier] else np.linalg.inv(step)) @ moved[moving]
+        gain = round(sum(likeliness(moved, pair) for pair in apart) - now, DIGITS)
+        if gain > most:
+            best, most = moved, gain
+    return best
 
 
 def _remembered(looked: Looked, habit: Habit) -> Likeliness:

@@ -9,7 +9,7 @@ import pytest
 
 from mvseg.tracking.align import refine
 from mvseg.tracking.bent_costs import bent_costs, pair_costs
-from mvseg.tracking.fitted_costs import LINKS, fitted_costs
+from mvseg.tracking.fitted_costs import LINKS, fitted_costs, size_costs
 from mvseg.tracking.leaves import Pair, leaves_of
 from tests.plants_over_days import Blades, grow_blades, see
 
@@ -51,3 +51,19 @@ def test_a_plant_that_leans_over_is_bent_before_its_leaves_are_compared() -> Non
     assert bent[rows, there].max() < -4
     bent[rows, there] = np.inf
     assert bent.min() > 0
+
+
+def test_a_leaf_that_has_stopped_growing_keeps_its_length_or_its_area_and_a_young_one_may_grow() -> None:
+    pair, there = pair_of(grow_blades(4, 5), grow_blades(4, 5))
+    rows = np.arange(4)
+    before, after = np.array([100.0, 100.0, 40.0, 40.0]), np.array([100.0, 65.0, 85.0, 40.0])
+    first = replace(pair.first, lengths=before, areas=20 * before)
+    second = replace(pair.second, lengths=np.empty(4), areas=np.empty(4))
+    second.lengths[there], second.areas[there] = after, (2000, 2000, 3600, 800)
+    days = replace(pair, first=first, second=second, days=3)
+    costs = size_costs(days, LINKS)[rows, there]
+    assert costs[[0, 2]].max() < 0.2
+    assert 1 < costs[3] < 2.5  # it may have stopped early, which is rarer
+    assert costs[1] < 2.5  # a surface shows it shorter, with the area that it had
+    no_areas = replace(days, second=replace(second, areas=np.full(4, np.nan)))
+    assert size_costs(no_areas, LINKS)[rows, there][1] > costs[1] + 1  # then its length alone tells

@@ -64,6 +64,16 @@ def test_one_date_that_stands_wrong_to_all_others_is_moved_the_first_one_too(dat
     np.testing.assert_allclose(poses[0], np.eye(4), atol=1e-9)
 
 
+def test_later_dates_that_stand_wrong_together_are_moved_together() -> None:
+    """Leaves grew much in between: one date alone would lose more than it gains."""
+    leaves = [leaves_of(see(grown(BLADES, size), n, turn=0)[0]) for n, size in enumerate((1, 1.01, 1.7, 1.71))]
+    steps = {(n, n + 1): list_poses(Pair.of(leaves[n], leaves[n + 1], days=1, knows_up=True)) for n in range(3)}
+    start = np.stack([np.eye(4)] * 2 + [make_poses(HALF_TURN, np.zeros(3))] * 2)
+    with patch("mvseg.tracking.place_dates.chain_dates", return_value=(start, np.zeros(4, int))):
+        poses, _, _ = place_dates(4, steps, Habit(0.3))
+    assert poses[:, 0, 0].min() > 0.99
+
+
 def test_pots_that_are_said_to_be_fixed_stand_as_they_stood() -> None:
     """Even where the leaves say otherwise."""
     poses, _, steady = place_dates(4, look_at(TURNS), Habit(1.0))
