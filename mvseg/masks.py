@@ -20,7 +20,6 @@ from mvseg.regions import Regions, stack_regions
 T = TypeVar("T")
 
 SURE = 0.5  # match score from which a mask counts for its instance's support
-VERY_SURE = 0.9  # match score from which an id is hardly ever wrong
 COLUMNS = (  # that are tensors
     "instance_ids",
     "match_scores",
