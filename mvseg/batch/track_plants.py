@@ -14,7 +14,6 @@ from mvseg._version import made_by
 from mvseg.batch.tables import read_table
 from mvseg.batch.workers import Engine, Lost, open_workers
 from mvseg.corrections.file import Edit, load_corrections
-from mvseg.corrections.track_links import find_links
 from mvseg.errors import InputError
 from mvseg.results.earlier import RUN_FILE, Output, replace_result
 from mvseg.system.file_hash import hash_files
@@ -23,7 +22,7 @@ from mvseg.tracking.config import Pots
 from mvseg.tracking.growth import measure_growth
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
 from mvseg.tracking.pictures import SIDE
-from mvseg.tracking.recorded import PlantResults, record_plants
+from mvseg.tracking.recorded import PlantResults, find_plant_links, record_plants
 from mvseg.tracking.tables import join_tables, write_tables
 from mvseg.tracking.track import track_leaves
 
@@ -137,7 +136,7 @@ def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots
     plant, place = item
     try:
         dates = plant.read(pictures=SIDE if report else 0)
-        links, lost = find_links(edits, {date.scene: date.folder for date in dates if date.folder is not None})
+        links, lost = find_plant_links(edits, dates)
         tracks = track_leaves(dates, links=links, pots=pots, plant=plant.plant)
     except InputError as error:
         return TrackedPlant(sentence=f"plant {plant.plant}: {error}")

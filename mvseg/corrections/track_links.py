@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -20,12 +20,15 @@ class LeafLink:
     leaves: tuple[tuple[str, int], ...]
 
 
-def find_links(edits: Sequence[Edit], folders: Mapping[str, Path]) -> tuple[list[LeafLink], dict[int, str]]:
+def find_links(
+    edits: Sequence[Edit], folders: Mapping[str, Path], shaped: Collection[tuple[str, int]] | None = None
+) -> tuple[list[LeafLink], dict[int, str]]:
     """The links between leaves of a plant, and {place of an edit: what hinders it}: it points at no leaf, or
     contradicts later ones, which win.
 
-    `folders` are {scene: result folder} of its dates. Edits of single scenes, and those that name none of these, which
-    are another plant's, are passed over. A scene may be named by the end of its path, if no other one ends so.
+    `folders` are {scene: result folder} of its dates, `shaped` those of their leaves (scene, leaf) that can be linked;
+    None: all. Edits of single scenes, and those that name none of these scenes, which are another plant's, are passed
+    over. A scene may be named by the end of its path, if no other one ends so.
     """
     links: dict[int, LeafLink] = {}
     problems: dict[int, str] = {}
@@ -47,6 +50,8 @@ def find_links(edits: Sequence[Edit], folders: Mapping[str, Path]) -> tuple[list
             ]
             if nowhere:
                 problems[index] = f"{edit.op}: there is no leaf at {', '.join(nowhere)}"
+            elif shaped is not None and (flat := [each for each in leaves if each not in shaped]):
+                problems[index] = f"{edit.op}: leaf {flat[0][1]} of {flat[0][0]} has no shape, so nothing can be linked"
             else:
                 links[index] = LeafLink(edit.op == "same_track", tuple(leaves))
     kept = _without_contradicted(links, problems)

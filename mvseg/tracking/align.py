@@ -26,6 +26,7 @@ from mvseg.tracking.leaves import Pair
 NUM_REFINED = 20  # poses of two dates: this many of those that look best are refined
 UPRIGHT = 2.0  # the direction of up, where a pose is fitted: it weighs as much as this many leaves
 ROUNDS = 5  # rounds of pairing leaves and fitting a pose to them: at most this many (a technical limit)
+LEAST_WEIGHT = 1.0  # a pair that a person says is one leaf, where a pose is fitted: its weight is at least this
 TIP = 0.43  # the tip of a leaf, where a pose is fitted: it weighs this much of what base and middle do, for tips sway
 TURNS = 30  # turns of a pot that leaves can tell apart: this many, of 12 degrees (a definition)
 TEMPER = 0.45  # a gain of a pose: this share counts as log odds; `python benchmarks/fit_chances.py` fits it
@@ -257,7 +258,8 @@ def refine(pair: Pair, pose: Floats) -> Alignment:
         pairs = best_pairs(costs)
         if not len(pairs) or np.array_equal(pairs, before):
             break
-        pose = _fit(pair, pairs, -costs[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
+        own = np.maximum(pair.said - costs, np.where(pair.said < 0, LEAST_WEIGHT, 0.0))  # as if nobody had said it
+        pose = _fit(pair, pairs, own[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
     else:
         costs = fitted_costs(pair.moved(pose))
         pairs = best_pairs(costs)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import html
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
 from string import Template
@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from mvseg.results.overlay import instance_color
+from mvseg.results.report.page import ASSETS as REPORT_ASSETS
 from mvseg.results.report.page import dump_inside_script
 from mvseg.tracking.dates import ROWS
 from mvseg.tracking.growth import SIZES, Growth
@@ -22,6 +23,7 @@ from mvseg.tracking.track import Tracks
 PAGE_FILE = "tracks.html"
 CURVE_STEPS = 40  # points of a drawn curve (a definition)
 ASSETS = files("mvseg.tracking") / "assets"
+SERVED_SCRIPTS = ("selection.js", "numbers.js", "edits.js", "server.js")  # of the page that corrects a result
 
 
 def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
@@ -30,13 +32,24 @@ def write_page(folder: Path, tracks: Tracks, growth: Growth) -> None:
     Raises:
         OSError: it cannot be written.
     """
-    page = Template((ASSETS / "tracks.page.html").read_text(encoding="utf-8")).substitute(
-        title=html.escape(f"{tracks.plant} - mvseg track"),
-        style=(ASSETS / "tracks.css").read_text(encoding="utf-8"),
-        data=dump_inside_script(describe_tracks(tracks, growth)),
-        script=(ASSETS / "tracks.js").read_text(encoding="utf-8"),
-    )
+    page = build_page(tracks.plant, describe_tracks(tracks, growth))
     (folder / PAGE_FILE).write_text(page, encoding="utf-8", newline="\n")
+
+
+def build_page(plant: str, data: Mapping[str, Any]) -> str:
+    """The page; `data` of `describe_tracks`, with "correct" where `mvseg correct` serves it: {"edits", "revision", and
+    what else its script reads}."""
+    is_served = "correct" in data
+    scripts = [REPORT_ASSETS / name for name in SERVED_SCRIPTS] if is_served else []
+    styles = ["tracks.css", *(["tracks_correct.css"] if is_served else [])]
+    scripts += [ASSETS / name for name in ("tracks.js", *(("tracks_correct.js",) if is_served else ()))]
+    return Template((ASSETS / "tracks.page.html").read_text(encoding="utf-8")).substitute(
+        title=html.escape(f"{plant} - mvseg track"),
+        style="".join((ASSETS / name).read_text(encoding="utf-8") for name in styles),
+        correct=(ASSETS / "correct.part.html").read_text(encoding="utf-8") if is_served else "",
+        data=dump_inside_script(data),
+        script="\n".join(script.read_text(encoding="utf-8") for script in scripts),
+    )
 
 
 def write_index(path: Path, plants: Sequence[tuple[str, int, int]]) -> None:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import combinations, pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -40,13 +40,16 @@ class Question:
         return LeafLink(is_same, leaves)
 
 
-def list_questions(tracks: Tracks) -> list[Question]:
-    """The most doubtful first; each leaf is asked about once as the earlier one, and once as the later one."""
+def list_questions(tracks: Tracks, links: Sequence[LeafLink] = ()) -> list[Question]:
+    """The most doubtful first; each leaf is asked about once as the earlier one, and once as the later one. What the
+    `links` answer is not asked again."""
+    said = {frozenset(pair) for link in links for pair in combinations(link.leaves, 2)}
     every = sorted((*_of_links(tracks), *_of_ends(tracks)), key=lambda each: (-each.doubt, each.before, each.after))
     asked: list[Question] = []
     for each in every:
         is_new = all(each.before != other.before and each.after != other.after for other in asked)
-        if is_new and each.doubt >= LEAST_DOUBT and len(asked) < MOST_QUESTIONS:
+        is_answered = frozenset(each.link(tracks, is_same=True).leaves) in said
+        if is_new and not is_answered and each.doubt >= LEAST_DOUBT and len(asked) < MOST_QUESTIONS:
             asked.append(each)
     return asked
 

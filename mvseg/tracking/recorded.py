@@ -9,6 +9,8 @@ from typing import Any, ClassVar, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
+from mvseg.corrections.file import Edit
+from mvseg.corrections.track_links import LeafLink, find_links
 from mvseg.errors import InputError
 from mvseg.formats.json_file import read_json
 from mvseg.results.earlier import RUN_FILE
@@ -86,6 +88,12 @@ def record_plants(plants: Sequence[PlantResults]) -> list[dict[str, Any]]:
         {"plant": each.plant, "results": [str(path.resolve()) for path in each.folders], "times": list(each.times)}
         for each in plants
     ]
+
+
+def find_plant_links(edits: Sequence[Edit], dates: Sequence[PlantOnDate]) -> tuple[list[LeafLink], dict[int, str]]:
+    """What a person says of the leaves of a plant, and what hinders single edits, see `find_links`."""
+    folders = {date.scene: date.folder for date in dates if date.folder is not None}
+    return find_links(edits, folders, {(date.scene, date.leaves[n].leaf) for date in dates for n in date.shaped})
 
 
 def is_tracks(folder: Path) -> bool:

@@ -87,7 +87,7 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         for key in ("ArrowRight", "ArrowRight", "ArrowUp"):
             shown.keyboard.press(key)
         assert shown.locator("#leaf").inner_text() == "Leaf 2"
-        assert shown.locator("#crops img").count() == 6
+        assert shown.locator("#crops img").count() == shown.locator("#crops canvas.alone").count() == 6
         assert shown.locator("#chart polygon").count() == 1  # its band
         assert shown.locator("#model").inner_text().startswith("curve: ")
         assert shown.evaluate("document.querySelector('canvas').toDataURL()") != before

@@ -3,8 +3,9 @@ const data = JSON.parse(document.getElementById("data").textContent);
 const find = (id) => document.getElementById(id);
 const WIDE = Math.max(190, Math.min(420, Math.floor(1300 / data.dates.length))), HIGH = WIDE;
 const DOWN = 25 * Math.PI / 180; // how steeply the plants are looked at
-const tracks = Object.keys(data.colors).map(Number);
+let tracks = [];
 let picked = 0;
+let onClick = (leaf) => pick(leaf ? leaf.track : 0), onDraw = () => {}; // `mvseg correct` has others
 
 function make(name, text, parent, kind) {
   const element = document.createElement(name);
@@ -38,7 +39,7 @@ function drawDate(canvas, date) {
     pen.fillStyle = pen.strokeStyle = data.colors[leaf.track];
     if (leaf.flat) { path.closePath(); pen.fill(path); pen.strokeStyle = "#0008"; pen.lineWidth = 0.5; pen.stroke(path); }
     else { pen.lineWidth = 4; pen.stroke(path); }
-    return { track: leaf.track, path };
+    return { leaf, path, middle: middleOf(line) };
   });
   pen.globalAlpha = 1;
 }
@@ -48,11 +49,54 @@ function pickAt(canvas, event) {
   const x = (event.clientX - box.left) * 2, y = (event.clientY - box.top) * 2;
   pen.lineWidth = 6;
   const hit = [...canvas.leaves].reverse().find(({ path }) => pen.isPointInPath(path, x, y) || pen.isPointInStroke(path, x, y));
-  pick(hit ? hit.track : 0);
+  onClick(hit ? hit.leaf : null);
+}
+
+function middleOf(line) {
+  return [0, 1].map((axis) => line.reduce((sum, point) => sum + point[axis], 0) / line.length);
 }
 
 function drawDates() {
   for (const [date, canvas] of [...document.querySelectorAll("#dates canvas")].entries()) drawDate(canvas, date);
+  for (const canvas of document.querySelectorAll("canvas.alone")) drawAlone(canvas);
+  onDraw();
+}
+
+// One leaf of a date, as large as fits.
+function drawAlone(canvas) {
+  const { leaf } = canvas, line = project(leaf.shape, find("turn").value * Math.PI / 180), pen = canvas.getContext("2d");
+  const [x, y] = [0, 1].map((axis) => line.map((point) => point[axis]));
+  const side = canvas.width, scale = 0.85 * side / Math.max(Math.max(...x) - Math.min(...x), Math.max(...y) - Math.min(...y), 1e-9);
+  const place = (values, at) => side / 2 + (at - (Math.max(...values) + Math.min(...values)) / 2) * scale;
+  pen.clearRect(0, 0, side, side);
+  pen.beginPath();
+  line.forEach((point) => pen.lineTo(place(x, point[0]), place(y, point[1])));
+  pen.fillStyle = pen.strokeStyle = data.colors[leaf.track];
+  pen.lineWidth = 4;
+  if (leaf.flat) { pen.closePath(); pen.fill(); } else pen.stroke();
+}
+
+// The history of a leaf: its picture and its shape on each date, and where it has none, why.
+function buildHistory(track, parent) {
+  const seen = new Map(data.leaves.filter((leaf) => leaf.track === track).map((leaf) => [leaf.date, leaf]));
+  const gaps = new Map(data.gaps.filter((gap) => gap[1] === track).map(([date, , state]) => [date, state]));
+  const strip = make("div", undefined, parent, "history");
+  data.dates.forEach(({ written }, date) => {
+    const leaf = seen.get(date), figure = make("figure", undefined, strip);
+    if (leaf && leaf.crop) {
+      const image = make("img", undefined, figure);
+      image.src = `data:image/jpeg;base64,${leaf.crop}`;
+      image.alt = `leaf ${track} on ${written}`;
+    }
+    if (leaf && leaf.shape.length) {
+      const canvas = make("canvas", undefined, figure, "alone");
+      canvas.width = canvas.height = 144;
+      canvas.leaf = leaf;
+    }
+    const p = leaf && leaf.p !== null ? `, probability ${leaf.p}` : "";
+    make("figcaption", leaf ? `${written}${leaf.state === "born" ? ", born" : ""}${p}` : `${written}: ${gaps.get(date) || "not there"}`, figure);
+  });
+  return strip;
 }
 
 function buildDates() {
@@ -65,6 +109,7 @@ function buildDates() {
 }
 
 function buildTable() {
+  find("tracks").replaceChildren();
   const table = make("table", undefined, find("tracks")), head = make("tr", undefined, make("thead", undefined, table));
   make("th", "leaf", head);
   data.dates.forEach((date) => make("th", date.written, head));
@@ -78,6 +123,7 @@ function buildTable() {
   }
   for (const leaf of data.leaves) {
     const cell = make("span", undefined, rows[leaf.track].children[leaf.date + 1], `cell ${leaf.state}`);
+    cell.leaf = leaf;
     cell.style.background = data.colors[leaf.track];
     cell.style.opacity = leaf.p === null ? 1 : 0.25 + 0.75 * leaf.p;
     cell.title = `leaf ${leaf.leaf}, ${leaf.state}` + (leaf.p === null ? "" : `, probability ${leaf.p}`);
@@ -138,12 +184,7 @@ function pick(track) {
   find("leaf").textContent = track ? `Leaf ${track}` : "All leaves";
   for (const row of document.querySelectorAll("tbody tr")) row.classList.toggle("picked", Number(row.dataset.track) === track);
   find("crops").replaceChildren();
-  for (const leaf of data.leaves.filter((each) => each.track === track && each.crop)) {
-    const figure = make("figure", undefined, find("crops")), image = make("img", undefined, figure);
-    image.src = `data:image/jpeg;base64,${leaf.crop}`;
-    image.alt = `leaf ${track} on ${data.dates[leaf.date].written}`;
-    make("figcaption", data.dates[leaf.date].written, figure);
-  }
+  if (track) buildHistory(track, find("crops"));
   drawDates();
   drawChart();
 }
@@ -158,13 +199,20 @@ function press(event) {
   event.preventDefault();
 }
 
+// All that follows from the tracks.
+function show() {
+  tracks = Object.keys(data.colors).map(Number);
+  find("summary").textContent = `${tracks.length} leaves on ${data.dates.length} dates`;
+  find("warnings").replaceChildren();
+  for (const sentence of data.warnings) make("li", sentence, find("warnings"));
+  buildTable();
+  pick(tracks.includes(picked) ? picked : 0);
+}
+
 find("plant").textContent = data.plant;
-find("summary").textContent = `${tracks.length} leaves on ${data.dates.length} dates`;
-for (const sentence of data.warnings) make("li", sentence, find("warnings"));
 for (const trait of Object.keys(data.numbers)) make("option", trait, find("trait")).value = trait;
 find("trait").addEventListener("change", drawChart);
 find("turn").addEventListener("input", drawDates);
 document.addEventListener("keydown", press);
 buildDates();
-buildTable();
-pick(0);
+show();
