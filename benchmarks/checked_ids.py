@@ -222,8 +222,8 @@ def main() -> None:
     if studies:
         print(f"{'by numbers of others':26}{'ARI':>9}{'lost':>9}{'won':>9}")
         for each in studies:
-            others = [other for other in studies if other.given.plant != each.given.plant]
-            print(f"{each.given.name:26}{judge(each, fit(others))}", flush=True)
+            if others := [other for other in studies if other.given.plant != each.given.plant]:
+                print(f"{each.given.name:26}{judge(each, fit(others))}", flush=True)
         print("fitted on all of them:", fit(studies))
 
 
