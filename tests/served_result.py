@@ -6,15 +6,20 @@ import http.client
 import json
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
-from mvseg.corrections.file import name_edits
+import pytest
+
+from mvseg.corrections.file import Corrections, name_edits
+from mvseg.results.result import Learned
 from mvseg.server.correction_server import CorrectionServer, Corrector
 from mvseg.server.open_result import OpenResult
+from mvseg.system.running import Cancelled
 
 WAIT = 60.0  # seconds, on a busy machine
 
@@ -32,6 +37,27 @@ def serve(folder: Path) -> Iterator[CorrectionServer]:
         server.shutdown()
         for thread in threads:
             thread.join()
+
+
+class Lesson:
+    """Stands in for `OpenResult.learn`: it tells of a step, and ends when it is told to, or cancelled."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go_on, self.learned_from = threading.Event(), list[Corrections]()
+
+        def learn(
+            opened: OpenResult, corrections: Corrections, is_old: Callable[[], bool], report: Callable[[str], None]
+        ) -> None:
+            self.learned_from.append(corrections)
+            report("learning: step 30 of 75")
+            while not self.go_on.wait(0.02):
+                if is_old():
+                    raise Cancelled
+            known, said = opened._known
+            opened.learned = replace(known, learned=Learned(weights=b"learned", rounds=1)), said
+
+        monkeypatch.setattr(OpenResult, "learn", learn)
+        monkeypatch.setattr(OpenResult, "can_learn", True)
 
 
 def ask(

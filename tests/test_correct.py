@@ -42,7 +42,7 @@ from mvseg.server.open_result import OpenResult, keep_numbers, open_alone
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
 from scene_folders import write_scene
-from served_result import WAIT, ask, save, save_text, serve, text_of, wait_until_computed
+from served_result import WAIT, Lesson, ask, save, save_text, serve, text_of, wait_until_computed
 
 
 @pytest.fixture(scope="module")
@@ -456,6 +456,86 @@ def test_edits_that_come_while_the_whole_result_is_made_are_kept(
     assert run_while(lambda: path.write_bytes(text_of(theirs))) == (200, {"said": "done"})
     assert json.loads(path.read_text())["edits"] == theirs
     assert ask(served, "GET", "state")[1]["isChanged"]
+
+
+def wait_for_news(served: CorrectionServer, state: dict[str, Any]) -> dict[str, Any]:
+    return dict(ask(served, "GET", f"state?after={state['number']}")[1])
+
+
+def test_a_detector_learns_beside_the_page(
+    served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is edited meanwhile is saved, and computed afterwards; the whole result is found by what was learned; and
+    it can be undone."""
+    lesson, (view, at) = Lesson(monkeypatch), middle(served.corrector.opened, 0)
+    runs: list[list[str]] = []
+
+    def run(command: list[str], **_: object) -> subprocess.CompletedProcess[str]:
+        runs.append([Path(word).read_text() if word.endswith(".safetensors") else word for word in command[3:8]])
+        return subprocess.CompletedProcess([], 0, "done\n", "")
+
+    monkeypatch.setattr("mvseg.server.correction_server.subprocess.run", run)
+    before = wait_until_computed(served)
+    assert before["learning"] == {"now": "", "isLearned": False, "seconds": 90 + 4 * 6}
+    assert ask(served, "POST", "learn")[0] == 200
+    state = before
+    while state["learning"]["now"] != "learning: step 30 of 75":
+        state = wait_for_news(served, state)
+    assert not state["update"]
+    assert save(served, [{"op": "reject", "view": view, "at": at}])[0] == 200
+    assert len(load_corrections(folder / "corrections.json").edits) == 1
+    for place in ("learn", "unlearn", "whole"):
+        status, refusal = ask(served, "POST", place)
+        assert (status, refusal["problem"]) == (409, "The detector is learning: wait until it is done, or cancel it.")
+    lesson.go_on.set()
+    while not state["learning"]["isLearned"] or state["isComputing"]:
+        state = wait_for_news(served, state)
+    assert state["update"]["numMasks"] == before["update"]["numMasks"] - 1
+    assert state["learning"]["now"] == ""
+    assert [len(each.edits) for each in lesson.learned_from] == [0]
+    assert ask(served, "POST", "whole")[0] == 200
+    assert ask(served, "POST", "unlearn")[0] == 200
+    (folder / "detector.safetensors").write_text("learned")  # as that run would have
+    state = wait_until_computed(served)
+    assert not state["learning"]["isLearned"]
+    assert state["number"] > before["number"]
+    assert ask(served, "POST", "whole")[0] == 200
+    (folder / "detector.safetensors").unlink()
+    assert ask(served, "POST", "whole")[0] == 200
+    assert [run[:1] for run in runs] == [["infer"]] * 3
+    assert [run[3:] for run in runs] == [
+        ["--detector", "learned"],
+        ["--learn", "off"],
+        ["--corrections", str(folder / "corrections.json")],
+    ]
+
+
+def test_learning_that_is_cancelled_or_fails_changes_nothing(
+    served: CorrectionServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert ask(served, "GET", "state")[1]["learning"] is None  # its masks were given
+    status, refusal = ask(served, "POST", "learn")
+    assert (status, refusal["problem"]) == (409, "No detector found these masks, so there is none that could learn.")
+    lesson = Lesson(monkeypatch)
+    state = wait_until_computed(served)
+    ask(served, "POST", "learn")
+    while not lesson.learned_from:
+        state = wait_for_news(served, state)
+    before = state["number"]
+    assert ask(served, "POST", "cancel")[0] == 200
+    while not state["number"] > before or state["learning"]["now"]:
+        state = wait_for_news(served, state)
+    assert (state["update"], state["problem"], state["learning"]["isLearned"]) == (None, "", False)
+
+    def fail(*_: object) -> None:
+        raise InputError("the views agree about 2 leaves.")
+
+    monkeypatch.setattr(OpenResult, "learn", fail)
+    ask(served, "POST", "learn")
+    while not state["problem"]:
+        state = wait_for_news(served, state)
+    assert (state["problem"], state["learning"]["now"]) == ("the views agree about 2 leaves.", "")
+    assert not state["isComputing"]
 
 
 def test_inputs_that_changed_or_moved_since(

@@ -14,7 +14,7 @@ from mvseg.runs.one_scene import run_one_scene
 from mvseg.server.correction_server import CorrectionServer
 from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from scene_folders import write_scene
-from served_result import serve, text_of
+from served_result import Lesson, serve, text_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
 
@@ -153,4 +153,27 @@ def test_a_file_that_another_program_has_changed_is_offered(
     tab.page.get_by_role("button", name="Reload").click()
     tab.wait_for("What you see follows from all edits.")
     assert len(tab.rows()) == 2
+    tab.page.close()
+
+
+def test_a_detector_learns_while_a_person_edits(
+    browser: sync_api.Browser, served: CorrectionServer, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lesson, tab = Lesson(monkeypatch), Tab(browser, served)
+    tab.wait_for("About 2 minutes for 4 photos on two processor cores; your edits stay, and it can be undone.")
+    tab.page.keyboard.press("t")
+    tab.wait_for("learning: step 30 of 75")
+    tab.press_on(0, 1, "r")
+    tab.wait_for("1 edit saved. It is computed when the detector has learned.")
+    assert ops(folder) == ["reject"]
+    tab.page.get_by_role("button", name="Cancel").click()
+    tab.wait_for("What you see follows from all edits.")
+    tab.page.get_by_role("button", name="Learn from these leaves").click()
+    tab.wait_for("learning: step 30 of 75")
+    lesson.go_on.set()
+    tab.wait_for("The detector has learned from these leaves.")
+    assert [len(each.edits) for each in lesson.learned_from] == [0, 1]
+    tab.page.get_by_role("button", name="Undo learning").click()
+    tab.wait_for("About 2 minutes")
+    assert len(tab.rows()) == 1
     tab.page.close()

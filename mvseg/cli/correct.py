@@ -53,6 +53,8 @@ def run(args: Namespace) -> int:
             server.serve_forever()
         except KeyboardInterrupt:
             command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE)
+            if opened.learned is not None:
+                print("\nWhat the detector has learned is in the whole result, if the page made it since.", flush=True)
             print(f"\nThe whole result with these corrections: {command}", flush=True)
         finally:
             corrector.close()

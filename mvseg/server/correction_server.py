@@ -19,6 +19,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Annotated, Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -39,6 +41,7 @@ HOST = "127.0.0.1"
 WAIT_SECONDS = 20.0  # that a page's question for news stays open
 LOOK_SECONDS = 1.0  # until it looks again whether another program has changed the edits
 MOST_CORNERS = 10_000
+LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # that learning takes on two cores, which the page says before
 CHANGED = "corrections.json was changed by another program since this page was loaded."
 
 
@@ -56,7 +59,10 @@ class _Rough(BaseModel):
 
 
 class Corrector:
-    """One open result, its newest edits, and a thread that computes their consequences; the newest edits win."""
+    """One open result, its newest edits, and a thread that computes their consequences; the newest edits win.
+
+    The same thread lets the detector learn: what is edited meanwhile is saved, and computed afterwards.
+    """
 
     def __init__(self, opened: OpenResult) -> None:
         """Raises InputError: the corrections saved in the folder, or a photo, cannot be read, or they are another
@@ -69,6 +75,8 @@ class Corrector:
         self.pictures = [draw_picture(photos(view), self.shown.masks, view=view, is_whole=True) for view in views]
         self.news = threading.Condition()
         self.wanted, self.computed = 1, 0
+        self.number, self.updated = 0, 0  # of all news, and of the newest result among them
+        self.learning, self.is_cancelled = "", False  # what is done of it, "" for nothing
         self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
         self.is_closing = False
@@ -157,17 +165,46 @@ class Corrector:
         """Work until `close`; for a thread of its own."""
         while True:
             with self.news:
-                self.news.wait_for(lambda: self.is_closing or self.wanted > self.computed)
+                self.news.wait_for(lambda: self.is_closing or self.learning or self.wanted > self.computed)
                 if self.is_closing:
                     return
-                wanted, corrections = self.wanted, self.corrections
-            self._compute_once(wanted, corrections)
+                wanted, corrections, is_learning = self.wanted, self.corrections, bool(self.learning)
+            if is_learning:
+                self._learn_once(corrections)
+            else:
+                self._compute_once(wanted, corrections)
+
+    def _learn_once(self, corrections: Corrections) -> None:
+        problem, wanted = self.problem, 0
+        try:
+            self.opened.learn(corrections, lambda: self.is_closing or self.is_cancelled, self._tell)
+            wanted = 1  # all follows anew
+        except Cancelled:
+            pass
+        except InputError as error:
+            problem = str(error)
+        except Exception as error:  # nor over this
+            problem = f"Nothing was learned ({type(error).__name__}: {error})."
+        with self.news:
+            self.wanted += wanted
+            self.learning, self.problem = "", problem
+            self._notify()
+
+    def _tell(self, said: str) -> None:
+        with self.news:
+            self.learning = said
+            self._notify()
+
+    def _notify(self) -> None:
+        """There is something new to hear of, for whoever holds the lock."""
+        self.number += 1
+        self.news.notify_all()
 
     def _compute_once(self, wanted: int, corrections: Corrections) -> None:
         outcomes, news = [""] * len(corrections.edits), (self.shown, self.pictures, self.update)
         try:
             shown, outcomes, messages = self.opened.recompute(
-                corrections, lambda: self.is_closing or self.wanted > wanted
+                corrections, lambda: self.is_closing or bool(self.learning) or self.wanted > wanted
             )
             sizes = shown.scene.cameras.sizes.tolist()
             pictures = [
@@ -185,26 +222,73 @@ class Corrector:
         with self.news:
             self.shown, self.pictures, self.update = news
             self.problem, self.outcomes, self.computed = problem, outcomes, wanted
-            self.news.notify_all()
+            self._notify()
+            self.updated = self.number
 
     def state(self, after: int) -> dict[str, Any]:
         """What the page shows, and the name of the edits that are saved (`revision`): at once for an `after` below 0,
         otherwise as soon as there is something newer."""
         with self.news:
             end = time.monotonic() + WAIT_SECONDS
-            while 0 <= after >= self.computed and not self.is_closing and time.monotonic() < end:
+            while 0 <= after >= self.number and not self.is_closing and time.monotonic() < end:
                 if self._is_changed():
                     break
                 self.news.wait(LOOK_SECONDS)
             return {
-                "number": self.computed,
+                "number": self.number,
                 "revision": name_edits(self.corrections.edits),
                 "isComputing": self.wanted > self.computed,
                 "isChanged": self._is_changed(),
                 "problem": self.problem,
                 "outcomes": self.outcomes,
-                "update": self.update if self.computed > after else None,
+                "update": self.update if self.updated > after else None,
+                "learning": self._describe_learning() if self.opened.can_learn else None,
             }
+
+    def _describe_learning(self) -> dict[str, Any]:
+        seconds = LEARN_SECONDS + LEARN_SECONDS_PER_PHOTO * len(self.opened.scene.views)
+        return {"now": self.learning, "isLearned": self.opened.learned is not None, "seconds": seconds}
+
+    def learn(self) -> dict[str, Any]:
+        """Let the detector learn the leaves that the views agree about, and those that a person outlined, see
+        `OpenResult.learn`; `state` says how far it is.
+
+        Raises:
+            Refused: there is no detector; it learns already, or the whole result is being made.
+        """
+        with self.news:
+            if not self.opened.can_learn:
+                raise Refused(HTTPStatus.CONFLICT, "No detector found these masks, so there is none that could learn.")
+            self._refuse_while_learning()
+            if self.making_whole.locked():
+                raise Refused(HTTPStatus.CONFLICT, "The whole result is being made: wait until it is there.")
+            self.learning, self.is_cancelled = "looking for what to learn from", False
+            self._notify()
+        return {}
+
+    def cancel(self) -> dict[str, Any]:
+        """Learn no further; all stays as it was."""
+        with self.news:
+            self.is_cancelled = True
+        return {}
+
+    def unlearn(self) -> dict[str, Any]:
+        """Go back to the detector before it learned.
+
+        Raises:
+            Refused: it learns.
+        """
+        with self.news:
+            self._refuse_while_learning()
+            if self.opened.learned is not None:
+                self.opened.learned = None
+                self.wanted += 1
+                self._notify()
+        return {}
+
+    def _refuse_while_learning(self) -> None:
+        if self.learning:
+            raise Refused(HTTPStatus.CONFLICT, "The detector is learning: wait until it is done, or cancel it.")
 
     def outline(self, text: bytes) -> dict[str, Any]:
         """An outline of what lies in a rough one, both in pixels of the user's photo.
@@ -229,10 +313,11 @@ class Corrector:
         return {"polygon": np.round(placed, 2).tolist()}
 
     def whole(self) -> dict[str, Any]:
-        """Make the whole result with the saved edits, in its place, by a process of its own, and say where it is.
+        """Make the whole result with the saved edits, and with what was learned, in its place, by a process of its own,
+        and say where it is.
 
         Raises:
-            Refused: it is being made already.
+            Refused: it is being made already, or the detector learns.
             InputError: the run ended with an error; its sentence.
         """
         if not self.making_whole.acquire(blocking=False):
@@ -241,13 +326,15 @@ class Corrector:
             folder = self.opened.folder.resolve()
             path = folder / CORRECTIONS_FILE
             with self.news:
+                self._refuse_while_learning()
                 if self._is_changed():
                     raise InputError(CHANGED)
                 write_corrections(path, self.corrections)
                 self.written, before = self._stamp(), self.corrections
-            words = ["infer", "--again", str(folder), "--corrections", str(path), "--quiet"]
-            command = [sys.executable, "-m", "mvseg.cli", *words]
-            run = subprocess.run(command, capture_output=True, text=True, check=False)
+            with TemporaryDirectory() as place:
+                words = ["infer", "--again", str(folder), *self.opened.again_with(Path(place))]
+                command = [sys.executable, "-m", "mvseg.cli", *words, "--corrections", str(path), "--quiet"]
+                run = subprocess.run(command, capture_output=True, text=True, check=False)
             with self.news:
                 self._keep_newer(before)
         finally:
@@ -316,6 +403,9 @@ class _Handler(BaseHTTPRequestHandler):
             {
                 "outline": lambda: self._json(corrector.outline(self._body())),
                 "whole": lambda: self._json(corrector.whole()),
+                "learn": lambda: self._json(corrector.learn()),
+                "cancel": lambda: self._json(corrector.cancel()),
+                "unlearn": lambda: self._json(corrector.unlearn()),
             }
         )
 

@@ -58,11 +58,12 @@ class OpenResult:
         """
         self.folder = folder
         self.run = read_recorded(folder)
+        self._detector = _read_detector(folder)
         changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
         self.notice = " ".join(("What you see is computed anew.", *changes)) if changes else ""
         saved = self.saved_corrections()  # the views that they name are taken
         config = self.run.config
-        if (folder / DETECTOR_FILE).is_file():  # it has learned this plant: nobody waits for that again
+        if self._detector is not None:  # it has learned this plant: nobody waits for that again
             config = replace(config, detect=replace(config.detect, weights=str(folder)), learn="off")
         self.opened = open_scene(self.run.scene, self.run.masks, config, corrections=saved)
         self.scene, self.photos = self.opened.scene, self.opened.photos
@@ -70,6 +71,11 @@ class OpenResult:
             raise InputError(f"{self.scene.views[0].path}: the photos of this result are gone, expected them there")
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self.learned: tuple[Known, list[str]] | None = None  # what is known since the detector learned the plant
+
+    @property
+    def can_learn(self) -> bool:
+        """Whether there is a detector, and views choose what it finds."""
+        return self.opened.is_chosen
 
     def saved_corrections(self) -> Corrections:
         """What was saved into the result folder before; none without the file."""
@@ -134,12 +140,28 @@ class OpenResult:
             raise InputError(f"{' '.join(said)}.")
         self.learned = learned, said
 
+    def again_with(self, place: Path) -> list[str]:
+        """The options of `mvseg infer --again` by which the whole result is found by the detector of what is shown,
+        whichever lies in the folder by now; its weights are written into the folder `place`."""
+        weights = self._detector if self.learned is None else self.learned[0].learned.weights
+        if weights == _read_detector(self.folder):
+            return []
+        if weights is None:
+            return ["--learn", "off"]
+        (place / DETECTOR_FILE).write_bytes(weights)
+        return ["--detector", str(place / DETECTOR_FILE)]
+
     @cached_property
     def _known(self) -> tuple[Known, list[str]]:
         """What is known without a person, and the warnings on the way; it stays."""
         with collect_warnings() as messages:
             known = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
         return known, messages
+
+
+def _read_detector(folder: Path) -> bytes | None:
+    path = folder / DETECTOR_FILE
+    return path.read_bytes() if path.is_file() else None
 
 
 def keep_numbers(result: Result, known: dict[str, int]) -> Result:

@@ -1,7 +1,7 @@
 // The mode "Correct": two photos side by side, what a person picks and draws in them, and what they say of it.
 
 const KEYS = { n: "next", s: "same", d: "different", r: "reject", R: "reject-all", c: "confirm", C: "confirm-all",
-  u: "undo", o: "outline", l: "split", b: "brush", e: "erase", a: "area" };
+  u: "undo", o: "outline", l: "split", b: "brush", e: "erase", a: "area", t: "learn" };
 const TOOLS = ["outline", "split", "brush", "erase", "area"];
 const RADIUS = { start: 12, least: 2, most: 80, step: 1.3 }; // of the brush, pixels of the screen
 
@@ -161,6 +161,7 @@ class Work {
     const wasAsked = this.doubt;
     if (op === "next") return this.next();
     if (op === "undo") return this.undo();
+    if (op === "learn") return this.server?.learn();
     if (TOOLS.includes(op)) return this.take(op);
     const found = this.editsOf(op, all !== undefined || ["few", "leaf"].includes(wasAsked?.kind));
     if (!found.length) return;

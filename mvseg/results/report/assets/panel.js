@@ -12,6 +12,7 @@ const HINTS = {
   erase: "Take away from what is painted, or from the mask that is picked here. [ and ]: size of the eraser.",
   split: "Draw a line across the mask, from edge to edge, where the two leaves meet. Esc: not now.",
   word: "Outlines with the same name, in several photos, show the same leaf.",
+  learned: "The detector has learned from these leaves. It is kept by the whole result.",
   saved: "Saved where your browser saves files. To have every photo follow: " +
     "mvseg infer SCENE --corrections corrections.json",
 };
@@ -24,7 +25,8 @@ class Panel {
     });
     this.file = element("input", { type: "file", accept: ".json,application/json", hidden: "" });
     this.file.addEventListener("change", () => this.load());
-    const names = ["ask", "picked", "tools", "list", "note", "state"];
+    this.progress = element("p", { class: "note" });
+    const names = ["ask", "picked", "tools", "list", "learn", "note", "state"];
     this.parts = Object.fromEntries(names.map((name) => [name, document.getElementById(`correct-${name}`)]));
     document.getElementById("correct").append(this.file);
     const { edits, outcomes } = work.data.correct;
@@ -52,6 +54,7 @@ class Panel {
     parts.picked.replaceChildren(...this.picked());
     parts.tools.replaceChildren(...this.tools());
     parts.list.replaceChildren(...this.list());
+    parts.learn.replaceChildren(...this.learning());
     const notes = [work.note, work.edits.problem, work.server?.problem];
     parts.note.replaceChildren(...notes.filter(Boolean).map((note) => element("span", {}, note)),
       ...(work.server?.isStale ? this.reload() : []));
@@ -157,6 +160,29 @@ class Panel {
         this.button("Load\u2026", null, () => this.file.click()),
         ...(server ? [this.button("Make the whole result", null, () => server.whole())] : [])),
     ];
+  }
+
+  // Where a detector found the masks, and the page is served.
+  learning() {
+    const { server } = this.work;
+    if (!server?.learning) return [];
+    const { now, isLearned, seconds } = server.learning;
+    const title = element("h2", {}, "A plant that the detector does not know");
+    if (now) {
+      this.showProgress();
+      return [title, this.progress, element("div", { class: "answers" },
+        this.button("Cancel", null, () => server.learn("cancel")))];
+    }
+    const cost = "The detector learns the leaves that the photos agree about, and your outlines, and looks again. " +
+      `About ${count(Math.ceil(seconds / 60), "minute")} for ${count(this.work.data.views.length, "photo")} on two ` +
+      "processor cores; your edits stay, and it can be undone.";
+    return [title, element("p", { class: "note" }, isLearned ? HINTS.learned : cost),
+      element("div", { class: "answers" }, this.action("learn", "Learn from these leaves"),
+        ...(isLearned ? [this.button("Undo learning", null, () => server.learn("unlearn"))] : []))];
+  }
+
+  showProgress() {
+    this.progress.textContent = `${this.work.server.learning.now}\u2026`;
   }
 
   row(edit, index) {

@@ -15,6 +15,7 @@ class Server {
     this.isComputing = true; // the masks do not follow from all edits yet
     this.base = work.data.correct.revision; // name of the edits that are saved, as far as this page knows
     this.own = new Set([this.base]); // names of all lists that it started from or saved
+    this.learning = null; // {now: what is done, "" for nothing; isLearned, seconds}; null: nothing can learn
     this.isStale = false; // another page has changed the edits: this one must not save over them
     work.edits.listen(() => {
       [this.unsaved, this.isComputing] = [true, true];
@@ -50,8 +51,9 @@ class Server {
         const { saved, revision } = await this.ask(`edits?base=${this.base}`, list);
         this.base = revision;
         this.own.add(revision);
-        const isDone = this.number > before;
-        this.tell({ saving: "" }, isDone ? this.state : `${count(saved, "edit")} saved. Computing what follows\u2026`);
+        const isDone = this.number > before && !this.learning?.now;
+        const next = this.learning?.now ? "It is computed when the detector has learned." : "Computing what follows\u2026";
+        this.tell({ saving: "" }, isDone ? this.state : `${count(saved, "edit")} saved. ${next}`);
       } catch (error) {
         this.isStale = error.status === 409;
         this.unsaved = !(error.status < 500); // what may go better later
@@ -76,7 +78,7 @@ class Server {
     }
   }
 
-  hear({ number, revision, outcomes, update, problem, isComputing, isChanged }) {
+  hear({ number, revision, outcomes, update, problem, isComputing, isChanged, learning }) {
     if (isChanged || !this.own.has(revision)) {
       this.isStale = true;
       const who = isChanged ? "Another program has changed corrections.json." : "Another page has changed the edits.";
@@ -84,13 +86,16 @@ class Server {
       return;
     }
     const isFirst = this.number < 0;
-    Object.assign(this, { number, outcomes, isComputing: isComputing || this.unsaved });
+    const goesOn = this.learning?.now && learning.now && !update;
+    Object.assign(this, { number, outcomes, learning, isComputing: isComputing || this.unsaved });
+    if (goesOn) return this.work.panel.showProgress(); // no button changes under the pointer
     if (update) {
       this.isNewer ||= !isFirst;
       this.work.update(update);
     }
     const done = update || !problem ? "What you see follows from all edits." : "";
-    this.tell({ state: problem }, isComputing ? "Computing what follows from the edits\u2026" : done);
+    const later = learning?.now ? "Edits are saved, and computed when the detector has learned." : "";
+    this.tell({ state: problem }, later || (isComputing ? "Computing what follows from the edits\u2026" : done));
   }
 
   // A rough outline becomes that of the leaf inside it.
@@ -118,6 +123,17 @@ class Server {
       this.tell({ whole: "" }, said);
     } catch (error) {
       this.tell({ whole: `The whole result was not made: ${error.message}` }, "");
+    }
+  }
+
+  // What the detector knows: "learn" from these leaves, "cancel" that, or "unlearn".
+  async learn(what = "learn") {
+    if (!this.learning || (what === "learn" && this.learning.now)) return;
+    try {
+      await this.ask(what, { method: "POST" });
+      this.tell({ learning: "" }, this.state);
+    } catch (error) {
+      this.tell({ learning: error.message }, this.state);
     }
   }
 
