@@ -49,6 +49,18 @@ def grown(blades: Blades, factor: float) -> Blades:
     return {leaf: blade[0, 1] + factor * (blade - blade[0, 1]) for leaf, blade in blades.items()}
 
 
+def turned(blades: Blades, degrees: float) -> Blades:
+    """The whole plant about the stem."""
+    pot = Rotation.from_euler("z", degrees, degrees=True)
+    return {leaf: pot.apply(blade.reshape(-1, 3)).reshape(blade.shape) for leaf, blade in blades.items()}
+
+
+def opposite_leaves(count: int) -> Blades:
+    """Pairs of leaves that stand opposite each other: the plant looks the same from behind."""
+    blades = grow_blades(count, 5)
+    return blades | {leaf + count: blade for leaf, blade in turned(blades, 180).items()}
+
+
 def see(
     blades: Mapping[int, Floats],
     time: float,

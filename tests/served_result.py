@@ -15,19 +15,32 @@ from urllib.parse import urlsplit
 
 import pytest
 
+from mvseg.cli import main
 from mvseg.corrections.file import Corrections, name_edits
 from mvseg.results.result import Learned
-from mvseg.server.correction_server import CorrectionServer, Corrector
+from mvseg.server.correction_server import Corrector
+from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult
+from mvseg.server.open_tracks import OpenTracks
 from mvseg.system.running import Cancelled
+from tests.plants_over_days import opposite_leaves, turned, write_result
 
 WAIT = 60.0  # seconds, on a busy machine
 
 
+def write_two_ways(folder: Path) -> Path:
+    """Tracks of a plant on two dates that looks the same from behind: each link may as well be to the leaf behind."""
+    for name, degrees in (("a", 0), ("b", 40)):
+        write_result(folder / name, turned(opposite_leaves(3), degrees))
+    results, out = [str(folder / name) for name in ("a", "b")], str(folder / "tracks")
+    assert main(["track", *results, "--times", "0", "1", "--pots", "turned", "--out", out, "--quiet"]) == 0
+    return folder / "tracks"
+
+
 @contextmanager
-def serve(folder: Path) -> Iterator[CorrectionServer]:
-    """The server of a result folder, which computes, too."""
-    corrector = Corrector(OpenResult(folder))
+def serve(what: Path | OpenTracks) -> Iterator[CorrectionServer]:
+    """The server of a result folder, or of tracks, which computes, too."""
+    corrector = Corrector[OpenResult | OpenTracks](OpenResult(what) if isinstance(what, Path) else what)
     with CorrectionServer(corrector) as server:
         threads = [threading.Thread(target=work) for work in (server.serve_forever, corrector.compute)]
         for thread in threads:
@@ -98,3 +111,7 @@ def wait_until_computed(server: CorrectionServer) -> dict[str, Any]:
             return dict(state)
         time.sleep(0.02)
     raise AssertionError("nothing was computed")
+
+
+def wait_for_news(server: CorrectionServer, state: dict[str, Any]) -> dict[str, Any]:
+    return dict(ask(server, "GET", f"state?after={state['number']}")[1])

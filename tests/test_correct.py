@@ -37,12 +37,13 @@ from mvseg.regions import regions_from_label_maps
 from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.scene import Scene, View
-from mvseg.server.correction_server import CHANGED, CorrectionServer, Corrector
+from mvseg.server.correction_server import CHANGED, Corrector
+from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult, keep_numbers, open_alone
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
 from scene_folders import write_scene
-from served_result import WAIT, Lesson, ask, save, save_text, serve, text_of, wait_until_computed
+from served_result import WAIT, Lesson, ask, save, save_text, serve, text_of, wait_for_news, wait_until_computed
 
 
 @pytest.fixture(scope="module")
@@ -456,10 +457,6 @@ def test_edits_that_come_while_the_whole_result_is_made_are_kept(
     assert run_while(lambda: path.write_bytes(text_of(theirs))) == (200, {"said": "done"})
     assert json.loads(path.read_text())["edits"] == theirs
     assert ask(served, "GET", "state")[1]["isChanged"]
-
-
-def wait_for_news(served: CorrectionServer, state: dict[str, Any]) -> dict[str, Any]:
-    return dict(ask(served, "GET", f"state?after={state['number']}")[1])
 
 
 def test_a_detector_learns_beside_the_page(

@@ -11,7 +11,7 @@ import pytest
 
 from mvseg.config import RunConfig
 from mvseg.runs.one_scene import run_one_scene
-from mvseg.server.correction_server import CorrectionServer
+from mvseg.server.local_server import CorrectionServer
 from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from scene_folders import write_scene
 from served_result import Lesson, serve, text_of

@@ -1,4 +1,4 @@
-"""Correct a result in the browser: served to this machine only, saved after every edit."""
+"""Correct a result, or tracks, in the browser: served to this machine only, saved after every edit."""
 
 from __future__ import annotations
 
@@ -16,7 +16,8 @@ from mvseg.errors import InputError
 
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
-    parser.add_argument("result", type=Path, help="result folder of mvseg infer or match")
+    parser.add_argument("result", type=Path, help="result folder of mvseg infer or match, or output of mvseg track")
+    parser.add_argument("--plant", type=str | None, help="of an output of mvseg track with several plants")
     parser.add_argument("--no_browser", action="store_true", help="only print the address, do not open the browser")
     add_shared(parser, "num_workers")
 
@@ -27,22 +28,28 @@ def run(args: Namespace) -> int:
 
     from mvseg.results.read import find_result
     from mvseg.runs.recorded_run import repeat_command
-    from mvseg.server.correction_server import CorrectionServer, Corrector
-    from mvseg.server.open_result import CORRECTIONS_FILE, OpenResult, check_writable, open_alone
+    from mvseg.server.correction_server import CORRECTIONS_FILE, Corrector
+    from mvseg.server.local_server import CorrectionServer
+    from mvseg.server.open_result import OpenResult, check_writable, open_alone
+    from mvseg.server.open_tracks import OpenTracks
     from mvseg.system.running import running
     from mvseg.system.worker_pool import default_workers
+    from mvseg.tracking.recorded import is_tracks
 
-    folder = find_result(args.result)
+    has_tracks = is_tracks(args.result)
+    folder = args.result if has_tracks else find_result(args.result)
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder, expected a result of mvseg infer")
+    if args.plant is not None and not has_tracks:
+        raise InputError(f"{folder}: holds one plant, expected --plant with an output of mvseg track only")
     check_writable(folder)
     num_workers = default_workers() if args.num_workers is None else args.num_workers
     with open_alone(folder), ExitStack() as stack:
-        stack.enter_context(running(num_workers=num_workers, keep=True))
-        opened = OpenResult(folder)
+        stack.enter_context(running(num_workers=1 if has_tracks else num_workers, keep=True))
+        opened: OpenResult | OpenTracks = OpenTracks(folder, args.plant) if has_tracks else OpenResult(folder)
         if opened.notice:
             print(f"mvseg: {opened.notice}", file=sys.stderr)
-        corrector = Corrector(opened)
+        corrector = Corrector[OpenResult | OpenTracks](opened)
         server = stack.enter_context(CorrectionServer(corrector))
         computing = threading.Thread(target=copy_context().run, args=(corrector.compute,))
         try:
@@ -52,10 +59,12 @@ def run(args: Namespace) -> int:
                 webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
-            command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE)
-            if opened.learned is not None:
+            verb = "track" if has_tracks else "infer"
+            command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE, verb=verb)
+            if opened.learner is not None and opened.learner.is_learned:
                 print("\nWhat the detector has learned is in the whole result, if the page made it since.", flush=True)
-            print(f"\nThe whole result with these corrections: {command}", flush=True)
+            what = "tables and page" if has_tracks else "whole result"
+            print(f"\nThe {what} with these corrections: {command}", flush=True)
         finally:
             corrector.close()
             stack.close()  # the workers stop, whatever they are doing

@@ -84,9 +84,9 @@ def record_places(scene: Path, out: Path, masks: Path | None, corrections: Path 
     return absolute | {"from_here": {name: path_from(out, path) for name, path in absolute.items() if path is not None}}
 
 
-def repeat_command(folder: Path, corrections: Path) -> str:
-    """The command that makes the whole result again, with its options and with corrections."""
-    return shlex.join(["mvseg", "infer", "--again", str(folder), "--corrections", str(corrections)])
+def repeat_command(folder: Path, corrections: Path, *, verb: str = "infer") -> str:
+    """The command that makes the whole result, or tracks, again, with its options and with corrections."""
+    return shlex.join(["mvseg", verb, "--again", str(folder), "--corrections", str(corrections)])
 
 
 def _list_changes(folder: Path, said: RunRecord) -> list[str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
@@ -11,14 +12,20 @@ from functools import cached_property
 from itertools import count
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Annotated, Any
 
+import numpy as np
 import torch
+from pydantic import BaseModel, Field
 from torch import Tensor
 
-from mvseg.corrections.file import Corrections, load_corrections
+from mvseg.corrections.file import Corrections, Point, load_corrections
+from mvseg.corrections.rough_outline import refine_outline
+from mvseg.corrections.same_scene import check_made_for, mark_photos, with_marks
 from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detectors.weights_file import DETECTOR_FILE
-from mvseg.errors import InputError, collect_warnings
+from mvseg.errors import InputError, InputWarning, collect_warnings
+from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
@@ -31,12 +38,20 @@ from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.regions import stack_regions
 from mvseg.results.read import load_result
 from mvseg.results.report.correct import describe_fate
+from mvseg.results.report.page import build_page, describe_update
+from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
+from mvseg.server.correction_server import CORRECTIONS_FILE, Update
 from mvseg.system.atomic import lock_place
 from mvseg.system.running import running
 
-CORRECTIONS_FILE = "corrections.json"
+MOST_CORNERS = 10_000
+
+
+class _Rough(BaseModel):
+    view: str
+    polygon: Annotated[list[Point], Field(min_length=3, max_length=MOST_CORNERS)]
 
 
 class OpenResult:
@@ -69,6 +84,8 @@ class OpenResult:
         self.scene, self.photos = self.opened.scene, self.opened.photos
         if not self.photos.exist:
             raise InputError(f"{self.scene.views[0].path}: the photos of this result are gone, expected them there")
+        self.answers = {"outline": self.outline}
+        self.marks = mark_photos(self.photos)
         self._numbers: dict[str, int] = {}  # of the leaf that each mask showed last
         self.learned: tuple[Known, list[str]] | None = None  # what is known since the detector learned the plant
 
@@ -76,6 +93,57 @@ class OpenResult:
     def can_learn(self) -> bool:
         """Whether there is a detector, and views choose what it finds."""
         return self.opened.is_chosen
+
+    @property
+    def learner(self) -> OpenResult | None:
+        """Itself, where there is a detector that may learn."""
+        return self if self.can_learn else None
+
+    @property
+    def is_learned(self) -> bool:
+        """Whether the detector has learned the plant since this was opened."""
+        return self.learned is not None
+
+    @property
+    def num_views(self) -> int:
+        return len(self.scene.views)
+
+    def read_edits(self) -> tuple[Corrections, str]:
+        """The edits in the folder, and what a person should know of them."""
+        found = self.saved_corrections()
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", InputWarning)
+            check_made_for(found, self.photos)
+        return found, " ".join(filter(None, (self.notice, *(f"{each.message}." for each in caught))))
+
+    def mark(self, corrections: Corrections) -> Corrections:
+        """The edits with the marks of the photos that they name."""
+        return with_marks(corrections, self.scene, self.marks)
+
+    def page(self, corrections: Corrections) -> str:
+        """The page with the newest result, and with all edits."""
+        shown, pictures = self._shown
+        shown = replace(shown, corrections=corrections)
+        return build_page(shown, pictures, run=self.run.said.as_json(), is_served=True)
+
+    def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
+        """What follows from the edits, see `recompute`."""
+        shown, outcomes, messages = self.recompute(corrections, is_old)
+        sizes = shown.scene.cameras.sizes.tolist()
+        pictures = [
+            picture.with_masks(shown.masks, view=view, size=tuple(sizes[view]))
+            for view, picture in enumerate(self._shown[1])
+        ]
+        news = describe_update(shown, pictures)
+        self._shown = shown, pictures
+        yield Update(news, outcomes, messages)
+
+    @cached_property
+    def _shown(self) -> tuple[Result, list[Picture]]:
+        """The newest result, and a picture of each view; at first, what lies in the folder."""
+        saved = self.saved_result()
+        views = range(len(self.scene.views))
+        return saved, [draw_picture(self.photos(view), saved.masks, view=view, is_whole=True) for view in views]
 
     def saved_corrections(self) -> Corrections:
         """What was saved into the result folder before; none without the file."""
@@ -140,9 +208,16 @@ class OpenResult:
             raise InputError(f"{' '.join(said)}.")
         self.learned = learned, said
 
-    def again_with(self, place: Path) -> list[str]:
-        """The options of `mvseg infer --again` by which the whole result is found by the detector of what is shown,
+    def unlearn(self) -> None:
+        """Go back to the detector before it learned."""
+        self.learned = None
+
+    def again(self, place: Path) -> list[str]:
+        """`mvseg infer --again`, with options by which the whole result is found by the detector of what is shown,
         whichever lies in the folder by now; its weights are written into the folder `place`."""
+        return ["infer", "--again", str(self.folder.resolve()), *self._again_with(place)]
+
+    def _again_with(self, place: Path) -> list[str]:
         weights = self._detector if self.learned is None else self.learned[0].learned.weights
         if weights == _read_detector(self.folder):
             return []
@@ -150,6 +225,28 @@ class OpenResult:
             return ["--learn", "off"]
         (place / DETECTOR_FILE).write_bytes(weights)
         return ["--detector", str(place / DETECTOR_FILE)]
+
+    def outline(self, text: bytes) -> dict[str, Any]:
+        """An outline of what lies in a rough one, both in pixels of the user's photo.
+
+        Raises:
+            InputError: a request of another form, no such view, or nothing to outline.
+        """
+        scene = self.scene
+        try:
+            asked = _Rough.model_validate_json(text)
+            view = [each.name for each in scene.views].index(asked.view)
+        except ValueError:
+            what = '{"view": name of a photo, "polygon": [[x, y], ...]}'
+            raise InputError(f"expected {what}, 3 to {MOST_CORNERS} points in the photo") from None
+        rough = np.array(asked.polygon)
+        lens, K = scene.views[view].lens, scene.cameras.K[view].cpu().numpy()
+        straight = rough if lens is None else pinhole_from_photo(lens, K, rough)
+        if not np.isfinite(straight).all():
+            raise InputError("the rough outline leaves what the lens shows")
+        found = refine_outline(self.photos(view), straight)
+        placed = found if lens is None else photo_from_pinhole(lens, K, found)
+        return {"polygon": np.round(placed, 2).tolist()}
 
     @cached_property
     def _known(self) -> tuple[Known, list[str]]:

@@ -46,6 +46,7 @@ def build_page(plant: str, data: Mapping[str, Any]) -> str:
     return Template((ASSETS / "tracks.page.html").read_text(encoding="utf-8")).substitute(
         title=html.escape(f"{plant} - mvseg track"),
         style="".join((ASSETS / name).read_text(encoding="utf-8") for name in styles),
+        connect="; connect-src 'self'" if is_served else "",
         correct=(ASSETS / "correct.part.html").read_text(encoding="utf-8") if is_served else "",
         data=dump_inside_script(data),
         script="\n".join(script.read_text(encoding="utf-8") for script in scripts),

@@ -6,23 +6,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.spatial.transform import Rotation
 
 from mvseg.tracking.associate import Association, link_leaves, sum_over_poses
 from mvseg.tracking.compare import Comparison, compare_dates
 from mvseg.tracking.leaves import leaves_of
-from tests.plants_over_days import Blades, grow_blades, see
-
-HALF_TURN = Rotation.from_euler("z", 180, degrees=True)
-
-
-def opposite_leaves(count: int) -> Blades:
-    """Pairs of leaves that stand opposite each other: the plant looks the same from behind."""
-    blades = grow_blades(count, 5)
-    behind = {
-        leaf + count: HALF_TURN.apply(blade.reshape(-1, 3)).reshape(blade.shape) for leaf, blade in blades.items()
-    }
-    return blades | behind
+from tests.plants_over_days import Blades, grow_blades, opposite_leaves, see
 
 
 def link_two(blades: Blades) -> tuple[list[Association], Comparison]:

@@ -9,8 +9,7 @@ import numpy as np
 from mvseg.system.running import running
 from mvseg.tracking.questions import MOST_QUESTIONS, describe_changes, list_questions
 from mvseg.tracking.track import Tracks, track_leaves
-from tests.plants_over_days import grow_blades, see, true_tracks
-from tests.tracking.test_compare import opposite_leaves
+from tests.plants_over_days import grow_blades, opposite_leaves, see, true_tracks
 
 
 def in_two_ways() -> tuple[Tracks, list[list[int]]]:

@@ -75,7 +75,7 @@ class TrackWork {
 
   say(op, one, other) {
     this.note = `${this.nameOf(one)} and ${this.nameOf(other)}: ${op === "same_track" ? "the same" : "not the same"}.`;
-    pick(one.track);
+    pick(0);
     this.edits.add({ op, at: [this.placeOf(one), this.placeOf(other)] });
   }
 
@@ -99,18 +99,18 @@ class TrackWork {
   }
 
   answer(op) {
-    const asked = this.question();
+    const asked = this.sight ? null : this.question();
     if (asked) this.say(op, asked.before, asked.after);
   }
 
   next() {
+    if (this.sight) return this.look(null);
     const asked = (data.questions ?? []).find((one) => !this.skipped.has(this.keyOf(one)));
     if (asked) this.skipped.add(this.keyOf(asked));
     else this.skipped.clear();
     this.note = "";
-    this.changed();
-    const now = this.question();
-    if (now) pick(now.before.track);
+    pick(0);
+    return this.changed();
   }
 
   press(event) {

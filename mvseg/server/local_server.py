@@ -1,0 +1,152 @@
+"""A page at 127.0.0.1 that corrects something.
+
+It can be reached from this machine only, and only with the token in its address: requests that name another host or
+come from another page's origin are refused, which keeps out other users' browsers and pages that rebind their name.
+"""
+
+from __future__ import annotations
+
+import hmac
+import json
+import re
+import secrets
+from collections.abc import Callable, Mapping
+from functools import partial
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import TYPE_CHECKING, Any
+from urllib.parse import parse_qs, urlsplit
+
+from mvseg.corrections.file import MOST_BYTES
+from mvseg.errors import InputError
+
+if TYPE_CHECKING:
+    from mvseg.server.correction_server import Corrector
+
+HOST = "127.0.0.1"
+
+
+class Refused(Exception):
+    """A request that is not answered, with the status and a sentence."""
+
+    def __init__(self, status: HTTPStatus, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status = status
+
+
+class CorrectionServer(ThreadingHTTPServer):
+    """Serves one `Corrector` on a free port of this machine.
+
+    Attributes:
+        token: part of every address that is answered.
+        address: of the page.
+    """
+
+    daemon_threads = True
+
+    def __init__(self, corrector: Corrector[Any], port: int = 0) -> None:
+        self.corrector, self.token = corrector, secrets.token_urlsafe(24)
+        super().__init__((HOST, port), _Handler)
+        self.address = f"http://{HOST}:{self.server_port}/{self.token}/"
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """A page that was closed meanwhile is no news."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: CorrectionServer
+    protocol_version = "HTTP/1.1"
+    timeout = 60
+
+    def do_GET(self) -> None:
+        corrector, is_number = self.server.corrector, re.compile("[0-9]{1,15}").fullmatch
+
+        def state() -> None:
+            asked = self._asked("after")
+            self._json(corrector.state(int(asked) if is_number(asked) else -1))
+
+        self._answer({"": lambda: self._send(corrector.page(), "text/html; charset=utf-8"), "state": state})
+
+    def do_PUT(self) -> None:
+        self._answer({"edits": lambda: self._json(self.server.corrector.save(self._body(), self._asked("base")))})
+
+    def do_POST(self) -> None:
+        corrector = self.server.corrector
+        asked = {
+            place: partial(lambda answer: self._json(answer(self._body())), answer)
+            for place, answer in corrector.opened.answers.items()
+        }
+        self._answer(
+            {
+                **asked,
+                "whole": lambda: self._json(corrector.whole()),
+                "learn": lambda: self._json(corrector.learn()),
+                "cancel": lambda: self._json(corrector.cancel()),
+                "unlearn": lambda: self._json(corrector.unlearn()),
+            }
+        )
+
+    def _answer(self, places: Mapping[str, Callable[[], None]]) -> None:
+        try:
+            if (place := self._place()) not in places:
+                raise Refused(HTTPStatus.NOT_FOUND, "There is nothing here.")
+            places[place]()
+        except Refused as error:
+            self._json({"problem": str(error)}, error.status)
+        except InputError as error:
+            self._json({"problem": str(error)}, HTTPStatus.BAD_REQUEST)
+        except ConnectionError:
+            self.close_connection = True
+        except OSError as error:
+            folder = self.server.corrector.opened.folder
+            sentence = f"{folder}: the edit could not be saved ({error.strerror})"
+            self._json({"problem": sentence}, HTTPStatus.INTERNAL_SERVER_ERROR)
+
+    def _place(self) -> str:
+        """The requested path, below the token.
+
+        Raises:
+            Refused: by another name of this machine, from another page, without the token, or no address at all.
+        """
+        own = f"{HOST}:{self.server.server_port}"
+        origin = self.headers.get("Origin")
+        if self.headers.get("Host") != own or (origin is not None and origin != f"http://{own}"):
+            raise Refused(HTTPStatus.FORBIDDEN, "This address is only for the page that mvseg correct opens.")
+        try:
+            path = urlsplit(self.path).path
+        except ValueError:  # http://[
+            raise Refused(HTTPStatus.BAD_REQUEST, "The address cannot be read.") from None
+        token, _, place = path.lstrip("/").partition("/")
+        if not hmac.compare_digest(token.encode(), self.server.token.encode()):
+            raise Refused(HTTPStatus.FORBIDDEN, "The token is missing or old: open what mvseg correct prints.")
+        return place
+
+    def _asked(self, name: str) -> str:
+        """What the address says after the question mark; "" for nothing."""
+        return parse_qs(urlsplit(self.path).query).get(name, [""])[0]
+
+    def _body(self) -> bytes:
+        length = self.headers.get("Content-Length", "")
+        if not (length.isascii() and length.isdigit() and len(length) < 16):
+            raise Refused(HTTPStatus.LENGTH_REQUIRED, "The request does not say how long it is.")
+        if int(length) > MOST_BYTES:
+            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"More than {MOST_BYTES // 2**20} MiB are not read.")
+        return self.rfile.read(int(length))
+
+    def _json(self, content: Mapping[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:
+        if status != HTTPStatus.OK:
+            self.close_connection = True  # what was sent may not have been read
+        self._send(json.dumps(content, default=str).encode(), "application/json", status)
+
+    def _send(self, body: bytes, kind: str, status: HTTPStatus = HTTPStatus.OK) -> None:
+        self.send_response(status)
+        headers = {"Content-Type": kind, "Content-Length": str(len(body)), "Cache-Control": "no-store",
+                   "X-Content-Type-Options": "nosniff", "X-Frame-Options": "DENY", "Referrer-Policy": "no-referrer",
+                   "Cross-Origin-Resource-Policy": "same-origin"}  # fmt: skip
+        for name, value in (headers | ({"Connection": "close"} if self.close_connection else {})).items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(body)
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """The terminal is for the person: nothing."""

@@ -1,0 +1,138 @@
+"""Tracks that a person corrects: links between dates; each edit tracks the plant anew."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mvseg.corrections.file import Corrections, dump_edits, load_corrections, name_edits
+from mvseg.corrections.track_links import LeafLink
+from mvseg.errors import InputError
+from mvseg.formats.find_views import list_some
+from mvseg.server.correction_server import CORRECTIONS_FILE, Update
+from mvseg.system.running import Cancelled
+from mvseg.tracking.growth import measure_growth
+from mvseg.tracking.page import build_page, describe_tracks
+from mvseg.tracking.pictures import LARGE_SIDE
+from mvseg.tracking.questions import Question, describe_changes, list_questions
+from mvseg.tracking.recorded import PlantResults, RecordedTracks, find_plant_links, read_recorded_tracks
+from mvseg.tracking.track import Tracks, track_leaves
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """What a page shows: tracks, and what follows from them for it."""
+
+    tracks: Tracks
+    data: dict[str, Any]
+
+
+class OpenTracks:
+    """The folder of `mvseg track`, and one of its plants.
+
+    Attributes:
+        folder: of the tracks.
+        answers, learner, notice: there are none, see `Opened` and `OpenResult`.
+        recorded: the run that made them.
+        plant: that is corrected.
+    """
+
+    learner, notice = None, ""
+
+    def __init__(self, folder: Path, plant: str | None = None) -> None:
+        """Read the results of the plant's dates.
+
+        Raises:
+            InputError: see `read_recorded_tracks` and `track_leaves`; there is no such plant, or several and none is
+                named.
+        """
+        self.folder, self.answers = folder, dict[str, Callable[[bytes], Mapping[str, Any]]]()
+        self.recorded = read_recorded_tracks(folder)
+        self.plant = _choose_plant(self.recorded, plant)
+        self.dates = self.plant.read(pictures=LARGE_SIDE)
+        self._shown = self._track(self._links(self.read_edits()[0])[0])
+
+    def read_edits(self) -> tuple[Corrections, str]:
+        """The edits in the folder, or else those that the tracks were made with."""
+        own, given = self.folder / CORRECTIONS_FILE, self.recorded.corrections
+        path = own if own.is_file() else given
+        return (Corrections() if path is None else load_corrections(path)), self.notice
+
+    def mark(self, corrections: Corrections) -> Corrections:
+        """The edits as they are: links between dates name scenes, not photos alone."""
+        return corrections
+
+    def page(self, corrections: Corrections) -> str:
+        """The page with the newest tracks, and with all edits."""
+        correct = {
+            "key": "", "isServed": True, "photos": {}, "edits": dump_edits(corrections.edits),
+            "revision": name_edits(corrections.edits),
+        }  # fmt: skip
+        return build_page(self.plant.plant, self._shown.data | {"correct": correct})
+
+    def updates(self, corrections: Corrections, is_old: Callable[[], bool]) -> Iterator[Update]:
+        """The tracks with these edits; then, what the answers to each question would change.
+
+        Raises:
+            Cancelled: `is_old` said so.
+            InputError: see `track_leaves`.
+        """
+        links, outcomes = self._links(corrections)
+        self._shown = shown = self._track(links)
+        yield Update(_without_pictures(shown.data), outcomes, [])
+        questions = []
+        for question in list_questions(shown.tracks, links):
+            if is_old():
+                raise Cancelled
+            questions.append(_describe_question(question) | {"changes": self._changes(question, links)})
+        shown.data["questions"] = questions
+        yield Update(_without_pictures(shown.data), outcomes, [])
+
+    def again(self, _: Path) -> list[str]:
+        """`mvseg track --again`: the tables of all plants."""
+        return ["track", "--again", str(self.folder.resolve())]
+
+    def _links(self, corrections: Corrections) -> tuple[list[LeafLink], list[str]]:
+        """What a person says, and what hinders each edit; "" for nothing."""
+        links, problems = find_plant_links(corrections.edits, self.dates)
+        return links, [problems.get(index, "") for index in range(len(corrections.edits))]
+
+    def _track(self, links: Sequence[LeafLink]) -> _Shown:
+        tracks = self._track_with(links)
+        data = describe_tracks(tracks, measure_growth(tracks))
+        data["questions"] = [_describe_question(each) for each in list_questions(tracks, links)]
+        return _Shown(tracks, data)
+
+    def _track_with(self, links: Sequence[LeafLink]) -> Tracks:
+        return track_leaves(self.dates, links=links, pots=self.recorded.pots, plant=self.plant.plant)
+
+    def _changes(self, question: Question, links: Sequence[LeafLink]) -> list[str]:
+        """What is different if the tracks are wrong there."""
+        with suppress(InputError):  # it contradicts what was said before
+            other = question.link(self._shown.tracks, is_same=not question.is_linked)
+            return describe_changes(self._shown.tracks, self._track_with([*links, other]))
+        return []
+
+
+def _choose_plant(recorded: RecordedTracks, name: str | None) -> PlantResults:
+    found = [each for each in recorded.plants if name in (None, each.plant)]
+    if len(found) == 1:
+        return found[0]
+    names = list_some([each.plant for each in recorded.plants])
+    what = f"holds {len(found)} plants" if name is None else f"holds no plant {name}"
+    raise InputError(f"{recorded.folder}: {what}, expected one of {names} with --plant")
+
+
+def _describe_question(question: Question) -> dict[str, Any]:
+    """As the page reads it; "changes" are None until they are known."""
+    return {"before": question.before, "after": question.after, "isLinked": question.is_linked,
+            "doubt": round(question.doubt, 3), "changes": None}  # fmt: skip
+
+
+def _without_pictures(data: Mapping[str, Any]) -> dict[str, Any]:
+    """What may have changed of what the page shows: pictures of leaves stay."""
+    leaves = [{k: v for k, v in leaf.items() if k not in ("crop", "place")} for leaf in data["leaves"]]
+    return {**data, "leaves": leaves}
