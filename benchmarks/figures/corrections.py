@@ -1,4 +1,4 @@
-"""Draws the pictures of docs/correcting.md: `python benchmarks/figures/corrections.py --folder DIR`
+"""Draws the pictures of docs/corrections.md: `python benchmarks/figures/corrections.py --folder DIR`
 
 The shipped plant gets masks with a segmenter's faults; a person, driven by playwright, opens the page of the result in
 chromium. A result that is in DIR is not made again.
