@@ -51,9 +51,9 @@ class Scales:
     parting: float
 
 
-# `python benchmarks/fit_costs.py` fits both, on seedlings, a maize, a basil and simulated plants, in true poses; `grown`
-# of links, whose fit is 0.233, was chosen (docs/notes/tracking.md). Poses are found by bases and directions: midribs lie
-# near each other in poses that are exact only.
+# `python benchmarks/fit_costs.py` fits both, on seedlings, a maize, a basil and simulated plants, in true poses;
+# `grown` of links, whose fit is 0.233, was chosen (docs/notes/tracking.md). Poses are found by bases and directions:
+# midribs lie near each other in poses that are exact only.
 POSES = Scales(across=0.223, along=0.028, stretch=0.226, turn=0.288, growth=0.262, grown=0.503, size=0.104,
                spurt=0.296, loose=0.301, lines=0.0, near=1.0, parting=7.969)  # fmt: skip
 LINKS = Scales(across=0.640, along=0.044, stretch=0.742, turn=0.420, growth=0.325, grown=0.1, size=0.112,
