@@ -89,6 +89,21 @@ def test_contributors_read_the_floors_as_they_are() -> None:
     assert "\n".join("  ".join(rooms) for rooms in FLOORS) in page
 
 
+def test_contributors_find_every_room_benchmark_and_script() -> None:
+    """A room says what it does in its `__init__.py`; tables name all scripts that run, and all of the pages."""
+    rooms = {module.rpartition(".")[0] for module in MODULES} - {""}
+    docstrings = {room: ast.get_docstring(ast.parse(MODULES.get(f"{room}.__init__", ""))) for room in rooms}
+    assert {room for room, docstring in docstrings.items() if not docstring} == set()
+    cells = [line.split("|")[1] for line in (ROOT / "CONTRIBUTING.md").read_text("utf-8").splitlines() if "|" in line]
+    named = {name for cell in cells for name in re.findall(r"`([\w/.]+)`", cell)}
+    home = ROOT / "benchmarks"
+    scripts = [path for path in home.rglob("*.py") if 'if __name__ == "__main__"' in path.read_text("utf-8")]
+    paths = {path.relative_to(home).as_posix() for path in scripts}
+    assert {path for path in paths if not {path, path.partition("/")[0] + "/"} & named} == set()
+    assert {path.name for path in PACKAGE.rglob("assets/*.js")} <= named
+    assert {name for name in named if name.endswith(".js")} <= {path.name for path in PACKAGE.rglob("assets/*.js")}
+
+
 def test_imports_go_one_way() -> None:
     assert {room_of(module) for module in MODULES} <= FLOOR_OF.keys()
     forbidden = {module: forbidden_rooms(source, module) for module, source in MODULES.items()}

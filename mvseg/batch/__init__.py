@@ -1,1 +1,1 @@
-"""Many scenes: their list, workers on this machine or a cluster, resume, and the joined tables."""
+"""Runs many scenes: their list, workers on this machine or a cluster, what is resumed, and the joined tables."""

@@ -1,1 +1,1 @@
-"""What would go wrong with a scene, found before anything long runs."""
+"""Finds what is wrong with cameras, photos, masks and poses of a scene before anything long runs."""

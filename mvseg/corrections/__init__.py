@@ -1,1 +1,1 @@
-"""What a person corrects in the photos of a scene, and what a run makes of it."""
+"""Reads what a person says is wrong, applies it to the masks of a scene, and ranks what else is worth asking about."""

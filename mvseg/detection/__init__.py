@@ -1,1 +1,1 @@
-"""A detector that sees all views of a scene at once (Sec. 3.2)."""
+"""Finds leaves in all photos of a scene at once: proposals, matched, thinned across views (Sec. 3.2), chosen."""

@@ -1,1 +1,1 @@
-"""How good masks, ids and shapes are."""
+"""Measures how good masks, ids and shapes are, against the true ones."""

@@ -1,1 +1,1 @@
-"""The whole method: one file a stage, and `run_scene.py` is the page to begin with."""
+"""The whole method: one file a stage; begin with `run_scene.py`."""

@@ -1,1 +1,1 @@
-"""From photos alone to cameras with a scale and axes: structure from motion, and what fixes its free similarity."""
+"""From photos alone to cameras with a scale and axes: structure from motion, turntables, and poses refined by masks."""

@@ -1,1 +1,1 @@
-"""From the masks of one instance to its shape in 3D."""
+"""Turns the masks of one instance in several views into its shape in 3D: a surface or voxels."""

@@ -1,1 +1,1 @@
-"""The result folder and the page in it."""
+"""Writes the result folder, whole or not at all, and reads it back; draws the pictures and the page in it."""

@@ -1,1 +1,1 @@
-"""Services of the operating system: atomic writes and locks, signals, worker processes."""
+"""Services of the operating system and of Python: whole writes, hashes, signals, worker processes, late imports."""

@@ -1,1 +1,1 @@
-"""The same leaf over days: results of one plant on several dates, aligned and linked into tracks."""
+"""Follows leaves over days: results of one plant on several dates, aligned and linked into tracks, and their growth."""

@@ -1,1 +1,1 @@
-"""What plant scientists measure: traits of leaves and of the whole plant, with their uncertainty."""
+"""Measures what plant scientists want to know of leaves and of the whole plant, with standard deviations."""

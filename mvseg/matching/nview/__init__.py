@@ -1,1 +1,1 @@
-"""Matching by what all views show along the rays of each region."""
+"""The default matcher: finds the partition of masks that explains best what all views show along the rays of each."""
