@@ -22,7 +22,7 @@ from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, c
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
-from mvseg.tracking.pictures import LeafPicture, picture_leaves
+from mvseg.tracking.pictures import LeafPicture, picture_leaves, picture_plant
 from mvseg.traits.leaf import Measurement
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
@@ -90,6 +90,7 @@ class PlantOnDate:
         whole: {trait: number} of the plant.
         folder: of the result; None in memory.
         pictures: {leaf: picture} for a page; empty where nobody asked for them.
+        photo: JPEG of the plant for a page, or nothing.
     """
 
     scene: str
@@ -101,6 +102,7 @@ class PlantOnDate:
     whole: Mapping[str, Number]
     folder: Path | None = None
     pictures: Mapping[int, LeafPicture] = field(default_factory=dict)
+    photo: bytes = b""
 
     @property
     def shaped(self) -> list[int]:
@@ -124,7 +126,8 @@ def read_date(folder: Path, time: str | float, *, pictures: int = 0) -> PlantOnD
     date = replace(date_of(result, time), scene=folder.name, folder=folder)
     if not pictures:
         return date
-    return replace(date, pictures=picture_leaves(result, [leaf.leaf for leaf in date.leaves], side=pictures))
+    found = picture_leaves(result, [leaf.leaf for leaf in date.leaves], side=pictures)
+    return replace(date, pictures=found, photo=picture_plant(result))
 
 
 def date_of(result: Result, time: str | float) -> PlantOnDate:

@@ -16,7 +16,7 @@ import numpy as np
 from mvseg.results.overlay import instance_color
 from mvseg.results.report.page import ASSETS as REPORT_ASSETS
 from mvseg.results.report.page import dump_inside_script
-from mvseg.tracking.dates import ROWS
+from mvseg.tracking.dates import ROWS, Number
 from mvseg.tracking.growth import SIZES, Growth
 from mvseg.tracking.track import Tracks
 
@@ -93,7 +93,19 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
             )  # fmt: skip
     return {
         "plant": tracks.plant,
-        "dates": [{"scene": date.scene, "time": date.time, "written": date.written} for date in tracks.dates],
+        "dates": [
+            {
+                "scene": date.scene,
+                "time": date.time,
+                "written": date.written,
+                "photo": base64.b64encode(date.photo).decode("ascii"),
+                "leaves": row.leaves,
+                "born": row.born,
+                "gone": row.gone,
+            }
+            for date, row in zip(tracks.dates, growth.plant, strict=True)
+        ],
+        "knows_up": all(date.knows_up for date in tracks.dates),
         "leaves": leaves,
         "gaps": [[row.date, row.track, row.state] for row in tracks.rows if row.leaf is None],
         "colors": {str(n): f"#{bytes(instance_color(n)).hex()}" for n in range(1, tracks.num_tracks + 1)},
@@ -102,8 +114,8 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
 
 
 def _describe_growth(tracks: Tracks, growth: Growth) -> dict[str, Any]:
-    """numbers: {trait: {unit, tracks: {track: [[date, value, sd], ...]}}}, and curves: {trait: {track: {model, line:
-    [[time, value], ...]}}}."""
+    """numbers: {trait: {unit, tracks: {track: [[date, value, sd], ...]}}}, curves: {trait: {track: {model, line:
+    [[time, value], ...]}}}, and whole: as numbers, of the whole plant, whose track is 0."""
     numbers: dict[str, dict[str, Any]] = {}
     for point in growth.points:
         of_trait = numbers.setdefault(point.trait, {"unit": point.number.unit, "tracks": {}})
@@ -114,7 +126,25 @@ def _describe_growth(tracks: Tracks, growth: Growth) -> dict[str, Any]:
     for curve in growth.curves:
         line = [[round(t, 3), _round(v, 5)] for t, v in zip(times.tolist(), curve.at(times).tolist(), strict=True)]
         curves[curve.trait][str(curve.track)] = {"model": curve.model, "line": line}
-    return {"numbers": numbers, "curves": curves}
+    return {"numbers": numbers, "curves": curves, "whole": _describe_plant(growth)}
+
+
+def _describe_plant(growth: Growth) -> dict[str, Any]:
+    """See `_describe_growth`."""
+    rows = [
+        {"total area": row.total_area, "relative growth rate": row.relative_growth_rate,
+         "leaves": Number(row.leaves, 0.0, ""), "leaves that appeared": Number(row.born, 0.0, ""),
+         "days per new leaf": Number(row.phyllochron, 0.0, "days")}
+        for row in growth.plant
+    ]  # fmt: skip
+    described = {}
+    for trait in rows[0]:
+        seen = [(row.date, of_date[trait]) for row, of_date in zip(growth.plant, rows, strict=True)]
+        points = [[date, _round(number.value, 5), _round(number.sd, 3) or 0.0]
+                  for date, number in seen if math.isfinite(number.value)]  # fmt: skip
+        units = [number.unit for _, number in seen if math.isfinite(number.value)]
+        described[trait] = {"unit": units[-1] if units else "", "tracks": {"0": points}}
+    return described
 
 
 def _round(value: float, digits: int) -> float | None:

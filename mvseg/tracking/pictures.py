@@ -17,6 +17,7 @@ from mvseg.results.photo_masks import labels_in_photo
 from mvseg.results.result import Result
 
 SIDE, LARGE_SIDE, QUALITY = 72, 160, 70  # pixels and JPEG quality of a picture (a definition)
+PLANT_SIDE = 120  # pixels of the picture of a plant (a definition)
 LIT, DARK = np.uint8(200), np.uint8(24)  # greys of a mask and around it without a photo (a definition)
 
 
@@ -49,6 +50,15 @@ def picture_leaves(result: Result, leaves: Collection[int], *, side: int = SIDE)
             jpeg = cut_picture(photo, mask, side=side)
             pictures[leaf] = LeafPicture(jpeg, about.name, _inner_point(mask))
     return pictures
+
+
+def picture_plant(result: Result) -> bytes:
+    """JPEG of all leaves in the photo in which they are largest, as `cut_picture`; nothing where there is no mask."""
+    shown = [labels_in_photo(result, view) > 0 for view in range(len(result.scene.views))]
+    view = int(np.argmax([mask.mean() for mask in shown]))
+    if not shown[view].any():
+        return b""
+    return cut_picture(_photo(result.scene.views[view].path, shown[view].shape), shown[view], side=PLANT_SIDE)
 
 
 def _inner_point(mask: np.ndarray) -> tuple[float, float]:

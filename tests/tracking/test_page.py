@@ -99,3 +99,39 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         assert shown.locator("#leaf").inner_text() == f"Leaf {leaf['track']}"
         opened.close()  # offline, and without a complaint
         browser.close()
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+def test_growth_at_a_glance_on_a_phone(tmp_path: Path) -> None:
+    """Leaf 3 is new on the second date, leaf 1 gone."""
+    tracks, photo = many_dates(2, 4), noisy_picture().jpeg
+    state = {(1, 3): "born", (1, 1): "gone"}
+    rows = tuple(
+        replace(row, state=state.get((row.date, row.track), "seen"), leaf=None if row.track == 1 else row.leaf)
+        if row.date else row
+        for row in tracks.rows if (row.date, row.track) != (0, 3)
+    )  # fmt: skip
+    dates = tuple(replace(date, photo=photo) for date in tracks.dates)
+    kept = [{row.leaf for row in rows if row.date == n} for n in (0, 1)]
+    dates = tuple(replace(date, leaves=tuple(leaf for leaf in date.leaves if leaf.leaf in of))
+                  for date, of in zip(dates, kept, strict=True))  # fmt: skip
+    changed = replace(tracks, dates=dates, rows=rows)
+    write_page(tmp_path, changed, measure_growth(changed))
+    with sync_api.sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=NO_WEBGL)
+        opened = Opened(browser, tmp_path / "tracks.html", (420, 900), has_space=False)
+        shown = opened.page
+        assert shown.evaluate("document.documentElement.scrollWidth") <= 420
+        boxes = [each.bounding_box() for each in shown.locator("#dates canvas").all()]
+        assert all(box is not None and box["x"] + box["width"] <= 420 for box in boxes)  # both are seen whole
+        assert "3 leaves" in shown.locator("#dates figcaption").nth(1).inner_text()
+        assert "1 new · 1 gone" in shown.locator("#dates figcaption").nth(1).inner_text()
+        assert "days" in shown.locator("#chart text").all_text_contents()
+        assert shown.locator("#chart image").count() == 2
+        assert shown.locator("#chart .born").count() == shown.locator("#chart .gone").count() == 1
+        from_below = [row.locator("td").nth(1).inner_text() for row in shown.locator("tbody tr").all()]
+        assert from_below == ["1", "2", "3", "4"]
+        shown.locator("#trait").select_option("relative growth rate")
+        assert shown.locator("#chart circle").count() == 1
+        opened.close()
+        browser.close()

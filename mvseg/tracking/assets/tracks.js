@@ -1,10 +1,11 @@
 "use strict";
 const data = JSON.parse(document.getElementById("data").textContent);
 const find = (id) => document.getElementById(id);
-const WIDE = Math.max(190, Math.min(420, Math.floor(1300 / data.dates.length))), HIGH = WIDE;
+const WIDE = Math.max(150, Math.min(420, Math.floor((Math.min(1330, innerWidth) - 30) / data.dates.length) - 10)), HIGH = WIDE;
 const DOWN = 25 * Math.PI / 180; // how steeply the plants are looked at
 let tracks = [];
 let picked = 0;
+let fromBelow = new Map();
 let onClick = (leaf) => pick(leaf ? leaf.track : 0), onDraw = () => {}; // `mvseg correct` has others
 
 function make(name, text, parent, kind) {
@@ -42,6 +43,25 @@ function drawDate(canvas, date) {
     return { leaf, path, middle: middleOf(line) };
   });
   pen.globalAlpha = 1;
+  pen.font = "bold 11px system-ui, sans-serif";
+  pen.textAlign = "center";
+  pen.lineWidth = 3;
+  for (const { leaf, middle: [x, y] } of canvas.leaves) {
+    if (picked && leaf.track !== picked) continue;
+    pen.strokeStyle = "#fffc"; pen.fillStyle = "#000";
+    pen.strokeText(fromBelow.get(leaf.track) ?? "", x, y); pen.fillText(fromBelow.get(leaf.track) ?? "", x, y);
+  }
+}
+
+// {track: its number from below}, by the mean height of its base; none where up is not known.
+function ranks() {
+  const heights = {};
+  for (const leaf of data.knows_up ? data.leaves.filter((each) => each.shape.length) : []) {
+    (heights[leaf.track] ||= []).push(leaf.shape[2]);
+  }
+  const mean = (values) => values.reduce((sum, value) => sum + value, 0) / values.length;
+  const order = Object.entries(heights).sort((one, other) => mean(one[1]) - mean(other[1]));
+  return new Map(order.map(([track], index) => [Number(track), index + 1]));
 }
 
 function pickAt(canvas, event) {
@@ -103,32 +123,55 @@ function buildDates() {
   data.dates.forEach((date) => {
     const figure = make("figure", undefined, find("dates")), canvas = make("canvas", undefined, figure);
     canvas.width = 2 * WIDE; canvas.height = 2 * HIGH; canvas.style.width = `${WIDE}px`;
+    figure.style.width = `${WIDE + 2}px`;
     canvas.addEventListener("click", (event) => pickAt(canvas, event));
-    make("figcaption", `${date.written} · ${date.scene}`, figure);
+    make("figcaption", undefined, figure);
   });
 }
+
+// Under each date what the plant did.
+function captionDates() {
+  const area = data.whole["total area"];
+  document.querySelectorAll("#dates > figure > figcaption").forEach((caption, index) => {
+    const date = data.dates[index], of = area.tracks[0].find((point) => point[0] === index);
+    caption.textContent = `${dayOf(date)} · ${date.scene}`;
+    const events = [`${date.leaves} leaves`, of && `${withUnit(Number(of[1].toPrecision(3)), area.unit)}`,
+      index && date.born && `${date.born} new`, date.gone && `${date.gone} gone`];
+    make("span", events.filter(Boolean).join(" · "), caption, "events");
+  });
+}
+
+function isNumber(date) { return Number(date.written) === date.time; }
+
+function dayOf(date) { return isNumber(date) ? `day ${date.written}` : date.written; }
+
+function withUnit(value, unit) { return value + (unit ? ` ${unit.replace("^2", "\u00b2").replace("^3", "\u00b3")}` : ""); }
 
 function buildTable() {
   find("tracks").replaceChildren();
   const table = make("table", undefined, find("tracks")), head = make("tr", undefined, make("thead", undefined, table));
   make("th", "leaf", head);
+  make("th", "from below", head);
   data.dates.forEach((date) => make("th", date.written, head));
   const body = make("tbody", undefined, table), rows = {};
+  find("ranks").textContent = fromBelow.size ? "numbers on leaves: from below, by the mean height of the base"
+    : "leaves have no numbers from below: up is not known";
   for (const track of tracks) {
     rows[track] = make("tr", undefined, body);
     rows[track].dataset.track = track;
     rows[track].addEventListener("click", () => pick(track));
     make("td", track, rows[track]);
+    make("td", fromBelow.get(track) ?? "", rows[track]);
     data.dates.forEach(() => make("td", "", rows[track]));
   }
   for (const leaf of data.leaves) {
-    const cell = make("span", undefined, rows[leaf.track].children[leaf.date + 1], `cell ${leaf.state}`);
+    const cell = make("span", undefined, rows[leaf.track].children[leaf.date + 2], `cell ${leaf.state}`);
     cell.leaf = leaf;
     cell.style.background = data.colors[leaf.track];
     cell.style.opacity = leaf.p === null ? 1 : 0.25 + 0.75 * leaf.p;
     cell.title = `leaf ${leaf.leaf}, ${leaf.state}` + (leaf.p === null ? "" : `, probability ${leaf.p}`);
   }
-  for (const [date, track, state] of data.gaps) make("span", undefined, rows[track].children[date + 1], `cell ${state}`).title = state;
+  for (const [date, track, state] of data.gaps) make("span", undefined, rows[track].children[date + 2], `cell ${state}`).title = state;
 }
 
 function svg(name, settings, text) {
@@ -140,43 +183,71 @@ function svg(name, settings, text) {
 }
 
 function drawChart() {
-  const trait = find("trait").value, of = data.numbers[trait];
-  find("chart").replaceChildren();
+  const trait = find("trait").value, of = data.numbers[trait] || data.whole[trait], chart = find("chart");
+  const wide = Math.max(300, Math.min(900, chart.clientWidth || 720)), right = wide - 16, left = 62;
+  chart.replaceChildren();
+  chart.setAttribute("viewBox", `0 0 ${wide} 336`);
   find("model").textContent = "";
   if (!of) return;
-  const shown = Object.entries(of.tracks).filter(([track]) => !picked || Number(track) === picked);
+  const shown = Object.entries(of.tracks).filter(([track]) => !picked || track === "0" || Number(track) === picked);
   const values = shown.flatMap(([, points]) => points.flatMap(([, value, sd]) => [value - sd, value + sd]));
   if (!values.length) { find("model").textContent = "not measured on any date"; return; }
   const low = Math.min(0, ...values), high = Math.max(...values, low + 1e-9), first = data.dates[0].time;
   const span = Math.max(data.dates.at(-1).time - first, 1e-9);
-  const x = (time) => 70 + (time - first) / span * 610, y = (value) => 300 - (value - low) / (high - low) * 275;
+  const x = (time) => left + 28 + (time - first) / span * (right - left - 56), y = (value) => 290 - (value - low) / (high - low) * 265;
   const decade = 10 ** Math.floor(Math.log10((high - low) / 4));
   const step = decade * [1, 2, 5, 10].find((factor) => factor * decade >= (high - low) / 6);
   for (let tick = Math.ceil(low / step); tick * step <= high; tick += 1) {
-    svg("line", { x1: 70, x2: 680, y1: y(tick * step), y2: y(tick * step), stroke: "#8884" });
-    svg("text", { x: 62, y: y(tick * step) + 4, "text-anchor": "end" }, Number((tick * step).toPrecision(6)));
+    svg("line", { x1: left, x2: right, y1: y(tick * step), y2: y(tick * step), stroke: "#8884" });
+    svg("text", { x: left - 8, y: y(tick * step) + 4, "text-anchor": "end" }, Number((tick * step).toPrecision(6)));
   }
-  let free = -Infinity;
-  for (const date of data.dates) {
-    svg("line", { x1: x(date.time), x2: x(date.time), y1: 300, y2: 304, stroke: "#888" });
-    const half = 3.5 * date.written.length + 4;
-    if (x(date.time) - half < free) continue;
-    svg("text", { x: x(date.time), y: 318, "text-anchor": "middle" }, date.written);
-    free = x(date.time) + half;
-  }
-  const unit = of.unit.replace("^2", "\u00b2").replace("^3", "\u00b3");
-  svg("text", { x: 70, y: 12 }, trait.replaceAll("_", " ") + (unit ? ` (${unit})` : "") + " \u00b1 1 sd");
+  drawDays(x, [left, right], wide);
+  svg("text", { x: left, y: 12 }, trait.replaceAll("_", " ") + (of.unit ? ` (${withUnit("", of.unit).trim()})` : "") + " \u00b1 1 sd");
   for (const [track, points] of shown) {
     const at = points.map(([date, value, sd]) => [x(data.dates[date].time), y(value - sd), y(value + sd), y(value)]);
-    const color = data.colors[track], curve = (data.curves[trait] || {})[track];
+    const color = data.colors[track] || "currentColor", curve = (data.curves[trait] || {})[track];
     const band = [...at.map((p) => `${p[0]},${p[1]}`), ...[...at].reverse().map((p) => `${p[0]},${p[2]}`)];
     svg("polygon", { points: band.join(" "), fill: color, opacity: picked ? 0.25 : 0.12 });
     const within = (point) => point[0] >= data.dates[points[0][0]].time && point[0] <= data.dates[points.at(-1)[0]].time;
     const line = curve ? curve.line.filter(within).map((p) => `${x(p[0])},${y(p[1])}`) : at.map((p) => `${p[0]},${p[3]}`);
     svg("polyline", { points: line.join(" "), fill: "none", stroke: color, "stroke-width": 2 });
-    for (const p of at) svg("circle", { cx: p[0], cy: p[3], r: 3, fill: color });
+    const born = data.leaves.find((leaf) => leaf.track === Number(track) && leaf.state === "born");
+    at.forEach((p, n) => {
+      const isNew = born && born.date === points[n][0] && born.date > 0;
+      svg("circle", { cx: p[0], cy: p[3], r: isNew ? 5 : 3, fill: isNew ? "none" : color, stroke: color, "stroke-width": 2, class: isNew ? "born" : "seen" });
+    });
+    const gone = data.gaps.find((gap) => gap[1] === Number(track) && gap[2] === "gone");
+    if (gone && at.length) {
+      const px = x(data.dates[gone[0]].time), py = at.at(-1)[3];
+      svg("path", { d: `M${at.at(-1)[0]},${py}L${px},${py}`, stroke: color, "stroke-dasharray": "2 4" });
+      svg("path", { d: `M${px - 4},${py - 4}l8,8m0,-8l-8,8`, stroke: color, "stroke-width": 2, class: "gone" });
+    }
     if (curve && picked) find("model").textContent = `curve: ${curve.model}`;
   }
+}
+
+// The axis of days, and under it a photo of each date that has room.
+function drawDays(x, [left, right], wide) {
+  const first = data.dates[0], photos = data.dates.some((date) => date.photo);
+  const gaps = data.dates.slice(1).map((date, n) => x(date.time) - x(data.dates[n].time));
+  const side = Math.max(44, Math.min(120, Math.floor((right - left) / 3) - 4, ...gaps.map((gap) => gap - 4)));
+  let free = -Infinity, freePhoto = -Infinity;
+  for (const date of data.dates) {
+    const written = isNumber(date) ? date.written : String(Number((date.time - first.time).toFixed(2)));
+    svg("line", { x1: x(date.time), x2: x(date.time), y1: 290, y2: 295, stroke: "#888" });
+    const half = 3.5 * written.length + 4;
+    if (x(date.time) - half >= free) {
+      svg("text", { x: x(date.time), y: 309, "text-anchor": "middle" }, written);
+      free = x(date.time) + half;
+    }
+    const at = Math.max(2, Math.min(wide - side - 2, x(date.time) - side / 2));
+    if (!date.photo || at < freePhoto) continue;
+    const image = svg("image", { x: at, y: 336, width: side, height: side, href: `data:image/jpeg;base64,${date.photo}` });
+    image.setAttribute("aria-label", `the plant on ${dayOf(date)}`);
+    freePhoto = at + side;
+  }
+  svg("text", { x: (left + right) / 2, y: 327, "text-anchor": "middle" }, isNumber(first) ? "days" : `days since ${first.written}`);
+  if (photos) find("chart").setAttribute("viewBox", `0 0 ${wide} ${340 + side}`);
 }
 
 function pick(track) {
@@ -205,12 +276,19 @@ function show() {
   find("summary").textContent = `${tracks.length} leaves on ${data.dates.length} dates`;
   find("warnings").replaceChildren();
   for (const sentence of data.warnings) make("li", sentence, find("warnings"));
+  fromBelow = ranks();
+  captionDates();
   buildTable();
   pick(tracks.includes(picked) ? picked : 0);
 }
 
 find("plant").textContent = data.plant;
-for (const trait of Object.keys(data.numbers)) make("option", trait, find("trait")).value = trait;
+for (const [label, of] of [["leaves", data.numbers], ["the whole plant", data.whole]]) {
+  const group = make("optgroup", undefined, find("trait"));
+  group.label = label;
+  for (const trait of Object.keys(of)) make("option", trait.replaceAll("_", " "), group).value = trait;
+}
+addEventListener("resize", drawChart);
 find("trait").addEventListener("change", drawChart);
 find("turn").addEventListener("input", drawDates);
 document.addEventListener("keydown", press);
