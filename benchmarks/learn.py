@@ -3,7 +3,7 @@
 For each scene a table: as it is; after one, two, three rounds (each from the labels of the last, whatever E says),
 and after one round in which a person has outlined six leaves in two photos each, the largest ones that are not right;
 his masks do not count in the figures. E, the expected number of right masks, stands beside what the truth says, where
-the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep: E grows by a tenth or more.
+the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep: E grows by `GROWTH`.
 Weights and detections are kept in --cache.
 """
 

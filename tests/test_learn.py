@@ -73,7 +73,7 @@ def lower(known: Known, chance: float = 0.9) -> Known:
     ("rounds", "growth", "tried", "kept"),
     [
         (1, (1.2, 1.2), 1, 1),
-        (3, (1.2, 1.15, 1.05), 3, 2),  # the third grows by less than a tenth
+        (3, (1.2, 1.2, 1.1), 3, 2),  # the third grows by too little
         (3, (1.05, 1.5), 1, 0),
         (2, (0.5, 9.0), 1, 0),
         ("off", (1.2,), 0, 0),
