@@ -50,8 +50,8 @@ def learn(
 
     A round: labels from what the views chose, and from what a person corrected; the weights that the run began with
     learn these (`fine_tune`); the detector looks again, at the same size; the views choose. The better one stays, by
-    E, the expected number of right masks. Rounds end when E grows by less than `GROWTH`. Ctrl-C ends them, too, and what
-    was there stays.
+    E, the expected number of right masks. Rounds end when E grows by less than `GROWTH`. Ctrl-C ends them, too, and
+    what was there stays.
 
     Args:
         known: of leaves that the views chose.
