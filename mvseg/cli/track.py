@@ -23,15 +23,15 @@ def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
     help_results = "output of mvseg batch (every plant with two dates or more), or the results of one plant"
     parser.add_argument("results", type=Path, nargs="*", help=help_results)
-    help_again = "repeat the run that made these tracks, with its options and, if given, with other --corrections"
+    help_again = "tracks to make anew, as they were made, or with other --corrections"
     parser.add_argument("--again", type=Path | None, help=help_again)
     help_times = "of each result: numbers (days) or ISO dates (2026-05-31 or 20260531)"
     parser.add_argument("--times", type=str, nargs="+", help=help_times)
     parser.add_argument("--plant", type=str | None, help="name of the plant, with --times (default: that of --out)")
-    parser.add_argument("--out", type=Path | None, help="folder for the tables and pages (of --again: where they are)")
+    parser.add_argument("--out", type=Path | None, help="folder for tables and pages (--again: the same)")
     help_pots = "fixed (they stand as they stood), turned, or auto: learned from the dates of each plant"
     parser.add_argument("--pots", type=Pots, default="auto", help=help_pots)
-    help_corrections = "file of corrections with same_track and different_track, see docs/tracking.md"
+    help_corrections = "file with same_track and different_track, see docs/tracking.md"
     parser.add_argument("--corrections", type=Path | None, help=help_corrections)
     parser.add_argument("--report", type=bool, default=True, help="write tracks.html")
     parser.add_argument("--num_workers", type=int | None, help="plants tracked at once, each in a process of its own")
