@@ -114,7 +114,7 @@ def _shrink(image: np.ndarray, width: int) -> bytes:
 
 def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
     """The masks of one view, large ones first, so that small ones lie on top; those outside of the part of the photo
-    that the picture shows (`box`, xyxy, pixels) are left out."""
+    that the picture shows (`box`, xyxy, pixels), too: a person may look for them."""
     regions, others = masks.regions, masks.second_ids.tolist()
     members = ((regions.view_index == view) & (regions.areas > 0)).nonzero()[:, 0]
     members = members[regions.areas[members].argsort(descending=True, stable=True)]
@@ -123,9 +123,6 @@ def outline_masks(masks: Masks, *, view: int, box: Box) -> list[MaskContour]:
         mask = regions.crop(region).cpu().numpy().astype(np.uint8)
         corner = np.array(regions.boxes[region, :2].tolist())
         path, around = trace_mask(mask, corner, box=box)
-        height = round(UNITS * (box[3] - box[1]) / (box[2] - box[0]))
-        if around[2] <= 0 or around[3] <= 0 or around[0] >= UNITS or around[1] >= height:
-            continue
         middle, radius = find_thickest(mask)
         x, y = np.round(_place(np.array(middle) + corner + 0.5, box)).astype(int).tolist()
         thickness = 2 * radius * UNITS / (box[2] - box[0])

@@ -366,6 +366,34 @@ def test_the_most_doubtful_is_asked_first_and_answered_by_a_key(
     person.close()
 
 
+def test_no_mask_is_hidden_around_the_plant(browser: sync_api.Browser, balls: Result, tmp_path: Path) -> None:
+    """The pictures show one leaf and what is near it; the masks of the others lie around it, matched to none."""
+    ids = balls.masks.instance_ids.where(balls.masks.instance_ids == 1, -1)
+    masks = replace(balls.masks, instance_ids=ids)
+    result = replace(balls, matching=balls.matching.with_masks(masks), instances=Instances())
+    person = Person(browser, write_page(tmp_path / "report.html", result))
+    assert (
+        person.page.locator("#table-caption")
+        .text_content()
+        .endswith(f"{int((ids < 1).sum())} masks matched to no leaf.")
+    )
+    seen = """() => {
+      const { picture, view } = modes.work.panes[0];
+      const whole = picture.getBoundingClientRect();
+      const shown = [...picture.querySelectorAll("path.mask")].map((path) => path.getBoundingClientRect());
+      const isInside = (one) => one.left >= whole.left - 1 && one.right <= whole.right + 1
+        && one.top >= whole.top - 1 && one.bottom <= whole.bottom + 1;
+      return [data.views[view].box, shown.length, shown.filter(isInside).length];
+    }"""
+    for view in range(len(balls.scene.views)):
+        person.page.evaluate("(view) => modes.work.panes[0].show(view)", view)
+        person.page.get_by_role("button", name="whole plant").first.click()
+        box, drawn, inside = person.page.evaluate(seen)
+        assert box != [0, 0, 1, 1]
+        assert drawn == inside == int((masks.view_index == view).sum())
+    person.close()
+
+
 @pytest.fixture(scope="module")
 def offered(balls: Result, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The page of the balls without the third, which is a candidate that was not chosen."""

@@ -59,20 +59,21 @@ def test_large_masks_come_first_and_numbers_lie_inside() -> None:
     labels[100:104, 60:64] = 1
     labels[60:100, 60:120] = 2
     labels[100:130, 120:160] = 3
-    labels[0:10, 0:30] = 4  # outside of the box
+    labels[0:10, 0:30] = 4  # outside of the box: not hidden
     regions = regions_from_label_maps([labels, labels])
     part = torch.zeros(40, 60, dtype=torch.bool)
     merged = (MergedMask(region=1, own=5, other=2, part=part),)
     masks = as_masks(regions, [3, 5, -1, 1, 1, 2, 3, 4]).with_merged(merged)
     found = outline_masks(masks, view=0, box=BOX)
     said = [(outline.region, outline.leaf, outline.other) for outline in found]
-    assert said == [(1, 5, 2), (2, -1, None), (0, 3, None)]
-    assert [outline.is_sure for outline in found] == [True, True, True]
-    assert [outline.is_sure for outline in outline_masks(masks, view=1, box=BOX)] == [False, False, True]
-    for outline, label in zip(found, (2, 3, 1), strict=True):
+    assert said == [(1, 5, 2), (2, -1, None), (3, 1, None), (0, 3, None)]
+    assert found[2].box[2:] < (0, 0)
+    assert [outline.is_sure for outline in found] == [True, True, True, True]
+    assert [outline.is_sure for outline in outline_masks(masks, view=1, box=BOX)][2:] == [False, True]
+    for outline, label in zip(found, (2, 3, 4, 1), strict=True):
         x, y = outline.at
         assert labels[int(y / 10 + 20), int(x / 10 + 40)] == label
-    assert found[0].height > found[2].height
+    assert found[0].height > found[3].height
 
 
 def test_a_view_without_masks() -> None:

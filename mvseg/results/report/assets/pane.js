@@ -124,8 +124,12 @@ class Pane {
     return Math.max(this.box.width / (clientWidth || 600), this.box.height / (clientHeight || 450)); // units per pixel
   }
 
+  // The picture, and the masks around it, if any.
   fit() {
-    this.look({ x: 0, y: 0, width: UNITS, height: this.frame.height });
+    const boxes = this.work.data.views[this.view].masks.map((mask) => mask.box);
+    const [x, y, right, bottom] = boxAround([[0, 0], [UNITS, this.frame.height],
+      ...boxes.flatMap(([x1, y1, x2, y2]) => [[x1, y1], [x2, y2]])]);
+    this.look({ x, y, width: right - x, height: bottom - y });
   }
 
   // The surroundings of a box (xyxy), so that one sees what is next to it.

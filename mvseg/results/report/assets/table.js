@@ -10,8 +10,7 @@ function buildTable(data) {
   const headers = columns.map((column, index) => makeHeader(column, () => sort(index)));
   head.append(element("tr", {}, ...headers));
   headers[0].setAttribute("aria-sort", "ascending");
-  const masks = data.views.flatMap((view) => view.masks);
-  const unmatched = data.numMasks - masks.filter((mask) => mask.leaf > 0).length;
+  const unmatched = data.views.flatMap((view) => view.masks).filter((mask) => mask.leaf < 1).length;
   document.getElementById("table-caption").textContent = describeTable(data, unmatched);
 
   function sort(index) {
