@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from mvseg.crop import Crop
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
+from mvseg.system.running import kept
 
 BAND = 0.05  # an edge may move by at most this fraction of the root of its mask's area
 AROUND = 3  # the photo at most so many bands away from a mask tells what the background looks like
@@ -63,6 +64,7 @@ def snap_masks(masks: Masks, photos: ReadPhoto) -> Masks:
     return replace_crops(masks, crops)
 
 
+@kept
 def snap(mask: Bools, photo: Pixels, *, others: Bools) -> Bools:
     """The mask whose edge lies where colours change, within `BAND` of where it was.
 
@@ -72,7 +74,8 @@ def snap(mask: Bools, photo: Pixels, *, others: Bools) -> Bools:
         others: (H, W) bool, disjoint from the mask: what other masks show.
 
     Returns:
-        (H, W) bool. The mask as it is, where too little of it lies deep inside, or nothing is around it.
+        (H, W) bool. The mask as it is, where too little of it lies deep inside, or nothing is around it. Found once for
+        the same mask and photo where the run keeps what it computed.
     """
     height, width = mask.shape
     scale = min(1.0, MOST_PX / max(math.sqrt(mask.sum()), 1.0))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from mvseg.formats.photos import Photos
 from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene
+from mvseg.system.running import running
 from mvseg.verification.snap_edges import BAND, snap, snap_masks
 
 SIZE = 160
@@ -106,6 +109,21 @@ def two_leaves() -> tuple[np.ndarray, Regions]:
     labels[ellipse((58, 80), (40, 30), 0)] = 1
     masks = grown(labels == 1, -2).astype(int) + 2 * grown(labels == 2, -2)
     return labels, regions_from_label_maps([masks, masks])
+
+
+def test_edges_that_did_not_change_are_not_looked_for_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    leaf, cut = ellipse(), []
+    regions = regions_from_label_maps([np.roll(leaf, 2, 1).astype(np.int64), np.roll(leaf, 3, 0).astype(np.int64)])
+    masks = Masks.of(regions, torch.tensor([1, 1]), origin=Origin.DETECTED)
+    photos = [paint(leaf.astype(int)), paint(leaf.astype(int), seed=1)].__getitem__
+    whole, grab = snap_masks(masks, photos), cv2.grabCut
+    monkeypatch.setattr(cv2, "grabCut", lambda *args: (cut.append(1), grab(*args)))
+    with running(keep=True):
+        for table, calls in ((masks, 2), (masks, 2), (replace(masks, regions=regions.select(torch.tensor([1, 0]))), 2)):
+            again = snap_masks(table, photos)
+            assert len(cut) == calls
+    monkeypatch.setattr(cv2, "grabCut", grab)
+    assert torch.equal(again.select(torch.tensor([1, 0])).regions.crops, whole.regions.crops)
 
 
 def test_masks_of_one_photo_do_not_grow_into_each_other() -> None:
