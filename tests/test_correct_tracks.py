@@ -113,6 +113,18 @@ def test_the_tables_follow_when_they_are_asked_for(
     assert ask(served, "POST", "outline", b"{}")[0] == 404
 
 
+def test_edits_of_single_scenes_in_the_file_stay(folder: Path) -> None:
+    reject = {"op": "reject", "view": "000", "at": [1.0, 2.0]}
+    marks = {"000": {"width": 120, "height": 40}}
+    text = {"format": "mvseg-corrections/1", "photos": marks, "edits": [reject]}
+    (folder / "corrections.json").write_text(json.dumps(text))
+    with serve(OpenTracks(folder)) as server:
+        assert save(server, [reject, link("same_track", 1, 1)])[0] == 200
+        assert wait_until_computed(server)["outcomes"] == ["", ""]
+    saved = json.loads((folder / "corrections.json").read_text())
+    assert saved == text | {"edits": [reject, link("same_track", 1, 1)]}
+
+
 def test_tracks_that_cannot_be_corrected(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(InputError, match="holds no plant maize, expected one of tracks with --plant"):
         OpenTracks(folder, "maize")

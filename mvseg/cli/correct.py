@@ -59,11 +59,10 @@ def run(args: Namespace) -> int:
                 webbrowser.open(server.address)
             server.serve_forever()
         except KeyboardInterrupt:
-            verb = "track" if has_tracks else "infer"
-            command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE, verb=verb)
             if opened.learner is not None and opened.learner.is_learned:
                 print("\nWhat the detector has learned is in the whole result, if the page made it since.", flush=True)
-            what = "tables and page" if has_tracks else "whole result"
+            what, verb = ("tables and page", "track") if has_tracks else ("whole result", "infer")
+            command = repeat_command(folder.resolve(), folder.resolve() / CORRECTIONS_FILE, verb=verb)
             print(f"\nThe {what} with these corrections: {command}", flush=True)
         finally:
             corrector.close()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,11 +59,13 @@ class OpenTracks:
         """The edits in the folder, or else those that the tracks were made with."""
         own, given = self.folder / CORRECTIONS_FILE, self.recorded.corrections
         path = own if own.is_file() else given
-        return (Corrections() if path is None else load_corrections(path)), self.notice
+        found = Corrections() if path is None else load_corrections(path)
+        self._photos = found.photos
+        return found, self.notice
 
     def mark(self, corrections: Corrections) -> Corrections:
-        """The edits as they are: links between dates name scenes, not photos alone."""
-        return corrections
+        """The edits, with the marks of photos in their file: those of single scenes there stay."""
+        return replace(corrections, photos=self._photos)
 
     def page(self, corrections: Corrections) -> str:
         """The page with the newest tracks, and with all edits."""

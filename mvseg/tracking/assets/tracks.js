@@ -6,7 +6,8 @@ const DOWN = 25 * Math.PI / 180; // how steeply the plants are looked at
 let tracks = [];
 let picked = 0;
 let fromBelow = new Map();
-let onClick = (leaf) => pick(leaf ? leaf.track : 0), onDraw = () => {}; // `mvseg correct` has others
+// `mvseg correct` has others of these.
+let onClick = (leaf) => pick(leaf ? leaf.track : 0), onDraw = () => {}, labelOf = (leaf) => fromBelow.get(leaf.track) ?? "";
 
 function make(name, text, parent, kind) {
   const element = document.createElement(name);
@@ -49,7 +50,7 @@ function drawDate(canvas, date) {
   for (const { leaf, middle: [x, y] } of canvas.leaves) {
     if (picked && leaf.track !== picked) continue;
     pen.strokeStyle = "#fffc"; pen.fillStyle = "#000";
-    pen.strokeText(fromBelow.get(leaf.track) ?? "", x, y); pen.fillText(fromBelow.get(leaf.track) ?? "", x, y);
+    pen.strokeText(labelOf(leaf), x, y); pen.fillText(labelOf(leaf), x, y);
   }
 }
 
