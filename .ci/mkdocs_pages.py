@@ -20,7 +20,7 @@ VERSION = os.environ.get("DOCS_VERSION", "")  # of a release, whose site keeps i
 SOURCE = f"{REPOSITORY}/blob/{'v' + VERSION if VERSION else 'main'}/"
 # Pages in the order of the site; those that are not there are left out, and those that are not listed come last.
 ORDER = {
-    "Start": ("index.md", "guide.md", "check.md", "results.md", "corrections.md"),
+    "Start": ("index.md", "guide.md", "check.md", "results.md", "corrections.md", "glossary.md"),
     "Bring your own": (
         "own-masks.md", "own-cameras.md", "pose.md", "recipes.md", "fine-tune.md", "batch.md", "tracking.md",
         "data-out.md", "formats.md",

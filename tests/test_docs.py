@@ -105,6 +105,19 @@ def test_every_public_name_is_on_the_page() -> None:
     assert set(mvseg.matching.__all__) <= set(listed)
 
 
+def test_names_in_the_notes_are_in_the_code() -> None:
+    """Of files, and identifiers that no English word looks like; of dotted names, each part."""
+    sources = [path for room in ("mvseg", "benchmarks", "tests") for path in (ROOT / room).rglob("*.py")]
+    known = {path.name for path in sources}
+    known |= {word for path in sources for word in re.findall(r"\w+", path.read_text(encoding="utf-8"))}
+    for page in (DOCS / "notes").glob("*.md"):
+        quoted = re.findall(r"`(?:[\w.]+/)*([A-Za-z_][\w.]*)(?:\(.*?\))?`", page.read_text(encoding="utf-8"))
+        files = {name for name in quoted if name.endswith(".py")}
+        parts = {part for name in {*quoted} - files for part in name.split(".")}
+        identifiers = {part for part in parts if re.search(r"[a-z]_[a-z]|[a-z][A-Z]|^[A-Z][A-Z_]+$", part)}
+        assert (files | identifiers) - known - {"cProfile"} == set(), page.name
+
+
 def test_pages_that_nobody_listed_are_shown(pages: ModuleType) -> None:
     nav = pages.order_pages(["guide.md", "index.md", "harvest.md", "api.md"])
     assert nav == [{"Start": ["index.md", "guide.md"]}, {"Bring your own": ["harvest.md"]}, {"Python": ["api.md"]}]

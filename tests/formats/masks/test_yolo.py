@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -52,6 +53,18 @@ def test_a_rectangle_has_exact_pixels(tmp_path: Path) -> None:
     mask = np.zeros((10, 10), bool)
     mask[2:7, 1:5] = True
     np.testing.assert_array_equal(read_yolo(path, 10, 10, names={})[0].mask, mask)
+
+
+def test_contours_of_pixel_centres_lose_half_a_pixel_all_round(tmp_path: Path) -> None:
+    """As docs/own-masks.md says of masks that tools make polygons of: the file does not tell."""
+    mask = np.zeros((40, 40), np.uint8)
+    mask[5:15, 8:28] = 1
+    ((contour,), _) = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    path = write(tmp_path, " ".join(["0", *(f"{share:.6f}" for share in (contour / 40).ravel())]))
+    found = read_yolo(path, 40, 40, names={})[0].mask
+    assert found is not None
+    mask[14] = mask[:, 27] = 0
+    np.testing.assert_array_equal(found, mask.astype(bool))
 
 
 @pytest.mark.parametrize(
