@@ -37,10 +37,10 @@ FACTS = {
     "Spatial distribution": "row:4",
 }
 NUMBERS = [
-    ("", "number_of_leaves", "2", "", "1", "matching", "TO:0000241"),
-    ("1", "area", "812.5", "3.1", "mm^2", "surface", "TO:0000540"),
-    ("2", "area", "", "", "mm^2", "no credible surface", "TO:0000540"),
-    ("2", "volume", "90", "", "mm^3", "voxels", ""),
+    ("", "number_of_leaves", "2", "", "1", "matching", "TO:0000241", "UO:0000186"),
+    ("1", "area", "812.5", "3.1", "mm^2", "surface", "TO:0000540", "UO:0000082"),
+    ("2", "area", "", "", "mm^2", "no credible surface", "TO:0000540", "UO:0000082"),
+    ("2", "volume", "90", "", "mm^3", "voxels", "", ""),
 ]
 # BrAPI v2: the properties of Observation and ObservationNewRequest that are text
 BRAPI_TEXT = {
@@ -52,7 +52,7 @@ BRAPI_TEXT = {
 
 def write_traits(path: Path, rows: list[dict[str, str]]) -> Path:
     """The tables/traits.csv of a batch with the same numbers for each plant."""
-    columns = [*rows[0], "leaf", "trait", "value", "sd", "unit", "method", "ontology"]
+    columns = [*rows[0], "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology"]
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerows([columns, *([*row.values(), *numbers] for row in rows for numbers in NUMBERS)])

@@ -23,7 +23,7 @@ from mvseg.traits.ontology import DEFINITIONS
 
 Row = dict[str, str]
 CHECKLIST = [line.split("\t") for line in Path(__file__).with_name("miappe-1.1.tsv").read_text().splitlines()]
-OWN_COLUMNS = {"leaf", "trait", "value", "sd", "unit", "method", "ontology"}
+OWN_COLUMNS = {"leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology"}
 OF_PLANTS = ("investigation", "study", "person", "biological_material", "observation_unit")
 STUDY, MATERIAL, UNIT = "Study unique ID", "Biological material ID", "Observation unit ID"
 LINKS = {"investigation": (), "observed_variable": (), "observation_unit": (STUDY, MATERIAL)}  # to other tables
@@ -91,7 +91,8 @@ def brapi_answer(rows: Sequence[Row]) -> dict[str, object]:
     data = []
     for row in rows:
         said = {name.casefold(): cell for name, cell in row.items()}
-        more = {name: row[name] for name in ("scene", "leaf", "sd", "unit", "method", "ontology")}  # BrAPI has no keys
+        rest = ("scene", "leaf", "sd", "unit", "method", "ontology", "unit_ontology")  # BrAPI has no keys for them
+        more = {name: row[name] for name in rest}
         known = {"observationTimeStamp": time_stamp(row), "studyDbId": said.get(STUDY.casefold(), "")}
         known["germplasmDbId"] = said.get(MATERIAL.casefold(), "")
         data.append({

@@ -159,9 +159,9 @@ def describe_leaf(
         reasons = (why,)
     found = {trait.name: numbers.get(trait.name, missing(why)) for trait in LEAF_TRAITS}
     if isinstance(shape, LeafSurface):
-        found["quality"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons)))
+        found["iou"] = Measurement(median_iou(shape), float("nan"), "; ".join(("surface", *reasons)))
     elif shape is not None and (num_parts := shape.num_pieces) > 1:
         reasons = (*reasons, f"in {num_parts} pieces")
-        found["quality"] = missing(f"{why}; in {num_parts} pieces")
+        found["iou"] = missing(f"{why}; in {num_parts} pieces")
     method = "none" if shape is None else "surface" if isinstance(shape, LeafSurface) else "voxels"
     return LeafTraits(leaf=instance, numbers=found, method=method, reasons=reasons, rejection=rejection)

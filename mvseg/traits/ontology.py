@@ -1,6 +1,7 @@
 """The names of the traits, what they mean and in which unit; docs/traits.md has the formulas.
 
-Accessions are of the Plant Trait Ontology (TO), where it has a term for exactly this.
+Accessions of traits are of the Plant Trait Ontology (TO), those of units of the Units of Measurement Ontology (UO);
+"" where none is for exactly this.
 """
 
 from __future__ import annotations
@@ -70,13 +71,13 @@ VOXEL_TRAITS = (
 COUNTED_TRAITS = (
     _counted("num_views", "views with a mask of the leaf"),
     _counted("sure_views", "views with a sure match"),
-    _counted("quality", "median IoU of the surface with the leaf's masks"),
+    _counted("iou", "median IoU of the surface with the leaf's masks"),
 )
 LEAF_TRAITS = (*SURFACE_TRAITS, *SEEN_TRAITS, *VOXEL_TRAITS, *COUNTED_TRAITS)
 PLANT_TRAITS = (
     _counted("number_of_leaves", "instances that are not rejected", "TO:0000241"),
     Definition("total_leaf_area", "area", "of the leaves that have a surface; the method says how many have none"),
-    Definition("height", "length", "from the lowest to the highest point of the leaves"),
+    Definition("height", "length", "from the lowest to the highest point of the leaves", "TO:0000207"),
     Definition("convex_hull_volume", "volume", "of the convex hull of the leaves"),
     Definition("projected_area", "area", "what the leaves cover, seen from above"),
     Definition("light_interception", "1", "projected_area / total_leaf_area: 1 = flat and side by side"),
@@ -88,6 +89,12 @@ PLANT_TRAITS = (
 DEFINITIONS = {definition.name: definition for definition in (*LEAF_TRAITS, *PLANT_TRAITS)}
 POWERS = {"length": "", "area": "^2", "volume": "^3"}
 UNKNOWN_UNIT = "world unit"  # where the cameras do not say what their lengths are
+UNIT_ACCESSIONS = {
+    "m": "UO:0000008", "cm": "UO:0000015", "mm": "UO:0000016", "um": "UO:0000017", "µm": "UO:0000017",
+    "m^2": "UO:0000080", "cm^2": "UO:0000081", "mm^2": "UO:0000082",
+    "m^3": "UO:0000096", "cm^3": "UO:0000097", "dm^3": "UO:0000100",
+    "degree": "UO:0000185", "1": "UO:0000186",
+}  # fmt: skip
 
 
 def unit_of(kind: Kind, unit: str) -> str:

@@ -18,13 +18,12 @@ from mvseg.errors import InputError
 from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
-from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
+from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
-COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology")
+COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
 FORMULA_STARTS = ("=", "+", "-", "@")
 NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
-WIDE_TRAITS = [trait for trait in LEAF_TRAITS if trait.name != "quality"]
 GOOD, REJECTED = "good", "rejected: "
 
 
@@ -39,31 +38,30 @@ def write_long(path: Path, traits: Traits) -> None:
         for name, number in numbers.items():
             if number.exists or name not in VOXEL_NAMES:
                 trait = DEFINITIONS[name]
-                about = unit_of(trait.kind, traits.unit), number.method, trait.ontology
+                unit = unit_of(trait.kind, traits.unit)
+                about = unit, number.method, trait.ontology, UNIT_ACCESSIONS.get(unit, "")
                 rows.append(as_cells(traits.plant, leaf, name, number.value, number.sd, *about))
     write_csv(path, COLUMNS, rows)
 
 
 def write_wide(path: Path, traits: Traits, probabilities: Mapping[int, float] = MappingProxyType({})) -> None:
-    """One row per leaf: each trait, beside it its standard deviation, and in the end the unit of lengths, the method,
-    the quality: "good", or the reasons to doubt the numbers; and how likely it is a leaf, where the views chose it."""
+    """One row per leaf: plant, leaf, each trait with its standard deviation beside it, the unit of lengths, the method,
+    the quality ("good", or the reasons to doubt the numbers), and how likely it is a leaf, where the views chose it."""
     rows = []
     for leaf in traits.leaves:
         numbers: list[float] = []
-        for trait in WIDE_TRAITS:
+        for trait in LEAF_TRAITS:
             number = leaf.numbers[trait.name]
             numbers += [number.value, number.sd] if trait.has_sd else [number.value]
         texts = traits.unit or UNKNOWN_UNIT, leaf.method, "; ".join(leaf.reasons) or GOOD
-        rows.append(
-            as_cells(leaf.leaf, *numbers, leaf.numbers["quality"].value, *texts, probabilities.get(leaf.leaf))
-        )
+        rows.append(as_cells(traits.plant, leaf.leaf, *numbers, *texts, probabilities.get(leaf.leaf)))
     write_csv(path, wide_columns(), rows)
 
 
 def wide_columns() -> list[str]:
     """The columns of `write_wide`."""
-    pairs = [[trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name] for trait in WIDE_TRAITS]
-    return ["leaf", *chain.from_iterable(pairs), "iou", "unit", "method", "quality", "probability"]
+    pairs = [[trait.name, f"{trait.name}_sd"] if trait.has_sd else [trait.name] for trait in LEAF_TRAITS]
+    return ["plant", "leaf", *chain.from_iterable(pairs), "unit", "method", "quality", "probability"]
 
 
 def read_traits(
@@ -95,9 +93,10 @@ def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurem
     rejection = None
     if reasons and reasons[0].startswith(REJECTED):
         rejection = Rejection.of(reasons[0].removeprefix(REJECTED))
+    absent = {name: missing("has no voxels") for name in VOXEL_NAMES}  # the only ones that have no row then
     return LeafTraits(
         leaf=leaf,
-        numbers={trait.name: numbers.get(trait.name, missing("has no voxels")) for trait in LEAF_TRAITS},
+        numbers={trait.name: (absent | numbers)[trait.name] for trait in LEAF_TRAITS},
         method=row["method"],
         reasons=reasons,
         rejection=rejection,

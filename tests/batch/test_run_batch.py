@@ -100,12 +100,13 @@ def test_the_tables_of_a_batch(here: None, plants: Path, tmp_path: Path, capsys:
     basil = [row for row in joined if row["scene"] == "plants_basil"]
     assert {(row["plant"], row["time"], row["pot"]) for row in basil} == {("'=b1", "-2", "red")}
     assert {(row["plant"], row["pot"]) for row in joined if row not in basil} == {("m1", "'@2")}
-    own = ["leaf", "trait", "value", "sd", "unit", "method", "ontology"]
+    own = ["leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology"]
     assert [[row[name] for name in own] for row in basil] == [[row[name] for name in own] for row in single]
     wide = read_table(out / "tables" / "traits_wide.csv")
     assert [(row["scene"], row["leaf"]) for row in wide] == [
         (scene, str(leaf)) for scene in ("plants_basil", "plants_mint") for leaf in (1, 2, 3)
     ]
+    assert list(wide[0])[:6] == ["scene", "plant", "time", "pot", "leaf", "area"]  # plant once, as the list has it
     summary = read_table(out / "tables" / "summary.csv")
     columns = ("scene", "plant", "state", "instances", "masks", "views", "warnings", "warning_text")
     warning = "the cameras are in mm: unit cm without a scale only renames it"

@@ -102,7 +102,7 @@ def test_a_leaf_without_a_credible_surface_has_voxels_and_a_reason() -> None:
     assert [leaf.method for leaf in traits.leaves] == ["surface", "voxels", "surface", "none"]
     assert good.reasons == ()
     assert doubted.reasons == ("seen in two views only",)
-    assert doubted.numbers["quality"].method == "surface; seen in two views only"
+    assert doubted.numbers["iou"].method == "surface; seen in two views only"
     assert voxels.reasons == ("no credible surface; its masks agree on no point",)
     assert nothing.reasons == ("no credible surface; seen in one view only",)
     assert {name for name, n in voxels.numbers.items() if n.exists} == {
@@ -123,7 +123,7 @@ def test_rejected_leaves_are_empty_counted_and_left_out() -> None:
     assert traits.rejected == {"few_sure_views": 1}
     leaf = traits.leaves[1]
     assert leaf.reasons == ("rejected: 1 sure views, asked for are 2",)
-    assert {name for name, n in leaf.numbers.items() if n.exists} == {"num_views", "sure_views", "quality"}
+    assert {name for name, n in leaf.numbers.items() if n.exists} == {"num_views", "sure_views", "iou"}
     assert leaf.numbers["area"].method == leaf.reasons[0]
     assert traits.whole["number_of_leaves"].value == 3
     kept = measure_plant(
@@ -158,7 +158,7 @@ def test_a_shape_of_several_pieces_says_so(asked_for: bool) -> None:
     assert leaf.numbers["num_pieces"].value == 2
     assert leaf.reasons[-1] == "in 2 pieces"
     why = "no credible surface; its masks agree on no point" if asked_for else "no surface was asked for"
-    assert leaf.numbers["quality"].method == f"{why}; in 2 pieces"
+    assert leaf.numbers["iou"].method == f"{why}; in 2 pieces"
     assert leaf.numbers["area"].method == why
 
 

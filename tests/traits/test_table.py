@@ -1,6 +1,8 @@
 from __future__ import annotations
 
 import csv
+import shutil
+import subprocess
 from dataclasses import replace
 from pathlib import Path
 
@@ -47,7 +49,8 @@ def long(tmp_path: Path) -> list[dict[str, str]]:
 
 
 def test_long_form(long: list[dict[str, str]]) -> None:
-    assert tuple(long[0]) == COLUMNS == ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology")
+    columns = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
+    assert tuple(long[0]) == COLUMNS == columns
     names = [trait.name for trait in LEAF_TRAITS if trait not in VOXEL_TRAITS]
     rows = [(leaf, name) for leaf in ("1", "2") for name in names]
     assert [(row["leaf"], row["trait"]) for row in long] == [("", trait.name) for trait in PLANT_TRAITS] + rows
@@ -72,9 +75,13 @@ def test_units_and_accessions(long: list[dict[str, str]], tmp_path: Path) -> Non
     accessions = {row["trait"]: row["ontology"] for row in long if row["ontology"]}
     assert accessions == {
         "number_of_leaves": "TO:0000241", "length": "TO:0000135", "width": "TO:0000370", "area": "TO:0000540",
-        "insertion_angle": "TO:0000206",
+        "insertion_angle": "TO:0000206", "height": "TO:0000207",
     }  # fmt: skip
+    of_units = {"area": "UO:0000082", "length": "UO:0000016", "inclination": "UO:0000185", "hue": "UO:0000185",
+                "greenness_index": "UO:0000186"}  # fmt: skip
+    assert {name: of_leaf[name]["unit_ontology"] for name in of_units} == of_units
     write_long(tmp_path / "unknown.csv", traits_of(unit=""))
+    assert {row["unit_ontology"] for row in read(tmp_path / "unknown.csv")} == {"", "UO:0000185", "UO:0000186"}
     units = {row["trait"]: row["unit"] for row in read(tmp_path / "unknown.csv")}
     assert (units["area"], units["convex_hull_volume"]) == ("world unit^2", "world unit^3")
     write_wide(tmp_path / "wide.csv", traits_of(unit=""))
@@ -84,16 +91,17 @@ def test_units_and_accessions(long: list[dict[str, str]], tmp_path: Path) -> Non
 def test_wide_form(tmp_path: Path) -> None:
     write_wide(tmp_path / "wide.csv", traits_of())
     first, second = read(tmp_path / "wide.csv")
-    assert [*first][:9] == ["leaf", "area", "area_sd", "length", "length_sd", "width", "width_sd", "length_width_ratio",
-                            "length_width_ratio_sd"]  # fmt: skip
-    assert [*first][-5:] == ["iou", "unit", "method", "quality", "probability"]
+    begin = ["plant", "leaf", "area", "area_sd", "length", "length_sd", "width", "width_sd", "length_width_ratio"]
+    assert [*first][:10] == [*begin, "length_width_ratio_sd"]
+    assert [*first][-6:] == ["sure_views", "iou", "unit", "method", "quality", "probability"]
     write_wide(tmp_path / "chosen.csv", traits_of(), {2: 0.75})
     assert [row["probability"] for row in read(tmp_path / "chosen.csv")] == ["", "0.75"]
     assert (first["leaf"], first["quality"], second["leaf"]) == ("1", "good", "2")
     assert second["quality"] == "; ".join(traits_of().leaves[1].reasons)
     numbers = traits_of().leaves[0].numbers
     assert float(first["azimuth"]) == pytest.approx(numbers["azimuth"].value, rel=1e-5)
-    assert {name for name, cell in second.items() if cell} == {"leaf", "unit", "method", "quality"}
+    assert {name for name, cell in second.items() if cell} == {"plant", "leaf", "unit", "method", "quality"}
+    assert {first["plant"], second["plant"]} == {"basil"}
     assert "num_views_sd" not in first
 
 
@@ -126,3 +134,19 @@ def test_pandas_reads_both(tmp_path: Path) -> None:
     long, wide = pandas.read_csv(tmp_path / "long.csv"), pandas.read_csv(tmp_path / "wide.csv")
     assert long["value"].dtype == long["sd"].dtype == wide["area"].dtype == "float64"
     assert wide["leaf"].tolist() == [1, 2]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("Rscript") is None, reason="R is not installed")
+def test_r_reads_both(tmp_path: Path) -> None:
+    """Numbers are numbers, empty cells are NA, and leaves are joined by plant and leaf."""
+    write_long(tmp_path / "long.csv", traits_of())
+    write_wide(tmp_path / "wide.csv", traits_of())
+    code = """
+    long <- read.csv("long.csv"); wide <- read.csv("wide.csv")
+    stopifnot(is.numeric(long$value), is.numeric(long$sd), is.numeric(wide$area), identical(wide$leaf, 1:2))
+    stopifnot(identical(is.na(wide$iou), c(FALSE, TRUE)), identical(wide$quality == "good", c(TRUE, FALSE)))
+    both <- merge(wide, subset(long, trait == "iou"), by = c("plant", "leaf"))
+    stopifnot(nrow(both) == 2, identical(both$iou, both$value), sum(is.na(long$leaf)) > 0)
+    """
+    subprocess.run(["Rscript", "-"], input=code, cwd=tmp_path, text=True, check=True)
