@@ -24,8 +24,12 @@ from mvseg.traits.ontology import (
 from mvseg.traits.table import VOXEL_NAMES, format_number
 
 COLOURS = ("mean_red", "mean_green", "mean_blue")
-# The corners of boxes are in traits.csv; in a table they are of no interest.
+# Not shown until they are asked for.
 NO_COLUMNS = {*COLOURS, *(trait.name for trait in VOXEL_TRAITS if trait.name.endswith(("_min", "_max")))}
+LABELS = {  # as people say it; of the others the name, with spaces
+    "length_width_ratio": "length / width", "iou": "IoU", "num_views": "views", "num_pieces": "pieces",
+    "mean_red": "red", "mean_green": "green", "mean_blue": "blue",
+}  # fmt: skip
 UNITLESS = {"degree": "°", "1": ""}
 
 
@@ -80,4 +84,5 @@ def describe_traits(traits: Traits | None) -> dict[str, Any]:
 
 def _describe_trait(trait: Definition, unit: str) -> dict[str, Any]:
     written = UNITLESS.get(trait.kind, unit_of(trait.kind, unit)).replace("^2", "²").replace("^3", "³")
-    return {"name": trait.name, "unit": written, "meaning": trait.meaning}
+    label = LABELS.get(trait.name, trait.name.replace("_", " "))
+    return {"name": trait.name, "label": label, "unit": written, "meaning": trait.meaning, "hasSd": trait.has_sd}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -143,6 +144,30 @@ def test_headers_sort_and_sort_back(opened: Viewer, balls: Result) -> None:
     assert opened.page.locator("#table th[aria-sort]").count() == 1
 
 
+def test_columns_are_chosen_and_saved_as_csv(opened: Viewer, balls: Result) -> None:
+    assert balls.traits is not None
+    header = opened.page.locator("#table th", has_text="x min")
+    assert (header.is_visible(), opened.page.locator("#table th", has_text="pieces").is_visible()) == (False, True)
+    opened.page.locator("#table-columns summary").click()
+    opened.page.get_by_label("x min", exact=True).check()
+    opened.page.get_by_label("pieces", exact=True).uncheck()
+    assert (header.is_visible(), opened.page.locator("#table th", has_text="pieces").is_visible()) == (True, False)
+    opened.page.locator("#table th", has_text="leaf").first.locator("button").click()  # the last one first
+    with opened.page.expect_download() as download:
+        opened.page.locator("#save-table").click()
+    with Path(download.value.path()).open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert {"num_pieces", "x_max"}.isdisjoint(rows[0])
+    assert [row["leaf"] for row in rows] == ["3", "2", "1"]
+    assert {(row["plant"], row["unit"]) for row in rows} == {(f"plant {HOSTILE}", f"mm {HOSTILE}")}
+    assert {row["quality"] for row in rows} == {f"doubt {HOSTILE}"}
+    for row, leaf in zip(reversed(rows), balls.traits.leaves, strict=True):
+        for name in ("volume", "x_min", "num_views"):
+            assert float(row[name]) == pytest.approx(leaf.numbers[name].value, rel=1e-5)
+    written = opened.page.evaluate("[writeCell('=1+2'), writeCell(-1.5), writeCell('a, b'), writeCell(null)]")
+    assert written == ["'=1+2", "-1.5", '"a, b"', ""]
+
+
 def test_keys_go_through_the_table(opened: Viewer) -> None:
     opened.page.locator("#table tbody button").first.focus()
     opened.page.keyboard.press("Enter")
@@ -207,7 +232,7 @@ def test_ids_alone_have_a_page_without_leaves_in_3d(browser: sync_api.Browser, f
     assert opened.page.locator("#space-note").inner_text().startswith("Cameras only")
     opened.click_on_mask(2)
     assert opened.selected() == everywhere(2) | {"space": []}
-    assert opened.page.locator("#table th").all_inner_texts() == ["leaf", "views", "match"]
+    assert opened.page.locator("#table th").all_inner_texts() == ["leaf", "views", "match score"]
     opened.close()
 
 

@@ -37,6 +37,7 @@ def test_units_are_written_as_people_do_and_columns_chosen(balls: Result) -> Non
     assert (traits["volume"]["unit"], traits["num_views"]["unit"], traits["x_min"]["unit"]) == ("mm³", "", "mm")
     assert (traits["volume"]["isColumn"], traits["x_min"]["isColumn"]) == (True, False)
     assert "area" not in traits  # no leaf has one
+    assert [traits[name]["label"] for name in ("volume", "num_views", "x_min")] == ["volume", "views", "x min"]
     plant = {trait["name"]: trait["unit"] for trait in described["plantTraits"]}
     assert (plant["total_leaf_area"], plant["number_of_leaves"]) == ("mm²", "")
     assert described["whole"]["number_of_leaves"]["value"] == 3

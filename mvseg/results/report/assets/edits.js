@@ -68,9 +68,7 @@ class Edits {
   }
 
   save() {
-    const address = URL.createObjectURL(new Blob([this.text()], { type: "application/json" }));
-    element("a", { href: address, download: "corrections.json" }).click();
-    setTimeout(() => URL.revokeObjectURL(address), 60000);
+    saveFile("corrections.json", this.text(), "application/json");
   }
 }
 

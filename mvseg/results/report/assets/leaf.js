@@ -73,10 +73,10 @@ function traitTable(traits, numbers) {
   for (const trait of traits) {
     const number = numbers[trait.name];
     if (number?.value !== undefined) {
-      rows.push(element("tr", {}, element("th", { scope: "row", title: trait.meaning }, nameOf(trait)),
+      rows.push(element("tr", {}, element("th", { scope: "row", title: trait.meaning }, trait.label),
         element("td", { title: number.on }, formatTrait(number, trait.unit))));
     } else if (number) {
-      missing.set(number.why, [...(missing.get(number.why) ?? []), nameOf(trait)]);
+      missing.set(number.why, [...(missing.get(number.why) ?? []), trait.label]);
     }
   }
   const reasons = [...missing].map(([why, names]) => element("p", { class: "note" }, `${names.join(", ")}: ${why}`));

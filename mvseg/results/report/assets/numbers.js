@@ -31,10 +31,6 @@ function formatTrait(number, unit) {
   return text.value + sd + (unit === "" ? "" : unit === "\u00b0" ? unit : ` ${unit}`);
 }
 
-function nameOf(trait) {
-  return trait.name.replaceAll("_", " ");
-}
-
 function count(number, noun, nouns = `${noun}s`) {
   return `${number} ${number === 1 ? noun : nouns}`;
 }

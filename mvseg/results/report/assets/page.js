@@ -12,7 +12,7 @@ function buildTip(data) {
     tip.hidden = leaf === undefined;
     if (leaf === undefined) return;
     const number = main && leaf.traits?.[main.name];
-    const size = number?.value === undefined ? "" : `, ${nameOf(main)} ${formatTrait(number, main.unit)}`;
+    const size = number?.value === undefined ? "" : `, ${main.label} ${formatTrait(number, main.unit)}`;
     tip.textContent = `Leaf ${leaf.id}${size}`;
   });
 }

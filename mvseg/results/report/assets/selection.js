@@ -51,6 +51,13 @@ function element(name, attributes = {}, ...children) {
   return fill(document.createElement(name), attributes, children);
 }
 
+// The browser saves text as a file of this name.
+function saveFile(name, text, type) {
+  const address = URL.createObjectURL(new Blob([text], { type }));
+  element("a", { href: address, download: name }).click();
+  setTimeout(() => URL.revokeObjectURL(address), 60000);
+}
+
 function drawing(name, attributes = {}, ...children) {
   return fill(document.createElementNS(SVG, name), attributes, children);
 }

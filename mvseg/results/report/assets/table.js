@@ -1,4 +1,5 @@
-// The table of leaves. A click on a header sorts; missing numbers are last either way.
+// The table of leaves. A click on a header sorts; missing numbers are last either way. Columns are chosen, and what is
+// shown can be saved as CSV.
 
 function buildTable(data) {
   const columns = listColumns(data);
@@ -10,6 +11,13 @@ function buildTable(data) {
   const headers = columns.map((column, index) => makeHeader(column, () => sort(index)));
   head.append(element("tr", {}, ...headers));
   headers[0].setAttribute("aria-sort", "ascending");
+  const choices = columns.map((column, index) => makeChoice(column, [head.rows[0], ...body.rows], index));
+  document.getElementById("table-columns").append(...choices.slice(1).map((box) => box.parentElement));
+  document.getElementById("save-table").addEventListener("click", () => {
+    const shown = columns.filter((_, index) => choices[index].checked);
+    saveFile(`${data.plant}.csv`, writeTable(shown, rows.map((row) => data.leaves.find((leaf) => leaf.id === row.leaf))),
+      "text/csv");
+  });
   const unmatched = data.views.flatMap((view) => view.masks).filter((mask) => mask.leaf < 1).length;
   document.getElementById("table-caption").textContent = describeTable(data, unmatched);
 
@@ -62,7 +70,34 @@ function compare(a, b, sign) {
   return sign * (typeof a === "string" ? a.localeCompare(b) : a - b);
 }
 
-// Each column: name, unit, meaning, and for a leaf its text and what it is sorted by.
+// A checkbox that shows a column of these rows; it hides the column right away if nobody asked for it.
+function makeChoice(column, rows, index) {
+  const box = element("input", { type: "checkbox" });
+  const show = () => rows.forEach((row) => { row.cells[index].hidden = !box.checked; });
+  box.checked = column.isShown;
+  box.addEventListener("change", show);
+  show();
+  element("label", {}, box, column.name);
+  return box;
+}
+
+// CSV with the names of traits_wide.csv; numbers are those of the data, not rounded further.
+function writeTable(columns, leaves) {
+  const fields = columns.flatMap((column) => column.fields);
+  const lines = [fields.map(([name]) => name), ...leaves.map((leaf) => fields.map(([, value]) => value(leaf)))];
+  return lines.map((line) => `${line.map(writeCell).join(",")}\n`).join("");
+}
+
+// As `escape_text` of mvseg/traits/table.py: no spreadsheet takes text for a formula.
+function writeCell(value) {
+  if (value === null || value === undefined) return "";
+  const text = String(value).split(/\s+/).filter(Boolean).join(" ");
+  const safe = typeof value === "string" && /^[=+@-]/.test(text) ? `'${text}` : text;
+  return /[",]/.test(safe) ? `"${safe.replaceAll('"', '""')}"` : safe;
+}
+
+// Each column: name, unit, meaning, whether it is shown at first, for a leaf its text and what it is sorted by, and its
+// fields in CSV.
 function listColumns(data) {
   const masks = data.views.flatMap((view) => view.masks);
   const mean = (leaf) => {
@@ -70,31 +105,40 @@ function listColumns(data) {
     return scores.length ? scores.reduce((sum, score) => sum + score, 0) / scores.length : null;
   };
   const numViews = (leaf) => data.views.filter((view) => showsLeaf(view, leaf.id)).length;
-  const traits = data.traits.filter((trait) => trait.isColumn).map((trait) => ({
-    name: nameOf(trait),
+  const traits = [true, false].flatMap((isShown) => data.traits.filter((trait) => trait.isColumn === isShown));
+  const measured = traits.map((trait) => ({
+    name: trait.label,
+    isShown: trait.isColumn,
     unit: trait.unit,
     meaning: trait.meaning,
     cell: (leaf) => numberCell(leaf.traits[trait.name], trait.unit),
     key: (leaf) => leaf.traits[trait.name]?.value ?? null,
+    fields: [
+      [trait.name, (leaf) => leaf.traits[trait.name]?.value],
+      ...(trait.hasSd ? [[`${trait.name}_sd`, (leaf) => leaf.traits[trait.name]?.sd]] : []),
+    ],
   }));
-  const plain = (name, meaning, key, write = String) => ({
-    name, unit: "", meaning, key, cell: (one) => element("td", {}, key(one) === null ? "\u2013" : write(key(one))),
+  const plain = (name, meaning, field, key, write = String) => ({
+    name, unit: "", meaning, key, isShown: true, fields: [[field, key]], cell: (one) => element("td", {}, key(one) === null ? "\u2013" : write(key(one))),
   });
-  const leaf = { ...plain("leaf", "number of the leaf, in all files", (one) => one.id), cell: leafCell };
-  const score = plain("match", "mean match score of the leaf's masks, 1 is best", mean, (value) => value.toFixed(2));
-  const chance = data.leaves.some((one) => one.probability !== undefined) ? [plain("leaf?",
-    "how likely this is a leaf", (one) => one.probability ?? null, (value) => value.toFixed(2))] : [];
+  const twoDigits = (value) => value.toFixed(2);
+  const leaf = { ...plain("leaf", "number of the leaf, in all files", "leaf", (one) => one.id), cell: leafCell };
+  leaf.fields = [["plant", () => data.plant], ...leaf.fields, ["unit", () => data.unit]];
+  const score = plain("match score", "mean match score of the leaf's masks, 1 is best", "match_score", mean, twoDigits);
+  const chance = data.leaves.some((one) => one.probability !== undefined) ? [plain("leaf probability",
+    "how likely this is a leaf", "probability", (one) => one.probability ?? null, twoDigits)] : [];
   if (data.traits.length === 0) {
-    return [leaf, ...chance, plain("views", "photos with a mask of the leaf", numViews), score];
+    return [leaf, ...chance, plain("views", "photos with a mask of the leaf", "num_views", numViews), score];
   }
-  const shape = plain("shape", "what was measured", (one) => one.shape);
+  const shape = plain("shape", "what was measured", "method", (one) => one.shape);
   const doubts = (one) => one.doubts.join("; ");
   const quality = {
-    ...plain("doubts", "reasons to doubt the numbers", (one) => doubts(one) || null),
+    ...plain("doubts", "reasons to doubt the numbers", "quality", (one) => doubts(one) || null),
+    fields: [["quality", (one) => doubts(one) || "good"]],
     cell: (one) => element("td", { class: "text" }, doubts(one)),
     kind: "text",
   };
-  return [leaf, ...chance, ...traits, score, shape, quality];
+  return [leaf, ...chance, ...measured, score, shape, quality];
 }
 
 function leafCell(leaf) {
