@@ -12,38 +12,44 @@ demo: $(VENV)/installed
 test slow: export OMP_NUM_THREADS := 1
 test slow: PYTEST := $(PYTHON) -m pytest -n 2 --dist worksteal
 
-test: $(VENV)/installed
+test: $(VENV)/complete
 	$(PYTEST)
 
 # whole commands, killed workers, notebooks: about three minutes
-slow: $(VENV)/installed
+slow: $(VENV)/complete
 	$(PYTEST) -m slow
 
 # the numeric tests in the arithmetic of other processors; ARITHMETICS="sse avx2" tries two of them
-processors: $(VENV)/installed
+processors: $(VENV)/complete
 	$(PYTHON) .ci/processors.py $(ARITHMETICS)
 
 # about ten minutes: broken files for every reader, and runs that are killed at random moments
-fuzz: $(VENV)/installed
+fuzz: $(VENV)/complete
 	MVSEG_FUZZ_EXAMPLES=2000 $(PYTHON) -m pytest tests/fuzz
 	MVSEG_KILLS=20 MVSEG_KILL_SEED=$$(date +%s) $(PYTHON) -m pytest -m "" tests/test_kill.py
 
 # minutes; PREVIOUS=DIR takes turns with another checkout; FULL=--full renders more scenes at first; FULL=--threads_only
 # measures one thread against two, and nothing else
-bench: $(VENV)/installed
+bench: $(VENV)/complete
 	$(PYTHON) -m benchmarks.speed $(FULL) $(if $(PREVIOUS),--previous $(PREVIOUS)) --cache results/speed --into docs
 
-lint: $(VENV)/installed
+lint: $(VENV)/complete
 	$(PYTHON) -m ruff check .
 	$(PYTHON) -m mypy
 
 # the site, in build/site; a warning is an error (with --quiet, it would not be)
-docs: $(VENV)/installed
+docs: $(VENV)/complete
 	NO_MKDOCS_2_WARNING=1 $(PYTHON) -m mkdocs build --strict --config-file .ci/mkdocs.yml
 
+# what a user needs
 $(VENV)/installed: pyproject.toml
 	python3 -m venv $(VENV)
 	$(PYTHON) -m pip install --quiet --upgrade pip
+	$(PYTHON) -m pip install --quiet --editable .
+	touch $@
+
+# and what tests, lint and site need besides
+$(VENV)/complete: $(VENV)/installed
 	$(PYTHON) -m pip install --quiet --editable '.[test,lint,docs]'
 	touch $@
 
