@@ -94,7 +94,7 @@ def test_edit_reload_edit(browser: sync_api.Browser, served: CorrectionServer, f
     tab.wait_for("What you see follows from all edits.")
     assert ops(folder) == ["confirm"]
     tab.page.locator("#mode-look").click()
-    tab.page.wait_for_function("!document.querySelector('main').hidden && data.numMasks === 12")
+    tab.page.wait_for_function("() => !document.querySelector('main').hidden && data.numMasks === 12")
     tab.page.close()
 
 

@@ -87,7 +87,8 @@ class Server {
     }
     const isFirst = this.number < 0;
     const goesOn = this.learning?.now && learning.now && !update;
-    Object.assign(this, { number, outcomes, learning, isComputing: isComputing || this.unsaved });
+    const isOld = revision !== this.base; // it was on its way while newer edits were saved
+    Object.assign(this, { number, outcomes, learning, isComputing: isComputing || this.unsaved || isOld });
     if (goesOn) return this.work.panel.showProgress(); // no button changes under the pointer
     if (update) {
       this.isNewer ||= !isFirst;
