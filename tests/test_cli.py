@@ -728,7 +728,7 @@ def test_scene_or_masks_that_are_not_there(plant: Path, tmp_path: Path, capsys: 
         photo.rename(photo.with_suffix(".HEIC"))
     assert main(["infer", str(plant), *out]) == 2
     neither = f"{plant}: there are neither photos nor masks (--masks), expected one of them"
-    assert complaint(capsys).startswith(f"{neither}; 000.HEIC is a HEIC file: convert it to JPEG or PNG")
+    assert complaint(capsys).startswith(f"{neither}; found 000.HEIC, 001.HEIC")
     shutil.rmtree(plant / "images")
     assert main(["infer", str(plant), *out]) == 2
     assert complaint(capsys) == neither

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from mvseg.errors import InputError, warn
-from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
+from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.scene import View
 
 SHOWN = 3  # names in a message
@@ -68,7 +68,7 @@ def base_name(name: str) -> str:
     """A file name without folders, the suffixes of images, Roboflow's ending and Label Studio's prefix, in small
     letters."""
     last = name.replace("\\", "/").rsplit("/", 1)[-1]
-    while "." in last and f".{last.rsplit('.', 1)[1].lower()}" in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES):
+    while "." in last and f".{last.rsplit('.', 1)[1].lower()}" in PHOTO_SUFFIXES:
         last = last.rsplit(".", 1)[0]
     return LABEL_STUDIO.sub("", ROBOFLOW.sub("", last)).lower()
 

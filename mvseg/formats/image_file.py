@@ -1,8 +1,8 @@
 """Image files: decoded whole or not at all, by Pillow.
 
 Pillow refuses truncated files. It does not detect a flipped bit in a PNG, so the checksums of PNG files are verified
-here. Orientation tags are ignored in every format, TIFF's own included: rows and columns are those that the file
-stores, as COLMAP reads them, to which cameras and masks refer.
+here. Orientation tags are ignored in every format, TIFF's own and HEIC's included: rows and columns are those that the
+file stores, as COLMAP reads them, to which cameras and masks refer.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import math
 import os
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import lru_cache
 from io import BytesIO
@@ -30,9 +30,10 @@ from PIL.TiffImagePlugin import TiffImageFile
 from PIL.WebPImagePlugin import WebPImageFile
 
 from mvseg.errors import InputError
+from mvseg.formats.heic import BRANDS, TURN, open_heic
+from mvseg.formats.heic import SUFFIXES as HEIC_SUFFIXES
 
-PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp")
-PHONE_SUFFIXES = (".heic", ".heif")  # known by name, to say what to do with them
+PHOTO_SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp", *HEIC_SUFFIXES)
 MAX_SIDE = 1 << 20  # pixels
 MAX_PIXELS = 1 << 28  # more than any camera has; a file of 1 MB may claim, and decode to, a thousand million
 GREY = 2  # largest difference between the channels of a grey photo
@@ -64,7 +65,7 @@ class WrongSize(InputError):
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
-    """Decode a JPEG, PNG, TIFF, BMP or WebP file, recognised by its content; the first image of several.
+    """Decode a JPEG, PNG, TIFF, BMP, WebP or HEIC file, recognised by its content; the first image of several.
 
     Args:
         path: the file.
@@ -88,11 +89,21 @@ def read_image(path: Path, size: tuple[int, int] | None = None) -> Image.Image:
             raise WrongSize(image.width, image.height)
         if image.width * image.height > MAX_PIXELS:
             raise InputError(f"it is {image.width} x {image.height} pixels, expected at most {MAX_PIXELS} in all")
-        turn = _orientation_of(image) if isinstance(image, TiffImageFile) else 1
+        turn = _orientation_of(image) if _is_turned_by_decoder(image) else 1
         _load(image)
-        if turn > 1:  # Pillow has turned it
-            image.getexif()[ORIENTATION] = BACK.get(turn, turn)
-            ImageOps.exif_transpose(image, in_place=True)
+        return _turn_back(image, turn) if turn > 1 else image
+
+
+def _is_turned_by_decoder(image: ImageFile) -> bool:
+    return isinstance(image, TiffImageFile) or TURN in image.info
+
+
+def _turn_back(image: ImageFile, turn: int) -> Image.Image:
+    """A decoded image that has been turned, as the file stores it."""
+    image.getexif()[ORIENTATION] = BACK.get(turn, turn)
+    if not isinstance(image, TiffImageFile):
+        return ImageOps.exif_transpose(image)
+    ImageOps.exif_transpose(image, in_place=True)  # its tags are asked for later
     return image
 
 
@@ -106,7 +117,7 @@ def read_image_size(path: Path) -> tuple[int, int]:
         reader = _find_reader(file.read(16))
         file.seek(0)
         image = reader(file)
-        is_swapped = isinstance(image, TiffImageFile) and _orientation_of(image) >= 5  # as it will be turned
+        is_swapped = _is_turned_by_decoder(image) and _orientation_of(image) >= 5  # as it will be turned
     return image.size[::-1] if is_swapped else image.size
 
 
@@ -122,15 +133,14 @@ def _any_fault() -> Iterator[None]:
         raise InputError(reason or type(error).__name__) from None
 
 
-def _find_reader(start: bytes) -> type[ImageFile]:
+def _find_reader(start: bytes) -> Callable[[IO[bytes]], ImageFile]:
     """Pillow's reader for a file with these first bytes."""
-    if start[4:8] == b"ftyp" and start[8:12] in (b"heic", b"heix", b"mif1", b"msf1", b"hevc", b"heim", b"avif"):
-        expected = "expected JPEG, PNG, TIFF, BMP or WebP: convert it without turning or scaling it"
-        raise InputError(f"it is a HEIC file, {expected}")
+    if start[4:8] == b"ftyp" and start[8:12] in BRANDS:
+        return open_heic
     for magic, reader in READERS:
         if start.startswith(magic):
             return reader
-    raise InputError("it is not a JPEG, PNG, TIFF, BMP or WebP file")
+    raise InputError("it is not a JPEG, PNG, TIFF, BMP, WebP or HEIC file")
 
 
 def read_rgb(path: Path, size: tuple[int, int] | None = None, *, bits: int = 8) -> np.ndarray:
@@ -246,6 +256,8 @@ def _orientation_of(image: ImageFile) -> int:
             exif.load(_find_chunk(image.fp, b"eXIf"))
             image.fp.seek(at)
         said = exif.get(ORIENTATION)
+    elif TURN in image.info:
+        said = image.info[TURN]
     else:
         said = image.getexif().get(ORIENTATION)
     return said if isinstance(said, int) and 1 <= said <= 8 else 1

@@ -17,7 +17,6 @@ from mvseg.errors import InputError, check_arguments, faults_of, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.image_file import (
     MAX_PIXELS,
-    PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
     WrongSize,
     file_name_problem,
@@ -215,9 +214,6 @@ def describe_folder(folder: Path) -> str:
         names = sorted(path.name for path in folder.iterdir() if path.is_file())
     except OSError:
         return ""
-    phone = [name for name in names if name.lower().endswith(PHONE_SUFFIXES)]
-    if phone:
-        return f"; {phone[0]} is a HEIC file: convert it to JPEG or PNG without turning or scaling it"
     pictures = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
     return f"; found {list_some(pictures)}" if pictures else ""
 

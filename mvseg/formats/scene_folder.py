@@ -13,7 +13,7 @@ from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
 from mvseg.formats.find_views import list_some
-from mvseg.formats.image_file import PHONE_SUFFIXES, PHOTO_SUFFIXES
+from mvseg.formats.image_file import PHOTO_SUFFIXES
 from mvseg.formats.masks.read_views import read_views
 from mvseg.formats.masks.recognise import MaskFiles, recognise_masks
 from mvseg.formats.masks.view_regions import stack_views
@@ -92,10 +92,6 @@ def _describe(folder: Path) -> str:
     photos = [name for name in names if name.lower().endswith(PHOTO_SUFFIXES)]
     if photos:
         return f"found {len(photos)} photos ({photos[0]}, ...): mvseg pose {folder} --out SCENE estimates their cameras"
-    phone = [name for name in names if name.lower().endswith(PHONE_SUFFIXES)]
-    if phone:
-        next_step = "convert them to JPEG; mvseg pose estimates the cameras of photos"
-        return f"found {len(phone)} HEIC files ({phone[0]}, ...): {next_step}"
     return f"found {list_some(sorted(path.name for path in folder.iterdir()))}"
 
 

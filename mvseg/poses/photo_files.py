@@ -12,9 +12,9 @@ from PIL import Image, ImageOps
 
 from mvseg.errors import InputError, faults_of
 from mvseg.formats.find_views import natural_order
+from mvseg.formats.heic import SUFFIXES as HEIC_SUFFIXES
 from mvseg.formats.image_file import (
     ORIENTATION,
-    PHONE_SUFFIXES,
     PHOTO_SUFFIXES,
     read_image,
     read_orientation,
@@ -79,8 +79,8 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
         The folder (or its `images/`), and the paths of the photos relative to it, in natural order.
 
     Raises:
-        InputError: there is no such folder, it holds fewer than three photos or HEIC files, or two photos differ in
-            their suffix only.
+        InputError: there is no such folder, it holds fewer than three photos, or two photos differ in their suffix
+            only.
     """
     if not folder.is_dir():
         problem = "is a file" if folder.exists() else "no such folder"
@@ -91,12 +91,10 @@ def list_photos(folder: Path) -> tuple[Path, list[str]]:
     if not _are_photos(files):
         folders = [path for path in sorted(folder.iterdir()) if path.is_dir() and not path.name.startswith(".")]
         files += [path for each in folders for path in _files_in(each)]
-    phone = [path.name for path in files if path.suffix.lower() in PHONE_SUFFIXES]
-    if phone:
-        raise InputError(f"{folder}: {phone[0]} is a HEIC file ({len(phone)} in all), expected JPEG: convert them")
     photos = [path.relative_to(folder).as_posix() for path in files if path.suffix.lower() in PHOTO_SUFFIXES]
     if len(photos) < 3:
-        raise InputError(f"{folder}: found {len(photos)} photos (JPEG, PNG, TIFF, BMP, WebP), expected at least three")
+        kinds = "JPEG, PNG, TIFF, BMP, WebP, HEIC"
+        raise InputError(f"{folder}: found {len(photos)} photos ({kinds}), expected at least three")
     first_with: dict[str, str] = {}
     for name in photos:
         other = first_with.setdefault(name.rpartition(".")[0].lower(), name)
@@ -111,14 +109,15 @@ def _files_in(folder: Path) -> list[Path]:
 
 
 def _are_photos(files: Sequence[Path]) -> bool:
-    return any(path.suffix.lower() in (*PHOTO_SUFFIXES, *PHONE_SUFFIXES) for path in files)
+    return any(path.suffix.lower() in PHOTO_SUFFIXES for path in files)
 
 
 def copy_photos(folder: Path, names: Sequence[str], images: Path) -> list[PhotoFile]:
     """Copy photos, by their paths in `folder`, into a scene's new `images/`, as they are where that is possible.
 
-    Photos that EXIF turns are written anew, upright, as JPEG if they are JPEG; so are WebP files and those of 10, 12 or
-    14 bits in 16, which COLMAP cannot read. All others of these become 8-bit PNG, brightened by the same factor.
+    Photos that EXIF turns are written anew, upright, as JPEG if they are JPEG; so are WebP and HEIC files and those of
+    10, 12 or 14 bits in 16, which COLMAP cannot read. HEIC becomes JPEG, too; all others of these become 8-bit PNG,
+    brightened by the same factor.
 
     Raises:
         InputError: a photo is broken or truncated; it is named.
@@ -139,8 +138,11 @@ def _copy(source: Path, path: Path, images: Path, *, bits: int) -> PhotoFile:
     turned = orientation != 1
     image = read_image(source)  # decoded, so that a truncated file is found now
     optics = _describe_optics(image)
-    if turned and image.format == "JPEG":
+    is_heic = source.suffix.lower() in HEIC_SUFFIXES
+    if is_heic or (turned and image.format == "JPEG"):
+        path = path.with_suffix(".jpg") if is_heic else path
         exif = image.getexif()
+        exif[ORIENTATION] = orientation
         image = ImageOps.exif_transpose(image)
         exif[ORIENTATION] = 1
         image.convert("RGB").save(path, format="JPEG", quality=QUALITY, subsampling=0, exif=exif)

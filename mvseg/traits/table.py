@@ -96,7 +96,7 @@ def _read_leaf(leaf: int, row: Mapping[str, str], numbers: Mapping[str, Measurem
     absent = {name: missing("has no voxels") for name in VOXEL_NAMES}  # the only ones that have no row then
     return LeafTraits(
         leaf=leaf,
-        numbers={trait.name: (absent | numbers)[trait.name] for trait in LEAF_TRAITS},
+        numbers={trait.name: {**absent, **numbers}[trait.name] for trait in LEAF_TRAITS},
         method=row["method"],
         reasons=reasons,
         rejection=rejection,

@@ -122,9 +122,9 @@ def test_png_with_one_wrong_bit_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "message"),
     [
-        (b"", "it is not a JPEG, PNG, TIFF, BMP or WebP file"),
-        (b"hello", "it is not a JPEG, PNG, TIFF, BMP or WebP file"),
-        (b"%!PS-Adobe-3.0 EPSF-3.0", "it is not a JPEG, PNG, TIFF, BMP or WebP file"),
+        (b"", "it is not a JPEG, PNG, TIFF, BMP, WebP or HEIC file"),
+        (b"hello", "it is not a JPEG, PNG, TIFF, BMP, WebP or HEIC file"),
+        (b"%!PS-Adobe-3.0 EPSF-3.0", "it is not a JPEG, PNG, TIFF, BMP, WebP or HEIC file"),
         (b"\xff\xd8", "."),
         (b"\x89PNG\r\n\x1a\n", "it is cut short"),
         (b"RIFF0000WAVE", "."),

@@ -81,9 +81,6 @@ def test_no_folder_and_no_cameras(tmp_path: Path) -> None:
         load_scene(tmp_path / "absent")
     with pytest.raises(InputError, match=r"no cameras, expected cameras\.json, a COLMAP model in"):
         load_scene(tmp_path)
-    (tmp_path / "IMG_1.HEIC").touch()
-    with pytest.raises(InputError, match=r"found 1 HEIC files \(IMG_1.HEIC, ...\): convert them to JPEG"):
-        load_scene(tmp_path)
     (tmp_path / "1.jpg").touch()
     with pytest.raises(InputError, match=r"found 1 photos \(1.jpg, ...\): mvseg pose .* --out SCENE estimates"):
         load_scene(tmp_path)
