@@ -29,7 +29,7 @@ class Opened:
         self.page.on("dialog", lambda dialog: self.problems.append(dialog.message))
         self.page.goto(file.as_uri())
         if has_space:
-            self.page.wait_for_function("Number(document.getElementById('canvas').dataset.frames) > 0")
+            self.page.wait_for_function("() => Number(document.getElementById('canvas').dataset.frames) > 0")
 
     def close(self) -> None:
         self.context.close()
