@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from mvseg.masks import SURE, Masks
+from mvseg.results.scale_bar import ScaleBar
 
 MAX_SIDE = 1600  # pixels of an overlay's longer side
 MARGIN = 0.06  # around the plant in a picture, of its longer side
@@ -30,7 +31,7 @@ def instance_color(instance: int) -> tuple[int, int, int]:
     return round(255 * red), round(255 * green), round(255 * blue)
 
 
-def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
+def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int, bar: ScaleBar | None = None) -> np.ndarray:
     """Tint the masks of one view in the colours of their instances, with contour and number.
 
     Unmatched ones are grey and have no number; numbers get a question mark where the match score is below 0.5.
@@ -39,6 +40,7 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
         photo: (H, W, 3) uint8 RGB, undistorted.
         masks: D masks.
         view: index of the view.
+        bar: a scale bar for the lower left corner.
 
     Returns:
         uint8 RGB, scaled down so that the longer side has at most 1600 pixels.
@@ -68,7 +70,11 @@ def draw_overlay(photo: np.ndarray, masks: Masks, *, view: int) -> np.ndarray:
             (column, row), radius = find_thickest(mask)
             doubt = "?" if masks.match_scores[index] < SURE else ""
             numbers.append((f"{instance}{doubt}", (x + column, y + row), radius))
-    _write(painted, numbers, scale=max(0.35, longer / 1100))
+    letters = max(0.35, longer / 1100)
+    ink = _write(numbers, size, scale=letters)
+    if bar is not None:
+        _draw_bar(ink, bar, scale=letters)
+    _print(painted, ink, scale=letters)
     return painted
 
 
@@ -95,14 +101,29 @@ def find_thickest(mask: np.ndarray) -> tuple[tuple[int, int], float]:
     return (int(column), int(row)), float(depth.max())
 
 
-def _write(canvas: np.ndarray, numbers: Sequence[_Number], *, scale: float) -> None:
-    """Black numbers with a white edge, smaller on small leaves."""
-    ink = np.zeros(canvas.shape[:2], np.uint8)
+def _write(numbers: Sequence[_Number], size: tuple[int, int], *, scale: float) -> np.ndarray:
+    """Where a picture of this width and height has ink (uint8): numbers, smaller on small leaves."""
+    ink = np.zeros(size[::-1], np.uint8)
     for text, (column, row), radius in numbers:
         own = float(np.clip(2 * radius / CAPITAL, max(0.35, 0.5 * scale), scale))
         (width, height), _ = cv2.getTextSize(text, cv2.FONT_HERSHEY_SIMPLEX, own, 1)
         corner = (column - width // 2, row + height // 2)
         cv2.putText(ink, text, corner, cv2.FONT_HERSHEY_SIMPLEX, own, 255, max(1, round(2 * own)), cv2.LINE_AA)
+    return ink
+
+
+def _draw_bar(ink: np.ndarray, bar: ScaleBar, *, scale: float) -> None:
+    """A bar, and its length above it."""
+    height, width = ink.shape
+    margin, thickness = round(CAPITAL * scale), max(2, round(5 * scale))
+    left, bottom = margin, height - margin
+    ink[bottom - thickness : bottom, left : left + max(1, round(bar.share * width))] = 255
+    place = (left, bottom - 2 * thickness)
+    cv2.putText(ink, bar.text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.8 * scale, 255, max(1, round(2 * scale)), cv2.LINE_AA)
+
+
+def _print(canvas: np.ndarray, ink: np.ndarray, *, scale: float) -> None:
+    """Black ink with a white edge."""
     # A thicker stroke underneath would not do as an edge: thickness differs between versions of OpenCV.
     edge = 2 * max(1, round(2 * scale)) + 1
     halo = cv2.dilate(ink, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (edge, edge)))

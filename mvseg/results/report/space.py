@@ -7,7 +7,6 @@ radius of 1.
 from __future__ import annotations
 
 import base64
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -22,6 +21,7 @@ from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.result import Result
+from mvseg.results.scale_bar import round_length
 from mvseg.scene import Cameras, Scene
 from mvseg.traits.up import level_frame
 
@@ -32,7 +32,6 @@ VOXEL_FACES = 700  # triangles of a leaf of voxels
 STEPS = 32767  # of a coordinate from 0 to 1: 16 bits
 PLANT_SHARE = 0.25  # radius of a plant without shapes, as a share of the distance of its cameras
 LEVEL = 0.3  # length of the mean up vector of the cameras, from which it is used as that of the plant
-GRID_STEPS = (1, 2, 5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,8 +131,7 @@ def describe_cameras(cameras: Cameras, frame: Frame) -> list[dict[str, Any]]:
 
 def grid_step(radius: float) -> float:
     """Side of the squares of the grid: 1, 2 or 5 times a power of ten, a fifth to a half of the plant's radius."""
-    power = 10 ** math.floor(math.log10(radius / 2))
-    return max(step * power for step in GRID_STEPS if step * power <= radius / 2)
+    return round_length(radius / 2)
 
 
 def _encode(points: Floats, mesh: trimesh.Trimesh) -> dict[str, str]:
