@@ -177,3 +177,27 @@ def test_a_detector_learns_while_a_person_edits(
     tab.wait_for("About 2 minutes")
     assert len(tab.rows()) == 1
     tab.page.close()
+
+
+def test_fitting_to_the_leaf_is_undone_alone(browser: sync_api.Browser, served: CorrectionServer) -> None:
+    tab = Tab(browser, served)
+    points = "modes.work.draft.points"
+    tab.page.evaluate("""(() => {
+      const { work } = modes;
+      const [x1, y1, x2, y2] = data.views[0].masks[0].box;
+      work.take("outline");
+      const corners = [[x1 - 30, y1 - 30], [x2 + 30, y1 - 30], [x2 + 30, y2 + 30], [x1 - 30, y2 + 30]];
+      work.draft = { pane: work.panes[0], kind: "outline", points: corners, isClosed: false };
+      work.finish();
+    })()""")
+    drawn = tab.page.evaluate(points)
+    tab.page.get_by_role("button", name="Fit it to the leaf").click()
+    tab.page.get_by_role("button", name="As I drew it").wait_for()
+    assert len(tab.page.evaluate(points)) > 4
+    tab.page.get_by_role("button", name="As I drew it").click()
+    assert tab.page.evaluate(points) == drawn
+    assert tab.page.get_by_role("button", name="As I drew it").count() == 0
+    tab.page.keyboard.press("Enter")
+    tab.wait_for("What you see follows from all edits.")
+    assert tab.rows()[0].startswith("outline")
+    tab.page.close()

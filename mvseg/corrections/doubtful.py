@@ -1,7 +1,8 @@
-"""The queue of a person who corrects a result: what is most likely wrong comes first."""
+"""The queue of a person who corrects a result: the answers that are expected to change most come first."""
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -12,6 +13,8 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
+from mvseg.corrections.unmasked import Unmasked, find_unmasked
+from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
@@ -20,16 +23,22 @@ from mvseg.verification.evidence import OPEN_PIXELS, SHARED, Evidence, Ints, Sho
 
 Bools = NDArray[np.bool_]
 
+DIGITS = 6  # of what an answer changes: what differs less is a tie, on every processor
 LEAST_DOUBT = 0.3  # what is surer is not asked
-MOST_DOUBTS = 200  # nobody answers more
+MOST_DOUBTS = 200  # of which a page asks a few, and the others where a person clicks
 OPEN = 0.5  # a view should show a mask of a surface if at least this fraction of it is unhidden, and `OPEN_PIXELS`
 EMPTY = 0.6  # of that part, outside all masks: the mask is missing
 SIMILAR = 0.4  # IoU of that part with a mask of another leaf, that may be it
 SMOOTH = 1.5  # pixels that a proposed outline may be off
 LEAST_CHANCE = 0.1  # of a candidate that was not chosen, to be a leaf, from which it is asked about
 MISSING, COVERED, LONE = 0.8, 0.9, 0.6  # doubt of what cannot be told from scores, at most
+UNMASKED = 0.8  # doubt of a place that has the colour of leaves, and no mask
+HALF = 0.5  # of a mask, that such a place beside it has at least: the mask may show half a leaf
+LEAST_HALVES = 3  # photos from which that is asked: one mask may as well touch another leaf
+MOST_PLACES = 12  # that one question shows
 
-Kind = Literal["match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
+Kind = Literal["place", "half", "match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
+FIRST = ("place", "half")  # what nothing but an outline mends, and all photos follow
 Outlines = tuple[tuple[int, NDArray[np.float64]], ...]
 
 
@@ -38,18 +47,22 @@ class Doubt:
     """One question to a person.
 
     Attributes:
-        kind: "match": is the mask of that leaf? "unmatched": is it a leaf, and which? "few": is this a leaf? (it was
+        kind: "place": large places have the colour of leaves, and no mask: are there leaves? "half": does a leaf have
+            half masks only? (such places are beside them in several views; or another leaf was missed there);
+            "match": is the mask of that leaf? "unmatched": is it a leaf, and which? "few": is this a leaf? (it was
             found in few of the views that should show it); "surface": does the mask show that leaf? (the leaf's
             surface explains it badly); "covered": the leaf should be where a mask of another one is; "missing": it
             should be where no mask is; "leaf": is this a leaf? (a candidate that was not chosen).
         doubt: how likely something is wrong, from 0 to 1; rough, to sort by.
         view: index of the view.
-        instance: id of the leaf; -1 for "unmatched" without a guess, and for "leaf".
-        region: row of the mask; -1 for "missing" and "leaf".
+        instance: id of the leaf; -1 for "unmatched" without a guess, for "place" and "leaf".
+        region: row of the mask; -1 for "place", "missing" and "leaf".
         other: row of the mask of the same leaf in another view that shows it best; -1 for none.
-        found, expected: number of views that have a mask of the leaf, and that should.
+        found, expected: number of views that have a mask of the leaf, and that should; of "half", those that have half
+            a mask, and that have any.
+        size: of what it is about, from 0 to 1: its area as a share of that of a usual mask, at most 1.
         outlines: views, `view` first, and (P, 2) float64 pixels, undistorted: where the leaf should be; one of
-            "missing", two or more of "leaf", none of the others.
+            "missing", two or more of "leaf", those of "place" and "half", none of the others.
     """
 
     kind: Kind
@@ -61,20 +74,32 @@ class Doubt:
     found: int = 0
     expected: int = 0
     outlines: Outlines = ()
+    size: float = 1.0
+
+    @property
+    def change(self) -> float:
+        """How many usual masks an answer is expected to change."""
+        return round(self.doubt * self.size * max(1, self.found, len(self.outlines)), DIGITS)
 
 
 def list_doubts(
-    masks: Masks, surfaces: Mapping[int, LeafSurface] | None, *, cameras: Cameras, left: Sequence[LeftOut] = ()
+    masks: Masks,
+    surfaces: Mapping[int, LeafSurface] | None,
+    *,
+    cameras: Cameras,
+    left: Sequence[LeftOut] = (),
+    photos: ReadPhoto | None = None,
 ) -> list[Doubt]:
-    """What a person should look at, the most doubtful first, at most `MOST_DOUBTS`; masks that a person made or
-    confirmed are not asked about, and every other mask once.
+    """What a person should look at, at most `MOST_DOUBTS`: first places without masks and half masks, then what an
+    answer is expected to change most (`Doubt.change`); masks that a person made or confirmed are not asked about, and
+    every other mask once.
 
     Args:
         masks: D masks, matched.
         surfaces: {instance id: surface}; None where there are none: only matching is doubted then.
         cameras: V cameras.
-        left: candidates that were not chosen; those that may be leaves come where answers add most: by their chance
-            times their size.
+        left: candidates that were not chosen.
+        photos: of the views; None: nobody looks for places without masks.
     """
     masks, known, cameras = masks.to("cpu"), surfaces or {}, cameras.to("cpu")
     found = _doubt_matches(masks)
@@ -89,19 +114,27 @@ def list_doubts(
         for rows, candidate in zip(free, left, strict=True):
             rows += _free_rows(candidate.masks, view, taken)
     found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
+    usual, areas = _usual_area(masks), masks.regions.areas.tolist()
+    if photos is not None:
+        found += _doubt_unmasked(masks, find_unmasked(masks, photos, least_area=HALF * usual), usual=usual)
+    found = [replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in found]
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
-    queue = _doubt_left(left, free, usual=_usual_area(masks))
-    for each in sorted(found, key=lambda one: (-one.doubt, one.view, one.instance, one.region)):
+    queue = _doubt_left(left, free, usual=usual)
+    for each in sorted(found, key=lambda one: (*_order(one), one.view, one.instance, one.region)):
         name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
         if each.doubt >= LEAST_DOUBT and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
             asked.add(name)
             queue.append(each)
-    queue.sort(key=lambda one: -one.doubt)
+    queue.sort(key=_order)
     return [
         each if each.instance < 0 else replace(each, other=best_mask(masks, each.instance, but=each.view))
         for each in queue[:MOST_DOUBTS]
     ]
+
+
+def _order(doubt: Doubt) -> tuple[bool, float]:
+    return doubt.kind not in FIRST, -doubt.change
 
 
 def best_mask(masks: Masks, instance: int, *, but: int) -> int:
@@ -123,7 +156,7 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
         if ids[row] > 0:
             found.append(Doubt("match", 1 - score, views[row], ids[row], region=row))
         elif areas[row] > 0:
-            doubt = LONE * min(1.0, float(areas[row]) / max(usual, 1.0))
+            doubt = LONE * min(1.0, float(areas[row]) / usual)
             found.append(Doubt("unmatched", doubt, views[row], -1, region=row))
     return found
 
@@ -131,7 +164,34 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
 def _usual_area(masks: Masks) -> float:
     """The median of those that are matched; pixels."""
     matched = masks.regions.areas[masks.instance_ids > 0].float()
-    return float(matched.median()) if len(matched) else 1.0
+    return max(float(matched.median()), 1.0) if len(matched) else 1.0
+
+
+def _doubt_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) -> list[Doubt]:
+    """Large places without masks, all in one question; and leaves beside whose masks there are such places in several
+    views, a question each."""
+    ids, areas, drawn = masks.instance_ids.tolist(), masks.regions.areas.tolist(), masks.is_corrected.tolist()
+    places, halves = [], defaultdict[int, dict[int, Unmasked]](dict)
+    for part in sorted(parts, key=lambda one: (-one.area, one.view)):
+        if part.row >= 0 and ids[part.row] > 0 and not drawn[part.row] and part.area >= HALF * areas[part.row]:
+            halves[ids[part.row]].setdefault(part.view, part)
+        if part.area >= usual:
+            places.append(part)
+    found = []
+    for instance, views in sorted(halves.items()):
+        if len(views) < LEAST_HALVES:
+            continue
+        places = [part for part in places if part.row < 0 or ids[part.row] != instance]
+        largest = max(views.values(), key=lambda one: one.area)
+        outlines = tuple((part.view, part.outline) for part in views.values())
+        found.append(
+            Doubt("half", UNMASKED, largest.view, instance, region=largest.row, found=len(views),
+                  expected=len(set(masks.view_index[masks.instance_ids == instance].tolist())), outlines=outlines)
+        )  # fmt: skip
+    if places:
+        outlines = tuple((part.view, part.outline) for part in places[:MOST_PLACES])
+        found.append(Doubt("place", UNMASKED, outlines[0][0], -1, outlines=outlines))
+    return found
 
 
 def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
@@ -158,7 +218,7 @@ def _doubt_left(left: Sequence[LeftOut], free: Sequence[Sequence[int]], *, usual
             (int(regions.view_index[row]), _outline(regions.crop(row).numpy(), regions.boxes[row, :2].tolist()))
             for row in (rows[place] for place in order)
         )
-        doubt = each.chance * min(1.0, float(areas.median()) / max(usual, 1.0))
+        doubt = each.chance * min(1.0, float(areas.median()) / usual)
         found.append(Doubt("leaf", doubt, outlines[0][0], -1, outlines=outlines))
     return found
 
@@ -190,7 +250,8 @@ def _doubt_view(
             found.append(Doubt("covered", doubt, view, instance, region=nearest))
         elif empty >= EMPTY:
             outlines = ((view, _outline(mask, (box[1].start, box[0].start))),)
-            found.append(Doubt("missing", MISSING * empty * share, view, instance, outlines=outlines))
+            size = min(1.0, float(mask.sum()) / _usual_area(masks))
+            found.append(Doubt("missing", MISSING * empty * share, view, instance, outlines=outlines, size=size))
     return found
 
 

@@ -172,3 +172,55 @@ def test_what_is_likelier_and_larger_is_asked_first() -> None:
     found = [each for each in list_doubts(nothing, None, cameras=CAMERAS, left=left) if each.kind == "leaf"]
     assert [each.doubt for each in found] == sorted((each.doubt for each in found), reverse=True)
     assert len(found) == 2
+
+
+GREEN, BROWN = (60, 160, 40), (120, 80, 40)
+PHOTOS = [np.where(labels[..., None] > 0, GREEN, BROWN).astype(np.uint8) for labels in TRUE]
+
+
+def test_large_places_that_look_like_leaves_come_first() -> None:
+    maps = [np.where(labels == 3, 3, 0) for labels in TRUE]
+    photos = [np.where((labels == 1)[..., None], BROWN, photo) for labels, photo in zip(TRUE, PHOTOS, strict=True)]
+    masks = masks_of(maps).close_gaps()
+    masks.match_scores[0] = 0.01
+    first, *others = list_doubts(masks, None, cameras=CAMERAS, photos=[p.astype(np.uint8) for p in photos].__getitem__)
+    assert (first.kind, first.instance, first.region) == ("place", -1, -1)
+    assert [each.kind for each in others] == ["match"]
+    assert len(first.outlines) >= 4
+    for view, outline in first.outlines:
+        drawn = cv2.fillPoly(np.zeros(TRUE[view].shape, np.uint8), [np.round(outline - 0.5).astype(np.int32)], 1) > 0
+        assert (TRUE[view][drawn] == 2).mean() > 0.9
+    sizes = [cv2.contourArea(outline.astype(np.float32)) for _, outline in first.outlines]
+    assert sizes == sorted(sizes, reverse=True)
+
+
+def halved(views: tuple[int, ...]) -> Masks:
+    """The true masks; those of leaf 2 show its upper half in some views."""
+    maps = [labels.copy() for labels in TRUE]
+    for view in views:
+        rows, columns = np.nonzero(maps[view] == 2)
+        order = np.argsort(rows, kind="stable")[len(rows) * 4 // 10 :]
+        maps[view][rows[order], columns[order]] = 0
+    return masks_of(maps)
+
+
+def test_half_masks_of_a_leaf_are_one_question() -> None:
+    views = tuple(view for view, labels in enumerate(TRUE) if (labels == 2).sum() > 0.5 * (TRUE[0] == 2).sum())
+    found = list_doubts(halved(views), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
+    half = [each for each in found if each.kind == "half"]
+    assert [(each.instance, each.found >= 3) for each in half] == [(2, True)]
+    assert found[0] is half[0]
+    assert {view for view, _ in half[0].outlines} <= {*views}
+    few = list_doubts(halved(views[:2]), None, cameras=CAMERAS, photos=PHOTOS.__getitem__)
+    assert {each.kind for each in few} <= {"place"}
+
+
+def test_what_changes_more_masks_is_asked_first() -> None:
+    """A leaf of two masks that is likely wrong, before a mask that is more so."""
+    maps = [np.where((labels == 3) & (view > 1), 0, labels) for view, labels in enumerate(TRUE)]
+    masks = masks_of(maps)
+    row = row_of(masks, view=4, leaf=2)
+    masks.match_scores[row] = 0.3
+    found = list_doubts(masks, None, cameras=CAMERAS)
+    assert [each.kind for each in found] == ["few", "match"]
+    assert found[0].doubt < found[1].doubt

@@ -81,9 +81,10 @@ def describe_lenses(scene: Scene) -> tuple[list[dict[str, Any]], list[int | None
 def describe_doubts(result: Result, pictures: Sequence[Picture]) -> list[dict[str, Any]]:
     """The queue; outlines in units of the pictures."""
     cameras = result.scene.cameras.to("cpu")
+    photos = result.photos if result.photos is not None and result.photos.exist else None
     return [
         _describe_doubt(doubt, pictures, cameras.sizes.tolist())
-        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras, left=result.left)
+        for doubt in list_doubts(result.masks, result.surfaces, cameras=cameras, left=result.left, photos=photos)
     ]
 
 
@@ -95,5 +96,5 @@ def _describe_doubt(doubt: Doubt, pictures: Sequence[Picture], sizes: Sequence[S
         points = np.round((outline - (left, top)) * UNITS / (right - left)).astype(int).tolist()
         outlines.append({"view": view, "outline": points})
     said = asdict(doubt) | {"doubt": round(doubt.doubt, 3), "leaf": doubt.instance, "outlines": outlines}
-    del said["instance"]
+    del said["instance"], said["size"]
     return said

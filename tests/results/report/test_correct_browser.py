@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pycolmap
 import pytest
+import torch
 
 from mvseg.corrections.apply import Fate
 from mvseg.corrections.file import load_corrections, parse_corrections
@@ -391,6 +392,27 @@ def test_no_mask_is_hidden_around_the_plant(browser: sync_api.Browser, balls: Re
         box, drawn, inside = person.page.evaluate(seen)
         assert box != [0, 0, 1, 1]
         assert drawn == inside == int((masks.view_index == view).sum())
+    person.close()
+
+
+def test_an_outline_is_an_answer(browser: sync_api.Browser, balls: Result, tmp_path: Path) -> None:
+    """It is drawn in the photo that the question is about, and shows the leaf of the mask that is compared with it; at
+    most ten questions are asked."""
+    doubtful = balls.matching.with_masks(replace(balls.masks, match_scores=torch.full((12,), 0.2)))
+    person = Person(browser, write_page(tmp_path / "report.html", replace(balls, matching=doubtful)))
+    assert "10 questions " in person.page.locator("#correct-ask").inner_text()
+    person.page.keyboard.press("n")
+    view, (x, y), other = person.page.evaluate(
+        "(() => { const { doubt } = modes.work; return [doubt.view, doubt.mask.at, doubt.otherView]; })()"
+    )
+    person.page.get_by_role("button", name="Yes, but I draw it").click()
+    person.drag(0, [[x - 60, y - 60], [x + 60, y - 60], [x + 60, y + 60], [x - 60, y + 60], [x - 60, y - 50]])
+    person.page.keyboard.press("Enter")
+    outline, same = person.save(tmp_path)
+    names = [each.name for each in balls.scene.views]
+    assert (outline["op"], outline["view"]) == ("outline", names[view])
+    assert (same["op"], [place[0] for place in same["at"]]) == ("same", [names[view], names[other]])
+    assert person.page.locator("#correct-ask p").inner_text().startswith("Photo")  # the next one
     person.close()
 
 

@@ -126,7 +126,7 @@ class Work {
 
   next() {
     if (this.doubt) this.skipped.add(this.doubt.name);
-    const { open } = this;
+    const open = this.open.slice(0, MOST_ASKED);
     let left = open.filter((doubt) => !this.skipped.has(doubt.name));
     if (!left.length && open.length) {
       this.skipped.clear();
@@ -219,6 +219,20 @@ class Work {
     return outlines.flatMap(({ view, outline }) => this.outlineEdits(view, outline, `offered ${number}`));
   }
 
+  // An outline that a person draws: the answer to a question shows what that asks about, in its photo.
+  drawnEdits(view, points, leaf) {
+    const { doubt } = this;
+    if (doubt?.kind === "leaf" && !leaf) {
+      const others = doubt.outlines.filter((one) => one.view !== view);
+      return this.offeredEdits("confirm", [{ view, outline: points }, ...others]);
+    }
+    const isAnswer = doubt && !["place", "leaf"].includes(doubt.kind) && !leaf;
+    if (isAnswer && doubt.otherMask && !this.picks.some((pick) => pick.view !== view)) {
+      this.picks = [this.pickOf(doubt.otherView, `r${doubt.otherMask.region}`, doubt.otherMask)];
+    }
+    return this.outlineEdits(view, points, leaf);
+  }
+
   noLeafIn({ view, outline }) {
     return { op: "reject", view: this.data.views[view].name, at: this.frames[view].toPhoto(insidePoint(outline)) };
   }
@@ -253,7 +267,7 @@ class Work {
       this.draft = { pane, kind: "outline", points: [], isClosed: true, paint };
     }
     this.draft.paint.stroke(from, to, { radius: this.radius * pane.unit, erases });
-    this.draft.points = this.draft.paint.outline();
+    Object.assign(this.draft, { points: this.draft.paint.outline(), drawn: undefined });
     this.changed();
   }
 
@@ -295,8 +309,14 @@ class Work {
     const { pane, points } = this.draft;
     if (points.length < 3) return this.discard("Nothing is left of it.");
     const wasAsked = this.doubt;
-    this.add(this.outlineEdits(pane.view, points, leaf));
-    if (wasAsked?.outlines.length) this.next();
+    this.add(this.drawnEdits(pane.view, points, leaf));
+    if (wasAsked && wasAsked.kind !== "place") this.next();
+  }
+
+  // The outline as it was before it was fitted to the leaf.
+  unfit() {
+    Object.assign(this.draft, { points: this.draft.drawn, drawn: undefined });
+    this.changed();
   }
 
   discard(text = "") {

@@ -73,15 +73,16 @@ class Panel {
 
   question() {
     const { doubt, open } = this.work;
+    const asked = Math.min(open.length, MOST_ASKED);
     if (!doubt) {
       const text = open.length
-        ? `${count(open.length, "question")} about masks that may be wrong, the most doubtful first.`
+        ? `${count(asked, "question")} about what may be wrong, those first whose answers change most.`
         : "Nothing doubtful is left.";
       const ask = this.action("next", "Ask me", { disabled: !open.length, main: true });
       return [element("h2", {}, "Questions"), element("p", {}, text), ask];
     }
     const answers = answersTo(doubt).map(([name, text], n) => this.action(name, text, { main: n === 0 }));
-    return [element("h2", {}, `Question (${open.length} left)`), element("p", {}, askAbout(doubt, this.work)),
+    return [element("h2", {}, `Question (${asked} left)`), element("p", {}, askAbout(doubt, this.work)),
       element("div", { class: "answers" }, ...answers)];
   }
 
@@ -136,6 +137,7 @@ class Panel {
     return [...same, element("div", { class: "answers" },
       this.button("Keep it", "Enter", () => this.keep(), { main: true }),
       ...(work.server ? [this.button("Fit it to the leaf", null, () => work.server.fit())] : []),
+      ...(work.draft.drawn ? [this.button("As I drew it", null, () => work.unfit())] : []),
       this.button("Discard", "Esc", () => work.discard()))];
   }
 

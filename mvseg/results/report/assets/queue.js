@@ -1,4 +1,6 @@
-// The most doubtful first: what the page asks, and in which order.
+// What the page asks: of what it is told, in that order, the first ones. The others are asked where a person clicks.
+
+const MOST_ASKED = 10;
 
 function askAbout(doubt, { data }) {
   const view = data.views[doubt.view].name;
@@ -6,6 +8,10 @@ function askAbout(doubt, { data }) {
   const other = doubt.otherView === undefined ? null : data.views[doubt.otherView].name;
   const beside = other === null ? "" : ` Photo ${other} shows that leaf.`;
   switch (doubt.kind) {
+    case "place": return "These large places have the colour of leaves, and no mask. Outline the leaves there, each in " +
+      "two photos under one name: the others follow.";
+    case "half": return `Leaf ${doubt.leaf} may have half masks in ${count(doubt.found, "photo")}, or a leaf beside it was ` +
+      "missed: the dashed lines show what looks like it. Outline all of it.";
     case "match": return other === null
       ? `Photo ${view}: no other photo shows ${leaf}. Is it a leaf?`
       : `Photo ${view}: is this ${leaf}?${beside}`;
@@ -23,14 +29,17 @@ function askAbout(doubt, { data }) {
 
 // The answers that make sense: [action, text on its button].
 function answersTo(doubt) {
-  const pair = [["same", "Yes, the same leaf"], ["different", "No, another leaf"]];
+  const draw = ["outline", "Yes, but I draw it"];
+  const pair = [["same", "Yes, the same leaf"], draw, ["different", "No, another leaf"]];
   const later = ["next", "I cannot tell"];
   switch (doubt.kind) {
-    case "missing": return [["confirm", "Yes, keep this outline"], ["reject", "No, or not to be seen"], later];
-    case "few": case "leaf": return [["confirm", "Yes"], ["reject", "No leaf, nowhere"], later];
+    case "place": return [["outline", "I outline a leaf"], ["next", "No leaves, or not now"]];
+    case "half": return [["outline", "I outline it"], ["next", "It is whole, or I cannot tell"]];
+    case "missing": return [["confirm", "Yes, keep this outline"], draw, ["reject", "No, or not to be seen"], later];
+    case "few": case "leaf": return [["confirm", "Yes"], draw, ["reject", "No leaf, nowhere"], later];
     case "covered": return [...pair, later];
     default: return doubt.otherView === undefined
-      ? [["confirm", "Yes"], ["reject", "No leaf"], later]
+      ? [["confirm", "Yes"], draw, ["reject", "No leaf"], later]
       : [...pair, ["reject", "No leaf at all"], later];
   }
 }

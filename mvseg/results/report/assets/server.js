@@ -108,6 +108,7 @@ class Server {
       const polygon = draft.points.map((point) => frames[view].toPhoto(point));
       const body = JSON.stringify({ view: data.views[view].name, polygon });
       const found = await this.ask("outline", { method: "POST", body });
+      draft.drawn ??= draft.points; // fitting can be undone alone
       draft.points = found.polygon.map((point) => frames[view].toPicture(point));
       this.tell({ fit: "" }, "");
       document.querySelector("#correct-tools button.main")?.focus(); // Enter keeps it, and does not fit it again

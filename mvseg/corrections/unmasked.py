@@ -1,0 +1,101 @@
+"""Parts of the photos that have the colour of leaves and no mask: what was missed there, only a person can say."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from mvseg.formats.photos import ReadPhoto
+from mvseg.masks import Masks
+from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+
+Ints = NDArray[np.int64]
+Bools = NDArray[np.bool_]
+
+MOST_PX = 600  # of a photo that is looked at: a limit of time
+OPENING = 5  # pixels of these: what is thinner is a stem, or the seam beside a mask
+COMPACT = 0.25  # of a part's area, the square of its largest width: stems have less, and leaves of more than 5 to 1
+BESIDE = 3  # pixels of these between a mask and what it leaves out of its leaf
+MOST_SHARE = 0.2  # of a photo: what is larger is no leaf, but the ground
+
+
+@dataclass(frozen=True, eq=False)
+class Unmasked:
+    """One part.
+
+    Attributes:
+        view: index of the view.
+        row: of the mask that it touches, with the longest border; -1 for none.
+        area: pixels.
+        outline: (P, 2) float64 pixels, undistorted.
+    """
+
+    view: int
+    row: int
+    area: float
+    outline: NDArray[np.float64]
+
+
+def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list[Unmasked]:
+    """The parts of at least `least_area` pixels, by view; none where nothing is matched, whose colours tell what leaves
+    look like. What is long and thin like a stem is left out, and so is what reaches the edge of the photo: it rather
+    lies behind the plant.
+
+    Args:
+        masks: D masks on the CPU, matched.
+        photos: of the views.
+    """
+    if not masks.num_instances:
+        return []
+    views = [_thin(masks, photos(view), view) for view in range(masks.regions.num_views)]
+    leaf = np.append(masks.instance_ids.numpy() > 0, False)  # the last one is for row -1
+    counts = ColorCounts.none()
+    for photo, rows, _ in views:
+        counts += count_colors(photo, leaf[rows])
+    colors = leaf_colors(counts)
+    return [
+        part
+        for view, (photo, rows, step) in enumerate(views)
+        for part in _parts(has_leaf_color(photo, colors) & (rows < 0), rows, view=view, step=step)
+        if part.area >= least_area
+    ]
+
+
+def _thin(masks: Masks, photo: NDArray[np.uint8], view: int) -> tuple[NDArray[np.uint8], Ints, int]:
+    """Every `step`-th pixel of a view: the photo, and the row of the mask there, -1 for none."""
+    height, width = photo.shape[:2]
+    step = -(-max(width, height) // MOST_PX)
+    rows = np.full((height, width), -1)
+    for row in (masks.view_index == view).nonzero()[:, 0].tolist():
+        crop = masks.regions.placed(row)
+        crop.cut(rows)[crop.pixels.numpy()] = row
+    return np.ascontiguousarray(photo[::step, ::step]), rows[::step, ::step], step
+
+
+def _parts(is_free: Bools, rows: Ints, *, view: int, step: int) -> Iterator[Unmasked]:
+    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING, OPENING), np.uint8))
+    count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
+    height, width = rows.shape
+    for label in range(1, count):
+        left, top, wide, high, area = stats[label].tolist()
+        if not (left > 0 and top > 0 and left + wide < width and top + high < height) or area > MOST_SHARE * rows.size:
+            continue
+        box = np.s_[max(top - BESIDE, 0) : top + high + BESIDE, max(left - BESIDE, 0) : left + wide + BESIDE]
+        part = (labels[box] == label).astype(np.uint8)
+        if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < COMPACT * area:
+            continue
+        touched = rows[box][cv2.dilate(part, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0]
+        found, numbers = np.unique(touched[touched >= 0], return_counts=True)
+        lines, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        outline = cv2.approxPolyDP(max(lines, key=cv2.contourArea), 1.0, True)[:, 0]
+        corner = np.array([box[1].start, box[0].start])
+        yield Unmasked(
+            view=view,
+            row=int(found[numbers.argmax()]) if len(found) else -1,
+            area=float(area * step**2),
+            outline=np.asarray((outline + corner + 0.5) * step, np.float64),
+        )
