@@ -24,7 +24,7 @@ import torch
 from mvseg import load_result
 from mvseg.cli import main
 from mvseg.config import RunConfig
-from mvseg.corrections.file import Corrections, load_corrections, name_edits
+from mvseg.corrections.file import FORMAT, Corrections, load_corrections, name_edits, parse_corrections
 from mvseg.corrections.rough_outline import refine_outline
 from mvseg.corrections.same_scene import mark_photos, with_marks
 from mvseg.errors import InputError
@@ -40,6 +40,7 @@ from mvseg.scene import Scene, View
 from mvseg.server.correction_server import CHANGED, Corrector
 from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult, keep_numbers, open_alone
+from mvseg.server.vanished import tell_vanished
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
 from scene_folders import write_scene
@@ -533,6 +534,25 @@ def test_learning_that_is_cancelled_or_fails_changes_nothing(
         state = wait_for_news(served, state)
     assert (state["problem"], state["learning"]["now"]) == ("the views agree about 2 leaves.", "")
     assert not state["isComputing"]
+
+
+def test_a_leaf_that_goes_with_an_edit_of_another_is_named(served: CorrectionServer) -> None:
+    """One that the edit names goes without a word, and so does one when edits are undone."""
+    opened = served.corrector.opened
+    shown, (view, at) = opened.saved_result(), middle(opened, 0)
+    edits = parse_corrections({"format": FORMAT, "edits": [{"op": "reject", "view": view, "at": at}]}).edits
+    ids = shown.masks.instance_ids
+    own = int(ids[0])
+    other = next(each for each in ids.tolist() if each not in (-1, own))
+
+    def without(leaf: int) -> Result:
+        return replace(shown, matching=shown.matching.with_masks(shown.masks.select(ids != leaf)))
+
+    assert tell_vanished(shown, without(own), new=edits) == []
+    assert tell_vanished(shown, without(other), new=()) == []
+    assert tell_vanished(shown, without(other), new=edits) == [
+        f"Leaf {other} ({int((ids == other).sum())} masks) went with your last edit: undo it if that is wrong."
+    ]
 
 
 def test_inputs_that_changed_or_moved_since(

@@ -25,6 +25,7 @@ from mvseg.formats.find_views import find_views
 from mvseg.formats.lens import pinhole_from_photo, undistort
 from mvseg.masks import Masks, Origin
 from mvseg.matching.links import Links
+from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
@@ -171,6 +172,19 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
         refused=tuple(work.refused),
         fates=tuple(work.fates.values()),
     )
+
+
+def is_on(edit: Edit, regions: Regions, rows: Sequence[int], *, scene: Scene) -> bool:
+    """Whether an edit, not an outline, points at one of these masks."""
+    places = edit.at if isinstance(edit, Link) else ()
+    if isinstance(edit, (Reject, Confirm, Split)):
+        places = ((edit.view, *edit.at),)
+    work = _Work(scene, [])
+    for place in places:
+        with suppress(_Lost):
+            if set(rows) & set(regions.at(*_pixel_at(work, place))):
+                return True
+    return False
 
 
 def apply_everywhere(corrected: Corrected, matched: Masks) -> tuple[Masks, Corrected]:

@@ -43,6 +43,7 @@ from mvseg.results.report.pictures import Picture, draw_picture
 from mvseg.results.result import Result
 from mvseg.runs.recorded_run import read_recorded
 from mvseg.server.correction_server import CORRECTIONS_FILE, Update
+from mvseg.server.vanished import tell_vanished
 from mvseg.system.atomic import lock_place
 from mvseg.system.running import running
 
@@ -134,9 +135,12 @@ class OpenResult:
             picture.with_masks(shown.masks, view=view, size=tuple(sizes[view]))
             for view, picture in enumerate(self._shown[1])
         ]
+        before = self._shown[0]
+        known = () if before.corrections is None else before.corrections.edits
+        vanished = tell_vanished(before, shown, new=[each for each in corrections.edits if each not in known])
         news = describe_update(shown, pictures)
         self._shown = shown, pictures
-        yield Update(news, outcomes, messages)
+        yield Update(news, outcomes, vanished + messages)
 
     @cached_property
     def _shown(self) -> tuple[Result, list[Picture]]:
