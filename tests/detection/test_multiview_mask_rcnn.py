@@ -83,6 +83,15 @@ def test_without_cameras_it_is_the_detector_it_wraps() -> None:
     MultiViewMaskRCNN(tiny_detector()).load_state_dict(detector.state_dict())
 
 
+def test_a_label_beyond_the_classes_is_refused() -> None:
+    mask = torch.zeros(1, 120, 160, dtype=torch.uint8)
+    mask[:, 20:60, 20:60] = 1
+    box = torch.tensor([[20.0, 20, 60, 60]])
+    targets = [{"boxes": box, "labels": torch.tensor([label]), "masks": mask} for label in (2, 7)]
+    with pytest.raises(InputError, match="target 1 has labels from 7 to 7, expected 1 to 2"):
+        MultiViewMaskRCNN(tiny_detector()).train()(some_images(2), targets)
+
+
 def test_losses_in_train_mode_are_untouched_even_with_cameras() -> None:
     detector = tiny_detector().train()
     wrapped = MultiViewMaskRCNN(detector)
