@@ -110,7 +110,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
                 one of integers; in train mode, a label that is none of the detector's classes.
         """
         if self.training or cameras is None:
-            self._check_labels(targets or [])
+            if targets is not None and hasattr(self.roi_heads.box_predictor, "cls_score"):  # torchvision's own head
+                _check_labels(targets, int(self.roi_heads.box_predictor.cls_score.out_features) - 1)
             return super().forward(images, targets)
         for view, image in enumerate(images):
             _check_image(image, f"image {view}")
@@ -122,14 +123,6 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
             detections = [self._propose(image) for image in images]
             matching = _said_of(self._match(detections, cameras.to(images[0].device)))
             return self._collect(detections, sizes, masks=matching.masks)
-
-    def _check_labels(self, targets: list[dict[str, Tensor]]) -> None:
-        most = int(self.roi_heads.box_predictor.cls_score.out_features) - 1
-        for view, target in enumerate(targets):
-            labels = target["labels"]
-            if len(labels) and not 1 <= int(labels.min()) <= int(labels.max()) <= most:
-                found = f"{int(labels.min())} to {int(labels.max())}"
-                raise InputError(f"target {view} has labels from {found}, expected 1 to {most}, the detector's classes")
 
     def find_regions(self, images: Iterable[Tensor], cameras: Cameras) -> Matching:
         """As `forward` with cameras in eval mode, for large scenes: one image in memory at a time (with
@@ -245,6 +238,14 @@ def _result_dicts(masks: Masks, *, sizes: list[list[int]], device: torch.device)
         }
         results.append({key: value.to(device) for key, value in result.items()})
     return results
+
+
+def _check_labels(targets: Sequence[dict[str, Tensor]], most: int) -> None:
+    for view, target in enumerate(targets):
+        labels = target["labels"]
+        if len(labels) and not 1 <= int(labels.min()) <= int(labels.max()) <= most:
+            found = f"{int(labels.min())} to {int(labels.max())}"
+            raise InputError(f"target {view} has labels from {found}, expected 1 to {most}, the detector's classes")
 
 
 def _check_image(image: Tensor, name: str) -> None:
