@@ -77,11 +77,12 @@ def labels_of(image: Image.Image, path: Path) -> np.ndarray:
         raise InputError(f"{path}: holds signed or 32-bit numbers, expected 8 or 16 bits without sign")
     image = image.convert("L") if image.mode == "1" else image
     labels = np.zeros((image.height, image.width), np.uint16)
-    x1, y1, x2, y2 = image.getbbox() or (0, 0, 1, 0)
-    num_rows = max(1, CHUNK // (x2 - x1))
-    for top in range(y1, y2, num_rows):  # a part at a time, which Pillow copies several times
-        bottom = min(top + num_rows, y2)
-        labels[top:bottom, x1:x2] = np.asarray(image.crop((x1, top, x2, bottom)))
+    num_rows = max(1, CHUNK // image.width)
+    for top in range(0, image.height, num_rows):  # a part at a time, which Pillow copies several times
+        bottom = min(top + num_rows, image.height)
+        part = np.asarray(image.crop((0, top, image.width, bottom)))
+        if part.any():  # pages of zeros that are never written take no memory
+            labels[top:bottom] = part
     if image.mode == "P" and ((labels > 0) & (labels < VOC_BORDER)).any():
         labels[labels == VOC_BORDER] = IGNORE_LABEL
     return labels
