@@ -12,7 +12,7 @@ import json
 import math
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -23,9 +23,10 @@ import torch
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.label_maps import KINDS, add_scene_options, chosen_scenes, load_maps
+from benchmarks.thirds import changed
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import Affinity, region_affinity
-from mvseg.matching.nview.config import Gains, HypothesisCosts, NViewConfig, Thresholds
+from mvseg.matching.numbers import COSTS, GAINS, PIECES
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.symnmf import cluster_affinity
@@ -46,22 +47,29 @@ def one_per_view_ids(regions: Regions, cameras: Cameras, affinity: Affinity) -> 
     return one_per_view_clusters(ViewGraph.of(affinity, regions)).drop_singletons().instance_ids()
 
 
-def nview_ids(
-    regions: Regions, cameras: Cameras, affinity: Affinity, *, config: NViewConfig = NViewConfig()
+def nview_ids(regions: Regions, cameras: Cameras, affinity: Affinity) -> torch.Tensor:
+    return match_nview(regions, cameras, ViewGraph.of(affinity, regions)).instance_ids
+
+
+def ablated_ids(
+    regions: Regions, cameras: Cameras, affinity: Affinity, *, numbers: Any, values: Mapping[str, float]
 ) -> torch.Tensor:
-    return match_nview(regions, cameras, ViewGraph.of(affinity, regions), config=config).instance_ids
+    with changed(numbers, **values):
+        return nview_ids(regions, cameras, affinity)
 
 
 METHODS: dict[str, Method] = {"symnmf": symnmf_ids, "one-per-view": one_per_view_ids, "nview": nview_ids}
-ABLATIONS = {
-    "no weights": NViewConfig(gains=Gains(weight=0)),
-    "no coverage": NViewConfig(gains=Gains(coverage=0)),
-    "missed=absent": NViewConfig(costs=HypothesisCosts(absent=HypothesisCosts.missing)),
-    "hidden is free": NViewConfig(costs=HypothesisCosts(hidden=0)),
-    "pieces alone": NViewConfig(thresholds=Thresholds(covered=math.inf)),
-    "few views kept": NViewConfig(thresholds=Thresholds(few_covered=math.inf)),
+ABLATIONS: dict[str, tuple[Any, Mapping[str, float]]] = {
+    "no weights": (GAINS, {"weight": 0}),
+    "no coverage": (GAINS, {"coverage": 0}),
+    "missed=absent": (COSTS, {"absent": COSTS.missing}),
+    "hidden is free": (COSTS, {"hidden": 0}),
+    "pieces alone": (PIECES, {"covered": math.inf}),
+    "few views kept": (PIECES, {"few_covered": math.inf}),
 }
-METHODS |= {name: partial(nview_ids, config=config) for name, config in ABLATIONS.items()}
+METHODS |= {
+    name: partial(ablated_ids, numbers=numbers, values=values) for name, (numbers, values) in ABLATIONS.items()
+}
 
 
 def run_scene(spec: SceneSpec, *, cache: Path, methods: Iterable[str], kinds: Iterable[str]) -> list[dict[str, Any]]:

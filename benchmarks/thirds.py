@@ -1,6 +1,6 @@
 """What does a third more or less of a room's numbers change? `python benchmarks/thirds.py --cache DIR [--room NAME]`
 
-Numbers are those at the head of the modules, and for matching the fields of `NViewConfig`; one at a time is divided and
+Numbers are those of a room's `numbers.py`, or at the head of its modules; one at a time is divided and
 multiplied by 1.33, whole numbers change by 1 at least. The scenes are development plants.
 
 Of matching, with degraded masks: a line says of each scene how many ids of "nview" and of "one-per-view" change, by how
@@ -25,7 +25,7 @@ import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FunctionType, ModuleType
@@ -37,7 +37,8 @@ from scipy.optimize import linear_sum_assignment
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-import mvseg.matching
+
+import mvseg.matching.numbers
 import mvseg.reconstruction
 import mvseg.reconstruction.shapes
 import mvseg.verification
@@ -57,7 +58,6 @@ from mvseg.masks import Masks, Origin
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.match import match_masks
-from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.split import split_merged
@@ -109,8 +109,28 @@ def is_number(value: Any) -> bool:
     return all(map(is_number, value)) if isinstance(value, tuple) else isinstance(value, int | float)
 
 
+def list_fields(numbers: ModuleType) -> Iterator[tuple[str, Any, str]]:
+    """(name of a group, group, name of a number) of a room's `numbers.py`."""
+    for key, group in vars(numbers).items():
+        if is_dataclass(group) and not isinstance(group, type):
+            yield from ((key, group, field.name) for field in fields(group))
+
+
 @contextmanager
-def changed(module: ModuleType, name: str, value: Any) -> Iterator[None]:
+def changed(group: Any, **values: Any) -> Iterator[None]:
+    """Numbers of a room's `numbers.py` with other values, wherever they are read."""
+    before = {name: getattr(group, name) for name in values}
+    try:
+        for name, value in values.items():
+            object.__setattr__(group, name, value)  # frozen for everybody else
+        yield
+    finally:
+        for name, value in before.items():
+            object.__setattr__(group, name, value)
+
+
+@contextmanager
+def changed_head(module: ModuleType, name: str, value: Any) -> Iterator[None]:
     """A number with another value: wherever it was imported, in defaults, and in the numbers that are computed from it.
 
     What functions remember is forgotten.
@@ -126,7 +146,7 @@ def changed(module: ModuleType, name: str, value: Any) -> Iterator[None]:
             for function, node in functions:
                 set_defaults(function, node.args)
             for other, again in list_derived(module, name):
-                derived.enter_context(changed(module, other, again))
+                derived.enter_context(changed_head(module, other, again))
             forget(holders)
             yield
         finally:
@@ -185,13 +205,13 @@ def evaluate(expression: ast.expr, where: dict[str, Any]) -> Any:
     return eval(compile(ast.Expression(expression), "default", "eval"), where)
 
 
-def match_all(scenes: list[LabelledScene], config: NViewConfig = NViewConfig()) -> list[tuple[np.ndarray, ...]]:
+def match_all(scenes: list[LabelledScene]) -> list[tuple[np.ndarray, ...]]:
     """Per scene the ids of "nview", its scores, the ids of "one-per-view", and the pair F1 of both."""
     found: list[tuple[np.ndarray, ...]] = []
     for scene in scenes:
         regions, truth = scene.masks("degraded")
         graph = ViewGraph.of(region_affinity(regions, scene.cameras), regions)
-        matching = match_nview(regions, scene.cameras, graph, config=config)
+        matching = match_nview(regions, scene.cameras, graph)
         pairwise = one_per_view_clusters(graph).drop_singletons().instance_ids()
         f1 = [matching_metrics(ids, truth).pair_f1 for ids in (matching.instance_ids, pairwise)]
         found.append((matching.instance_ids.numpy(), matching.match_scores.numpy(), pairwise.numpy(), np.array(f1)))
@@ -218,25 +238,29 @@ def try_numbers(package: ModuleType, only: list[str] | None, compare: Callable[[
     for module, name in list_numbers(package):
         for factor in (1 / FACTOR, FACTOR) if only is None or name in only else ():
             try:
-                with changed(module, name, scaled(getattr(module, name), factor)):
+                with changed_head(module, name, scaled(getattr(module, name), factor)):
                     said = compare()
             except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
                 said = f"cannot be: {error}"
             print(f"{module.__name__.rpartition('.')[2]} {name} x {factor:.2f}: {said}", flush=True)
 
 
+def try_fields(numbers: ModuleType, only: list[str] | None, compare: Callable[[], str]) -> None:
+    """Print what each number of a `numbers.py` changes, by what `compare` says while it is another."""
+    for key, group, name in list_fields(numbers):
+        for factor in (1 / FACTOR, FACTOR) if only is None or name in only else ():
+            try:
+                with changed(group, **{name: scaled(getattr(group, name), factor)}):
+                    said = compare()
+            except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
+                said = f"cannot be: {error}"
+            print(f"{key}.{name} x {factor:.2f}: {said}", flush=True)
+
+
 def thirds_of_matching(args: argparse.Namespace) -> None:
     scenes = [load_maps(spec_of(*cell), args.cache) for cell in SCENES]
     before = match_all(scenes)
-    try_numbers(mvseg.matching, args.numbers, lambda: compare_matchings(before, match_all(scenes)))
-    config = NViewConfig()
-    for part in fields(config):
-        group = getattr(config, part.name)
-        for field in fields(group):
-            for factor in (1 / FACTOR, FACTOR) if args.numbers is None or field.name in args.numbers else ():
-                other = replace(group, **{field.name: factor * getattr(group, field.name)})
-                said = compare_matchings(before, match_all(scenes, replace(config, **{part.name: other})))
-                print(f"{part.name}.{field.name} x {factor:.2f}: {said}", flush=True)
+    try_fields(mvseg.matching.numbers, args.numbers, lambda: compare_matchings(before, match_all(scenes)))
 
 
 # --- verification
@@ -366,7 +390,7 @@ def thirds_of_verification(args: argparse.Namespace) -> None:
                 if room not in trial.modules:
                     continue
                 try:
-                    with changed(module, name, scaled(getattr(module, name), factor)):
+                    with changed_head(module, name, scaled(getattr(module, name), factor)):
                         now = trial.run().to("cpu")
                 except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
                     said.append(f"{trial.name} cannot be: {error}")

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 
 import mvseg.tracking
-from benchmarks.thirds import FACTOR, changed, list_numbers, scaled
+from benchmarks.thirds import FACTOR, changed_head, list_numbers, scaled
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series, see_two_plants
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate
@@ -86,7 +86,7 @@ def print_changes(every: Mapping[str, Series], numbers: list[str] | None = None)
     for module, name in list_numbers(mvseg.tracking):
         for what, value in list_changes(getattr(module, name)) if numbers is None or name in numbers else ():
             try:
-                with changed(module, name, value):
+                with changed_head(module, name, value):
                     said = [f"{key}: {compare_links(before[key], track_series(own))}" for key, own in every.items()]
             except (ArithmeticError, LookupError, ValueError) as error:
                 said = [f"cannot be: {error}"]

@@ -167,6 +167,30 @@ def test_warnings_are_given_by_one_function() -> None:
     assert by_hand <= {f"mvseg.{module}" for module in WARN_BY_HAND}
 
 
+NUMBERED = {"matching"}  # rooms whose numbers stand in their `numbers.py`
+
+
+def numbers_at_the_head(source: str) -> set[str]:
+    """Names that are set to plain numbers; sentinels are negative, weights beside their features are tuples."""
+    pairs = [(s.targets[0], s.value) for s in ast.parse(source).body if isinstance(s, ast.Assign)]
+    flat = [pair for target, value in pairs for pair in (
+        zip(target.elts, value.elts, strict=True) if isinstance(target, ast.Tuple) and isinstance(value, ast.Tuple)
+        else [(target, value)]
+    )]  # fmt: skip
+    numbers = [t for t, v in flat if isinstance(v, ast.Constant) and type(v.value) in (int, float)]
+    return {target.id for target in numbers if isinstance(target, ast.Name)}
+
+
+def test_numbers_of_a_room_stand_in_one_place_and_each_has_a_sentence() -> None:
+    assert numbers_at_the_head("a = 1\nB, C = 0.5, 'x'\nD = -1\nE = (1, 2)") == {"a", "B"}
+    heads = {module: numbers_at_the_head(source) for module, source in MODULES.items() if room_of(module) in NUMBERED}
+    assert {module: names for module, names in heads.items() if names} == {}
+    for room in NUMBERED:
+        lines = [line for line in MODULES[f"mvseg.{room}.numbers"].splitlines() if re.match(r"    \w+: ", line)]
+        assert lines
+        assert [line for line in lines if not re.search(r" = .+  # \w.+", line)] == []
+
+
 def typed_homes(package: str) -> dict[str, str]:
     """Public name -> module, from the imports in the package's `__init__.py` that only type checkers read."""
     (block,) = [node for node in ast.parse(MODULES[f"{package}.__init__"]).body if isinstance(node, ast.If)]

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.checks.finding import Finding, Level, Rule, list_findings
+from mvseg.matching.numbers import TANGENCY
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
-from mvseg.matching.tangency import WIDEST, hull_corners, touches_border
+from mvseg.matching.tangency import hull_corners, touches_border
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
@@ -197,7 +198,7 @@ def _spans(pencil: Pencil, side: int, corners: Tensor) -> _Spans:
     pitch = across.norm(dim=2) / (x.square() + y.square()).clamp(min=torch.finfo(x.dtype).tiny)
     at_ends = torch.stack((angle.argmin(1), angle.argmax(1)), 1)
     spans, pitches = angle.gather(1, at_ends), pitch.gather(1, at_ends)
-    is_span = (spans[:, 1] - spans[:, 0] < WIDEST) & (pitches > 0).all(1)
+    is_span = (spans[:, 1] - spans[:, 0] < TANGENCY.widest) & (pitches > 0).all(1)
     return _Spans(spans[is_span], pitches[is_span])
 
 

@@ -19,19 +19,12 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import check_arguments
+from mvseg.matching.numbers import EPIPOLAR
 from mvseg.matching.pencil import Pencil, epipolar_pencil, epipolar_pencils, is_coincident, mean_pitches
 from mvseg.matching.samples import Samples, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
-
-LINE_PX = 2.0  # thickness of an epipolar line (Sec. 3.1)
-# Limits of the computation: a third more or less of any changes no id of "nview" on degraded masks of 8 to 16 leaves.
-BINS_PER_PIXEL = 2  # a bin is half a pixel wide, so that a line of two pixels is resolved
-MIN_BINS, MAX_BINS = 64, 8192
-PITCH_PIXELS = 1024  # of a view's pixels tell how thick a line is, at least about this many
-WIDE = 0.25  # radians: a run becomes pixels if the angle changes by more along it, near an epipole or across the jump
-SHARE = 4096  # whole numbers count such shares of a pixel
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,8 +88,8 @@ def find_spans(pencil: Pencil, side: int, samples: Samples) -> Spans:
         first, last = low.split(len(owner))
         low, high = torch.minimum(first, last), torch.maximum(first, last)
         width = high - low
-        if float(width.max() if len(width) else 0) > WIDE:
-            is_wide = width > WIDE
+        if float(width.max() if len(width) else 0) > EPIPOLAR.wide:
+            is_wide = width > EPIPOLAR.wide
             pixels = samples.pixels(is_wide)
             angles = pencil.angles(side, pixels.xy)
             low, high = (torch.cat((ends[~is_wide], angles)) for ends in (low, high))
@@ -117,10 +110,10 @@ def choose_bins(pitches: tuple[float, float], angles: tuple[Tensor, Tensor]) -> 
     """
     ends = torch.stack([torch.stack(torch.aminmax(part)) for part in angles]).tolist()
     low, high = min(end[0] for end in ends), max(end[1] for end in ends)
-    per_unit = BINS_PER_PIXEL / max(min(pitches), 1e-12)
-    num_bins = int(min(max((high - low) * per_unit, MIN_BINS), MAX_BINS))
+    per_unit = EPIPOLAR.bins_per_pixel / max(min(pitches), 1e-12)
+    num_bins = int(min(max((high - low) * per_unit, EPIPOLAR.min_bins), EPIPOLAR.max_bins))
     per_unit = num_bins / max(high - low, 1e-12) * (1 - 1e-6)
-    half_line = [max(1, min(num_bins, round(LINE_PX / 2 * pitch * per_unit))) for pitch in pitches]
+    half_line = [max(1, min(num_bins, round(EPIPOLAR.line_px / 2 * pitch * per_unit))) for pitch in pitches]
     half_pixel = [max(1, min(num_bins, ceil(pitch / 2 * per_unit))) for pitch in pitches]
     return Bins(
         low=low,
@@ -142,14 +135,14 @@ def span_histogram(bins: Bins, spans: Spans) -> Tensor:
         return counts.reshape(spans.num_regions, padded)[:, 1:-1]
     low, high = bins.index(spans.low), bins.index(spans.high)
     # int32: half the memory traffic, as long as all pixels of a region may lie in one bin
-    kind = torch.int32 if SHARE * spans.num_pixels < 2**31 else torch.int64
-    share = torch.div(SHARE * spans.weight, high - low + 1).round_().to(kind)
+    kind = torch.int32 if EPIPOLAR.share * spans.num_pixels < 2**31 else torch.int64
+    share = torch.div(EPIPOLAR.share * spans.weight, high - low + 1).round_().to(kind)
     padded = bins.num_bins + 3  # a bin at either end collects what lies outside; one more where the last runs end
     start = spans.owner * padded + low + 1
     changes = share.new_zeros(spans.num_regions * padded)
     changes.index_add_(0, start, share).index_add_(0, start + (high - low + 1), share.neg())
     counts = changes.reshape(spans.num_regions, padded).cumsum(1, dtype=kind)
-    return counts[:, 1:-2].float().mul_(1 / SHARE)
+    return counts[:, 1:-2].float().mul_(1 / EPIPOLAR.share)
 
 
 @dataclass(frozen=True, eq=False)
@@ -221,8 +214,8 @@ def _pair_pitches(
 
 
 def _thin(samples: Samples) -> Tensor:
-    """Of many pixels, about PITCH_PIXELS on a square lattice: enough for a mean, whatever their order."""
-    step = int((samples.num_pixels / PITCH_PIXELS) ** 0.5)
+    """Of many pixels, about `EPIPOLAR.pitch_pixels` on a square lattice: enough for a mean, whatever their order."""
+    step = int((samples.num_pixels / EPIPOLAR.pitch_pixels) ** 0.5)
     if step < 2:
         return samples.pixels().xy
     xy = samples.pixels(samples.xy[:, 1].int() % step == 0).xy

@@ -15,7 +15,8 @@ from mvseg.masks import Masks
 from mvseg.matching.affinity import Affinity, region_affinity
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import NO_LINKS, Links
-from mvseg.matching.nview.match_nview import DILATIONS, match_nview
+from mvseg.matching.numbers import DOUBTS, NVIEW
+from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.one_per_view import one_per_view_clusters
 from mvseg.matching.partition import Clusters
 from mvseg.matching.pencil import is_coincident
@@ -26,12 +27,6 @@ from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
 MATCHED = "instance_ids", "match_scores", "second_ids", "second_parts"  # columns of `Masks` that matching fills
-# They decide what is warned of, and no id. Of 80 development scenes with exact poses and right ids one is
-# warned of: its detector finds a third of the leaves (`benchmarks/confidence.py`).
-TRUSTED = 0.75  # ids are taken for right if their mean match score is at least this
-ALIKE = 0.7  # a view is odd if it explains less than this share of what the median view explains
-SHOWN = 3  # views that a sentence names
-MIN_VIEWS = 4  # limit: with fewer views there is no telling which one is odd
 
 
 @check_arguments
@@ -76,8 +71,8 @@ def _match(
     regions: Regions, cameras: Cameras, config: MatchConfig, *, residual_px: int | None, links: Links
 ) -> Matching:
     links.components(len(regions))
-    if residual_px is not None and residual_px not in DILATIONS:
-        raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, DILATIONS))}")
+    if residual_px is not None and residual_px not in NVIEW.dilations:
+        raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, NVIEW.dilations))}")
     cameras = cameras.to(regions.device)
     check_views(regions, cameras)
     check_baselines(cameras)
@@ -225,14 +220,14 @@ def describe_disagreement(matching: Matching, names: Sequence[str] = ()) -> str:
     if report.explained is None or report.view_explained is None or regions.num_views < 3 or not len(regions):
         return ""
     sure = float(matching.match_scores[is_matched].mean()) if is_matched.any() else 0.0
-    is_capped, odd = report.residual_px == DILATIONS[-1], odd_views(report.view_explained)
-    if sure >= TRUSTED and not is_capped and not odd:
+    is_capped, odd = report.residual_px == NVIEW.dilations[-1], odd_views(report.view_explained)
+    if sure >= DOUBTS.trusted and not is_capped and not odd:
         return ""
     facts = f"{sure:.0%} of the ids are expected to be right"
     called = [names[view] if names else f"view {view}" for view in range(regions.num_views)]
     if odd:
-        more = f" and {len(odd) - SHOWN} more" if len(odd) > SHOWN else ""
-        facts += f", least in {', '.join(called[view] for view in odd[:SHOWN])}{more}"
+        more = f" and {len(odd) - DOUBTS.named} more" if len(odd) > DOUBTS.named else ""
+        facts += f", least in {', '.join(called[view] for view in odd[:DOUBTS.named])}{more}"
     if is_capped:
         facts += f", at a reprojection error of {report.residual_px} pixels or more"
     question = "does each mask, and each camera, belong to its photo? mvseg check compares them"
@@ -255,6 +250,6 @@ def odd_views(view_explained: Tensor) -> list[int]:
     `view_explained` (V,) is that of `Matching`; with fewer than four views, or where no view explains anything, there
     are none.
     """
-    if len(view_explained) < MIN_VIEWS:
+    if len(view_explained) < DOUBTS.min_views:
         return []
-    return (view_explained < ALIKE * view_explained.nanmedian()).nonzero()[:, 0].tolist()
+    return (view_explained < DOUBTS.alike * view_explained.nanmedian()).nonzero()[:, 0].tolist()

@@ -13,16 +13,9 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial.distance import squareform
 
+from mvseg.matching.numbers import ONE_PER_VIEW
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
-
-# A third less and more changes the pair F1 of "one-per-view" on degraded masks of 32 leaves in 5 views as each line
-# says, and that of 8 and 16 leaves by 0.005 at most; of "nview" it changes no id.
-STOP = 0.2  # two clusters are joined if their mean weight is at least this: -0.015, +0.031
-ALONE = 0.1  # a region stays alone if its summed weight, over V - 1, is less than this everywhere: +0.009, +0.033
-MAX_SWEEPS = 20  # limit: nearly always, nothing changes any more before
-TIE = 1e-9  # limit: equal weights differ by this, which is less than what float32 weights that differ at all do
-FORBIDDEN = 1e9  # limit: distance between regions of one view; a mean that includes it is never small enough
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -40,10 +33,10 @@ def one_per_view_clusters(graph: ViewGraph) -> Clusters:
         The clusters, those of one region included. They do not depend on the order of views and regions unless weights
         tie.
     """
-    return power_iteration(graph, link_average(graph))
+    return power_iteration(graph, link_average(graph, ONE_PER_VIEW.stop))
 
 
-def link_average(graph: ViewGraph, stop: float = STOP) -> Clusters:
+def link_average(graph: ViewGraph, stop: float) -> Clusters:
     """Average linkage in which clusters that share a view are never joined, nor those that are apart.
 
     Nodes of several regions are joined first: from then on linkage is that of the contracted graph, whose weights are
@@ -61,12 +54,12 @@ def link_average(graph: ViewGraph, stop: float = STOP) -> Clusters:
         return Clusters.of(np.arange(len(graph.weights)))
     farthest = graph.weights.max(initial=1.0)  # the distance between two regions without an edge
     distances = farthest - graph.weights
-    distances[graph.view_index[:, None] == graph.view_index] = FORBIDDEN
-    distances[graph.apart] = FORBIDDEN
+    distances[graph.view_index[:, None] == graph.view_index] = ONE_PER_VIEW.forbidden
+    distances[graph.apart] = ONE_PER_VIEW.forbidden
     distance = squareform(distances, checks=False)
-    distance += TIE * np.linspace(0, 1, len(distance))
+    distance += ONE_PER_VIEW.tie * np.linspace(0, 1, len(distance))
     distance[squareform(graph.node[:, None] == graph.node, checks=False)] = 0
-    cut = min(farthest - stop + TIE, np.nextafter(farthest, 0))
+    cut = min(farthest - stop + ONE_PER_VIEW.tie, np.nextafter(farthest, 0))
     return Clusters.of(fcluster(linkage(distance, "average"), cut, "distance"))
 
 
@@ -74,14 +67,14 @@ def power_iteration(graph: ViewGraph, clusters: Clusters) -> Clusters:
     """Re-assign the regions of one view after another to the clusters of the others, one to one.
 
     The gain of a region from a cluster is its summed weight to the members, divided by V - 1; a region may also stay
-    alone, for a gain of ALONE. A node of several regions moves as one, whenever a view of it is re-assigned; its gains
-    are their sums. The views with the largest total weight come first, whatever their numbers.
+    alone, for a gain of `ONE_PER_VIEW.alone`. A node of several regions moves as one, whenever a view of it is
+    re-assigned; its gains are their sums. The views with the largest total weight come first, whatever their numbers.
 
     Returns:
         The clusters, those of one region included.
     """
     order = view_order(graph)
-    for _ in range(MAX_SWEEPS):
+    for _ in range(ONE_PER_VIEW.max_sweeps):
         before, ids = clusters.ids, clusters.ids
         for view in order:
             movers = graph.movers(view)
@@ -93,7 +86,7 @@ def power_iteration(graph: ViewGraph, clusters: Clusters) -> Clusters:
             weights = np.add.reduceat(graph.weights[movers.rows].take(others, 1), start, 1)
             gain = movers.total(weights) / max(graph.num_views - 1, 1)
             gain[graph.forbidden(movers, ids, numbers)] = -np.inf
-            chosen = assign_one_to_one(gain, ALONE * movers.sizes)
+            chosen = assign_one_to_one(gain, ONE_PER_VIEW.alone * movers.sizes)
             fresh = ids.max(initial=-1) + 1 + np.arange(movers.num)
             rest[movers.rows] = np.append(numbers, fresh)[chosen][movers.owner]
             ids = rest

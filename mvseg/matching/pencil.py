@@ -9,9 +9,8 @@ import torch
 from torch import Tensor
 
 from mvseg.errors import InputError
+from mvseg.matching.numbers import EPIPOLAR
 from mvseg.scene import Cameras
-
-COINCIDENT = 1e-6  # limit: baselines shorter than this share of the longest one have no epipolar geometry
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,7 +79,7 @@ def is_coincident(cameras: Cameras) -> Tensor:
     centers = cameras.centers
     # Differences, not torch.cdist: that one cancels for many cameras far from the world's origin.
     distance = torch.linalg.vector_norm(centers[:, None] - centers, dim=2)
-    return distance <= COINCIDENT * distance.max()
+    return distance <= EPIPOLAR.coincident * distance.max()
 
 
 def epipolar_pencil(cameras: Cameras, i: int, j: int) -> Pencil:

@@ -9,9 +9,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from mvseg.matching.numbers import EPIPOLAR
 from mvseg.regions import Regions
-
-RUN_PX = 16  # limit: a run along a row of a mask has at most so many pixels: epipolar angles change evenly on it
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,18 +74,18 @@ def view_samples(regions: Regions) -> tuple[list[Samples], list[Tensor]]:
 
 
 def view_runs(regions: Regions, max_per_region: int | None = None) -> tuple[list[Samples], list[Tensor]]:
-    """The pixels of the regions as runs of at most RUN_PX along the rows, view by view; see `view_samples`. Of masks of
-    more than `max_per_region` pixels, the runs of points of a lattice (see `Regions.thin`)."""
+    """The pixels of the regions as runs of at most `EPIPOLAR.run_px` along the rows, view by view; see `view_samples`.
+    Of masks of more than `max_per_region` pixels, the runs of points of a lattice (see `Regions.thin`)."""
     members = [(regions.view_index == view).nonzero()[:, 0] for view in range(regions.num_views)]
     samples = []
     for nodes in members:
         chosen, areas = regions.select(nodes), regions.areas[nodes]
         if max_per_region is None:
-            xy, length, owner = chosen.runs(RUN_PX)
+            xy, length, owner = chosen.runs(EPIPOLAR.run_px)
             pitch, weight = torch.ones_like(length), length.float()
         else:
             chosen, origin, steps = chosen.thin(max_per_region)
-            lattice_xy, length, owner = chosen.runs(RUN_PX)
+            lattice_xy, length, owner = chosen.runs(EPIPOLAR.run_px)
             pitch, weight = steps[owner], length * (areas / chosen.areas.clamp(min=1)).float()[owner]
             xy = ((lattice_xy - 0.5) * pitch[:, None] + origin[owner]).T.contiguous().T
         last = torch.stack((xy[:, 0] + (length - 1) * pitch, xy[:, 1])).T

@@ -17,11 +17,9 @@ from torch import Tensor
 from mvseg.errors import check_arguments
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
+from mvseg.matching.numbers import SYMNMF
 from mvseg.matching.partition import Clusters
 from mvseg.system.running import progress_bar
-
-KS_AT_ONCE = 8  # limit: factorised together
-DAMPING = 0.5  # beta of the multiplicative update, as in the paper's SymNMF implementation
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +85,7 @@ def cluster_weights(W: Tensor, num_per_view: Tensor, config: MatchConfig) -> Clu
     candidates: dict[int, Tensor] = {}
     criterion: dict[int, float] = {}
     with progress_bar(total=high - low + 1, name="number of instances", unit="number") as bar:
-        for ks in torch.arange(low, high + 1).split(KS_AT_ONCE):
+        for ks in torch.arange(low, high + 1).split(SYMNMF.ks_at_once):
             linked_W = W[is_linked][:, is_linked]
             factors = factorise(linked_W, ks.tolist(), num_restarts=config.num_restarts, seed=config.seed)
             for k, H in zip(ks.tolist(), factors, strict=True):
@@ -127,7 +125,7 @@ def factorise(
     H = starts.flatten(0, 1).to(W) * scale  # transposed, (B, k, D), so that H W is one matrix product
     for _ in range(num_iterations):
         denominator = (H @ H.mT) @ H
-        H = H * (1 - DAMPING + DAMPING * (H @ W) / denominator.clamp(min=1e-12))
+        H = H * (1 - SYMNMF.damping + SYMNMF.damping * (H @ W) / denominator.clamp(min=1e-12))
     # |W - H^T H|^2 without its constant |W|^2
     loss = (H @ H.mT).square().sum((1, 2)) - 2 * ((H @ W) * H).sum((1, 2))
     best = loss.reshape(len(ks), num_restarts).argmin(1)

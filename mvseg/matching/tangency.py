@@ -17,12 +17,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.masks import Masks
+from mvseg.matching.numbers import TANGENCY
 from mvseg.matching.pencil import epipolar_pencils, is_coincident
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-
-SMALL_COMPONENT = 0.002  # a component does not count if it has less than this share of its mask's pixels
-WIDEST = 1.5  # limit, radians: a mask that fills more of the pencil holds the epipole, and begins and ends nowhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,7 +118,7 @@ def _hull(regions: Regions, index: int) -> Tensor:
 def without_small_components(mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
     """A mask (H, W) without the components of less than 0.2 % of its pixels: they would be its ends."""
     _, pieces, stats, _ = cv2.connectedComponentsWithStats(mask.astype(np.uint8))
-    is_kept = stats[:, cv2.CC_STAT_AREA] >= SMALL_COMPONENT * mask.sum()
+    is_kept = stats[:, cv2.CC_STAT_AREA] >= TANGENCY.small_component * mask.sum()
     is_kept[0] = False
     return is_kept[pieces].astype(np.uint8) if is_kept.any() else mask.astype(np.uint8)
 
@@ -148,7 +146,7 @@ def tangency_residuals(
         rows = frames[:, side]
         x, y = (outlines.corners[pairs[:, side]] @ rows[:, :, :2].mT + rows[:, None, :, 2]).unbind(2)
         angles.append(torch.atan2(y, x))
-    is_narrow = torch.stack([angle.amax(1) - angle.amin(1) < WIDEST for angle in angles]).all(0)
+    is_narrow = torch.stack([angle.amax(1) - angle.amin(1) < TANGENCY.widest for angle in angles]).all(0)
     kept = pairs[is_narrow]
     ends = [torch.stack([pick(angle, 1)[is_narrow] for angle in angles], 1) for pick in (torch.argmin, torch.argmax)]
     at = torch.cat([outlines.corners[kept, corner] for corner in ends])

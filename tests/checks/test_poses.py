@@ -17,7 +17,8 @@ from mvseg.checks.finding import Finding
 from mvseg.checks.poses import _chosen_pairs, pairwise_agreement, pose_findings, view_agreement
 from mvseg.errors import InputWarning
 from mvseg.formats.scene_folder import load_masks, load_scene
-from mvseg.matching.tangency import SMALL_COMPONENT, without_small_components
+from mvseg.matching.numbers import TANGENCY
+from mvseg.matching.tangency import without_small_components
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras, Scene
 from synthetic import ball_scene, cameras_at, moved, render_balls
@@ -176,7 +177,7 @@ def test_specks_do_not_end_a_mask() -> None:
     assert np.array_equal(without_small_components(mask).astype(bool), mask)
     dirty = mask.copy()
     dirty[2, 70] = True
-    assert SMALL_COMPONENT * mask.sum() > 1
+    assert TANGENCY.small_component * mask.sum() > 1
     assert np.array_equal(without_small_components(dirty).astype(bool), mask)
     assert without_small_components(np.ones((1, 1), bool)).tolist() == [[1]]
 

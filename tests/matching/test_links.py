@@ -18,7 +18,6 @@ from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links
 from mvseg.matching.match import match_regions
 from mvseg.matching.nview.cluster_scores import ClusterScores
-from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.plane_sweep import sweep_planes
 from mvseg.matching.nview.search import search
 from mvseg.matching.one_per_view import link_average, one_per_view_clusters
@@ -137,7 +136,7 @@ def test_nodes_of_one_region_are_no_links_to_the_bit() -> None:
     pairwise = one_per_view_clusters(graph)
     np.testing.assert_array_equal(pairwise.ids, one_per_view_clusters(trivial).ids)
     table = sweep_planes(regions, scene.cameras)
-    found = [search(ClusterScores(table, each, NViewConfig()), pairwise).ids for each in (graph, trivial)]
+    found = [search(ClusterScores(table, each), pairwise).ids for each in (graph, trivial)]
     np.testing.assert_array_equal(*found)
 
 

@@ -8,7 +8,6 @@ import torch
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.nview.cluster_scores import ClusterScores
-from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_nview import match_nview
 from mvseg.matching.nview.merged_masks import second_part
 from mvseg.matching.nview.plane_sweep import sweep_planes
@@ -40,7 +39,7 @@ def test_either_ball_is_the_part_that_the_true_image_shows() -> None:
     true = torch.from_numpy(scene.label_maps[int(regions.view_index[region])][y1:y2, x1:x2])
     mask, sweep = regions.crop(region), sweep_planes(regions, scene.cameras)
     no_weights = ViewGraph(np.zeros((len(regions), len(regions))), sweep.view_index, sweep.num_views)
-    scores = ClusterScores(sweep, no_weights, NViewConfig())
+    scores = ClusterScores(sweep, no_weights)
     for own, other in (numbers, numbers[::-1]):
         labels = regions.labels.clone()
         labels[region] = own

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,8 +14,8 @@ from mvseg.errors import InputError
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
 from mvseg.matching.match import match_regions
+from mvseg.matching.numbers import COSTS, EM, NVIEW, SWEEP
 from mvseg.matching.nview.cluster_scores import ClusterScores
-from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.hypothesis_index import index_hypotheses, pack_views
 from mvseg.matching.nview.initialisation import em_affinities
 from mvseg.matching.nview.match_nview import match_nview
@@ -45,8 +46,6 @@ from synthetic import (
     render_balls,
 )
 
-COSTS = NViewConfig().costs
-
 
 def solve(regions: Regions, cameras: Cameras) -> Matching:
     return match_nview(regions, cameras, ViewGraph.of(region_affinity(regions, cameras), regions))
@@ -70,7 +69,7 @@ def sweep(balls: BallScene) -> PlaneSweep:
 @pytest.fixture
 def scores(balls: BallScene, sweep: PlaneSweep) -> ClusterScores:
     weights = region_affinity(balls.regions, balls.cameras).to_dense().double().numpy()
-    return ClusterScores(sweep, ViewGraph(weights, sweep.view_index, sweep.num_views), NViewConfig())
+    return ClusterScores(sweep, ViewGraph(weights, sweep.view_index, sweep.num_views))
 
 
 # --- slow twins
@@ -155,7 +154,7 @@ def test_cached_scores_are_what_computing_again_gives(sweep: PlaneSweep, scores:
     for step in range(3):
         ids = clusters.ids
         clusters = Clusters.of(np.where(np.arange(len(ids)) % 7 == step, np.roll(ids, 1), ids))
-        fresh = ClusterScores(sweep, scores.graph, scores.config)
+        fresh = ClusterScores(sweep, scores.graph)
         np.testing.assert_allclose(scores.coverages(clusters), fresh.coverages(clusters), atol=1e-6)
         for _ in range(2):
             np.testing.assert_array_equal(scores.own(clusters), fresh.own(clusters))
@@ -207,7 +206,7 @@ def test_pixels_are_spread_evenly_and_never_more_than_asked(balls: BallScene) ->
 
 
 def test_blocks_of_rows_hold_every_row_once_and_cut_no_run(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.BLOCK_SIZE", 10)
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.SWEEP", replace(SWEEP, block_size=10))
     runs = np.repeat(np.arange(40), np.random.default_rng(0).integers(1, 9, 40))
     runs = np.append(runs, [40] * 35)  # longer than a block
     blocks = blocks_of_runs(run_starts(runs), len(runs))
@@ -222,9 +221,9 @@ def test_scores_do_not_depend_on_how_many_rows_are_worked_on_at_a_time(
 ) -> None:
     clusters = some_clusters(scores.sweep, 5)
     expected = scores.own(clusters), scores.coverages(clusters), em_affinities(scores.sweep)[-1]
-    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.BLOCK_SIZE", 50)
-    monkeypatch.setattr("mvseg.matching.nview.initialisation.BLOCK_SIZE", 7)
-    again = ClusterScores(scores.sweep, scores.graph, scores.config)
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.SWEEP", replace(SWEEP, block_size=50))
+    monkeypatch.setattr("mvseg.matching.nview.initialisation.SWEEP", replace(SWEEP, block_size=7))
+    again = ClusterScores(scores.sweep, scores.graph)
     found = again.own(clusters), again.coverages(clusters), em_affinities(scores.sweep)[-1]
     for each, wanted in zip(found, expected, strict=True):
         np.testing.assert_allclose(each, wanted, atol=1e-5)
@@ -234,7 +233,7 @@ def test_own_scores_are_kept_cluster_by_cluster(scores: ClusterScores) -> None:
     clusters = some_clusters(scores.sweep, 6)
     scores.own(clusters)
     moved_on = Clusters.of(np.where(np.arange(len(clusters.ids)) == 3, len(clusters), clusters.ids))
-    fresh = ClusterScores(scores.sweep, scores.graph, scores.config)
+    fresh = ClusterScores(scores.sweep, scores.graph)
     np.testing.assert_array_equal(scores.own(moved_on), fresh.own(moved_on))
 
 
@@ -394,7 +393,7 @@ def test_soft_affinity_is_symmetric_and_favours_the_truth(balls: BallScene, swee
 
 def test_soft_affinity_agrees_with_loops(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = ball_scene(3, 4, seed=2)
-    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.PIXELS", 4)
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.SWEEP", replace(SWEEP, rays=4))
     sweep = sweep_planes(scene.regions, scene.cameras)
     expected = soft_affinity_reference(
         sweep.labels.tolist(),
@@ -409,7 +408,7 @@ def test_soft_affinity_agrees_with_loops(monkeypatch: pytest.MonkeyPatch) -> Non
 def test_a_few_of_many_views_tell_the_soft_affinity(
     balls: BallScene, sweep: PlaneSweep, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mvseg.matching.nview.initialisation.EM_VIEWS", 4)
+    monkeypatch.setattr("mvseg.matching.nview.initialisation.EM", replace(EM, views=4))
     A = em_affinities(sweep)[-1]
     same = (balls.regions.labels[:, None] == balls.regions.labels).numpy()
     across = sweep.view_index[:, None] != sweep.view_index
@@ -509,9 +508,9 @@ def test_the_reprojection_error_may_be_known_from_an_earlier_matching(monkeypatc
 def test_a_few_rays_tell_the_reprojection_error(angle: float, monkeypatch: pytest.MonkeyPatch) -> None:
     scene = ball_scene(6, 6, seed=7, radius=0.1)
     cameras = turned_a_little(scene.cameras, angle)
-    monkeypatch.setattr("mvseg.matching.nview.match_nview.PROBE_RAYS", 10**9)
+    monkeypatch.setattr("mvseg.matching.nview.match_nview.NVIEW", replace(NVIEW, probe_rays=10**9))
     everything = solve(scene.regions, cameras)
-    monkeypatch.setattr("mvseg.matching.nview.match_nview.PROBE_RAYS", 5 * len(scene.regions))
+    monkeypatch.setattr("mvseg.matching.nview.match_nview.NVIEW", replace(NVIEW, probe_rays=5 * len(scene.regions)))
     few = solve(scene.regions, cameras)
     assert few.report.residual_px == everything.report.residual_px
     assert torch.equal(few.instance_ids, everything.instance_ids)
@@ -536,7 +535,7 @@ def test_regions_without_a_pixel_and_very_many_views(balls: BallScene, monkeypat
     assert matching.instance_ids[0] == -1
     assert same_partition(matching.instance_ids[1:], regions.labels[1:])
     # as with 500 times as many views: still one pixel per region
-    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.PLENTY", 0.01)
+    monkeypatch.setattr("mvseg.matching.nview.plane_sweep.SWEEP", replace(SWEEP, plenty=0.01))
     sweep = sweep_planes(balls.regions, balls.cameras)
     assert np.bincount(sweep.pixel_region).tolist() == [1] * len(balls.regions)
     assert np.isfinite(em_affinities(sweep)[-1]).all()

@@ -8,6 +8,7 @@ import torch
 
 from mvseg.evaluation.id_metrics import matching_metrics
 from mvseg.matching.affinity import region_affinity
+from mvseg.matching.numbers import ONE_PER_VIEW
 from mvseg.matching.one_per_view import (
     assign_one_to_one,
     join_alone,
@@ -66,7 +67,7 @@ def test_the_whole_view_decides_not_the_single_best_edge() -> None:
     W[0, 2], W[0, 3], W[1, 2], W[1, 3] = 0.9, 0.8, 0.8, 0.1
     W += W.T
     views = np.array([0, 0, 1, 1])
-    assert link_average(ViewGraph(W, views, 2)).ids.tolist() == [0, 1, 0, 2]
+    assert link_average(ViewGraph(W, views, 2), 0.2).ids.tolist() == [0, 1, 0, 2]
     assert ids_of(W, views.tolist()) == [1, 2, 2, 1]
 
 
@@ -84,7 +85,7 @@ def test_of_equal_weights_the_first_regions_win() -> None:
     W = np.zeros((4, 4))
     W[0, 2] = W[0, 3] = W[1, 2] = W[1, 3] = 0.5
     views = np.array([0, 0, 1, 1])
-    assert link_average(ViewGraph(W + W.T, views, 2)).ids.tolist() == [0, 1, 0, 1]
+    assert link_average(ViewGraph(W + W.T, views, 2), 0.2).ids.tolist() == [0, 1, 0, 1]
     assert link_average(ViewGraph(W + W.T, views, 2), stop=0.5).ids.tolist() == [0, 1, 0, 1]  # as large as asked for
 
 
@@ -131,7 +132,7 @@ def test_sweeps_settle() -> None:
     views = np.random.default_rng(1).integers(0, 4, 30)
     W = random_weights(views, 1)
     graph = ViewGraph(W, views, 4)
-    once = power_iteration(graph, link_average(graph))
+    once = power_iteration(graph, link_average(graph, ONE_PER_VIEW.stop))
     np.testing.assert_array_equal(power_iteration(graph, once).ids, once.ids)
 
 

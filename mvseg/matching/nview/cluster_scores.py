@@ -15,7 +15,7 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.matching.nview.config import NViewConfig
+from mvseg.matching.numbers import COSTS, GAINS, SEARCH
 from mvseg.matching.nview.hypothesis_index import pack_views
 from mvseg.matching.nview.plane_sweep import EMPTY, OUTSIDE, PlaneSweep, blocks_of_runs, run_starts
 from mvseg.matching.partition import Clusters, members_of
@@ -24,10 +24,6 @@ from mvseg.matching.view_graph import ViewGraph
 # Log-odds that two regions show one instance, by epipolar weight; measured on degraded masks of development plants.
 WEIGHTS = (0.0, 0.01, 0.05, 0.1, 0.25, 0.45, 0.65, 0.75, 0.85, 0.95, 1.0)
 LOG_ODDS = (-9.0, -7.0, -6.0, -5.5, -4.2, -3.3, -2.6, -2.1, -1.0, 0.5, 1.2)
-# A pair counts for one instance if its log-odds are above minus this much. A third more or less: pair F1 on degraded
-# masks of 32 leaves in 5 views -0.002 and +0.008, with fewer leaves no id changes.
-PRIOR = 2.5
-SLACK = 1e-4  # limit: rounding of a score that is only to be bounded
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -61,12 +57,10 @@ class ClusterScores:
     Attributes:
         sweep: hypotheses of D regions, ordered by view.
         graph: their epipolar weights.
-        config: costs, gains and thresholds.
     """
 
     sweep: PlaneSweep
     graph: ViewGraph
-    config: NViewConfig
     _scores: dict[tuple[int, bytes], Floats] = field(default_factory=dict, repr=False)
     _coverages: dict[bytes, Floats] = field(default_factory=dict, repr=False)
     _own: dict[bytes, Floats] = field(default_factory=dict, repr=False)
@@ -75,7 +69,7 @@ class ClusterScores:
     def evidence(self) -> Floats:
         """(D, D) float32 evidence for (> 0) or against (< 0) a pair of regions being one instance, from its epipolar
         weight."""
-        return (np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + PRIOR).astype(np.float32)
+        return (np.interp(self.graph.weights, WEIGHTS, LOG_ODDS) + GAINS.prior).astype(np.float32)
 
     def scores(self, view: int, numbers: Ints) -> Floats:
         """Leave-one-out scores of the regions of one view in clusters, S(n, c).
@@ -165,13 +159,13 @@ class ClusterScores:
         coverage[:, has_coverage] = coverages[clusters[has_coverage], here].T
         evidence = self.evidence[here].take(np.concatenate([*members, clusters[:0]]), 1)
         pairs = np.add.reduceat(evidence, (sizes.cumsum() - sizes)[clusters], 1)
-        total = score + self.config.gains.coverage * coverage + self.pair_factor * pairs
+        total = score + GAINS.coverage * coverage + self.pair_factor * pairs
         return ViewGains(clusters, score, coverage, total)
 
     @property
     def pair_factor(self) -> float:
         """Gain per unit of epipolar evidence for a pair, in this number of views."""
-        return self.config.gains.pair_factor(self.sweep.num_views)
+        return GAINS.pair_factor(self.sweep.num_views)
 
     def _members_elsewhere(self, view: int, numbers: Ints) -> list[Ints]:
         """The members of clusters 0 .. K - 1 in other views."""
@@ -189,7 +183,7 @@ class ClusterScores:
         regions, pixels = self.sweep.bounds.regions(view), self.sweep.bounds.pixels(view)
         owner = self.sweep.pixel_region[pixels] - regions.start
         start = run_starts(owner)
-        score = np.full((len(members), regions.stop - regions.start), -self.config.costs.hidden, np.float32)
+        score = np.full((len(members), regions.stop - regions.start), -COSTS.hidden, np.float32)
         if len(start):
             counts = np.diff(start, append=len(owner)).astype(np.float32)
             score[:, owner[start]] = np.add.reduceat(self._score_pixels(view, members), start, 1) / counts
@@ -202,7 +196,7 @@ class ClusterScores:
         more than the least that a pixel has.
         """
         pixels, here = self.sweep.bounds.pixels(view), self.sweep.bounds.hypotheses(view)
-        least = np.float32(-self.config.costs.hidden)
+        least = np.float32(-COSTS.hidden)
         best = np.full((len(members), pixels.stop - pixels.start), least)
         cluster, hypothesis, count = self.sweep.hypotheses_of_regions(view).count(members)
         hypothesis += here.start
@@ -215,12 +209,12 @@ class ClusterScores:
     def _score_hypotheses(self, hypotheses: Ints, count: Ints, *, views: NDArray[np.uint64]) -> Floats:
         """(R,) float32: the scores of hypotheses (R,) that show members of a cluster in `count` (R,) views, where
         `views` (W, R) has a bit for each view in which the cluster has a region."""
-        costs, empty_views = self.config.costs, self.sweep.empty_views
+        empty_views = self.sweep.empty_views
         missing = np.zeros(len(hypotheses), np.float32)
         for empty, shown in zip(empty_views, views, strict=True):
             missing += np.bitwise_count(empty.take(hypotheses) & shown)
-        score = np.float32(1 + costs.hidden) * count.astype(np.float32)
-        score -= np.float32(costs.missing - costs.absent) * missing
+        score = np.float32(1 + COSTS.hidden) * count.astype(np.float32)
+        score -= np.float32(COSTS.missing - COSTS.absent) * missing
         score /= self.sweep.num_inside.take(hypotheses)
         score -= self._costs_without_members.take(hypotheses)
         return score
@@ -228,9 +222,8 @@ class ClusterScores:
     @cached_property
     def _costs_without_members(self) -> Floats:
         """(I,) float32: what each hypothesis costs a cluster that none of its views shows."""
-        costs = self.config.costs
         share = np.bitwise_count(self.sweep.empty_views).sum(0, dtype=np.float32) / self.sweep.num_inside
-        return np.float32(costs.hidden) + np.float32(costs.absent - costs.hidden) * share
+        return np.float32(COSTS.hidden) + np.float32(COSTS.absent - COSTS.hidden) * share
 
     def _has_region(self, members: list[Ints]) -> NDArray[np.bool_]:
         """(C, V): in which views clusters have a region."""
@@ -241,17 +234,17 @@ class ClusterScores:
 
     def _cover(self, clusters: Clusters, asked: Ints) -> Floats:
         """(C, D) float32: the coverages of the C clusters in `asked`."""
-        sweep, costs, num_regions, num_views = self.sweep, self.config.costs, len(clusters.ids), self.sweep.num_views
+        sweep, num_regions, num_views = self.sweep, len(clusters.ids), self.sweep.num_views
         index_of = np.full(len(clusters), -1)
         index_of[asked] = np.arange(len(asked))
         has_region = self._has_region(clusters.members)
-        empty = np.where(has_region, np.float32(-costs.missing), np.float32(-costs.absent))
+        empty = np.where(has_region, np.float32(-COSTS.missing), np.float32(-COSTS.absent))
         num_pixels, covered = np.zeros((len(asked), num_views)), np.zeros((len(asked), num_regions))
         for hypotheses, score, is_own in self._own_hypotheses(clusters, asked):
             keep = self._may_be_best(hypotheses, score)
             pixel, labels = sweep.pixel[hypotheses[keep]], sweep.labels[hypotheses[keep]]
             region = sweep.pixel_region[pixel]
-            gain = np.where(is_own[keep], np.float32(1), np.float32(-costs.hidden))
+            gain = np.where(is_own[keep], np.float32(1), np.float32(-COSTS.hidden))
             np.copyto(gain, empty[clusters.ids[region]], where=labels == EMPTY)
             np.copyto(gain, 0, where=labels == OUTSIDE)
             hypothesis, view, share = best_elsewhere(gain, labels != OUTSIDE, pixel, own_view=sweep.view_index[region])
@@ -267,14 +260,14 @@ class ClusterScores:
         most, and costs `missing` or `absent` at most."""
         num_inside, pixel = self.sweep.num_inside[hypotheses], self.sweep.pixel[hypotheses]
         total, others = score * num_inside, np.maximum(num_inside - 1, 1)
-        most = np.maximum(score, (total + max(self.config.costs.missing, self.config.costs.absent)) / others)
+        most = np.maximum(score, (total + max(COSTS.missing, COSTS.absent)) / others)
         least, start = np.minimum(score, (total - 1) / others), run_starts(pixel)
         best = np.maximum(np.maximum.reduceat(least, start), 0)
-        return most + SLACK >= np.repeat(best, np.diff(start, append=len(pixel)))
+        return most + SEARCH.slack >= np.repeat(best, np.diff(start, append=len(pixel)))
 
     def _score_own(self, clusters: Clusters, asked: Ints) -> Floats:
         """(D,) score of each region in its own cluster, for those in the clusters `asked`."""
-        sweep, hidden = self.sweep, self.config.costs.hidden
+        sweep, hidden = self.sweep, COSTS.hidden
         best = np.full(len(sweep.pixel_region), -hidden)
         for hypotheses, score, _ in self._own_hypotheses(clusters, asked):
             pixel = sweep.pixel[hypotheses]

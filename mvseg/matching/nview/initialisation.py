@@ -11,21 +11,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.matching.nview.plane_sweep import BLOCK_SIZE, EMPTY, PLENTY, PlaneSweep, blocks_of_runs, run_starts
+from mvseg.matching.numbers import EM, SWEEP
+from mvseg.matching.nview.plane_sweep import EMPTY, PlaneSweep, blocks_of_runs, run_starts
 from mvseg.matching.one_per_view import link_average
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import ViewGraph
-
-# A third more or less of any of these changes no id of degraded masks of 8 to 32 leaves: the search finds the same.
-SHARPNESS = (8.0, 12.0, 16.0, 24.0, 32.0, 32.0)  # of the soft maximum over the hypotheses of a pixel, one per iteration
-EMPTY_COST = 0.7  # of a hypothesis in which all views show no region
-# Iteration whose affinity is clustered, and where the linkage stops. Without the second, degraded masks of 32 leaves in
-# 5 and 8 views lose up to 0.03 of ARI on two plants of six, those of 16 leaves nothing.
-INITIALISATIONS = ((-1, 0.3), (1, 0.1))
-MANY_VIEWS = 8  # with more than this, one start will do
-EM_PIXELS = 12  # limit: pixels per region, at most
-NEGLIGIBLE = 1e-5  # limit: a hypothesis is left out if the belief in it is less
-EM_VIEWS = 30  # limit: of a hypothesis are compared with each other, at most
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -37,7 +27,7 @@ def initial_partitions(sweep: PlaneSweep, graph: ViewGraph) -> list[Clusters]:
     history = em_affinities(sweep, graph)
     return [
         link_average(replace(graph, weights=history[iteration].astype(np.float64)), stop)
-        for iteration, stop in INITIALISATIONS[: 1 if sweep.num_views > MANY_VIEWS else None]
+        for iteration, stop in EM.starts[: 1 if sweep.num_views > EM.many_views else None]
     ]
 
 
@@ -45,10 +35,10 @@ def em_affinities(sweep: PlaneSweep, graph: ViewGraph | None = None) -> list[NDA
     """How likely two regions are one instance, from the hypotheses alone, by expectation maximisation.
 
     E step: the hypotheses of a pixel share one unit of belief by a soft maximum of their mean affinity between all
-    regions that they name (the pixel's own included), less EMPTY_COST for views that show nothing. With many views,
-    EM_VIEWS of them are compared with each other. M step: the affinity of region n to m is the belief in hypotheses
-    with m, averaged over the pixels of n, and made symmetric. What a person knows of two regions is 1 or 0 after each
-    step: hypotheses that show linked regions are believed, and with them all else that these show.
+    regions that they name (the pixel's own included), less `EM.empty_cost` for views that show nothing. With many
+    views, `EM.views` of them are compared with each other. M step: the affinity of region n to m is the belief in
+    hypotheses with m, averaged over the pixels of n, and made symmetric. What a person knows of two regions is 1 or 0
+    after each step: hypotheses that show linked regions are believed, and with them all else that these show.
 
     Args:
         sweep: hypotheses of D regions.
@@ -62,18 +52,18 @@ def em_affinities(sweep: PlaneSweep, graph: ViewGraph | None = None) -> list[NDA
     hypotheses = np.flatnonzero(is_used[sweep.pixel])
     start = run_starts(sweep.pixel[hypotheses])
     if not len(start):
-        return [np.zeros((num, num), np.float32)] * len(SHARPNESS)
+        return [np.zeros((num, num), np.float32)] * len(EM.sharpness)
     num_pixels = np.maximum(np.bincount(sweep.pixel_region[is_used], minlength=num), 1).astype(np.float32)[:, None]
     run_lengths = np.diff(np.append(start, len(hypotheses)))
     blocks = [_compare_views(sweep, hypotheses[block]) for block in blocks_of_runs(start, len(hypotheses))]
     affinity = _symmetric(_count_shown(sweep, hypotheses, start) / num_pixels)
     history = []
-    for beta in SHARPNESS:
+    for beta in EM.sharpness:
         score = np.concatenate([block.scores(affinity) for block in blocks])
         best = np.maximum.reduceat(score, start)
         belief = np.exp(beta * (score - np.repeat(best, run_lengths))).astype(np.float64)
         belief /= np.repeat(np.add.reduceat(belief, start), run_lengths)
-        is_believed = belief > NEGLIGIBLE
+        is_believed = belief > EM.negligible
         affinity = _symmetric(_share_belief(sweep, hypotheses[is_believed], belief[is_believed]) / num_pixels)
         if graph is not None and len(graph.links):
             affinity[graph.apart] = 0
@@ -88,8 +78,8 @@ def _symmetric(A: Floats) -> Floats:
 
 
 def _spread_pixels(sweep: PlaneSweep) -> NDArray[np.bool_]:
-    """(Q,) the pixels that EM uses: at most EM_PIXELS of each region, fewer with many views."""
-    most = max(1, round(EM_PIXELS * min(1, PLENTY / sweep.num_views)))
+    """(Q,) the pixels that EM uses: at most `EM.pixels` of each region, fewer with many views."""
+    most = max(1, round(EM.pixels * min(1, SWEEP.plenty / sweep.num_views)))
     counts = np.bincount(sweep.pixel_region, minlength=len(sweep.view_index))
     rank = np.arange(len(sweep.pixel_region)) - np.searchsorted(sweep.pixel_region, sweep.pixel_region)
     is_used: NDArray[np.bool_] = rank % np.maximum(1, -(-counts // most))[sweep.pixel_region] == 0
@@ -125,16 +115,16 @@ class _ComparedHypotheses:
             total[:stop] += np.take(flat, cell).sum(0)
         pairs = np.maximum(self.num_inside * (self.num_inside + 1), 1)
         score = np.empty_like(total)
-        score[self.order] = 2 * total / pairs - EMPTY_COST * self.num_empty / np.maximum(self.num_inside, 1)
+        score[self.order] = 2 * total / pairs - EM.empty_cost * self.num_empty / np.maximum(self.num_inside, 1)
         return score
 
 
 def _compare_views(sweep: PlaneSweep, hypotheses: Ints) -> _ComparedHypotheses:
-    """The hypotheses, with what EM_VIEWS views show at most; those are spread evenly, starting with the pixel's own."""
+    """The hypotheses, with what `EM.views` views show at most: spread evenly, starting with the pixel's own."""
     num, owner = len(sweep.view_index), sweep.pixel_region[sweep.pixel[hypotheses]]
     labels = sweep.labels[hypotheses]
-    if sweep.num_views > EM_VIEWS:
-        steps = np.arange(EM_VIEWS) * sweep.num_views // EM_VIEWS
+    if sweep.num_views > EM.views:
+        steps = np.arange(EM.views) * sweep.num_views // EM.views
         labels = np.take_along_axis(labels, (sweep.view_index[owner][:, None] + steps) % sweep.num_views, 1)
     named = np.where(labels < 0, num, labels).astype(np.int64)
     named = np.column_stack((owner, np.sort(named, 1)))
@@ -169,12 +159,12 @@ def _share_belief(sweep: PlaneSweep, hypotheses: Ints, belief: Floats) -> Floats
     """(D, D) float32: the summed belief in hypotheses on rays of the first region that name the second."""
     num = len(sweep.view_index)
     mass = np.zeros((num, num), np.float32)
-    for begin in range(0, len(hypotheses), BLOCK_SIZE):
-        block = hypotheses[begin : begin + BLOCK_SIZE]
+    for begin in range(0, len(hypotheses), SWEEP.block_size):
+        block = hypotheses[begin : begin + SWEEP.block_size]
         owner = sweep.pixel_region[sweep.pixel[block]]
         low, high = int(owner[0]), int(owner[-1]) + 1
         cell = ((owner - low) * (num + 1))[:, None] + np.where(sweep.labels[block] < 0, num, sweep.labels[block])
-        weight = np.broadcast_to(belief[begin : begin + BLOCK_SIZE, None], cell.shape)
+        weight = np.broadcast_to(belief[begin : begin + SWEEP.block_size, None], cell.shape)
         local = np.bincount(cell.ravel(), weight.ravel(), (high - low) * (num + 1))
         mass[low:high] += local.reshape(high - low, num + 1)[:, :num]
     return mass

@@ -15,8 +15,8 @@ import numpy as np
 import torch
 
 from mvseg.masks import Masks
+from mvseg.matching.numbers import NVIEW
 from mvseg.matching.nview.cluster_scores import ClusterScores
-from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.match_scores import collect_evidence, match_scores
 from mvseg.matching.nview.merged_masks import find_merged
 from mvseg.matching.nview.pieces import part_pieces
@@ -29,22 +29,12 @@ from mvseg.matching.view_graph import ViewGraph, first_without_links
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 
-DILATIONS = (1, 2, 4, 8)  # definition: the reprojection errors that are tried, pixels
-PROBE_RAYS = 1500  # limit: at least about so many tell whether a dilation helps
-# No dilation is tried if clusters from the weights alone have at least this mean score. A third less: pair F1 -0.022 on
-# degraded masks of 32 leaves in 5 views; a third more only tries dilations more often.
-EXPLAINED = 0.5
-# Clusters from the weights alone are the answer if those of all views have a mean score below this: poses are far off.
-# A third more or less changes nothing where poses are exact, or off by 2 pixels.
-UNEXPLAINED = 0.3
-
 
 def match_nview(
     regions: Regions,
     cameras: Cameras,
     graph: ViewGraph,
     *,
-    config: NViewConfig = NViewConfig(),
     residual_px: int | None = None,
 ) -> Matching:
     """Match the regions of V >= 2 views by what all views show.
@@ -53,8 +43,7 @@ def match_nview(
         regions: D regions in V views, in any order.
         cameras: V cameras.
         graph: the epipolar weights of the regions, and their links.
-        config: costs, gains and thresholds.
-        residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
+        residual_px: the reprojection error where it is known, one of `NVIEW.dilations`; None: estimated.
 
     Returns:
         The matching, on the device of the regions. Its method is "one-per-view" where the hypotheses do not explain the
@@ -63,7 +52,7 @@ def match_nview(
     """
     order = regions.view_index.argsort(stable=True)
     ordered, graph = regions.select(order), graph.select(order.cpu().numpy())
-    found = find_clusters(ordered, cameras, graph, config=config, residual_px=residual_px)
+    found = find_clusters(ordered, cameras, graph, residual_px=residual_px)
     clusters, chance = part_pieces(found.scores, found.clusters)
     evidence = collect_evidence(found.scores, clusters, found.pairwise)
     report = MatchReport(
@@ -104,7 +93,6 @@ def find_clusters(
     cameras: Cameras,
     graph: ViewGraph,
     *,
-    config: NViewConfig = NViewConfig(),
     residual_px: int | None = None,
 ) -> FoundClusters:
     """The clusters that explain all views best, or where hypotheses explain too little, those from the weights alone.
@@ -113,13 +101,10 @@ def find_clusters(
         regions: D regions, ordered by view.
         cameras: V cameras.
         graph: their epipolar weights, and their links.
-        config: costs, gains and thresholds.
-        residual_px: the reprojection error where it is known, one of DILATIONS; None: estimated.
+        residual_px: the reprojection error where it is known, one of `NVIEW.dilations`; None: estimated.
     """
     pairwise = one_per_view_clusters(graph.without_links)
-    scores, residual_px = select_dilation(
-        regions, cameras, graph, pairwise=pairwise, config=config, residual_px=residual_px
-    )
+    scores, residual_px = select_dilation(regions, cameras, graph, pairwise=pairwise, residual_px=residual_px)
 
     def cluster(graph: ViewGraph, unlinked: Clusters | None) -> Clusters:
         weighed = pairwise if unlinked is None else one_per_view_clusters(graph)
@@ -127,7 +112,7 @@ def find_clusters(
         return search(replace(scores, graph=graph), weighed, more_starts=starts)
 
     clusters, method = first_without_links(graph, cluster) if len(cameras) > 2 else pairwise, "nview"
-    if len(cameras) < 3 or scores.explained(clusters) < UNEXPLAINED:
+    if len(cameras) < 3 or scores.explained(clusters) < NVIEW.unexplained:
         clusters, method = first_without_links(graph, lambda graph, _: one_per_view_clusters(graph)), "one-per-view"
     return FoundClusters(clusters, pairwise, scores, residual_px, method)
 
@@ -143,7 +128,6 @@ def select_dilation(
     graph: ViewGraph,
     *,
     pairwise: Clusters,
-    config: NViewConfig,
     residual_px: int | None = None,
 ) -> tuple[ClusterScores, int]:
     """The scores of the plane sweep whose label maps are dilated by the reprojection error, and that error in pixels.
@@ -153,19 +137,19 @@ def select_dilation(
     """
 
     def score(sweep: PlaneSweep) -> ClusterScores:
-        return ClusterScores(sweep, graph, config)
+        return ClusterScores(sweep, graph)
 
-    first = score(sweep_planes(regions, cameras, dilation_px=residual_px or DILATIONS[0]))
+    first = score(sweep_planes(regions, cameras, dilation_px=residual_px or NVIEW.dilations[0]))
     explained = [first.explained(pairwise)]
-    if residual_px is not None or explained[0] >= EXPLAINED:
-        return first, residual_px or DILATIONS[0]
-    rays = min(rays_per_region(len(cameras)), -(-PROBE_RAYS // max(len(regions), 1)))
-    for sweep in sweep_dilated(regions, cameras, dilations=DILATIONS[1:], rays=rays):
+    if residual_px is not None or explained[0] >= NVIEW.explained:
+        return first, residual_px or NVIEW.dilations[0]
+    rays = min(rays_per_region(len(cameras)), -(-NVIEW.probe_rays // max(len(regions), 1)))
+    for sweep in sweep_dilated(regions, cameras, dilations=NVIEW.dilations[1:], rays=rays):
         explained.append(score(sweep).explained(pairwise))
     best = int(np.argmax(np.array(explained) >= max(explained) - 0.05))
     if best == 0:
-        return first, DILATIONS[0]
-    return score(sweep_planes(regions, cameras, dilation_px=DILATIONS[best])), DILATIONS[best]
+        return first, NVIEW.dilations[0]
+    return score(sweep_planes(regions, cameras, dilation_px=NVIEW.dilations[best])), NVIEW.dilations[best]
 
 
 def _final_numbers(ids: torch.Tensor) -> torch.Tensor:

@@ -8,20 +8,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.masks import MergedMask
+from mvseg.matching.numbers import PIECES
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.partition import Clusters
 from mvseg.regions import Regions
 
 Ints = NDArray[np.int64]
-# It decides where merged masks are cut; a third more or less changes no id.
-NEIGHBOURS = 3  # a pixel goes to the cluster that explains so many of its nearest sampled pixels better
 
 
 def find_merged(scores: ClusterScores, clusters: Clusters, regions: Regions) -> tuple[MergedMask, ...]:
     """Masks that cover two instances: two clusters explain disjoint parts of them.
 
     A cluster that has no region in a view, but covers one that belongs to another cluster, may share it. A pixel is
-    explained by a cluster when it scores nearly as well as the cluster's regions do in the median, see `Thresholds`. Of
+    explained by a cluster when it scores nearly as well as the cluster's regions do in the median, see `PIECES`. Of
     several such clusters, the one that explains most of the pixels that the region's own cluster does not is its
     second.
 
@@ -44,12 +43,12 @@ def find_merged(scores: ClusterScores, clusters: Clusters, regions: Regions) -> 
 
 def _may_be_second(scores: ClusterScores, clusters: Clusters) -> NDArray[np.bool_]:
     """(K, D) bool: the cluster is seen in enough views, has no region in the region's view, and covers the region."""
-    views, thresholds = scores.sweep.view_index, scores.config.thresholds
+    views = scores.sweep.view_index
     coverages = scores.coverages(clusters)
     is_shown = np.zeros((len(clusters), scores.sweep.num_views), bool)
     is_shown[clusters.ids, views] = True
-    is_seen_enough = is_shown.sum(1) >= max(2, thresholds.few * scores.sweep.num_views)
-    is_second = (coverages >= thresholds.merged_coverage) & is_seen_enough[:, None] & is_seen_enough[clusters.ids]
+    is_seen_enough = is_shown.sum(1) >= max(2, PIECES.few * scores.sweep.num_views)
+    is_second = (coverages >= PIECES.merged_coverage) & is_seen_enough[:, None] & is_seen_enough[clusters.ids]
     return is_second & ~is_shown[:, views]
 
 
@@ -66,7 +65,7 @@ def _shared_in_view(
     column[asked] = np.arange(len(asked))
     own = scores.own(clusters)
     median_score = np.array([np.median(own[clusters.members[number]]) for number in asked])
-    least = scores.config.thresholds.as_good * median_score[:, None]
+    least = PIECES.as_good * median_score[:, None]
     is_explained = scores.pixel_scores(view, column[clusters.ids]) >= least
     pixel_region = scores.sweep.pixel_region[scores.sweep.bounds.pixels(view)]
     pairs = []
@@ -75,7 +74,7 @@ def _shared_in_view(
         part = is_explained[column[candidates]][:, pixel_region == region]
         share = (part & ~part[0]).mean(1)
         best = int(share.argmax())
-        if share[best] >= scores.config.thresholds.merged_share:
+        if share[best] >= PIECES.merged_share:
             pairs.append((region, int(candidates[best])))
     return pairs
 
@@ -105,7 +104,8 @@ def second_part(scores: ClusterScores, clusters: Clusters, regions: Regions, *, 
     pair = np.where(ids == ids[region], 0, np.where(ids == second, 1, -1))
     pixel_scores = scores.pixel_scores(view, pair)[:, is_here]
     sampled = torch.from_numpy(sweep.pixel_xy[pixels][is_here]) - regions.boxes[region, :2].cpu()
-    nearest = torch.cdist(mask_pixels.flip(1) + 0.5, sampled).topk(min(NEIGHBOURS, len(sampled)), largest=False).indices
+    distance, num = torch.cdist(mask_pixels.flip(1) + 0.5, sampled), min(PIECES.neighbours, len(sampled))
+    nearest = distance.topk(num, largest=False).indices
     advantage = torch.from_numpy(pixel_scores[1] - pixel_scores[0])[nearest].mean(1)
     part[mask_pixels[:, 0], mask_pixels[:, 1]] = advantage > 0
     return part

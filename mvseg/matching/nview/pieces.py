@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import expit
 
+from mvseg.matching.numbers import PIECES
 from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.partition import Clusters
 
@@ -18,9 +19,6 @@ Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
 
 COEFFICIENTS = (1.28, 0.84, 3.69, 4.37, -3.93)  # intercept, then one for each column of `piece_features`
-# A mask leaves its cluster if it is a piece with a probability below this: higher, and ids of degraded masks lose more
-# than strangers go. A third less and more: pair F1 -0.005 and +0.010 on degraded masks of 32 leaves in 5 views.
-LEAST = 0.3
 
 
 def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Floats]:
@@ -33,7 +31,7 @@ def part_pieces(scores: ClusterScores, clusters: Clusters) -> tuple[Clusters, Fl
     chance = np.ones(len(clusters.ids))
     rows, features = piece_features(scores, clusters)
     chance[rows] = expit(COEFFICIENTS[0] + features @ np.array(COEFFICIENTS[1:]))
-    leaves = (chance < LEAST) & ~scores.graph.is_joined
+    leaves = (chance < PIECES.least) & ~scores.graph.is_joined
     parted = np.where(leaves, len(clusters) + np.arange(len(leaves)), clusters.ids)
     return Clusters.of(parted), np.where(leaves, 1.0, chance)
 

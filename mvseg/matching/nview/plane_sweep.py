@@ -20,6 +20,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.matching.numbers import SWEEP
 from mvseg.matching.nview.hypothesis_index import HypothesesOfRegions, index_hypotheses, pack_views
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -27,18 +28,6 @@ from mvseg.system.running import progress_bar
 
 # Labels of a hypothesis: no region there; outside the image, behind the camera, or the own view.
 EMPTY, OUTSIDE = -1, -2
-# A hypothesis is left out if more than this share of the views that its point lies in show no region. A third less:
-# pair F1 -0.005 on degraded masks of 32 leaves in 5 views; a third more changes no id.
-MAX_EMPTY = 0.5
-# Limits of the computation. A third more or less changes one id of degraded masks of 8 and 16 leaves; of 32 leaves in 5
-# views, PIXELS change the pair F1 by +0.001 and +0.007, DEPTHS by -0.034 and -0.019.
-PIXELS = 24  # rays per region, at most
-PLENTY = 10  # with more views than this fewer rays are cast: each shows more
-DEPTHS = 96  # along a ray
-NEAREST = 0.05  # no depth below this share of the longest baseline
-DOMINANCE_PASSES = 3
-BLOCK_SIZE = 2048  # hypotheses at a time: what is computed from them fits into the cache
-CHUNK = 512  # rays at a time: their samples fit into the cache
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
@@ -156,7 +145,7 @@ def sweep_dilated(
 
 def rays_per_region(num_views: int) -> int:
     """How many rays of each region are swept, at most."""
-    return max(1, round(PIXELS * min(1, PLENTY / num_views)))
+    return max(1, round(SWEEP.rays * min(1, SWEEP.plenty / num_views)))
 
 
 @torch.inference_mode()
@@ -167,7 +156,7 @@ def _sweep_views(label_maps: _LabelMaps, regions: Regions, xy: Tensor, *, region
     labels = [np.zeros((0, num_views), label_maps.maps[0].numpy().dtype)]
     for view in progress_bar(range(num_views), title, unit="view"):
         here = (regions.view_index[region] == view).nonzero()[:, 0]
-        for chunk in torch.split(here, CHUNK) if len(here) else ():
+        for chunk in torch.split(here, SWEEP.chunk) if len(here) else ():
             pixel, label, inverse_depth = _join_equal(*label_maps.hypotheses(view, xy[chunk]))
             pixels.append(pixel + int(chunk[0]))
             labels.append(np.ascontiguousarray(label.T))
@@ -246,7 +235,7 @@ class _LabelMaps:
         others = torch.tensor([other for other in range(len(self.maps)) if other != view])
         bases, offsets = self._project_rays(view, xy, others)
         low, high = self._inverse_range(bases, offsets, others)
-        steps = (torch.arange(DEPTHS) + 0.5) / DEPTHS
+        steps = (torch.arange(SWEEP.depths) + 0.5) / SWEEP.depths
         is_seen = low < high
         low, high = torch.where(is_seen, low, 0), torch.where(is_seen, high, 0)
         inverse = low[:, None] + (high - low)[:, None] * steps
@@ -256,10 +245,10 @@ class _LabelMaps:
             labels[other] = _look_up(inverse, base, offset, labels=self.maps[other])
             num_empty += labels[other] == EMPTY
             num_labels += labels[other] >= 0
-        most_empty = np.maximum(np.floor(MAX_EMPTY * (num_empty + num_labels)), 1)
-        keep = (num_labels > 0) & (num_empty <= most_empty) & np.repeat(is_seen.numpy(), DEPTHS)
+        most_empty = np.maximum(np.floor(SWEEP.max_empty * (num_empty + num_labels)), 1)
+        keep = (num_labels > 0) & (num_empty <= most_empty) & np.repeat(is_seen.numpy(), SWEEP.depths)
         kept = np.flatnonzero(keep)
-        return kept // DEPTHS, labels.take(kept, 1), inverse.numpy().ravel()[kept]
+        return kept // SWEEP.depths, labels.take(kept, 1), inverse.numpy().ravel()[kept]
 
     def _project_rays(self, view: int, xy: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         """A point at inverse depth w along a ray projects to base + w * offset, homogeneous: bases (O, P, 3) float32,
@@ -274,7 +263,7 @@ class _LabelMaps:
     def _inverse_range(self, bases: Tensor, offsets: Tensor, others: Tensor) -> tuple[Tensor, Tensor]:
         """(P,) smallest and largest inverse depth at which half of the other views may see a region."""
         distance = torch.cdist(self.cameras.centers, self.cameras.centers).max()
-        nearest = float(1 / (NEAREST * distance)) if distance > 0 else 0.0
+        nearest = float(1 / (SWEEP.nearest * distance)) if distance > 0 else 0.0
         shown = [index for index, other in enumerate(others.tolist()) if self.boxes[other] is not None]
         if not shown:
             nothing = torch.zeros_like(bases[0, :, 0])
@@ -304,7 +293,7 @@ def _cut(interval: tuple[Tensor, Tensor], slope: Tensor, start: Tensor) -> tuple
 
 
 def _look_up(inverse: Tensor, base: Tensor, offset: list[float], *, labels: Tensor) -> NDArray[np.integer]:
-    """(P * DEPTHS,) label at the projection of each sample."""
+    """(P * depths,) label at the projection of each sample."""
     height, width = labels.shape
     depth = torch.add(base[:, 2:], inverse, alpha=offset[2])
     is_behind = depth <= 0 if float(depth.min()) <= 0 else None
@@ -328,7 +317,7 @@ def _join_equal(pixel: Ints, labels: NDArray[np.integer], inverse: Floats) -> tu
     counts = np.diff(np.append(start, len(pixel)))
     inverse = (np.add.reduceat(inverse, start) / counts).astype(np.float32)
     pixel, labels = pixel[start], labels.take(start, 1)
-    for _ in range(DOMINANCE_PASSES):
+    for _ in range(SWEEP.dominance_passes):
         same_ray = pixel[1:] == pixel[:-1]
         differs, is_empty = labels[:, 1:] != labels[:, :-1], labels == EMPTY
         less = ~(differs & ~is_empty[:, 1:]).any(0) & same_ray
@@ -349,8 +338,8 @@ def run_starts(values: NDArray[np.integer]) -> Ints:
 
 
 def blocks_of_runs(start: Ints, num_hypotheses: int) -> list[slice]:
-    """Consecutive slices of hypotheses, of about BLOCK_SIZE each; no run is cut. `start` is where the runs start."""
+    """Consecutive slices of about `SWEEP.block_size` hypotheses; no run is cut. `start` is where the runs start."""
     if not len(start):
         return []
-    first = start[run_starts(start // BLOCK_SIZE)].tolist()
+    first = start[run_starts(start // SWEEP.block_size)].tolist()
     return [slice(begin, end) for begin, end in pairwise([*first, num_hypotheses])]

@@ -12,21 +12,13 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.matching.numbers import GAINS, PIECES, SEARCH
 from mvseg.matching.nview.cluster_scores import ClusterScores, ViewGains
-from mvseg.matching.nview.config import NViewConfig
 from mvseg.matching.nview.initialisation import initial_partitions
 from mvseg.matching.one_per_view import assign_one_to_one, join_alone, view_order
 from mvseg.matching.partition import Clusters
 from mvseg.matching.view_graph import Movers
 from mvseg.system.running import progress_bar
-
-MAX_SWEEPS = 3  # limit: one more or less changes no id on degraded masks of 8 to 32 leaves
-# Pairwise clusters are kept if they are worth at least this share of the best value. At 1, they never are, and no id of
-# degraded masks changes; at 0.74, those of 32 leaves in 5 views lose 0.20 of pair F1.
-AS_GOOD = 0.99
-# A region left alone joins a cluster if their mean epipolar weight is at least this. A third less changes no id of
-# degraded masks, a third more one.
-SECOND_CHANCE = 0.4
 
 Floats = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -50,9 +42,9 @@ def search(scores: ClusterScores, pairwise: Clusters, *, more_starts: Sequence[C
         refined.append(refine(scores, refine(scores, start), join_fragments=True))
     values = [scores.value(clusters) for clusters in (pairwise, *refined)]
     best = pairwise
-    if max(values) - values[0] > (1 - AS_GOOD) * abs(max(values)):
+    if max(values) - values[0] > (1 - SEARCH.as_good) * abs(max(values)):
         best = refined[int(np.argmax(values[1:]))]
-        best = join_alone(scores.graph, best, stop=SECOND_CHANCE)
+        best = join_alone(scores.graph, best, stop=SEARCH.second_chance)
     return join_few(scores, best)
 
 
@@ -65,7 +57,7 @@ def refine(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = 
         join_fragments: left-over regions may join a cluster that has a region in their view already.
     """
     order = view_order(scores.graph)
-    for _ in range(MAX_SWEEPS):
+    for _ in range(SEARCH.max_sweeps):
         ids, coverages = clusters.ids.copy(), scores.coverages(clusters)
         for view in progress_bar(order.tolist(), name="search", unit="view"):
             movers = scores.graph.movers(view)
@@ -76,7 +68,7 @@ def refine(scores: ClusterScores, clusters: Clusters, *, join_fragments: bool = 
             if join_fragments:
                 is_free = np.ones(movers.num, bool)
                 is_free[movers.owner[scores.graph.apart[movers.rows].any(1)]] = False  # as a person says
-                chosen = _join_fragments(chosen, gains, scores.config, is_free=is_free)
+                chosen = _join_fragments(chosen, gains, is_free=is_free)
             fresh = ids.max() + 1 + np.arange(len(chosen))
             ids[movers.rows] = np.append(gains.clusters, fresh)[chosen][movers.owner]
         before, clusters = clusters, Clusters.of(ids)
@@ -93,17 +85,17 @@ def join_few(scores: ClusterScores, clusters: Clusters) -> Clusters:
     it, if there is one, whether or not that one has a region in the view already. With fewer than four views nothing is
     dissolved, and never what a person has linked.
     """
-    sweep, thresholds = scores.sweep, scores.config.thresholds
+    sweep = scores.sweep
     is_shown = np.zeros((len(clusters), sweep.num_views), bool)
     is_shown[clusters.ids, sweep.view_index] = True
-    is_few = is_shown.sum(1) <= max(1, thresholds.few * sweep.num_views)
+    is_few = is_shown.sum(1) <= max(1, PIECES.few * sweep.num_views)
     if sweep.num_views < 4 or not is_few.any():
         return clusters
     coverages, joined, is_linked = scores.coverages(clusters), clusters.ids.copy(), scores.graph.is_linked
     for view in np.unique(sweep.view_index[is_few[clusters.ids]]).tolist():
         here = sweep.bounds.regions(view)
         gains = scores.gains(view, clusters.ids, coverages)
-        fits = ~is_few[gains.clusters] & (gains.coverage >= thresholds.few_covered) & (gains.score > 0)
+        fits = ~is_few[gains.clusters] & (gains.coverage >= PIECES.few_covered) & (gains.score > 0)
         moves = is_few[clusters.ids[here]] & fits.any(1) & ~is_linked[here]
         if moves.any():
             joined[here][moves] = gains.clusters[np.where(fits, gains.coverage, -1)[moves].argmax(1)]
@@ -130,14 +122,14 @@ def _gains(scores: ClusterScores, movers: Movers, ids: Ints, coverages: Floats) 
     return ViewGains(numbers, movers.total(score) / sizes, movers.total(coverage) / sizes, sums)
 
 
-def _join_fragments(chosen: Ints, gains: ViewGains, config: NViewConfig, *, is_free: NDArray[np.bool_]) -> Ints:
+def _join_fragments(chosen: Ints, gains: ViewGains, *, is_free: NDArray[np.bool_]) -> Ints:
     """Put left-over regions that are free (N,) to join into taken clusters that cover them and explain them well."""
     is_assigned = chosen < len(gains.clusters)
     holder_score = np.full(len(gains.clusters), np.inf)
     holder_score[chosen[is_assigned]] = gains.score[is_assigned, chosen[is_assigned]]
-    fits = (gains.coverage >= config.thresholds.covered) & (gains.score > 0)
-    fits &= gains.score >= config.thresholds.as_good * holder_score
-    value = np.where(fits, gains.score + config.gains.coverage * gains.coverage, -np.inf)
+    fits = (gains.coverage >= PIECES.covered) & (gains.score > 0)
+    fits &= gains.score >= PIECES.as_good * holder_score
+    value = np.where(fits, gains.score + GAINS.coverage * gains.coverage, -np.inf)
     joins = ~is_assigned & is_free & fits.any(1)
     chosen = chosen.copy()
     if joins.any():
