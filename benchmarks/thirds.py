@@ -41,7 +41,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 import mvseg.matching.numbers
 import mvseg.reconstruction
 import mvseg.reconstruction.shapes
-import mvseg.verification
+import mvseg.verification.numbers
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
 from benchmarks.label_maps import KINDS, LabelledScene, load_maps, visible_ids
@@ -75,6 +75,7 @@ from mvseg.system.running import running
 from mvseg.verification.checked_ids import check_ids
 from mvseg.verification.choose import choose_leaves
 from mvseg.verification.drawn_leaves import follow_drawn
+from mvseg.verification.numbers import AGAIN, CHOICE, COLORS, DRAWN, EVIDENCE, PARTS, ROUGH, SNAP
 from mvseg.verification.snap_edges import snap_masks
 
 FACTOR = 1.33
@@ -245,13 +246,13 @@ def try_numbers(package: ModuleType, only: list[str] | None, compare: Callable[[
             print(f"{module.__name__.rpartition('.')[2]} {name} x {factor:.2f}: {said}", flush=True)
 
 
-def try_fields(numbers: ModuleType, only: list[str] | None, compare: Callable[[], str]) -> None:
-    """Print what each number of a `numbers.py` changes, by what `compare` says while it is another."""
+def try_fields(numbers: ModuleType, only: list[str] | None, compare: Callable[[Any], str]) -> None:
+    """Print what each number of a `numbers.py` changes, by what `compare` says of its group while it is another."""
     for key, group, name in list_fields(numbers):
         for factor in (1 / FACTOR, FACTOR) if only is None or name in only else ():
             try:
                 with changed(group, **{name: scaled(getattr(group, name), factor)}):
-                    said = compare()
+                    said = compare(group)
             except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
                 said = f"cannot be: {error}"
             print(f"{key}.{name} x {factor:.2f}: {said}", flush=True)
@@ -260,7 +261,7 @@ def try_fields(numbers: ModuleType, only: list[str] | None, compare: Callable[[]
 def thirds_of_matching(args: argparse.Namespace) -> None:
     scenes = [load_maps(spec_of(*cell), args.cache) for cell in SCENES]
     before = match_all(scenes)
-    try_fields(mvseg.matching.numbers, args.numbers, lambda: compare_matchings(before, match_all(scenes)))
+    try_fields(mvseg.matching.numbers, args.numbers, lambda _: compare_matchings(before, match_all(scenes)))
 
 
 # --- verification
@@ -272,20 +273,20 @@ class Trial:
 
     Attributes:
         name: what is done, and to which scene.
-        modules: of verification, that work there.
+        groups: of numbers, that count there.
         run: gives the masks.
         truth: V label maps.
     """
 
     name: str
-    modules: tuple[str, ...]
+    groups: tuple[Any, ...]
     run: Callable[[], Masks]
     truth: Any
 
 
-CHECKING = "checked_ids", "join_halves", "shown_leaves", "match_again", "evidence"
-CHOOSING = ("choose", "leaf_scores", "rough_surfaces", "evidence", "snap_edges")
-DRAWING = ("drawn_leaves", "leaf_color")
+CHECKING = (EVIDENCE, PARTS, AGAIN)
+CHOOSING = (EVIDENCE, CHOICE, ROUGH, SNAP)
+DRAWING = (DRAWN, COLORS)
 
 
 def check_given(args: argparse.Namespace) -> Iterator[Trial]:
@@ -376,30 +377,25 @@ def count_changed(before: Masks, after: Masks) -> int:
 
 
 def thirds_of_verification(args: argparse.Namespace) -> None:
-    numbers = [each for each in list_numbers(mvseg.verification) if args.numbers is None or each[1] in args.numbers]
     trials = [trial for name in args.trials for trial in TRIALS[name](args)]
     before = [(masks := trial.run().to("cpu"), judge(masks, trial)) for trial in trials]
     for trial, (masks, metrics) in zip(trials, before, strict=True):
         scores = f"pair F1 {metrics.all_pair_f1:.3f}, MV-PQ {metrics.mv_pq:.3f}"
         print(f"{trial.name}: {len(masks)} masks, {scores}", flush=True)
-    for module, name in numbers:
-        room = module.__name__.rpartition(".")[2]
-        for factor in (1 / FACTOR, FACTOR) if any(room in trial.modules for trial in trials) else ():
-            said = []
-            for trial, (masks, metrics) in zip(trials, before, strict=True):
-                if room not in trial.modules:
-                    continue
-                try:
-                    with changed_head(module, name, scaled(getattr(module, name), factor)):
-                        now = trial.run().to("cpu")
-                except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
-                    said.append(f"{trial.name} cannot be: {error}")
-                    continue
-                if count := count_changed(masks, now):
-                    new = judge(now, trial)
-                    change = new.all_pair_f1 - metrics.all_pair_f1, new.mv_pq - metrics.mv_pq
-                    said.append(f"{trial.name} {count} masks, F1 {change[0]:+.3f}, PQ {change[1]:+.3f}")
-            print(f"{room} {name} x {factor:.2f}: {' | '.join(said) or 'nothing'}", flush=True)
+
+    def compare(group: Any) -> str:
+        said = []
+        for trial, (masks, metrics) in zip(trials, before, strict=True):
+            if not any(group is each for each in trial.groups):
+                continue
+            now = trial.run().to("cpu")
+            if count := count_changed(masks, now):
+                new = judge(now, trial)
+                change = new.all_pair_f1 - metrics.all_pair_f1, new.mv_pq - metrics.mv_pq
+                said.append(f"{trial.name} {count} masks, F1 {change[0]:+.3f}, PQ {change[1]:+.3f}")
+        return " | ".join(said) or "nothing"
+
+    try_fields(mvseg.verification.numbers, args.numbers, compare)
 
 
 def judge(masks: Masks, trial: Trial) -> LeafMetrics:

@@ -167,7 +167,8 @@ def test_warnings_are_given_by_one_function() -> None:
     assert by_hand <= {f"mvseg.{module}" for module in WARN_BY_HAND}
 
 
-NUMBERED = {"matching"}  # rooms whose numbers stand in their `numbers.py`
+NUMBERED = {"matching", "verification"}  # rooms whose numbers stand in their `numbers.py`
+BESIDE = {"mvseg.verification.leaf_scores"}  # what its features are made with stands beside their weights
 
 
 def numbers_at_the_head(source: str) -> set[str]:
@@ -184,7 +185,7 @@ def numbers_at_the_head(source: str) -> set[str]:
 def test_numbers_of_a_room_stand_in_one_place_and_each_has_a_sentence() -> None:
     assert numbers_at_the_head("a = 1\nB, C = 0.5, 'x'\nD = -1\nE = (1, 2)") == {"a", "B"}
     heads = {module: numbers_at_the_head(source) for module, source in MODULES.items() if room_of(module) in NUMBERED}
-    assert {module: names for module, names in heads.items() if names} == {}
+    assert {module for module, names in heads.items() if names} == BESIDE
     for room in NUMBERED:
         lines = [line for line in MODULES[f"mvseg.{room}.numbers"].splitlines() if re.match(r"    \w+: ", line)]
         assert lines

@@ -18,15 +18,16 @@ from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.choose import LEAST_VIEWS, LeftOut
-from mvseg.verification.evidence import OPEN_PIXELS, SHARED, Evidence, Ints, Shown, paint_view
+from mvseg.verification.choose import LeftOut
+from mvseg.verification.evidence import Evidence, Ints, Shown, paint_view
+from mvseg.verification.numbers import CHOICE, EVIDENCE
 
 Bools = NDArray[np.bool_]
 
 DIGITS = 6  # of what an answer changes: what differs less is a tie, on every processor
 LEAST_DOUBT = 0.3  # what is surer is not asked
 MOST_DOUBTS = 200  # of which a page asks a few, and the others where a person clicks
-OPEN = 0.5  # a view should show a mask of a surface if at least this fraction of it is unhidden, and `OPEN_PIXELS`
+OPEN = 0.5  # unhidden fraction of a surface of which a view should show a mask, at least; see `EVIDENCE.open_pixels`
 EMPTY = 0.6  # of that part, outside all masks: the mask is missing
 SIMILAR = 0.4  # IoU of that part with a mask of another leaf, that may be it
 SMOOTH = 1.5  # pixels that a proposed outline may be off
@@ -199,7 +200,7 @@ def _free_rows(masks: Masks, view: int, taken: Bools) -> list[int]:
     free = []
     for row in (masks.view_index == view).nonzero()[:, 0].tolist():
         crop = masks.regions.placed(row)
-        if float(crop.cut(taken)[crop.pixels.numpy()].mean()) <= SHARED:
+        if float(crop.cut(taken)[crop.pixels.numpy()].mean()) <= EVIDENCE.shared:
             free.append(row)
     return free
 
@@ -209,7 +210,7 @@ def _doubt_left(left: Sequence[LeftOut], free: Sequence[Sequence[int]], *, usual
     as `_usual_area` says."""
     found = []
     for each, rows in zip(left, free, strict=True):
-        if each.chance < LEAST_CHANCE or len(rows) < LEAST_VIEWS:
+        if each.chance < LEAST_CHANCE or len(rows) < CHOICE.least_views:
             continue
         regions = each.masks.regions
         areas = regions.areas[rows].double()
@@ -238,7 +239,7 @@ def _doubt_view(
         if box is None:
             continue
         mask, share = painted[box] == instance, float(evidence.share[view, instance])
-        if share < OPEN or mask.sum() < OPEN_PIXELS:
+        if share < OPEN or mask.sum() < EVIDENCE.open_pixels:
             continue
         should[instance, view] = True
         if instance in here:

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
-from mvseg.verification.evidence import SHARED
+from mvseg.verification.numbers import EVIDENCE
 
 FEW = 2  # a leaf may be added as it was found if at most so many views show it
 
@@ -68,7 +68,7 @@ def _few(masks: Masks, detected: Masks) -> Masks:
         taken = shown.label_map(view, torch.ones_like(shown.view_index), (right, bottom)) > 0
         for row in own[detected.detection_scores[own].argsort(descending=True, stable=True)].tolist():
             mask = detected.regions.mask(row, right, bottom)
-            if int((mask & taken).sum()) <= SHARED * int(mask.sum()):
+            if int((mask & taken).sum()) <= EVIDENCE.shared * int(mask.sum()):
                 kept.append(row)
                 taken |= mask
     added = detected.select(torch.tensor(sorted(kept), dtype=torch.int64))

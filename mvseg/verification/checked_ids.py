@@ -24,13 +24,11 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
 from mvseg.verification.evidence import Bools, Floats, Ints, Shown, paint_view
 from mvseg.verification.join_halves import join_halves, seen_rarely
-from mvseg.verification.match_again import VIEWS_TO_CHECK
+from mvseg.verification.numbers import AGAIN, PARTS
 from mvseg.verification.shown_leaves import ask, settle
 
 Surfaces = Mapping[int, LeafSurface]
 
-PIECE_INSIDE = 0.8  # a mask may be a piece of a leaf if at least this fraction of it lies in what is seen of the leaf
-EACH, BOTH = 0.2, 0.7  # a mask shows two leaves if at least these fractions of it show each of them, and both together
 
 
 def check_ids(
@@ -45,8 +43,8 @@ def check_ids(
     First the pieces (`move_pieces`) and the halves of leaves (`join_halves`), then all others that show another surface
     than their own, which may be that of an instance that is found among them (`ask_surfaces`). No mask loses its id
     without getting another. An instance may have several masks in a view afterwards: they show it together. With fewer
-    than `VIEWS_TO_CHECK` views, masks that are surely matched stay. Last, the masks that show two surfaces are marked
-    as merged (`find_shared`).
+    than `AGAIN.least_views` views, masks that are surely matched stay. Last, the masks that show two surfaces are
+    marked as merged (`find_shared`).
 
     Args:
         masks: D masks; those that are merged and move are forgotten to be so, unless they show two surfaces. Those that
@@ -61,7 +59,7 @@ def check_ids(
     """
     on_cpu, cameras = masks.to("cpu"), cameras.to("cpu")
     is_held: Bools = (on_cpu.is_corrected | on_cpu.is_linked).numpy()
-    if masks.regions.num_views < VIEWS_TO_CHECK:
+    if masks.regions.num_views < AGAIN.least_views:
         is_held = is_held | (on_cpu.match_scores >= SURE).numpy()
     shown = Shown.of(on_cpu.regions, surfaces, cameras)
     pieced = move_pieces(on_cpu, shown, is_held=is_held)
@@ -128,7 +126,7 @@ def move_pieces(masks: Masks, shown: Shown, *, is_held: Bools) -> Masks:
     ids = masks.instance_ids.numpy()
     few = seen_rarely(masks.regions, ids)
     inside = shown.compare(set(shown.instances.tolist()) - set(few)).inside
-    is_inside, revised = inside.max(1) >= PIECE_INSIDE, ids.copy()
+    is_inside, revised = inside.max(1) >= PARTS.piece_inside, ids.copy()
     for instance in few:
         own = ids == instance
         if 2 * (own & is_inside).sum() > own.sum():
@@ -151,7 +149,7 @@ def find_shared(masks: Masks, surfaces: Surfaces, *, shown: Shown, cameras: Came
     by_own = inside[every, own]
     inside[every, own] = 0
     second, by_second = inside.argmax(1), inside.max(1)
-    is_explained = (by_own >= EACH) & (by_second >= EACH) & (by_own + by_second >= BOTH)
+    is_explained = (by_own >= PARTS.each) & (by_second >= PARTS.each) & (by_own + by_second >= PARTS.both)
     pairs = {(mask.region, mask.own, mask.other) for mask in masks.merged}
     shared = []
     views = regions.view_index.numpy()

@@ -21,7 +21,7 @@ from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import FITS, Bools, Drawn, Floats, Ints, draw_views, see
+from mvseg.verification.evidence import Bools, Drawn, Floats, Ints, draw_views, see
 from mvseg.verification.leaf_scores import (
     FITTED,
     Candidates,
@@ -32,13 +32,8 @@ from mvseg.verification.leaf_scores import (
     log_odds,
     show_chances,
 )
-from mvseg.verification.rough_surfaces import LEAST_PARALLAX, fit_roughly, median_parallax
-
-ROUNDS = 2  # in the first nothing hides anything, in the second the leaves of the first do
-SAME = 0.8  # two candidates are one if the Jaccard index of their masks, by area, is more than this
-LEAST_SHOWN = 0.2  # a mask may show a leaf if q is at least this
-LEAST_VIEWS = 2  # a leaf has masks in at least so many views: a definition, as one view alone is no agreement
-DIGITS = 9  # q and P are rounded to so many digits: what differs less is a tie, on every processor
+from mvseg.verification.numbers import CHOICE, EVIDENCE, ROUGH
+from mvseg.verification.rough_surfaces import fit_roughly, median_parallax
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,8 +88,8 @@ def choose_leaves(
         min_probability: P from which a candidate is a leaf; None: where the expected F1 is largest (`least_chance`).
 
     Returns:
-        The leaves. Where the cameras see the plant from one side only, by less than `LEAST_PARALLAX`, surfaces are too
-        uncertain to judge by: matching and detection scores do it, and a warning (InputWarning) says so.
+        The leaves. Where the cameras see the plant from one side only, by less than `ROUGH.least_parallax`, surfaces
+        are too uncertain to judge by: matching and detection scores do it, and a warning (InputWarning) says so.
     """
     matched, proposals, cameras = matched.to("cpu"), proposals.to("cpu"), cameras.to("cpu")
     proposals = replace(proposals, regions=replace(proposals.regions, labels=torch.arange(len(proposals))))
@@ -132,7 +127,7 @@ def expect_right(masks: Masks, probabilities: Mapping[int, float]) -> float:
     for instance, chance in probabilities.items():
         chances[instance] = chance
     ids = masks.instance_ids.clamp(min=0).cpu()
-    return round(float((chances[ids] * masks.match_scores.cpu().double()).sum()), DIGITS)
+    return round(float((chances[ids] * masks.match_scores.cpu().double()).sum()), CHOICE.digits)
 
 
 def add_beside(masks: Masks, others: Masks, cameras: Cameras) -> Masks:
@@ -160,20 +155,20 @@ def _are_proposals(matched: Masks, proposals: Masks) -> Tensor:
 
 def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
     parallax = median_parallax(matched, cameras)
-    if parallax < LEAST_PARALLAX:
+    if parallax < ROUGH.least_parallax:
         message = f"the cameras see the leaves from one side only ({parallax:.0f} degrees apart, as a rule)"
         warn(f"{message}: their surfaces cannot verify their masks")
-    return parallax >= LEAST_PARALLAX
+    return parallax >= ROUGH.least_parallax
 
 
 def _without(proposals: Masks, gone: Masks | None) -> Bools:
-    """(R,) bool: the proposals that are not masks which a person took away, by `FITS`."""
+    """(R,) bool: the proposals that are not masks which a person took away, by `EVIDENCE.fits`."""
     stays = np.ones(len(proposals), bool)
     for row in range(0 if gone is None else len(gone)):
         assert gone is not None
         mask = gone.regions.placed(row)
         for other in (proposals.view_index == gone.view_index[row]).nonzero()[:, 0].tolist():
-            stays[other] &= proposals.regions.placed(other).iou(mask) <= FITS
+            stays[other] &= proposals.regions.placed(other).iou(mask) <= EVIDENCE.fits
     return stays
 
 
@@ -228,7 +223,7 @@ def _is_there(rows: Tensor, members: Sequence[Tensor], areas: Tensor) -> bool:
     """Whether the masks of one of the candidates are nearly these, by area."""
     for others in members:
         common, either = areas[rows[torch.isin(rows, others)]].sum(), areas[torch.cat((rows, others)).unique()].sum()
-        if common > SAME * either:
+        if common > CHOICE.same * either:
             return True
     return False
 
@@ -285,9 +280,9 @@ def choose(
     scores = table.detection_scores.double().numpy()
     hides, taken, q = np.zeros(len(candidates), bool), [], np.zeros((len(table), len(candidates)))
     steps: list[Step] = []
-    for _ in range(ROUNDS):
+    for _ in range(CHOICE.rounds):
         evidence = see(drawn, len(table), hides)
-        q = np.round(show_chances(candidates, evidence, scores, fitted), DIGITS)
+        q = np.round(show_chances(candidates, evidence, scores, fitted), CHOICE.digits)
         q[~same_class(candidates, table)] = 0
         if usable is not None:
             q[~usable] = 0
@@ -295,7 +290,7 @@ def choose(
         least = least_chance(np.array([each.chance for each in steps])) if min_probability is None else min_probability
         taken = [
             each for each in steps
-            if candidates.is_certain[each.candidate] or (each.chance >= least and len(each.rows) >= LEAST_VIEWS)
+            if candidates.is_certain[each.candidate] or (each.chance >= least and len(each.rows) >= CHOICE.least_views)
         ]  # fmt: skip
         hides = np.zeros(len(candidates), bool)
         hides[[each.candidate for each in taken]] = True
@@ -308,7 +303,7 @@ def choose(
     leaf = np.where(certain.any(1), certain.argmax(1), leaf) if len(chosen) else leaf
     shown = np.where(certain.any(1), 1.0, shown)
     counts = np.bincount(leaf[leaf >= 0], minlength=len(chosen))
-    stays = (counts >= LEAST_VIEWS) | candidates.is_certain[chosen]
+    stays = (counts >= CHOICE.least_views) | candidates.is_certain[chosen]
     number = np.where(stays, stays.cumsum() - 1, -1)
     leaf = np.where(leaf >= 0, number[leaf], -1) if len(chosen) else leaf
     chances = np.array([each.chance for each in taken])
@@ -337,7 +332,7 @@ def rank(
     while left.any():
         best, row = best_masks(free, rows_of_views)
         features, clear = leaf_features(candidates, best, sure[row], share=share, clear=clear)
-        chances = np.where(left, np.round(leaf_chances(candidates, features, fitted), DIGITS), -1.0)
+        chances = np.where(left, np.round(leaf_chances(candidates, features, fitted), CHOICE.digits), -1.0)
         first = int(chances.argmax())
         own = best[:, first]
         rows = row[own >= least_chance(own), first] if own.any() else np.zeros(0, np.int64)
@@ -360,7 +355,7 @@ def least_chance(chances: Floats) -> float:
     order = np.sort(chances)[::-1]
     if not len(order) or order[0] <= 0:
         return 1.0
-    gain = np.round(order.cumsum() / (np.arange(1, len(order) + 1) + order.sum()), DIGITS)
+    gain = np.round(order.cumsum() / (np.arange(1, len(order) + 1) + order.sum()), CHOICE.digits)
     return float(order[gain.argmax()])
 
 
@@ -372,7 +367,7 @@ def assign_masks(q: Floats, drawn: Sequence[Drawn]) -> tuple[Ints, Floats]:
     """
     leaf, shown = np.full(len(q), -1), np.zeros(len(q))
     for each in drawn if q.shape[1] else ():
-        free = np.where(q[each.rows] >= LEAST_SHOWN, q[each.rows], 0.0)
+        free = np.where(q[each.rows] >= CHOICE.least_shown, q[each.rows], 0.0)
         while True:
             masks, leaves = linear_sum_assignment(free, maximize=True)
             chances = free[masks, leaves]

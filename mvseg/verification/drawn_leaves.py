@@ -28,20 +28,14 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
-from mvseg.verification.evidence import FITS, OPEN_PIXELS
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
-from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
+from mvseg.verification.numbers import DRAWN, EVIDENCE, ROUGH
+from mvseg.verification.rough_surfaces import median_parallax
 
 Frame = NDArray[np.bool_]
 
-LEAST_VISIBLE = 0.3  # a view sees a surface openly if at least this fraction of it is unhidden, and `OPEN_PIXELS`
-LEAST_COLORED = 0.8  # the unhidden part becomes a mask if at least this fraction of it has the colour of leaves
 HULL = ReconstructConfig(voxel_budget=25_000)  # of what outlines allow; a limit of time
-ROUNDS = 2  # fits: the second one is to what is found where the surface of the first one is
-BESIDE_PX = 2  # a view may show a leaf at a pixel if leaf colour is at most so many pixels away
-MOST_AGAINST = 0.15  # a point may be a leaf's if at most this fraction of views shows another colour: stakes hide it
 COLUMNS = ("view_index", "boxes", "crops", "labels")
-REACH = 0.1  # a leaf may reach beyond its first surface by at most this fraction of the root of the surface's area
 
 
 def follow_drawn(
@@ -53,9 +47,9 @@ def follow_drawn(
 ) -> tuple[Masks, dict[int, LeafSurface]]:
     """Give the leaves that a person drew a mask in each other view that shows them openly.
 
-    That is where at least `LEAST_VISIBLE` of the leaf's surface, and `OPEN_PIXELS`, lie in no mask of another leaf,
-    and `LEAST_COLORED` of it have the colour of leaves. There, a mask that was matched to nothing and agrees with it
-    (`FITS`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
+    That is where at least `DRAWN.least_visible` of the leaf's surface, and `EVIDENCE.open_pixels`, lie in no mask of
+    another leaf, and `DRAWN.least_colored` of it have the colour of leaves. There, a mask that was matched to nothing
+    and agrees with it (`EVIDENCE.fits`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
 
     Args:
         masks: D masks, matched; those that a person drew have `Origin.CORRECTED`.
@@ -70,7 +64,7 @@ def follow_drawn(
     masks, cameras = masks.to("cpu"), cameras.to("cpu")
     drawn = masks.instance_ids[(masks.origin == Origin.CORRECTED) & (masks.instance_ids > 0)].unique().tolist()
     others = {leaf: _views_without(masks, leaf) for leaf in drawn}
-    if not any(others.values()) or median_parallax(masks, cameras) < LEAST_PARALLAX:
+    if not any(others.values()) or median_parallax(masks, cameras) < ROUGH.least_parallax:
         return masks, {}
     colored = [np.ones((height, width), bool) for width, height in cameras.sizes.tolist()]
     if photos is not None:
@@ -108,9 +102,9 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
     best = None
     left = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in _views_without(masks, leaf)}
     around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in left})
-    for _ in range(ROUNDS):
+    for _ in range(DRAWN.rounds):
         found = {view: _largest_part(left[view] & around[view]) for view in left if view in around}
-        parts = {view: Crop.of(part) for view, part in found.items() if int(part.sum()) >= OPEN_PIXELS}
+        parts = {view: Crop.of(part) for view, part in found.items() if int(part.sum()) >= EVIDENCE.open_pixels}
         if not parts:
             break
         best = fit(parts, best)
@@ -118,7 +112,7 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
             break
         around = _around(best, cameras, left)
     is_own = None if best is None else torch.isin(best.views, own.view_index)
-    if best is None or is_own is None or float(best.iou[is_own].min()) < FITS:  # the outlines are certain
+    if best is None or is_own is None or float(best.iou[is_own].min()) < EVIDENCE.fits:  # the outlines are certain
         return fit({}, None)
     return best
 
@@ -131,13 +125,13 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         whole = places[view]
         visible = replace(whole, pixels=whole.pixels & ~whole.cut(_others(masks, leaf, view, cameras)))
         leaf_colored = replace(visible, pixels=visible.pixels & whole.cut(torch.from_numpy(colored[view])))
-        is_open = visible.area >= max(OPEN_PIXELS, LEAST_VISIBLE * whole.area)
-        if not is_open or leaf_colored.area < LEAST_COLORED * visible.area:
+        is_open = visible.area >= max(EVIDENCE.open_pixels, DRAWN.least_visible * whole.area)
+        if not is_open or leaf_colored.area < DRAWN.least_colored * visible.area:
             continue
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
         fits = {row: masks.regions.placed(row).iou(visible) for row in free}
         best = max(fits, key=lambda row: fits[row], default=-1)
-        if best >= 0 and fits[best] >= FITS:
+        if best >= 0 and fits[best] >= EVIDENCE.fits:
             ids[best] = leaf
         else:
             parts[view] = leaf_colored.tighten()
@@ -170,7 +164,7 @@ def _with_hiding(masks: Masks, leaf: int, cameras: Cameras) -> Regions:
         here = (masks.view_index == view).nonzero()[:, 0].tolist()
         size, is_leaf = tuple(cameras.sizes[view].tolist()), masks.instance_ids == leaf
         frame = regions.label_map(view, is_leaf.long(), size).numpy() > 0
-        near = _dilate(frame, BESIDE_PX)
+        near = _dilate(frame, DRAWN.beside_px)
         others = [regions.placed(row) for row in here if not is_leaf[row]]
         shown[view] = Crop.of(frame).union(*(each for each in others if (each.cut(near) & each.pixels.numpy()).any()))
     return _with_parts(regions.select(torch.zeros(0, dtype=torch.int64)), shown)
@@ -193,9 +187,9 @@ def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Fram
         column, row = columns[view], rows[view]
         is_inside = (column >= 0) & (row >= 0) & (column < width) & (row < height) & (depth[view].numpy() > 0)
         place = np.where(is_inside, row * width + column, 0)
-        against += is_inside & ~_dilate(frame, BESIDE_PX).ravel()[place]
+        against += is_inside & ~_dilate(frame, DRAWN.beside_px).ravel()[place]
         places[view] = place, is_inside
-    is_left = against <= max(1, MOST_AGAINST * len(colored))
+    is_left = against <= max(1, DRAWN.most_against * len(colored))
     around = {}
     for view, (place, is_inside) in places.items():
         points = np.zeros(colored[view].shape, bool)
@@ -212,7 +206,7 @@ def _around(surface: LeafSurface, cameras: Cameras, frames: Mapping[int, Frame])
         if view in frames:
             height, width = frames[view].shape
             frame = part.paste((width, height)).numpy()
-            around[view] = _dilate(frame, max(BESIDE_PX, round(REACH * part.area**0.5)))
+            around[view] = _dilate(frame, max(DRAWN.beside_px, round(DRAWN.reach * part.area**0.5)))
     return around
 
 

@@ -21,15 +21,12 @@ from mvseg.crop import Crop
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
+from mvseg.verification.numbers import EVIDENCE
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-MOST_PX = 800  # masks are compared on photos whose longer side has at most so many pixels: a limit of time
-FITS = 0.5  # a mask shows a leaf if its IoU with what the view shows of it is at least this: a definition
-OPEN_PIXELS = 100  # a view sees a surface openly only if at least so many pixels of it are unhidden
-SHARED = 0.5  # two masks show one leaf if more than this fraction of the smaller one is in both: a definition
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,9 +53,9 @@ class Drawn:
 
     @cached_property
     def is_shared(self) -> Bools:
-        """(N, N) whether one covers more than `SHARED` of the smaller one of two masks."""
+        """(N, N) whether one covers more than `EVIDENCE.shared` of the smaller one of two masks."""
         areas, both = self.masks.sum(0), (self.masks.T @ self.masks).toarray()
-        is_shared: Bools = both > SHARED * np.maximum(np.minimum(areas[:, None], areas), 1)
+        is_shared: Bools = both > EVIDENCE.shared * np.maximum(np.minimum(areas[:, None], areas), 1)
         return is_shared
 
 
@@ -88,7 +85,7 @@ def draw_views(regions: Regions, surfaces: Sequence[LeafSurface | None], cameras
     nothing = [Crop((0, 0, 0, 0), torch.zeros(0, 0, dtype=torch.bool))] * len(cameras)
     shown = [nothing if each is None else each.project_parts(cameras) for each in surfaces]
     for view, (width, height) in enumerate(cameras.sizes.tolist()):
-        step = -(-max(width, height) // MOST_PX)
+        step = -(-max(width, height) // EVIDENCE.most_px)
         size = len(range(step // 2, height, step)), len(range(step // 2, width, step))
         rows = (regions.view_index == view).nonzero()[:, 0].numpy()
         masks = [regions.placed(row) for row in rows.tolist()]

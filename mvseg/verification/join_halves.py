@@ -17,16 +17,10 @@ from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.verification.evidence import Ints
+from mvseg.verification.numbers import PARTS
 
 Surfaces = Mapping[int, LeafSurface]
 
-FEW_VIEWS = 0.75  # an instance may be a part of a leaf if at most this fraction of the views shows it
-# Without the next two, 12 right masks of a real basil of 44 leaves move, and its ARI falls from 0.923 to 0.854; without
-# the third, two right ones of straps in pieces do (docs/notes/matching.md).
-OFTEN_SPLIT = 0.1  # masks are in pieces as a rule if at least this fraction of instances, view by view, has several
-MOST_SPLIT = 1  # elsewhere two instances are two leaves if more views than this have masks of both
-TOUCHES = 0.02  # a surface touches another one if it is at most this fraction of its length away
-AS_NEAR = 1.1  # one surface fits as well as two if its outline is at most so many times as far off as theirs
 
 
 def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cameras) -> Ints:
@@ -34,8 +28,8 @@ def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
 
     A credible surface of an instance that few views show is doubted where it touches another one. Two masks in one
     photo speak for two leaves: one photo may split a leaf by accident, several do so only where masks are often in
-    pieces (`OFTEN_SPLIT`). If no more than that speaks against it, and one surface that is fitted to the masks of both
-    fits them as well as two do (`fits_as_well`), they are the same leaf. All join the one of them with most masks.
+    pieces (`PARTS.often_split`). If no more than that speaks against it, and one surface that is fitted to the masks of
+    both fits them as well as two do (`fits_as_well`), they are the same leaf. All join the one of them with most masks.
 
     Args:
         regions: D regions on the CPU.
@@ -47,9 +41,9 @@ def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
     few = [part for part in seen_rarely(regions, ids) if part in shown and shown[part].is_credible]
     touching = {(part, whole) for part in few if (whole := touched_surface(part, shown))}
     counts, leaves = _count_masks(regions, ids), DisjointSet(np.unique(ids).tolist())
-    is_often_split = (counts > 1).sum() >= OFTEN_SPLIT * (counts > 0).sum()
+    is_often_split = (counts > 1).sum() >= PARTS.often_split * (counts > 0).sum()
     for pair in sorted({(min(pair), max(pair)) for pair in touching}):
-        may_be = is_often_split or (counts[list(pair)] > 0).all(0).sum() <= MOST_SPLIT
+        may_be = is_often_split or (counts[list(pair)] > 0).all(0).sum() <= PARTS.most_split
         if may_be and _is_one_leaf(regions, ids, pair, surfaces=shown, cameras=cameras):
             leaves.merge(*pair)
     joined = ids.copy()
@@ -59,9 +53,9 @@ def join_halves(regions: Regions, ids: Ints, surfaces: Surfaces, *, cameras: Cam
 
 
 def seen_rarely(regions: Regions, ids: Ints) -> list[int]:
-    """The instances that at most `FEW_VIEWS` of the views show, in ascending order."""
+    """The instances that at most `PARTS.few_views` of the views show, in ascending order."""
     num_views = (_count_masks(regions, ids) > 0).sum(1)
-    rarely: list[int] = np.flatnonzero((num_views > 0) & (num_views <= FEW_VIEWS * regions.num_views)).tolist()
+    rarely: list[int] = np.flatnonzero((num_views > 0) & (num_views <= PARTS.few_views * regions.num_views)).tolist()
     return rarely
 
 
@@ -78,7 +72,7 @@ def touched_surface(part: int, surfaces: Surfaces) -> int | None:
     tree = cKDTree(points.pop(part))
     gaps = {instance: float(tree.query(there)[0].min()) for instance, there in points.items()}
     nearest = min(gaps, key=lambda instance: gaps[instance], default=None)
-    return nearest if nearest is not None and gaps[nearest] <= TOUCHES * surfaces[part].length else None
+    return nearest if nearest is not None and gaps[nearest] <= PARTS.touches * surfaces[part].length else None
 
 
 def _is_one_leaf(regions: Regions, ids: Ints, pair: tuple[int, int], *, surfaces: Surfaces, cameras: Cameras) -> bool:
@@ -95,7 +89,7 @@ def fits_as_well(joint: LeafSurface, parts: Sequence[LeafSurface]) -> bool:
     """
     worst = min(float(part.iou.median()) for part in parts)
     farthest = max(_outline_px(part) for part in parts)
-    return joint.is_credible and float(joint.iou.median()) >= worst and _outline_px(joint) <= AS_NEAR * farthest
+    return joint.is_credible and float(joint.iou.median()) >= worst and _outline_px(joint) <= PARTS.as_near * farthest
 
 
 def _outline_px(surface: LeafSurface) -> float:

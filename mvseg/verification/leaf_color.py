@@ -11,9 +11,8 @@ from scipy.ndimage import gaussian_filter
 
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import SURE, Masks
+from mvseg.verification.numbers import COLORS
 
-BINS = 16  # colours are counted in so many bins of each channel
-BLUR = 1.0  # bins: standard deviation of the Gaussian that smooths the counts
 CHANNELS, RANGES = (0, 1, 2), (0, 256) * 3  # as OpenCV asks for them
 
 
@@ -22,7 +21,7 @@ class ColorCounts:
     """How often each colour occurs.
 
     Attributes:
-        inside: (BINS, BINS, BINS) int64, pixels of masks by red, green and blue.
+        inside: (bins, bins, bins) int64, pixels of masks by red, green and blue.
         outside: the same for all other pixels.
     """
 
@@ -31,7 +30,7 @@ class ColorCounts:
 
     @staticmethod
     def none() -> ColorCounts:
-        return ColorCounts(np.zeros((BINS,) * 3, np.int64), np.zeros((BINS,) * 3, np.int64))
+        return ColorCounts(np.zeros((COLORS.bins,) * 3, np.int64), np.zeros((COLORS.bins,) * 3, np.int64))
 
     def __add__(self, other: ColorCounts) -> ColorCounts:
         return ColorCounts(self.inside + other.inside, self.outside + other.outside)
@@ -44,13 +43,13 @@ def count_colors(photo: np.ndarray, is_inside: np.ndarray) -> ColorCounts:
 
 
 def leaf_colors(counts: ColorCounts) -> np.ndarray:
-    """(BINS, BINS, BINS) bool: colours that are more frequent inside than outside, each as a share of its side.
+    """(bins, bins, bins) bool: colours that are more frequent inside than outside, each as a share of its side.
 
     Leaves that were missed are counted outside. As long as they are a small part of what is outside, their colours are
     rarer there than inside. No colour is a leaf's when nothing is inside.
     """
     inside, outside = (
-        gaussian_filter(counted / max(counted.sum(), 1), BLUR, mode="constant")
+        gaussian_filter(counted / max(counted.sum(), 1), COLORS.blur, mode="constant")
         for counted in (counts.inside.astype(np.float64), counts.outside.astype(np.float64))
     )
     return inside > outside
@@ -64,9 +63,9 @@ def has_leaf_color(photo: np.ndarray, colors: np.ndarray) -> np.ndarray:
 
 
 def _count(photo: np.ndarray, part: np.ndarray) -> np.ndarray:
-    """(BINS, BINS, BINS) int64 of the pixels in a part (H, W) bool; exact up to 16 million of one colour."""
+    """(bins, bins, bins) int64 of the pixels in a part (H, W) bool; exact up to 16 million of one colour."""
     pixels, mask = photo.reshape(-1, 1, 3), part.reshape(-1, 1).astype(np.uint8)
-    counted = cv2.calcHist([pixels], CHANNELS, mask, (BINS,) * 3, RANGES)
+    counted = cv2.calcHist([pixels], CHANNELS, mask, (COLORS.bins,) * 3, RANGES)
     return counted.astype(np.int64)
 
 

@@ -21,11 +21,7 @@ from mvseg.matching.links import Links
 from mvseg.matching.match import match_masks
 from mvseg.scene import Cameras
 from mvseg.verification.evidence import Bools, Floats, Ints
-
-VIEWS_TO_CHECK = 5  # with fewer views, surfaces fit wrong masks about as well as right ones: two always agree on one
-# Masks are freed whose q for their own leaf is less: in turn, those that show another one as likely as not, and all
-# that are not sure. What is found without need is not taken (`GivenScores.price`).
-FREED = 0.5, 0.75
+from mvseg.verification.numbers import AGAIN
 
 
 def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, config: MatchConfig) -> list[Masks]:
@@ -35,7 +31,7 @@ def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, con
     no mask goes back to the one that it was taken from (`Links`).
 
     Args:
-        masks: D masks on the CPU, matched by the method "nview": with any other, or with fewer than `VIEWS_TO_CHECK`
+        masks: D masks on the CPU, matched by the method "nview": with any other, or with fewer than `AGAIN.least_views`
             views, nothing is found.
         leaf: (D,) int64, what each mask was matched to, from 0 on; -1 for nothing.
         odds: (D,) log odds that it shows that.
@@ -43,9 +39,9 @@ def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, con
         config: that the masks were matched with.
     """
     found: list[Masks] = []
-    if config.resolved_method != "nview" or masks.regions.num_views < VIEWS_TO_CHECK:
+    if config.resolved_method != "nview" or masks.regions.num_views < AGAIN.least_views:
         return found
-    for least in FREED:
+    for least in AGAIN.freed:
         is_free = (leaf < 0) | (odds < logit(least))
         if (is_free & (leaf >= 0)).any():
             with warnings.catch_warnings():

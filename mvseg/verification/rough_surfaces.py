@@ -11,9 +11,7 @@ from mvseg.masks import Masks
 from mvseg.reconstruction.surface.kept_surfaces import fit_kept
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-
-ROUGH_VIEWS = 12  # a rough surface is fitted to at most so many views of an instance: a limit of time
-LEAST_PARALLAX = 30.0  # surfaces judge masks if most instances are seen from directions at least so many degrees apart
+from mvseg.verification.numbers import ROUGH
 
 
 def fit_roughly(masks: Masks, cameras: Cameras) -> dict[int, LeafSurface]:
@@ -21,7 +19,7 @@ def fit_roughly(masks: Masks, cameras: Cameras) -> dict[int, LeafSurface]:
     then."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", InputWarning)
-        return fit_kept(masks.regions, masks.instance_ids, cameras, most_views=ROUGH_VIEWS, is_rough=True)
+        return fit_kept(masks.regions, masks.instance_ids, cameras, most_views=ROUGH.views, is_rough=True)
 
 
 def median_parallax(masks: Masks, cameras: Cameras) -> float:

@@ -19,10 +19,11 @@ from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-from mvseg.verification.choose import DIGITS, LEAST_VIEWS, gather_candidates, same_class
+from mvseg.verification.choose import gather_candidates, same_class
 from mvseg.verification.evidence import Bools, Drawn, Evidence, Floats, Ints, draw_views, see
 from mvseg.verification.leaf_scores import Candidates, log_odds
 from mvseg.verification.match_again import match_again
+from mvseg.verification.numbers import CHOICE
 
 
 @dataclass(frozen=True)
@@ -110,7 +111,7 @@ def show_odds(question: Question, fitted: GivenScores = GIVEN) -> Floats:
     """
     candidates, masks = question.candidates, question.masks
     evidence = see(question.drawn, len(masks), question.is_known & candidates.is_credible)
-    odds = np.round(shows_features(candidates, evidence) @ np.array(fitted.shows), DIGITS)
+    odds = np.round(shows_features(candidates, evidence) @ np.array(fitted.shows), CHOICE.digits)
     is_near = ~np.isnan(candidates.matched) | (candidates.is_credible & (evidence.claimed > 0))
     odds[~is_near | ~same_class(candidates, masks)] = -np.inf
     odds[candidates.certain.any(1)] = -np.inf
@@ -171,8 +172,8 @@ def settle(question: Question, fitted: GivenScores = GIVEN) -> tuple[Ints, Float
 
 
 def gained(question: Question, before: tuple[Ints, Floats], after: tuple[Ints, Floats], leaf: int) -> float:
-    """Log odds that the masks gain in all by a leaf; 0 if fewer than `LEAST_VIEWS` show it."""
+    """Log odds that the masks gain in all by a leaf; 0 if fewer than `CHOICE.least_views` show it."""
     is_other = before[0] != after[0]
-    if len(np.unique(question.masks.view_index.numpy()[after[0] == leaf])) < LEAST_VIEWS:
+    if len(np.unique(question.masks.view_index.numpy()[after[0] == leaf])) < CHOICE.least_views:
         return 0.0
-    return float(np.round((after[1][is_other] - before[1][is_other]).sum(), DIGITS))
+    return float(np.round((after[1][is_other] - before[1][is_other]).sum(), CHOICE.digits))

@@ -18,11 +18,7 @@ from mvseg.crop import Crop
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin, replace_crops
 from mvseg.system.running import kept
-
-BAND = 0.05  # an edge may move by at most this fraction of the root of its mask's area
-AROUND = 3  # the photo at most so many bands away from a mask tells what the background looks like
-MOST_PX = 100  # larger masks are scaled to this root of their area: a limit of time, with all pixels it is as good
-LEAST_PIXELS = 10  # an edge stays if fewer pixels are surely leaf, or background: GrabCut needs five of each
+from mvseg.verification.numbers import SNAP
 
 FOUND = torch.tensor([Origin.DETECTED, Origin.CONFIRMED])  # who confirmed a mask saw it with this edge
 
@@ -53,7 +49,7 @@ def snap_masks(masks: Masks, photos: ReadPhoto) -> Masks:
             shown = crops[row].cut(taken)
             shown |= crops[row].pixels.numpy()
         for row in (row for row in rows if moves[row]):
-            room = math.ceil(AROUND * BAND * math.sqrt(crops[row].area)) + 1
+            room = math.ceil(SNAP.around * SNAP.band * math.sqrt(crops[row].area)) + 1
             x1, y1 = (max(0, low - room) for low in crops[row].box[:2])
             x2, y2 = (min(size, high + room) for size, high in zip(photo.shape[1::-1], crops[row].box[2:], strict=True))
             around = crops[row].within((x1, y1, x2, y2))
@@ -66,7 +62,7 @@ def snap_masks(masks: Masks, photos: ReadPhoto) -> Masks:
 
 @kept
 def snap(mask: Bools, photo: Pixels, *, others: Bools) -> Bools:
-    """The mask whose edge lies where colours change, within `BAND` of where it was.
+    """The mask whose edge lies where colours change, within `SNAP.band` of where it was.
 
     Args:
         mask: (H, W) bool, with room for the background around it.
@@ -78,17 +74,17 @@ def snap(mask: Bools, photo: Pixels, *, others: Bools) -> Bools:
         the same mask and photo where the run keeps what it computed.
     """
     height, width = mask.shape
-    scale = min(1.0, MOST_PX / max(math.sqrt(mask.sum()), 1.0))
+    scale = min(1.0, SNAP.most_px / max(math.sqrt(mask.sum()), 1.0))
     size = max(1, round(width * scale)), max(1, round(height * scale))
     seen = cv2.resize(photo, size, interpolation=cv2.INTER_AREA)
     inside, beside = (
         cv2.resize(each.astype(np.float32), size, interpolation=cv2.INTER_AREA) > 0.5 for each in (mask, others)
     )
-    radius = max(1, round(BAND * math.sqrt(inside.sum())))
+    radius = max(1, round(SNAP.band * math.sqrt(inside.sum())))
     disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
     deep = cv2.erode(inside.astype(np.uint8), disk, borderValue=1) > 0
     far = (cv2.dilate(inside.astype(np.uint8), disk) == 0) | (beside & ~inside)
-    if min(deep.sum(), far.sum()) < LEAST_PIXELS:
+    if min(deep.sum(), far.sum()) < SNAP.least_pixels:
         return mask
     state = np.where(inside, cv2.GC_PR_FGD, cv2.GC_PR_BGD).astype(np.uint8)
     state[deep], state[far] = cv2.GC_FGD, cv2.GC_BGD

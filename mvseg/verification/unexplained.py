@@ -8,12 +8,9 @@ import numpy as np
 
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
-from mvseg.verification.evidence import MOST_PX
 from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.verification.numbers import COLORS, EVIDENCE
 
-# Leaves were missed if more than this fraction of the pixels of leaf colour lies in no mask. On plants that were found
-# whole, 0.15 to 0.39 does (stems, soil and pots), where a quarter was found, 0.48 to 0.84 (docs/notes/detector.md).
-MUCH = 0.5
 HELP = "outline six leaves in two photos each, and let the detector learn them (mvseg correct); or give masks (--masks)"
 LEARN = f"let the views teach the detector (--learn auto); then {HELP}"
 
@@ -37,7 +34,7 @@ def share_unexplained(masks: Masks, photos: ReadPhoto) -> float:
     for view in range(masks.regions.num_views):
         photo = photos(view)
         height, width = photo.shape[:2]
-        step = -(-max(height, width) // MOST_PX)
+        step = -(-max(height, width) // EVIDENCE.most_px)
         inside = masks.regions.label_map(view, (masks.instance_ids > 0).long(), (width, height)).numpy() > 0
         views.append((np.ascontiguousarray(photo[::step, ::step]), inside[::step, ::step]))
         counts += count_colors(*views[-1])
@@ -77,6 +74,6 @@ def find_missing(masks: Masks, photos: ReadPhoto, *, sure_score: float, may_lear
             helps,
         )
     share = share_unexplained(masks, photos)
-    if share > MUCH:
+    if share > COLORS.unexplained:
         return Missing(f"{share:.0%} of what has the colour of the leaves that were found is in none", helps)
     return None

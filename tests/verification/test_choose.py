@@ -19,7 +19,8 @@ from mvseg.scene import Cameras
 from mvseg.verification.choose import Leaves, add_beside, assign_masks, choose_leaves, gather_candidates, least_chance
 from mvseg.verification.evidence import draw_views
 from mvseg.verification.leaf_scores import Candidates, leaf_features
-from mvseg.verification.rough_surfaces import LEAST_PARALLAX, median_parallax
+from mvseg.verification.numbers import ROUGH
+from mvseg.verification.rough_surfaces import median_parallax
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 TRUE = true_maps()
@@ -215,7 +216,7 @@ def test_surfaces_judge_where_cameras_look_from_enough_sides(arc_deg: float, is_
     square[95:105, 95:105] = 1
     regions, ids = as_regions([square, square])
     matched = matched_of(proposals_of(regions, torch.full((2,), 0.8)), ids)
-    assert (median_parallax(matched, cameras) >= LEAST_PARALLAX) == is_around
+    assert (median_parallax(matched, cameras) >= ROUGH.least_parallax) == is_around
 
 
 @pytest.mark.parametrize(("number", "is_new"), [(15, True), (17, False)])

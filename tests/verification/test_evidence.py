@@ -12,6 +12,7 @@ from blade_scene import SIZE, as_regions
 from known_leaves import flat_leaf
 from mvseg.verification import evidence
 from mvseg.verification.evidence import Shown, draw_views, paint_view, see
+from mvseg.verification.numbers import EVIDENCE
 from three_leaves import CAMERAS, LEAVES, true_maps
 
 MAPS = true_maps()
@@ -52,7 +53,7 @@ def test_the_same_as_whole_frames(hides: np.ndarray) -> None:
 
 def test_large_photos_are_thinned(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = see(draw_views(REGIONS, SURFACES, CAMERAS), len(REGIONS), np.ones(4, bool))
-    monkeypatch.setattr(evidence, "MOST_PX", SIZE // 3)
+    monkeypatch.setattr(evidence, "EVIDENCE", replace(EVIDENCE, most_px=SIZE // 3))
     drawn = draw_views(REGIONS, SURFACES, CAMERAS)
     assert drawn[0].masks.shape[0] == len(range(2, SIZE, 4)) ** 2
     thin = see(drawn, len(REGIONS), np.ones(4, bool))

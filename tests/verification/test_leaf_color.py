@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mvseg.verification.leaf_color import BINS, ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
+from mvseg.verification.numbers import COLORS
 
 GREEN, DARK_GREEN, BROWN, WHITE = (60, 160, 40), (60, 150, 45), (120, 80, 40), (240, 240, 240)
 
@@ -39,10 +40,10 @@ def test_counts_and_colours_are_those_of_pixels_one_by_one() -> None:
     rng = np.random.default_rng(2)
     photo = np.stack([rng.permutation(256) for _ in range(3)], -1).astype(np.uint8).reshape(16, 16, 3)
     is_inside = rng.random((16, 16)) < 0.4
-    counts, colors = count_colors(photo, is_inside), rng.random((BINS,) * 3) < 0.3
+    counts, colors = count_colors(photo, is_inside), rng.random((COLORS.bins,) * 3) < 0.3
     expected = ColorCounts.none()
     for row, column in np.ndindex(16, 16):
-        place = tuple(photo[row, column] // (256 // BINS))
+        place = tuple(photo[row, column] // (256 // COLORS.bins))
         (expected.inside if is_inside[row, column] else expected.outside)[place] += 1
         assert has_leaf_color(photo, colors)[row, column] == colors[place]
     np.testing.assert_array_equal(counts.inside, expected.inside)

@@ -15,7 +15,8 @@ from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Scene
 from mvseg.system.running import running
-from mvseg.verification.snap_edges import BAND, snap, snap_masks
+from mvseg.verification.numbers import SNAP
+from mvseg.verification.snap_edges import snap, snap_masks
 
 SIZE = 160
 
@@ -72,7 +73,7 @@ def test_a_mirrored_photo_has_the_mirrored_mask(flip: tuple[slice, ...]) -> None
 def test_no_edge_moves_farther_than_the_band() -> None:
     leaf = ellipse()
     found = grown(leaf, -9)  # the photo says that the leaf is much larger
-    new, reach = snap(found, paint(leaf.astype(int)), others=NOTHING), round(BAND * np.sqrt(found.sum()))
+    new, reach = snap(found, paint(leaf.astype(int)), others=NOTHING), round(SNAP.band * np.sqrt(found.sum()))
     assert (new & ~grown(found, reach)).sum() == 0
     assert (grown(found, -reach) & ~new).sum() == 0
 
@@ -89,7 +90,7 @@ def test_large_photos_are_compared_at_fewer_pixels(monkeypatch: pytest.MonkeyPat
     large = cv2.resize(ellipse().astype(np.uint8), None, fx=4, fy=4, interpolation=cv2.INTER_LINEAR) > 0
     photo, found, nothing = paint(large.astype(int)), grown(large, 8), np.zeros_like(large)
     fast = snap(found, photo, others=nothing)
-    monkeypatch.setattr(snap_edges, "MOST_PX", 10_000)
+    monkeypatch.setattr(snap_edges, "SNAP", replace(SNAP, most_px=10_000))
     slow = snap(found, photo, others=nothing)
     assert min(iou(fast, slow), iou(fast, large), iou(slow, large)) > 0.98
 

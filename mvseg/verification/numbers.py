@@ -1,0 +1,109 @@
+"""The numbers of verification: definitions, technical limits, and what was fitted to development plants.
+
+`python benchmarks/thirds.py --cache DIR --room verification` prints what a third less or more of each changes; the
+table is in docs/notes/detector.md. Weights of regressions stand beside the features that they weigh (`leaf_scores.py`,
+`shown_leaves.py`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class EvidenceNumbers:
+    """What surfaces say of masks."""
+
+    most_px: int = 800  # limit: longer side of the photos on which masks are compared, at most
+    fits: float = 0.5  # definition: IoU with what a view shows of a leaf from which a mask shows the leaf
+    open_pixels: int = 100  # unhidden pixels of a surface that a view sees openly, at least
+    shared: float = 0.5  # definition: fraction of the smaller of two masks that is in both, where they show one leaf
+
+
+@dataclass(frozen=True)
+class RoughNumbers:
+    """Surfaces that judge masks before ids are final."""
+
+    views: int = 12  # limit: views of an instance that a rough surface is fitted to, at most
+    least_parallax: float = 30.0  # degrees between the directions that most instances are seen from, at least
+
+
+@dataclass(frozen=True)
+class PartNumbers:
+    """Masks and instances that show a part of a leaf, and masks that show two.
+
+    Without `often_split` and `most_split`, 12 right masks of a real basil of 44 leaves move, and its ARI falls from
+    0.923 to 0.854; without `touches`, two right ones of straps in pieces do (docs/notes/matching.md).
+    """
+
+    piece_inside: float = 0.8  # fraction of a piece of a leaf that lies in what is seen of the leaf, at least
+    each: float = 0.2  # fraction of a mask that each of the two leaves it shows covers, at least
+    both: float = 0.7  # and both together
+    few_views: float = 0.75  # fraction of the views that show an instance which may be a part of a leaf, at most
+    often_split: float = 0.1  # fraction of instances with several masks in a view from which pieces are the rule
+    most_split: int = 1  # views with masks of both of two instances that may be one leaf, at most, where they are not
+    touches: float = 0.02  # distance of two surfaces that touch, as a fraction of the length of the part, at most
+    as_near: float = 1.1  # distance of the outline of one surface that fits as well as two, in theirs, at most
+
+
+@dataclass(frozen=True)
+class AgainNumbers:
+    """Masks that are matched again."""
+
+    least_views: int = 5  # with fewer, surfaces fit wrong masks about as well as right ones: two always agree on one
+    # In turn, those that show another leaf as likely as not, and all that are not sure; what is found without need is
+    # not taken (`GivenScores.price`).
+    freed: tuple[float, ...] = (0.5, 0.75)  # q of masks for their own leaf below which they are freed
+
+
+@dataclass(frozen=True)
+class ChoiceNumbers:
+    """The choice of leaves and masks among what a detector found."""
+
+    rounds: int = 2  # in the first nothing hides anything, in the second the leaves of the first do
+    same: float = 0.8  # Jaccard index of the masks of two candidates, by area, above which they are one
+    least_shown: float = 0.2  # q from which a mask may show a leaf
+    least_views: int = 2  # definition: views in which a leaf has masks, at least; one view alone is no agreement
+    digits: int = 9  # limit: decimals of q and P; what differs less is a tie, on every processor
+
+
+@dataclass(frozen=True)
+class DrawnNumbers:
+    """What other views show of leaves that a person drew."""
+
+    least_visible: float = 0.3  # unhidden fraction of a surface that a view sees openly, at least; see `open_pixels`
+    least_colored: float = 0.8  # fraction of the unhidden part that has the colour of leaves, at least
+    rounds: int = 2  # fits: the second one is to what is found where the surface of the first one is
+    beside_px: int = 2  # pixels between leaf colour and where a view may show a leaf, at most
+    most_against: float = 0.15  # fraction of views with another colour at a point of a leaf, at most: stakes hide it
+    reach: float = 0.1  # reach of a leaf beyond its first surface, in roots of the surface's area, at most
+
+
+@dataclass(frozen=True)
+class ColorNumbers:
+    """The colour of leaves."""
+
+    bins: int = 16  # bins of each channel in which colours are counted
+    blur: float = 1.0  # standard deviation of the Gaussian that smooths the counts, in bins
+    # On plants that were found whole, 0.15 to 0.39 (stems, soil and pots), where a quarter was found, 0.48 to 0.84.
+    unexplained: float = 0.5  # fraction of leaf-coloured pixels in no mask above which leaves were missed
+
+
+@dataclass(frozen=True)
+class SnapNumbers:
+    """Edges of masks that move to where colours change."""
+
+    band: float = 0.05  # way that an edge may move, in roots of its mask's area
+    around: int = 3  # bands around a mask in which the photo tells what the background looks like
+    most_px: int = 100  # limit: root of the area of a mask, larger ones are scaled; with all pixels it is as good
+    least_pixels: int = 10  # pixels surely of leaf, or of background, where an edge moves: GrabCut needs five of each
+
+
+EVIDENCE = EvidenceNumbers()
+ROUGH = RoughNumbers()
+PARTS = PartNumbers()
+AGAIN = AgainNumbers()
+CHOICE = ChoiceNumbers()
+DRAWN = DrawnNumbers()
+COLORS = ColorNumbers()
+SNAP = SnapNumbers()
