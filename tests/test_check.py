@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mvseg.checks.check_scene import check_scene, warn_of_contradictions
-from mvseg.checks.photo_matches import PhotoMatches, _match, find_features
+from mvseg.checks.photo_matches import PhotoMatches, find_features, match_pair
 from mvseg.cli import main
 from mvseg.config import RunConfig
 from mvseg.demo import demo_scene as demo_folder
@@ -44,12 +44,12 @@ def once() -> Iterator[None]:
     def match(views: tuple[int, int], first: Any, second: Any, *, unit_px: float) -> PhotoMatches:
         key = (views, id(first), id(second), unit_px)  # `found` keeps them
         if key not in matched:
-            matched[key] = _match(views, first, second, unit_px=unit_px)
+            matched[key] = match_pair(views, first, second, unit_px=unit_px)
         return matched[key]
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("mvseg.checks.photo_matches.find_features", find)
-        patch.setattr("mvseg.checks.photo_matches._match", match)
+        patch.setattr("mvseg.checks.photo_matches.match_pair", match)
         yield
 
 

@@ -1,7 +1,4 @@
-"""Matched features of neighbouring photos: SIFT, on photos scaled down, for few pairs of views.
-
-SIFT is OpenCV's: it finds as many matches as COLMAP's, in half the time, and prints nothing.
-"""
+"""Matched features of neighbouring photos: SIFT, on photos scaled down, for few pairs of views."""
 
 from __future__ import annotations
 
@@ -15,6 +12,7 @@ from mvseg.checks.cameras import find_coverage
 from mvseg.errors import InputError
 from mvseg.formats.photos import ReadPhoto
 from mvseg.matching.pencil import is_coincident
+from mvseg.poses.sift import Sift, find_sift, match_descriptors
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
 
@@ -22,7 +20,6 @@ Floats = NDArray[np.float64]
 
 SIDE, MOST_FEATURES = 800, 1500  # pixels of the longer side; per photo
 CONTRAST = 0.013  # of SIFT; leaves have less than OpenCV's default of 0.04
-RATIO = 0.8  # of the distances to the best and the second best partner
 BEST_ANGLE, WIDEST_ANGLE = 15.0, 60.0  # degrees between two views: fewer features are the same above, less depth below
 PARTNERS = 4  # of each view: wrong cameras are wrong about what is near, too
 MOST_VIEWS, SOURCES = 24, 8  # of more views, the partners of some are looked for
@@ -71,7 +68,7 @@ def match_photos(read: ReadPhoto, cameras: Cameras) -> list[PhotoMatches]:
         except InputError:
             continue
     return [
-        _match(pair, features[pair[0]], features[pair[1]], unit_px=cameras.unit_px)
+        match_pair(pair, features[pair[0]], features[pair[1]], unit_px=cameras.unit_px)
         for pair in pairs
         if pair[0] in features and pair[1] in features
     ]
@@ -93,36 +90,15 @@ def neighbours(cameras: Cameras) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def find_features(photo: NDArray[np.uint8]) -> tuple[Floats, NDArray[np.float32]]:
-    """(N, 2) pixels of the photo (H, W, 3), and (N, 128) descriptors (RootSIFT)."""
-    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
-    scale = min(1.0, SIDE / max(grey.shape))
-    if scale < 1:
-        grey = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
-    points, found = cv2.SIFT.create(MOST_FEATURES, contrastThreshold=CONTRAST).detectAndCompute(grey, None)
-    if not points:
-        return np.zeros((0, 2)), np.zeros((0, 128), np.float32)
-    root = np.sqrt(found / np.abs(found).sum(1, keepdims=True).clip(min=1e-9))
-    return (np.array([point.pt for point in points]) + 0.5) / scale, root.astype(np.float32)
+def find_features(photo: NDArray[np.uint8]) -> Sift:
+    """Features of a photo (H, W, 3)."""
+    return find_sift(photo, image_size=SIDE, most=MOST_FEATURES, contrast=CONTRAST)
 
 
-def _match(
-    views: tuple[int, int],
-    first: tuple[Floats, NDArray[np.float32]],
-    second: tuple[Floats, NDArray[np.float32]],
-    *,
-    unit_px: float,
-) -> PhotoMatches:
-    """Features that are each other's best partners, and clearly so."""
-    (one, description), (other, others) = first, second
-    index = np.zeros((0, 2), int)
-    if min(len(one), len(other)) > 1:
-        alike = description @ others.T  # of vectors of length 1
-        best = alike.argmax(1)
-        distance = np.sqrt((2 - 2 * np.partition(alike, -2, axis=1)[:, -2:]).clip(min=0))
-        is_clear = (distance[:, 1] < RATIO * distance[:, 0]) & (alike.argmax(0)[best] == np.arange(len(one)))
-        index = np.stack((np.flatnonzero(is_clear), best[is_clear]), 1)
-    xy = np.stack((one[index[:, 0]], other[index[:, 1]]))
+def match_pair(views: tuple[int, int], first: Sift, second: Sift, *, unit_px: float) -> PhotoMatches:
+    """The features that views i and j share, see `Cameras.unit_px`."""
+    index = match_descriptors(first.descriptors, second.descriptors, back_ratio=1.0)
+    xy = np.stack((first.px[index[:, 0]], second.px[index[:, 1]])).astype(np.float64)
     has_moved = np.linalg.norm(xy[0] - xy[1], axis=1) > STILL * unit_px
     xy = xy[:, has_moved]
     is_rigid = np.zeros(xy.shape[1], bool)

@@ -13,7 +13,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
@@ -79,8 +78,7 @@ def find_features(database: Path, folder: Path, names: Sequence[str], *, image_s
     with pycolmap.Database.open(database) as opened:
         number_of = {image.name: image.image_id for image in opened.read_all_images()}
         for name in progress_bar(names, name="features", unit="photo"):
-            grey = np.asarray(cv2.cvtColor(read_rgb(folder / name), cv2.COLOR_RGB2GRAY), np.uint8)
-            sift = find_sift(grey, image_size=min(image_size, QUICK_SIZE), most=QUICK_MOST)
+            sift = find_sift(read_rgb(folder / name), image_size=min(image_size, QUICK_SIZE), most=QUICK_MOST)
             number = number_of[name]
             opened.write_keypoints(number, np.column_stack([sift.px, sift.scale, sift.angle]))
             bytes_of = pycolmap.FeatureDescriptors(pycolmap.FeatureExtractorType.SIFT, sift.descriptors)

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
-Grey = NDArray[np.uint8]
+Photo = NDArray[np.uint8]
 
 CONTRAST = 0.02  # COLMAP's; a third less finds a quarter more features of a plant before black cloth, and more noise
 EDGE = 10.0  # Lowe's and COLMAP's ratio of curvatures
@@ -45,19 +46,21 @@ class Sift:
         return len(self.px)
 
 
-def find_sift(grey: Grey, *, image_size: int, most: int) -> Sift:
+def find_sift(photo: Photo, *, image_size: int, most: int, contrast: float = CONTRAST) -> Sift:
     """The features of most contrast.
 
     Args:
-        grey: (H, W) uint8.
+        photo: (H, W, 3) uint8 RGB.
         image_size: a photo whose longer side has more pixels is scaled down to it.
         most: number of features that are kept.
+        contrast: the least of a feature.
     """
+    grey = cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY)
     factor = min(1.0, image_size / max(grey.shape))
     size = tuple(max(1, round(factor * side)) for side in grey.shape[::-1])
     small = grey if factor == 1 else cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
     finder = cv2.SIFT.create(
-        nfeatures=most, contrastThreshold=CONTRAST, edgeThreshold=EDGE, enable_precise_upscale=True
+        nfeatures=most, contrastThreshold=contrast, edgeThreshold=EDGE, enable_precise_upscale=True
     )
     points, histograms = finder.detectAndCompute(small, None)
     if not points:
@@ -75,35 +78,37 @@ def find_sift(grey: Grey, *, image_size: int, most: int) -> Sift:
     )
 
 
-def coarsest(sift: Sift) -> Floats:
-    """(C, 128) float32: descriptors, of length 1, of the COARSE features of largest scale, which are seen best from
-    elsewhere (Wu, Towards linear-time incremental structure from motion, 3DV 2013)."""
-    rows = np.argsort(-sift.scale, kind="stable")[:COARSE]
-    chosen = sift.descriptors[rows].astype(np.float32)
-    return chosen / np.maximum(np.linalg.norm(chosen, axis=1, keepdims=True), 1e-9)
+def coarsest(sift: Sift) -> NDArray[np.uint8]:
+    """(C, 128): descriptors of the COARSE features of largest scale, which are seen best from elsewhere (Wu, Towards
+    linear-time incremental structure from motion, 3DV 2013)."""
+    return sift.descriptors[np.argsort(-sift.scale, kind="stable")[:COARSE]]
 
 
-def count_alike(photos: Sequence[Floats]) -> NDArray[np.int64]:
-    """(V, V): how many coarse features of two photos match, from `coarsest` of V photos; symmetric, 0 on the diagonal.
-
-    Two features match if each is the other's nearest and, for both, nearer than RATIO of the second nearest.
-    """
+def count_alike(photos: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
+    """(V, V): how many coarse features of V photos match, from `coarsest` of each; symmetric, 0 on the diagonal."""
     alike = np.zeros((len(photos), len(photos)), np.int64)
-    for i, one in enumerate(photos):
-        for j in range(i):
-            alike[i, j] = alike[j, i] = _count_matches(one, photos[j])
+    for i, j in combinations(range(len(photos)), 2):
+        alike[i, j] = alike[j, i] = len(match_descriptors(photos[i], photos[j]))
     return alike
 
 
-def _count_matches(one: Floats, other: Floats) -> int:
+def match_descriptors(
+    one: NDArray[np.uint8], other: NDArray[np.uint8], *, back_ratio: float = RATIO
+) -> NDArray[np.int64]:
+    """(M, 2) rows of descriptors (A, 128) and (B, 128) that match.
+
+    Each is the other's nearest and nearer than the second nearest: RATIO of it as seen from the first, `back_ratio` of
+    it as seen from the other; 1 asks for the nearest only.
+    """
     if min(len(one), len(other)) < 2:
-        return 0
-    cosines = one @ other.T
-    return int((_clear_best(cosines) & _clear_best(cosines.T).T).sum())
+        return np.zeros((0, 2), np.int64)
+    one, other = (rows / np.maximum(np.linalg.norm(rows, axis=1, keepdims=True), 1e-9) for rows in (one, other))
+    cosines = one.astype(np.float32) @ other.astype(np.float32).T
+    return np.argwhere(_clear_best(cosines, RATIO) & _clear_best(cosines.T, back_ratio).T)
 
 
-def _clear_best(cosines: Floats) -> NDArray[np.bool_]:
-    """(A, B) bool: the nearest of B for each of A rows, where it is clearly the nearest."""
+def _clear_best(cosines: Floats, ratio: float) -> NDArray[np.bool_]:
+    """(A, B) bool: the nearest of B for each of A rows, where it is nearer than `ratio` of the second nearest."""
     second, best = np.partition(cosines, -2, axis=1)[:, -2:].T
-    near = 2 - 2 * best <= RATIO**2 * (2 - 2 * second)  # squared distances of descriptors of length 1
+    near = 2 - 2 * best <= ratio**2 * (2 - 2 * second)  # squared distances of descriptors of length 1
     return (cosines == best[:, None]) & near[:, None]

@@ -18,10 +18,11 @@ from mvseg.checks.epipolar_distances import (
     fundamental,
     scale_focal,
 )
-from mvseg.checks.photo_matches import PhotoMatches, _match, find_features, match_photos, neighbours
+from mvseg.checks.photo_matches import PhotoMatches, find_features, match_pair, match_photos, neighbours
 from mvseg.errors import InputError
 from mvseg.formats.photos import read_photo
 from mvseg.formats.scene_folder import load_scene
+from mvseg.poses.sift import Sift
 from mvseg.scene import Cameras, Scene
 from two_worlds import every_second_farther, half_turned
 
@@ -35,7 +36,7 @@ Look = Callable[[Cameras], list[PhotoMatches]]
 def look(demo_scene: Scene) -> Look:
     """What the photos of the shipped plant share where these cameras say what is near; each pair is matched once."""
     features = {view: find_features(read_photo(demo_scene, view)) for view in range(9)}
-    match = cache(lambda i, j, unit_px: _match((i, j), features[i], features[j], unit_px=unit_px))
+    match = cache(lambda i, j, unit_px: match_pair((i, j), features[i], features[j], unit_px=unit_px))
     return lambda cameras: [match(*pair, cameras.unit_px) for pair in neighbours(cameras)]
 
 
@@ -56,8 +57,9 @@ def one_turned(cameras: Cameras) -> Cameras:
 
 def test_right_cameras_have_no_finding(shared: list[PhotoMatches], look: Look, demo_scene: Scene) -> None:
     assert [pair.views for pair in look(demo_scene.cameras)] == [pair.views for pair in shared]
-    assert sum(pair.is_significant for pair in shared) >= 8
-    assert focal_factor(shared, demo_scene.cameras) == 1
+    significant = [pair for pair in shared if pair.is_significant]
+    assert len(significant) >= 8
+    assert focal_factor(significant, demo_scene.cameras) == 1
     assert say(shared, demo_scene.cameras) == []
 
 
@@ -113,7 +115,7 @@ def test_what_stands_still_tells_nothing(shared: list[PhotoMatches], demo_scene:
 
 def test_plain_photos_tell_nothing(demo_scene: Scene) -> None:
     black = np.zeros((480, 640, 3), np.uint8)
-    assert find_features(black)[0].shape == (0, 2)
+    assert len(find_features(black)) == 0
     shared = match_photos(lambda _: black, demo_scene.cameras)
     assert not any(pair.is_significant for pair in shared)
     assert say(shared, scale_focal(demo_scene.cameras, 0.5)) == []
@@ -133,8 +135,10 @@ def test_features_that_fit_nothing_are_no_evidence() -> None:
     random = np.random.default_rng(0)
     for num in (20, 40, 200):
         xy = random.uniform(0, 480, (2, num, 2))
-        described = np.eye(num, 128 if num <= 128 else num, dtype=np.float32)
-        assert not _match((0, 1), (xy[0], described), (xy[1], described), unit_px=1.0).is_significant
+        nothing = np.zeros(num, np.float32)
+        described = np.eye(num, dtype=np.uint8)
+        one, other = (Sift(px=px, scale=nothing, angle=nothing, descriptors=described) for px in xy.astype(np.float32))
+        assert not match_pair((0, 1), one, other, unit_px=1.0).is_significant
 
 
 def test_neighbours_are_near_and_few(demo_scene: Scene) -> None:

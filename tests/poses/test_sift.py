@@ -4,17 +4,17 @@ import cv2
 import numpy as np
 import pytest
 
-from mvseg.poses.sift import COARSE, RATIO, UNIT, coarsest, count_alike, find_sift
+from mvseg.poses.sift import COARSE, RATIO, UNIT, coarsest, count_alike, find_sift, match_descriptors
 from room_scene import texture
 
 
-def grey(seed: int = 0) -> np.ndarray:
-    return cv2.cvtColor(texture(seed, grains=(5, 12, 40)), cv2.COLOR_RGB2GRAY)[:400, :500]
+def rgb(seed: int = 0) -> np.ndarray:
+    return texture(seed, grains=(5, 12, 40))[:400, :500]
 
 
 def test_features_move_with_the_picture() -> None:
     """By whole pixels, away from the border, nearly all are found again where they must be."""
-    picture = grey()
+    picture = rgb()
     one = find_sift(picture[:360, :460], image_size=1000, most=4000)
     other = find_sift(picture[10:370, 24:484], image_size=1000, most=4000)
     is_inside = ((one.px > 80) & (one.px < [380, 280])).all(1)
@@ -25,7 +25,7 @@ def test_features_move_with_the_picture() -> None:
 
 def test_pixels_are_of_the_photo_whatever_the_size() -> None:
     """A photo that is scaled down gives the same features, but for the finest: no shift and no scale."""
-    large = cv2.resize(grey()[:260, :320], None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
+    large = cv2.resize(rgb()[:260, :320], None, fx=2, fy=2, interpolation=cv2.INTER_CUBIC)
     one = find_sift(large, image_size=640, most=4000)
     small = find_sift(large, image_size=320, most=4000)
     gaps = one.px[None] - small.px[:, None]
@@ -36,21 +36,21 @@ def test_pixels_are_of_the_photo_whatever_the_size() -> None:
 
 
 def test_descriptors_have_one_length_and_no_more_are_kept_than_asked_for() -> None:
-    sift = find_sift(grey(), image_size=1000, most=200)
+    sift = find_sift(rgb(), image_size=1000, most=200)
     assert len(sift) == 200
     assert sift.descriptors.dtype == np.uint8
     np.testing.assert_allclose(np.linalg.norm(sift.descriptors.astype(float), axis=1), UNIT, rtol=0.02)
 
 
 def test_a_photo_without_texture() -> None:
-    sift = find_sift(np.full((60, 80), 120, np.uint8), image_size=1000, most=100)
+    sift = find_sift(np.full((60, 80, 3), 120, np.uint8), image_size=1000, most=100)
     assert (len(sift), sift.px.shape, sift.descriptors.shape) == (0, (0, 2), (0, 128))
-    assert count_alike([coarsest(sift), coarsest(find_sift(grey(), image_size=500, most=100))]).tolist() == [[0, 0]] * 2
+    assert count_alike([coarsest(sift), coarsest(find_sift(rgb(), image_size=500, most=100))]).tolist() == [[0, 0]] * 2
 
 
 def test_alike_is_what_a_plain_count_says() -> None:
     """And pictures of one thing are alike, those of others are not."""
-    pictures = [grey(0)[:300, :400], grey(0)[60:360, 80:480], grey(1)[:300, :400]]
+    pictures = [rgb(0)[:300, :400], rgb(0)[60:360, 80:480], rgb(1)[:300, :400]]
     coarse = [coarsest(find_sift(picture, image_size=1000, most=4000)) for picture in pictures]
     assert all(len(each) == COARSE for each in coarse)
     alike = count_alike(coarse)
@@ -58,7 +58,9 @@ def test_alike_is_what_a_plain_count_says() -> None:
     assert (alike.diagonal() == 0).all()
     assert alike[0, 1] > 10 * max(alike[0, 2], 1)
     for i, j in ((0, 1), (0, 2)):
-        apart = np.linalg.norm(coarse[i][:, None].astype(float) - coarse[j][None], axis=2)
+        assert alike[i, j] == len(match_descriptors(coarse[i], coarse[j]))
+        unit = [each / np.linalg.norm(each.astype(float), axis=1, keepdims=True) for each in (coarse[i], coarse[j])]
+        apart = np.linalg.norm(unit[0][:, None] - unit[1], axis=2)
         count = 0
         for row, distances in enumerate(apart):
             column = int(distances.argmin())
