@@ -7,13 +7,16 @@ which points and cells are the outermost.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
+from torch import Tensor
 
 from mvseg.reconstruction.surface.leaf_patch import patch_grid
-from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, cell_normals
+from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface
 from mvseg.traits.from_above import Cells
 from mvseg.traits.leaf import UP_UNKNOWN, Measurement, missing
 from mvseg.traits.ontology import PLANT_TRAITS
@@ -38,53 +41,43 @@ def measure_whole(
     numbers = {"number_of_leaves": Measurement(float(num_leaves), float("nan"), "matching")}
     if not surfaces:
         return numbers | dict.fromkeys(FROM_SURFACES, NO_LEAVES)
-    grids = np.stack([surface.points().numpy() for surface in surfaces.values()])  # (N, rows, columns, 3)
     areas = np.array([surface.area for surface in surfaces.values()])
-    volume, hull_slopes = hull_volume(grids)
-    values = {"total_leaf_area": areas.sum(), "convex_hull_volume": volume}
-    slopes = [hull_slopes]
+    is_lit = None if frame is None else np.stack([cells[instance].is_lit for instance in surfaces])
+    measure = partial(measure_together, up=None if frame is None else frame[2], is_lit=is_lit)
+    coefficients = torch.stack([surface.coefficients for surface in surfaces.values()])
+    slopes = torch.autograd.functional.jacobian(measure, coefficients).flatten(2)  # (T, N, 78)
+    covariance = torch.stack([surface.covariance for surface in surfaces.values()])
+    sds = torch.einsum("tni,nij,tnj->nt", slopes, covariance, slopes).clamp(min=0).sqrt().numpy()
+    names = ["total_leaf_area", "convex_hull_volume", *(NEED_UP if frame is not None else ())]
+    values = dict(zip(names, measure(coefficients).tolist(), strict=True))
     if frame is not None:
-        covered = sum(cells[instance].projected_area for instance in surfaces)
-        height, height_slopes = height_of(grids, frame[2])
-        slopes.append(height_slopes)
-        values |= {"height": height, "projected_area": covered, "light_interception": min(covered / areas.sum(), 1.0)}
-
-    sds = []
-    for index, (instance, surface) in enumerate(surfaces.items()):
-        normals = cell_normals(grids[index])
-        unit = normals / np.linalg.norm(normals, axis=-1, keepdims=True).clip(min=1e-300)
-        by_area = slopes_of_grid(grids[index], unit)
-        by_point = [by_area, *(slope[index] for slope in slopes)]
-        if frame is not None:
-            is_lit, up = cells[instance].is_lit, frame[2]
-            by_shown = slopes_of_grid(grids[index], np.sign(normals @ up)[..., None] * is_lit[..., None] * up)
-            by_point += [by_shown, (by_shown - values["light_interception"] * by_area) / areas.sum()]
-        moves = np.stack(by_point).reshape(len(by_point), -1, 3)
-        by_coefficient = np.einsum("tpc,pb->tbc", moves, patch_grid(*MESH_SHAPE).basis).reshape(len(by_point), -1)
-        variance = np.einsum("ij,jk,ik->i", by_coefficient, surface.covariance.numpy(), by_coefficient)
-        sds.append(np.sqrt(np.maximum(variance, 0)))
-    together = np.sqrt(np.square(sds).sum(0))
+        values["light_interception"] = min(values["light_interception"], 1.0)
     method = "surface" if len(surfaces) == num_leaves else f"surface ({len(surfaces)} of {num_leaves} leaves)"
-    for (name, value), sd in zip(values.items(), together.tolist(), strict=True):
-        numbers[name] = Measurement(float(value), sd, method)
-    if not volume > 0:
+    for (name, value), sd in zip(values.items(), np.linalg.norm(sds, axis=0).tolist(), strict=True):
+        numbers[name] = Measurement(value, sd, method)
+    if not values["convex_hull_volume"] > 0:
         numbers["convex_hull_volume"] = FLAT
     if frame is None:
         numbers |= dict.fromkeys(NEED_UP, UP_UNKNOWN)
-    return numbers | area_deciles(areas, np.array(sds)[:, 0], method=method)
+    return numbers | area_deciles(areas, sds[:, 0], method=method)
 
 
-def slopes_of_grid(points: Floats, by_normal: Floats) -> Floats:
-    """(rows, columns, 3) derivatives by the points of a grid, of what has the derivatives `by_normal` (rows - 1,
-    columns - 1, 3) by its `cell_normals`."""
-    along, across = points[1:, 1:] - points[:-1, :-1], points[1:, :-1] - points[:-1, 1:]
-    by_along, by_across = np.cross(across, by_normal) / 2, np.cross(by_normal, along) / 2
-    slopes = np.zeros_like(points)
-    slopes[1:, 1:] += by_along
-    slopes[:-1, :-1] -= by_along
-    slopes[1:, :-1] += by_across
-    slopes[:-1, 1:] -= by_across
-    return slopes
+def measure_together(coefficients: Tensor, up: Floats | None, is_lit: NDArray[np.bool_] | None) -> Tensor:
+    """(2,) area and volume of the hull of leaves whose patches have the coefficients (N, 26, 3); (5,) with `NEED_UP`
+    where up is known, from the cells (N, rows, columns) that are lit."""
+    basis = torch.from_numpy(patch_grid(*MESH_SHAPE).basis)
+    points = (basis @ coefficients).unflatten(1, MESH_SHAPE)
+    diagonal = points[:, 1:, 1:] - points[:, :-1, :-1]
+    sides = (points[:, 1:, :-1] - points[:, :-1, :-1], points[:, :-1, 1:] - points[:, :-1, :-1])
+    lower, upper = torch.linalg.cross(sides[0], diagonal), torch.linalg.cross(diagonal, sides[1])
+    area = (torch.linalg.vector_norm(lower, dim=-1) + torch.linalg.vector_norm(upper, dim=-1)).sum() / 2
+    sizes = [area, hull_volume(points.reshape(-1, 3))]
+    if up is not None:
+        vertical = torch.from_numpy(up)
+        heights = points @ vertical
+        shown = ((lower + upper) @ vertical).abs()[torch.as_tensor(is_lit)].sum() / 2
+        sizes += [heights.max() - heights.min(), shown, shown / area]
+    return torch.stack(sizes)
 
 
 def area_deciles(areas: Floats, sds: Floats, *, method: str) -> dict[str, Measurement]:
@@ -99,30 +92,13 @@ def area_deciles(areas: Floats, sds: Floats, *, method: str) -> dict[str, Measur
     return numbers
 
 
-def hull_volume(points: Floats) -> tuple[float, Floats]:
-    """Volume of the convex hull of points (..., 3), and its derivatives by them, of the same shape.
-
-    Both are 0 for points in one plane.
-    """
-    flat = points.reshape(-1, 3)
-    slopes = np.zeros_like(flat)
+def hull_volume(points: Tensor) -> Tensor:
+    """Volume of the convex hull of points (P, 3) float64; 0 for points in one plane."""
     try:
-        hull = ConvexHull(flat)
+        hull = ConvexHull(points.detach().numpy())
     except QhullError:
-        return 0.0, slopes.reshape(points.shape)
-    corners = flat[hull.simplices]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    outwards = np.sign((across * hull.equations[:, :3]).sum(1))
-    for index in range(3):
-        opposite = np.cross(corners[:, (index + 1) % 3], corners[:, (index + 2) % 3])
-        np.add.at(slopes, hull.simplices[:, index], outwards[:, None] * opposite / 6)
-    return float(hull.volume), slopes.reshape(points.shape)
-
-
-def height_of(points: Floats, up: Floats) -> tuple[float, Floats]:
-    """Extent of points (..., 3) along up, and its derivatives by them."""
-    heights = points @ up
-    slopes = np.zeros_like(points)
-    slopes[np.unravel_index(heights.argmax(), heights.shape)] += up
-    slopes[np.unravel_index(heights.argmin(), heights.shape)] -= up
-    return float(np.ptp(heights)), slopes
+        return points.sum() * 0
+    first, second, third = points[torch.from_numpy(hull.simplices).long()].unbind(1)
+    across = torch.linalg.cross(second - first, third - first)
+    outwards = (across.detach() * torch.from_numpy(hull.equations[:, :3])).sum(1).sign()
+    return (outwards * (torch.linalg.cross(second, third) * first).sum(1)).sum() / 6

@@ -1,16 +1,19 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 import trimesh
 from scipy.spatial import ConvexHull
 
 from known_leaves import bent_blade, flat_leaf, move, turn_about
-from mvseg.reconstruction.surface.leaf_surface import LeafSurface, cell_normals
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.traits.from_above import look_from_above
 from mvseg.traits.leaf import Measurement, measure_leaf
 from mvseg.traits.ontology import PLANT_TRAITS
-from mvseg.traits.plant import NEED_UP, area_deciles, height_of, hull_volume, measure_whole, slopes_of_grid
+from mvseg.traits.plant import NEED_UP, area_deciles, hull_volume, measure_together, measure_whole
 from mvseg.traits.up import level_frame
 
 FRAME = level_frame((0.0, 0.0, 1.0))
@@ -58,23 +61,31 @@ def test_deviations_are_those_of_independent_leaves() -> None:
         assert 0 < found[name].sd < 0.2 * found[name].value
 
 
-def test_slopes_of_hull_and_height_are_their_differences() -> None:
-    rng = np.random.default_rng(1)
-    points, direction = rng.normal(size=(4, 30, 3)), rng.normal(size=(4, 30, 3))
-    for measured in (hull_volume, lambda p: height_of(p, FRAME[2])):
-        value, slopes = measured(points)
-        ahead, behind = (measured(points + sign * 1e-6 * direction)[0] for sign in (1, -1))
-        assert (slopes * direction).sum() == pytest.approx((ahead - behind) / 2e-6, rel=1e-4)
-        assert value > 0
-    assert hull_volume(points)[0] == pytest.approx(ConvexHull(points.reshape(-1, 3)).volume)
+def test_deviations_are_those_of_plain_differences() -> None:
+    """Slow twin: one leaf whose coefficients move along one direction, and no other.
+
+    The leaves are uneven: on straight lines of points, any move makes the hull larger.
+    """
+    uneven = 0.3 * torch.from_numpy(np.random.default_rng(9).normal(size=(26, 3)))
+    leaves = {i: replace(leaf, coefficients=leaf.coefficients + uneven) for i, leaf in some_leaves().items()}
+    cells = look_from_above(leaves, FRAME)
+    is_lit = np.stack([cells[leaf].is_lit for leaf in leaves])
+    coefficients = torch.stack([leaf.coefficients for leaf in leaves.values()])
+    for moved in range(3):
+        step = torch.zeros_like(coefficients)
+        step[moved] = torch.from_numpy(np.random.default_rng(moved).normal(size=(26, 3)))
+        ahead, behind = (measure_together(coefficients + sign * 1e-5 * step, FRAME[2], is_lit) for sign in (1, -1))
+        certain = {i: replace(leaf, covariance=torch.zeros(78, 78).double()) for i, leaf in leaves.items()}
+        along = torch.outer(step[moved].flatten(), step[moved].flatten())
+        found = measure(certain | {moved + 1: replace(certain[moved + 1], covariance=along)})
+        names = ("total_leaf_area", "convex_hull_volume", *NEED_UP)
+        expected = ((ahead - behind).abs() / 2e-5).tolist()
+        assert [found[name].sd for name in names] == pytest.approx(expected, rel=1e-4)
 
 
-def test_slopes_of_a_grid_are_those_of_its_normals() -> None:
-    rng = np.random.default_rng(3)
-    points, direction = rng.normal(size=(6, 5, 3)), rng.normal(size=(6, 5, 3))
-    by_normal = rng.normal(size=(5, 4, 3))
-    ahead, behind = ((by_normal * cell_normals(points + sign * direction)).sum() for sign in (1, -1))
-    assert (slopes_of_grid(points, by_normal) * direction).sum() == pytest.approx((ahead - behind) / 2)  # a quadratic
+def test_volume_of_a_hull_is_scipys() -> None:
+    points = torch.from_numpy(np.random.default_rng(1).normal(size=(120, 3)) + 5)
+    assert float(hull_volume(points)) == pytest.approx(ConvexHull(points.numpy()).volume)
 
 
 def test_one_flat_leaf_spans_no_volume() -> None:
