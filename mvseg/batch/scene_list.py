@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import re
 import sys
 from collections import Counter
@@ -14,13 +12,13 @@ from pathlib import Path
 from mvseg.batch.status import STATE, TABLES
 from mvseg.errors import InputError
 from mvseg.formats.scene_folder import is_scene_folder
+from mvseg.formats.text_file import read_table
 from mvseg.system.atomic import resolve_place
 
 OWN_COLUMNS = ("scene", "name", "masks", "corrections")
 # of summary.csv, behind those of the scene
 SUMMARY_COLUMNS = ("state", "instances", "masks", "views", "warnings", "seconds", "peak_mb", "warning_text", "sentence")
 RESERVED = {STATE, TABLES}
-MAX_BYTES = 1 << 26
 FORBIDDEN = "/\\\0" + ('<>:"|?*' if sys.platform == "win32" else "")  # in the name of a folder
 
 
@@ -140,27 +138,8 @@ def _beside_table(source: Path, path: str | None) -> Path | None:
 
 
 def _read_rows(source: Path) -> tuple[list[str], list[tuple[int, list[str]]]]:
-    """Columns, and the rows that are not empty, with the numbers of their lines; cells are stripped."""
-    try:
-        with source.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
-        text = data.decode("utf-8-sig")  # Windows editors put a mark in front
-    except OSError as error:
-        raise InputError(f"{source}: cannot be read ({error.strerror})") from None
-    except UnicodeDecodeError as error:
-        raise InputError(f"{source}: byte {error.start} is not UTF-8, expected a CSV table") from None
-    if len(data) > MAX_BYTES:
-        raise InputError(f"{source}: is larger than {MAX_BYTES} bytes, expected a table with one row per scene")
-    header = text.partition("\n")[0]
-    delimiter = ";" if ";" in header and "," not in header else ","  # as spreadsheets of European locales write
-    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter)
-    rows: list[tuple[int, list[str]]] = []
-    try:
-        for cells in reader:
-            if any(cell.strip() for cell in cells):
-                rows.append((reader.line_num, [cell.strip() for cell in cells]))
-    except csv.Error as error:
-        raise InputError(f"{source}: line {reader.line_num} is not CSV ({error})") from None
+    """Columns, and the rows that are not empty, with the numbers of their lines."""
+    rows = read_table(source, "a CSV table")
     if not rows:
         raise InputError(f"{source}: is empty, expected a table with a column 'scene'")
     (_, columns), *rows = rows

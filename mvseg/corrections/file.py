@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.types import StrictBool
 
 from mvseg.errors import InputError
-from mvseg.formats.json_file import Items, Pixels
+from mvseg.formats.json_file import Items, Pixels, load_json
 from mvseg.system.atomic import write_text_whole
 
 FORMAT = "mvseg-corrections/1"
@@ -134,17 +134,7 @@ def load_corrections(path: Path | str) -> Corrections:
         InputError: the file is missing, too large or not JSON; see `parse_corrections`.
     """
     path = Path(path)
-    try:
-        if path.stat().st_size > MOST_BYTES:
-            raise InputError(f"{path}: has {path.stat().st_size} bytes, expected at most {MOST_BYTES}")
-        data = json.loads(path.read_text(encoding="utf-8-sig"))
-    except InputError:
-        raise
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, numbers of thousands of digits
-        raise InputError(f"{path}: not a whole JSON file ({error})") from None
-    return parse_corrections(data, source=path)
+    return parse_corrections(load_json(path, most=MOST_BYTES), source=path)
 
 
 def parse_corrections(data: Any, source: Path | None = None) -> Corrections:

@@ -37,16 +37,20 @@ def read_json(path: Path, model: type[Model]) -> Model:
     return check_content(path, load_json(path), model)
 
 
-def load_json(path: Path) -> Any:
+def load_json(path: Path, *, most: int | None = None) -> Any:
     """What a JSON file holds, unchecked.
 
     Raises:
-        InputError: the file is missing or is not JSON.
+        InputError: the file is missing, has more than `most` bytes, or is not JSON.
     """
     try:
+        if most is not None and path.stat().st_size > most:
+            raise InputError(f"{path}: has {path.stat().st_size} bytes, expected at most {most}")
         return json.loads(path.read_text(encoding="utf-8-sig"))  # Windows editors write a byte order mark
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from None
+    except InputError:
+        raise
     except (ValueError, RecursionError) as error:  # bad UTF-8, bad JSON, numbers of thousands of digits
         raise InputError(f"{path}: not a whole JSON file ({error})") from None
 

@@ -10,11 +10,11 @@ be separated by commas, semicolons or tabs; other columns are ignored. Positions
 
 from __future__ import annotations
 
-import csv
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -23,12 +23,11 @@ from pydantic import BaseModel
 
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, read_json
-from mvseg.formats.text_file import read_text
+from mvseg.formats.text_file import read_table
 
 NAMES = ("photo", "image", "file", "filename", "file_name", "name")
 AXIS = re.compile(r"([xyz])(?:[_ ]?[\[(]?(mm|cm|dm|m|um|in|ft)[\])]?)?")
-MAX_BYTES = 1 << 26
-Rows = Sequence[dict[Any, Any]]
+Rows = Sequence[Mapping[Any, Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,19 +85,15 @@ def read_photo_angles(path: Path) -> dict[str, float]:
     return {name: angle for name, (angle,) in by_photo.items()}
 
 
-def _read_table(path: Path, what: str) -> list[dict[Any, Any]]:
-    """The rows of a CSV file, as {column: entry}."""
-    lines = read_text(path, f"a table of {what}", most=MAX_BYTES).splitlines()
-    delimiter = max(",;\t", key=lines[0].count) if lines else ","
-    try:
-        return list(csv.DictReader(lines, delimiter=delimiter, skipinitialspace=True))
-    except csv.Error as error:
-        raise InputError(f"{path}: is not a table of {what} ({error})") from None
+def _read_table(path: Path, what: str) -> Rows:
+    """The rows of a CSV file, as {column: entry}; None where a row has no such cell."""
+    (_, columns), *rows = read_table(path, f"a table of {what}") or [(0, [])]
+    return [dict(zip_longest(columns, cells[: len(columns)])) for _, cells in rows]
 
 
 def _columns(rows: Rows) -> dict[str, Any]:
     """{name in small letters: column}; that of the photos is called "photo", whatever its name."""
-    keys = {str(key).strip().lower(): key for key in (rows[0] if rows else ()) if key is not None}
+    keys = {str(key).strip().lower(): key for key in (rows[0] if rows else ())}
     photo = next((keys[name] for name in NAMES if name in keys), None)
     return keys if photo is None else keys | {"photo": photo}
 

@@ -1,7 +1,9 @@
-"""Text and YAML files that people write, read whole; each fault is one sentence."""
+"""Text, CSV and YAML files that people write, read whole; each fault is one sentence."""
 
 from __future__ import annotations
 
+import csv
+import io
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +11,7 @@ import yaml  # type: ignore[import-untyped]
 
 from mvseg.errors import InputError
 
-MAX_BYTES = 1 << 20
+MAX_BYTES, MAX_TABLE = 1 << 20, 1 << 26
 MAX_DEPTH, MAX_DIGITS = 32, 400  # of YAML: PyYAML recurses as deep as Python's stack
 
 
@@ -39,6 +41,23 @@ def read_text(path: Path, expected: str, *, most: int = MAX_BYTES) -> str:
         return read_bytes(path, expected, most=most).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: byte {error.start} is not UTF-8, expected {expected}") from None
+
+
+def read_table(path: Path, expected: str, *, most: int = MAX_TABLE) -> list[tuple[int, list[str]]]:
+    """The rows of a CSV file that are not empty, the header first: number of the line, and cells without space around
+    them. Cells are separated by commas, semicolons or tabs, whichever the header has most of.
+
+    Raises:
+        InputError: as `read_text`, or it is not CSV.
+    """
+    text = read_text(path, expected, most=most)
+    delimiter = max(",;\t", key=text.partition("\n")[0].count)
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=delimiter, skipinitialspace=True)
+    try:
+        rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    except csv.Error as error:
+        raise InputError(f"{path}: line {reader.line_num} is not CSV ({error})") from None
+    return [(line, cells) for line, cells in rows if any(cells)]
 
 
 def read_yaml(path: Path, expected: str, *, loader: Any = yaml.SafeLoader) -> Any:

@@ -8,19 +8,21 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Collection, Mapping, Sequence
-from itertools import chain
+from itertools import chain, zip_longest
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
 from mvseg.errors import InputError
+from mvseg.formats.text_file import read_table
 from mvseg.traits.filters import Rejection
 from mvseg.traits.leaf import Measurement, missing
 from mvseg.traits.measure import LeafTraits, Traits
 from mvseg.traits.ontology import DEFINITIONS, LEAF_TRAITS, UNIT_ACCESSIONS, UNKNOWN_UNIT, VOXEL_TRAITS, unit_of
 
 COLUMNS = ("plant", "leaf", "trait", "value", "sd", "unit", "method", "ontology", "unit_ontology")
+MOST_BYTES = 1 << 30  # of a table that is read
 FORMULA_STARTS = ("=", "+", "-", "@")
 NUMBER = re.compile(r"[-+]?[0-9.]+(e[-+]?[0-9]+)?", re.IGNORECASE)
 VOXEL_NAMES = {trait.name for trait in VOXEL_TRAITS}
@@ -137,15 +139,8 @@ def read_csv(path: Path, columns: Collection[str] = ()) -> list[dict[str, str]]:
     Raises:
         InputError: it cannot be read, or has no such column.
     """
-    try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file, restkey="", restval="")
-            rows, found = list(reader), reader.fieldnames or ()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-    except (ValueError, csv.Error) as error:
-        raise InputError(f"{path}: is no CSV table ({error})") from None
+    (_, found), *rows = read_table(path, "a table that mvseg wrote", most=MOST_BYTES) or [(0, [])]
     missing_ones = [column for column in columns if column not in found]
     if missing_ones:
         raise InputError(f"{path}: has no column '{missing_ones[0]}', expected a table that mvseg wrote")
-    return rows
+    return [dict(zip_longest(found, cells[: len(found)], fillvalue="")) for _, cells in rows]

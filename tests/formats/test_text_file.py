@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from mvseg.errors import InputError
-from mvseg.formats.text_file import read_yaml
+from mvseg.formats.text_file import read_table, read_yaml
 
 BOMB = "a: &a [x, x]\n" + "".join(f"{b}: &{b} [*{a}, *{a}]\n" for a, b in zip("abcdefgh", "bcdefghi", strict=True))
 
@@ -41,3 +41,15 @@ def test_a_folder_is_no_file(tmp_path: Path) -> None:
 def test_options_are_fine(text: str, tmp_path: Path) -> None:
     (tmp_path / "run.yaml").write_text(text, encoding="utf-8")
     read_yaml(tmp_path / "run.yaml", "options")
+
+
+def test_a_table_is_read_as_spreadsheets_and_editors_write_it(tmp_path: Path) -> None:
+    """Numbers of lines are those of an editor, also after a cell of two lines."""
+    path = tmp_path / "table.csv"
+    path.write_bytes('\ufeffa; b ;c\r\n\r\n1;"two\nlines, in one"\r\n;\r\n3; 4;5\r\n'.encode())
+    assert read_table(path, "a table") == [(1, ["a", "b", "c"]), (4, ["1", "two\nlines, in one"]), (6, ["3", "4", "5"])]
+    path.write_text("")
+    assert read_table(path, "a table") == []
+    path.write_bytes(b"a,b\n1,\xff\n")
+    with pytest.raises(InputError, match=r"table\.csv: byte 6 is not UTF-8, expected a table"):
+        read_table(path, "a table")
