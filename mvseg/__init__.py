@@ -12,7 +12,7 @@ from mvseg.system.lazy_names import lazy_names
 
 TYPE_CHECKING = False  # type checkers take it for true; to import `typing` takes longer than all of this
 if TYPE_CHECKING:
-    __version__: str
+    from mvseg._version import __version__ as __version__
     from mvseg.checks.check_scene import Check as Check
     from mvseg.checks.check_scene import check_scene as check_scene
     from mvseg.checks.finding import Finding as Finding
@@ -67,50 +67,4 @@ if TYPE_CHECKING:
     from mvseg.traits.measure import Traits as Traits
     from mvseg.traits.measure import measure_plant as measure_plant
 
-# The public names, by room.
-_HOME = {
-    "_version": ("__version__",),
-    "errors": ("InputError", "InputWarning"),
-    "scene": ("Cameras", "Scene"),
-    "regions": ("Regions", "regions_from_label_maps"),
-    "demo": ("demo_scene",),
-    "formats.scene_folder": ("load_masks", "load_scene"),
-    "formats.photos": ("load_photos",),
-    "formats.masks.arrays": ("regions_from_masks", "with_instance_ids"),
-    "detectors.zoo": ("load_detector",),
-    "matching.config": ("MatchConfig",),
-    "matching.epipolar": ("epipolar_map",),
-    "matching.affinity": ("Affinity", "region_affinity"),
-    "matching.symnmf": ("cluster_affinity",),
-    "matching.match": ("match_regions",),
-    "masks": ("Masks", "MergedMask", "Origin"),
-    "matching.result": ("Matching", "MatchReport"),
-    "poses.refine_poses": ("RefinedPoses", "refine_poses"),
-    "matching.split": ("split_merged",),
-    "reconstruction.config": ("ReconstructConfig",),
-    "reconstruction.voxels": ("reconstruct_instances",),
-    "reconstruction.surface.leaf_surface": ("LeafSurface",),
-    "reconstruction.surface.fit_surfaces": ("fit_surfaces",),
-    "detection.config": ("DetectConfig",),
-    "traits.config": ("TraitsConfig",),
-    "traits.measure": ("Traits", "measure_plant"),
-    "detection.assignment": ("EpipolarAssignment",),
-    "detection.nms": ("cluster_aware_nms",),
-    "detection.mask_rcnn": ("MultiViewMaskRCNN",),
-    "evaluation.id_metrics": ("matching_metrics",),
-    "evaluation.shape_distance": ("shape_distance",),
-    "checks.finding": ("Finding",),
-    "checks.check_scene": ("Check", "check_scene"),
-    "config": ("RunConfig",),
-    "corrections.file": ("Corrections", "load_corrections"),
-    "corrections.track_links": ("LeafLink",),
-    "results.read": ("load_result",),
-    "results.same_result": ("assert_same_result",),
-    "pipeline.run_scene": ("run_scene",),
-    "tracking.track": ("Tracks", "track_leaves"),
-    "system.running": ("running",),
-}
-__all__ = [name for names in _HOME.values() for name in names]
-
-
-__getattr__ = lazy_names(__name__, _HOME)
+__getattr__, __all__ = lazy_names(__name__, __file__)

@@ -22,16 +22,4 @@ if TYPE_CHECKING:
     from mvseg.matching.split import split_merged as split_merged
     from mvseg.matching.symnmf import cluster_affinity as cluster_affinity
 
-_HOME = {
-    "config": ("MatchConfig",),
-    "epipolar": ("epipolar_map",),
-    "affinity": ("Affinity", "region_affinity"),
-    "symnmf": ("cluster_affinity",),
-    "match": ("match_regions",),
-    "result": ("Matching", "MatchReport"),
-    "split": ("split_merged",),
-}
-__all__ = [name for names in _HOME.values() for name in names]
-
-
-__getattr__ = lazy_names(__name__, _HOME)
+__getattr__, __all__ = lazy_names(__name__, __file__)
