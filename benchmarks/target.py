@@ -21,9 +21,10 @@ from skimage.draw import polygon2mask
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from mvseg.cli import main as mvseg
+from mvseg.formats.board import marker_dictionary
 from mvseg.formats.lens import distort, opencv_lens
 from mvseg.formats.rig import write_rig
-from mvseg.formats.target import HEIGHT, INK, TAG, WIDTH, list_shapes, tag_corners, tag_distance, tag_modules
+from mvseg.formats.target import FAMILY, HEIGHT, TAG, WIDTH, list_shapes, tag_corners, tag_distance
 from mvseg.scene import Cameras, Scene, View
 from mvseg.simulation.scene_writer import write_jpeg
 
@@ -32,6 +33,7 @@ MIDDLE = np.array([WIDTH / 2, HEIGHT / 2])
 LARGER = 2  # photos are drawn so many times larger, and shrunk
 LENS = (0.02, -0.01)  # k1, k2
 GAMMA = 2.2
+INK = (213, 0, 120)  # sRGB
 BLACK = 0.04  # light that black toner reflects, of that of white paper
 LINEAR = (BLACK + (1 - BLACK) * (np.arange(256) / 255) ** GAMMA).astype(np.float32)
 SIZE, FOCAL = (2016, 1512), 1456.0
@@ -46,10 +48,10 @@ def draw_page(px_per_mm: int) -> np.ndarray:
         low, high = (np.round(each * fine).astype(int) for each in (shape.cell[0], shape.cell[2]))
         corners = (shape.outline * fine - low)[:, ::-1] - 0.5  # rows first, from the centre of the first pixel
         page[low[1] : high[1], low[0] : high[0]][polygon2mask(tuple((high - low)[::-1]), corners)] = INK
+    tags = marker_dictionary(FAMILY)
     for number, corners in tag_corners().items():
         (x1, y1), (x2, y2) = (np.round(corners[each] * fine).astype(int) for each in (0, 2))
-        black = cv2.resize(tag_modules(number).astype(np.uint8), (x2 - x1, y2 - y1), interpolation=cv2.INTER_NEAREST)
-        page[y1:y2, x1:x2][black > 0] = 0
+        page[y1:y2, x1:x2] = tags.generateImageMarker(number, x2 - x1, borderBits=1)[..., None]
     return np.asarray(cv2.resize(LINEAR[page], None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA))
 
 
