@@ -48,7 +48,7 @@ def measure_appearance(
     has_photos, has_colors = bool(surfaces) and photos.exist, False
     pixels = {instance: np.zeros(2, int) for instance in surfaces}  # projected, and covered by own masks
     colors: dict[int, list[tuple[int, Floats]]] = {instance: [] for instance in surfaces}  # see `mean_colors`
-    on_cpu = cameras.to("cpu")
+    parts = {instance: surface.project_parts(cameras) for instance, surface in surfaces.items()}
     for view, size in enumerate(cameras.sizes.tolist()):
         photo = photos(view) if has_photos else None
         if photo is not None and is_grey(photo):
@@ -56,8 +56,8 @@ def measure_appearance(
         has_colors |= photo is not None
         labels = masks.regions.label_map(view, masks.instance_ids, size).cpu().numpy().astype(np.uint16)
         is_sure = sure_pixels(labels)
-        for instance, surface in surfaces.items():
-            part = surface.project_parts(on_cpu)[view]
+        for instance in surfaces:
+            part = parts[instance][view]
             own = part.pixels.numpy() & (part.cut(labels) == instance)
             pixels[instance] += (part.area, own.sum())
             sure = own & part.cut(is_sure)

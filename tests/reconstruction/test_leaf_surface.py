@@ -78,3 +78,6 @@ def test_parts_are_what_whole_frames_show() -> None:
             np.testing.assert_array_equal(mask.numpy(), whole)
             np.testing.assert_array_equal(part.pixels.numpy(), part.cut(whole))
             assert part.area == whole.sum()
+        first, last = leaf.project_parts(cameras[[2, 0]])  # not drawn again
+        assert first is leaf.project_parts(cameras)[2]
+        assert last is leaf.project_parts(cameras)[0]

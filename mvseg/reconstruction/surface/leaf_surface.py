@@ -67,7 +67,7 @@ class LeafSurface:
     iou: Tensor
     is_oriented: bool
     quality: Quality
-    _drawn: dict[bytes, list[Crop]] = field(default_factory=dict, init=False, repr=False)
+    _drawn: dict[bytes, Crop] = field(default_factory=dict, init=False, repr=False)
 
     @staticmethod
     def none(views: Tensor, reason: str) -> LeafSurface:
@@ -178,13 +178,15 @@ class LeafSurface:
     def project_parts(self, cameras: Cameras) -> list[Crop]:
         """What `project` shows, as V crops on the CPU; empty ones where the surface is not in the view.
 
-        Drawn once for the same cameras: many stages ask, and so does each edit of a person.
+        Drawn once for the same camera: many stages ask, and so does each edit of a person.
         """
         cameras = cameras.to("cpu")
-        key = cameras.px_from_world.numpy().tobytes() + cameras.sizes.numpy().tobytes()
-        if key not in self._drawn:
-            self._drawn[key] = self._draw_parts(cameras)
-        return self._drawn[key]
+        poses, sizes = cameras.px_from_world.numpy(), cameras.sizes.numpy()
+        keys = [pose.tobytes() + size.tobytes() for pose, size in zip(poses, sizes, strict=True)]
+        new = [view for view, key in enumerate(keys) if key not in self._drawn]
+        if new:
+            self._drawn.update(zip((keys[view] for view in new), self._draw_parts(cameras[new]), strict=True))
+        return [self._drawn[key] for key in keys]
 
     def _draw_parts(self, cameras: Cameras) -> list[Crop]:
         sizes = cameras.sizes.tolist()
