@@ -16,8 +16,8 @@ Units      world units are the scene's (`Scene.unit`); thresholds are in pixels 
 Ids        instances are 1, 2, ... in Python as in files; -1 is a region matched to nothing, 0 the background of a label
            image. Cluster numbers (0, 1, ...) are array indices inside `matching/` and do not leave it.
 Types      cameras and plane angles in float64 on entry, image-sized work in float32; indices int64. Tensors, on the
-           device of the inputs; only `matching/nview/` works in NumPy, between `row_table` and the `Matching` that
-           `match_nview` returns.
+           device of the inputs; only `matching/nview/` works in NumPy, up to the `Matching` that `match_nview`
+           returns.
 Ragged     one flat tensor and an index vector, never padded, never lists of lists.
 """
 

@@ -135,8 +135,8 @@ def _check_binary_model(model: Path) -> None:
                 is_whole = end == len(data)
         except OSError as error:
             raise InputError(f"{path}: cannot be read ({error.strerror})") from None
-        except KeyError as model:
-            raise InputError(f"{path}: camera model number {model} is not known") from None
+        except KeyError as number:
+            raise InputError(f"{path}: camera model number {number} is not known") from None
         except (struct.error, ValueError, IndexError, OverflowError):  # beyond the end, or no byte at all
             is_whole = False
         if not is_whole:

@@ -140,13 +140,14 @@ def run_again(
     learned = load_learned(folder, run.said)
     if detector is not None:
         learned = replace(learned, weights=detector.read_bytes(), rounds=1)
+    edits = corrections or run.corrections
     run_one_scene(
         run.scene,
         None if run.masks is None else run.masks.resolve(),
         folder if out is None else out,
         config=run.config if learn is None else replace(run.config, learn=learn),
         learned=learned if learn is None else NOTHING_LEARNED,
-        corrections=(corrections or run.corrections) and Path(corrections or run.corrections or "").resolve(),
+        corrections=None if edits is None else Path(edits).resolve(),
         force_corrections=force_corrections,
         num_workers=num_workers,
         overwrite=overwrite,

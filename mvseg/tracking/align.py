@@ -124,11 +124,9 @@ def list_poses(pair: Pair) -> Poses:
     asked = [draw_poses(pair.take(row, column)) for row, column in np.argwhere(pair.said < 0)[..., None]]
     looked_at = np.concatenate([np.eye(4)[None], *asked])
     poses = np.concatenate([looked_at, draw_poses(pair)])
-    scores = alikeness(pair, poses).sum(1)
-    scores[0] += 2e6
-    scores[: len(looked_at)] += 1e6  # always looked at
+    rank = np.repeat([0, 1, 2], [1, len(looked_at) - 1, len(poses) - len(looked_at)])  # the first ones in any case
     found: list[Alignment] = [_as_it_stood(pair)]
-    left = np.argsort(-scores, kind="stable")
+    left = np.lexsort((-alikeness(pair, poses).sum(1), rank))
     while len(left) and len(found) < NUM_REFINED:
         found.append(refine(pair, poses[left[0]]))
         left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]

@@ -193,7 +193,7 @@ def _believe(measured: Floats, errors: MaskErrors | None) -> Floats:
 
 
 def _centre(measured: Floats, errors: MaskErrors | None) -> float:
-    """Which of the measured offsets is no offset."""
+    """The offset, in pixels, that masks without an error would have measured; `measured` is NaN where nothing was."""
     known = measured[np.isfinite(measured)]
     if not len(known):
         return 0.0
