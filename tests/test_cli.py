@@ -81,7 +81,7 @@ def test_demo_finds_every_leaf(demo: Path) -> None:
         *(f"labels/{name}" for name in views),
         *(f"overlay/{name}" for name in views),
         *(f"leaves/leaf_{leaf:03d}.ply" for leaf in range(1, 13)),
-        *("instances.json", "report.html", "run.json", "scene.glb", "surfaces.npz"),
+        *("before_edits.bin", "instances.json", "report.html", "run.json", "scene.glb", "surfaces.npz"),
         *("traits.csv", "traits_wide.csv"),
     }
     leaf_of_label: dict[int, set[int]] = {}

@@ -31,12 +31,15 @@ from mvseg.errors import InputError
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline.known import match_given
 from mvseg.pipeline.run_scene import run_scene
 from mvseg.reconstruction.surface.kept_surfaces import name_instance
 from mvseg.regions import regions_from_label_maps
+from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.result import Instances, Result
 from mvseg.runs.one_scene import run_one_scene
 from mvseg.scene import Scene, View
+from mvseg.server import open_result
 from mvseg.server.correction_server import CHANGED, Corrector
 from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult, keep_numbers, open_alone
@@ -206,6 +209,30 @@ def test_the_same_as_a_run_from_the_command_line(folder: Path) -> None:
     with pytest.raises(Cancelled):
         opened.recompute(corrections, lambda: True)
     (folder / "corrections.json").unlink()
+
+
+def test_it_opens_with_what_the_run_knew_before_edits(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And computes it where anything has changed: the photos, torch, or the file."""
+    place, computed = tmp_path / "result", list[Any]()
+    shutil.copytree(folder, place)
+    monkeypatch.setattr(open_result, "match_given", lambda opened: computed.append(opened) or match_given(opened))
+    known, said = OpenResult(place)._known
+    anew = match_given(OpenResult(place).opened)
+    assert (computed, said) == ([], [])
+    assert torch.equal(known.masks.instance_ids, anew.masks.instance_ids)
+    assert torch.equal(known.masks.regions.crops, anew.masks.regions.crops)
+    assert known.disagreement == anew.disagreement
+    with monkeypatch.context() as patch:
+        patch.setattr(torch, "__version__", "0.0")
+        assert len(OpenResult(place)._known[0].masks) == len(known.masks)
+    opened = OpenResult(place)
+    opened._changes.append("masks: has changed since this result was made.")
+    assert len(opened._known[0].masks) == len(known.masks)
+    (place / BEFORE_EDITS_FILE).write_bytes(b"another")
+    assert len(OpenResult(place)._known[0].masks) == len(known.masks)
+    assert len(computed) == 3
 
 
 def test_only_its_own_page_is_answered(served: CorrectionServer) -> None:

@@ -37,6 +37,7 @@ from mvseg.scene import Scene, View
 from mvseg.system.running import progress_bar
 
 REPORT_FILE = "report.html"
+BEFORE_EDITS_FILE = "before_edits.bin"  # see `mvseg.pipeline.before_edits`
 CAMERAS_FILE = "cameras.json"
 CORRECTED = {Origin.CORRECTED: "outline", Origin.CUT: "split", Origin.CONFIRMED: "confirm"}  # the edit that made a mask
 
@@ -79,6 +80,8 @@ def save_result(
             write_refined(folder / CAMERAS_FILE, result.scene)
         if result.learned.weights is not None:
             (folder / DETECTOR_FILE).write_bytes(result.learned.weights)
+        if result.before_edits is not None:
+            (folder / BEFORE_EDITS_FILE).write_bytes(result.before_edits)
         if report:
             from mvseg.results.report.page import write_report  # loads trimesh
 

@@ -128,9 +128,9 @@ def load_result(folder: Path | str) -> Result:
     """The result in a folder that mvseg wrote; neither the scene folder nor the photos are opened.
 
     Numbers are as exact as the files: cameras, surfaces, voxels and masks come back as they were, match scores and
-    probabilities with four decimals, traits with six digits. What only the run needed is not in the folder: `starts`
-    of the instances, and the candidates `left` out. `Scene.views` name the photos where they are now, if they moved
-    together with the result.
+    probabilities with four decimals, traits with six digits. What only the run and `mvseg correct` need is not read:
+    `starts` of the instances, the candidates `left` out, and what was known `before_edits`. `Scene.views` name the
+    photos where they are now, if they moved together with the result.
 
     Args:
         folder: of one scene, as `mvseg infer`, `mvseg match` and `mvseg batch` write it.

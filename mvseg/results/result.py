@@ -113,6 +113,7 @@ class Result:
         corrections: of a person; None where there were none.
         fates: the outcome of each of them.
         learned: by the detector from this scene.
+        before_edits: what was known before any edit, as `mvseg correct` opens it (`pack_known`); None: nothing is kept.
         run: that made a result which was loaded from its folder; None before it was saved.
     """
 
@@ -131,6 +132,7 @@ class Result:
     corrections: Corrections | None = None
     fates: tuple[Fate, ...] = ()
     learned: Learned = NOTHING_LEARNED
+    before_edits: bytes | None = None
     run: RunRecord | None = None
 
     def __repr__(self) -> str:

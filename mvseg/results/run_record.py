@@ -56,6 +56,7 @@ class RunRecord(_Part):
     format: int = Field(1, ge=1)
     mvseg: str = ""
     code: str = ""
+    torch: str = ""
     scene: str = ""
     inputs: dict[str, str] = {}
     config: dict[str, Any] = {}

@@ -29,6 +29,7 @@ from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
+from mvseg.pipeline.before_edits import unpack_known
 from mvseg.pipeline.find_leaves import find_in_photos
 from mvseg.pipeline.finish import shape_leaves
 from mvseg.pipeline.known import Known, match_given
@@ -36,6 +37,7 @@ from mvseg.pipeline.learn import learn
 from mvseg.pipeline.open_scene import open_scene
 from mvseg.reconstruction.surface.kept_surfaces import name_each
 from mvseg.regions import stack_regions
+from mvseg.results.folder import BEFORE_EDITS_FILE
 from mvseg.results.read import load_result
 from mvseg.results.report.correct import describe_fate
 from mvseg.results.report.page import build_page, describe_update
@@ -45,6 +47,7 @@ from mvseg.runs.recorded_run import read_recorded
 from mvseg.server.correction_server import CORRECTIONS_FILE, Update
 from mvseg.server.vanished import tell_vanished
 from mvseg.system.atomic import lock_place
+from mvseg.system.file_hash import hash_files
 from mvseg.system.running import running
 
 MOST_CORNERS = 10_000
@@ -75,8 +78,8 @@ class OpenResult:
         self.folder = folder
         self.run = read_recorded(folder)
         self._detector = _read_detector(folder)
-        changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
-        self.notice = " ".join(("What you see is computed anew.", *changes)) if changes else ""
+        self._changes = [each for each in self.run.changes if not each.startswith(f"{self.run.corrections}:")]
+        self.notice = " ".join(("What you see is computed anew.", *self._changes)) if self._changes else ""
         saved = self.saved_corrections()  # the views that they name are taken
         config = self.run.config
         if self._detector is not None:  # it has learned this plant: nobody waits for that again
@@ -205,9 +208,8 @@ class OpenResult:
         """
         if self.opened.given is not None:
             raise InputError("The masks of this result were given, so there is no detector that could learn.")
-        known, _ = self._known
         with running(is_cancelled=is_old, report=report), collect_warnings() as said, TemporaryDirectory() as place:
-            learned = learn(known, cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
+            learned = learn(self._seen, cache=CachedDetections(Path(place)), corrections=corrections, rounds=1)
         if learned.learned.weights is None:
             raise InputError(f"{' '.join(said)}.")
         self.learned = learned, said
@@ -255,9 +257,24 @@ class OpenResult:
     @cached_property
     def _known(self) -> tuple[Known, list[str]]:
         """What is known without a person, and the warnings on the way; it stays."""
+        before = None if (content := self._before_edits()) is None else unpack_known(content, self.opened)
+        if before is not None:
+            return before
         with collect_warnings() as messages:
             known = find_in_photos(self.opened) if self.opened.given is None else match_given(self.opened)
         return known, messages
+
+    @cached_property
+    def _seen(self) -> Known:
+        """The same, with the looks of the detector."""
+        known, _ = self._known
+        return known if known.looks else find_in_photos(self.opened)
+
+    def _before_edits(self) -> bytes | None:
+        """What the run knew before edits; None where it said nothing, or where something has changed since."""
+        path, said = self.folder / BEFORE_EDITS_FILE, self.run.said
+        is_same = not self._changes and said.torch == torch.__version__ and path.is_file()
+        return path.read_bytes() if is_same and hash_files(path) == said.files.get(BEFORE_EDITS_FILE) else None
 
 
 def _read_detector(folder: Path) -> bytes | None:

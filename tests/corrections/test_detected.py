@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import io
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -16,10 +18,12 @@ from mvseg.corrections.file import Corrections, Edit, Reject
 from mvseg.masks import Masks, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.pipeline.apply_edits import apply_edits
+from mvseg.pipeline.before_edits import pack_known, unpack_known
 from mvseg.pipeline.find_leaves import find_in_photos
 from mvseg.pipeline.known import Known
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras, Scene, View
+from mvseg.system.running import running
 from mvseg.verification import choose as choosing
 from three_leaves import CAMERAS, LEAVES, true_maps
 
@@ -69,6 +73,33 @@ def as_painted(state: Known) -> list[np.ndarray]:
     masks = state.masks
     leaves = IDS[masks.regions.labels] * (masks.instance_ids > 0)
     return [masks.regions.label_map(view, leaves, tuple(CAMERAS.sizes[view].tolist())).numpy() for view in range(6)]
+
+
+def test_what_was_known_before_edits_comes_back_and_nothing_but_data_is_read() -> None:
+    opened, reject = open_photos(SCENE), Corrections((Reject(view="v0", at=at(WEAK, 0), everywhere=True),))
+    with running(keep=True) as now:
+        assert now.kept is not None
+        now.kept.update({"surface": LEAVES[1], "edge": REGIONS.crop(0).numpy()})
+        content = pack_known(find_in_photos(opened), ["odd"])
+    with running(keep=True) as now:
+        found = unpack_known(content, opened)
+        assert found is not None
+        known, said = found
+        assert now.kept is not None
+        np.testing.assert_array_equal(now.kept["edge"], REGIONS.crop(0).numpy())
+        assert torch.equal(now.kept["surface"].covariance, LEAVES[1].covariance)
+    before = run()
+    assert said == ["odd"]
+    assert known.instances.probabilities == before.instances.probabilities
+    assert [each.chance for each in known.left] == [each.chance for each in before.left]
+    for state, other in ((known, before), (apply_edits(known, reject), apply_edits(before, reject))):
+        np.testing.assert_array_equal(as_painted(state), as_painted(other))
+    fewer = open_photos(SCENE.select(torch.arange(5)))
+    assert unpack_known(content, fewer) is None
+    code = io.BytesIO()
+    torch.save({"views": opened.names, "known": run}, code)
+    for broken in (b"", content[:-9], zlib.compress(b"text"), zlib.compress(code.getvalue())):
+        assert unpack_known(broken, opened) is None
 
 
 def test_an_edit_is_about_the_mask_that_is_seen_whatever_it_scores() -> None:

@@ -59,6 +59,7 @@ VOXELS = ReconstructConfig(shape="voxels", voxel_budget=8000)
 IDS_FILES = {
     *(f"labels/{view:03d}.png" for view in range(4)),
     *(f"overlay/{view:03d}.png" for view in range(4)),
+    "before_edits.bin",
     "instances.json",
     "report.html",
     "run.json",

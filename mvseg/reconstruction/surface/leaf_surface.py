@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 import torch
@@ -68,6 +69,10 @@ class LeafSurface:
     is_oriented: bool
     quality: Quality
     _drawn: dict[bytes, Crop] = field(default_factory=dict, init=False, repr=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What is pickled: not what it looks like, which follows from the rest."""
+        return self.__dict__ | {"_drawn": {}}
 
     @staticmethod
     def none(views: Tensor, reason: str) -> LeafSurface:

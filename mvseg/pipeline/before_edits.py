@@ -1,0 +1,69 @@
+"""What was known before a person's edits, kept in a result: `mvseg correct` opens with it, and finds nothing anew.
+
+It holds only where all that it follows from is the same: the version of mvseg and of torch, options, photos and cameras
+(see `RecordedRun.changes`). Elsewhere, and where the file is gone, all is computed as before.
+"""
+
+from __future__ import annotations
+
+import io
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from mvseg.masks import Masks
+from mvseg.matching.result import Matching, MatchReport
+from mvseg.pipeline.known import Known
+from mvseg.pipeline.open_scene import Opened
+from mvseg.poses.refine_poses import RefinedPoses
+from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality
+from mvseg.regions import Regions
+from mvseg.results.result import Instances
+from mvseg.scene import Cameras
+from mvseg.system.running import now_running
+from mvseg.verification.choose import LeftOut
+
+FIELDS = ("matching", "instances", "proposals", "matched", "left", "poses", "disagreement")
+# All that may be in the file: data without any code of its own, as a result may come from anybody.
+CLASSES: list[Any] = [Cameras, Instances, LeafSurface, LeftOut, MatchReport, Masks, Matching, Quality]
+CLASSES += [RefinedPoses, Regions]
+
+
+def pack_known(known: Known, said: Sequence[str]) -> bytes:
+    """What is known before edits, what the run has fitted to it, and the warnings on the way (`said`)."""
+    packed = io.BytesIO()
+    kept = now_running().kept or {}
+    torch.save(
+        {
+            "views": known.opened.names,
+            "cameras": known.scene.cameras,
+            "known": {name: getattr(known, name) for name in FIELDS},
+            "surfaces": {name: each for name, each in kept.items() if isinstance(each, LeafSurface)},
+            "masks": {name: torch.from_numpy(each) for name, each in kept.items() if isinstance(each, np.ndarray)},
+            "said": list(said),
+        },
+        packed,
+    )
+    return zlib.compress(packed.getvalue(), 1)
+
+
+def unpack_known(content: bytes, opened: Opened) -> tuple[Known, list[str]] | None:
+    """What `pack_known` packed, on the CPU, for the scene as it was opened, and the warnings; what was fitted is kept
+    where the run keeps what it computed. There are no looks: a detector that is to learn looks again. None: it is of
+    other views, or something else."""
+    try:
+        with torch.serialization.safe_globals(CLASSES):
+            packed = torch.load(io.BytesIO(zlib.decompress(content)), map_location="cpu", weights_only=True)
+        if packed["views"] != opened.names:
+            return None
+        scene = replace(opened.scene, cameras=packed["cameras"])
+        known = Known(opened=opened, scene=scene, looks=(), **packed["known"])
+        if (kept := now_running().kept) is not None:
+            kept.update(packed["surfaces"] | {name: each.numpy() for name, each in packed["masks"].items()})
+        return known, packed["said"]
+    except Exception:  # zlib and torch raise many kinds at broken files
+        return None
