@@ -17,12 +17,13 @@ import pytest
 
 from mvseg.cli import main
 from mvseg.corrections.file import Corrections, name_edits
+from mvseg.pipeline.known import Known, match_given
 from mvseg.results.result import Learned
 from mvseg.server.correction_server import Corrector
 from mvseg.server.local_server import CorrectionServer
 from mvseg.server.open_result import OpenResult
 from mvseg.server.open_tracks import OpenTracks
-from mvseg.system.running import Cancelled
+from mvseg.system.running import Cancelled, progress_bar
 from tests.plants_over_days import opposite_leaves, turned, write_result
 
 WAIT = 60.0  # seconds, on a busy machine
@@ -71,6 +72,21 @@ class Lesson:
 
         monkeypatch.setattr(OpenResult, "learn", learn)
         monkeypatch.setattr(OpenResult, "can_learn", True)
+
+
+class SlowLook:
+    """A result that says of each of two steps what it does, and waits there until `go_on`."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go_on = [threading.Event(), threading.Event()]
+
+        def look(opened: OpenResult) -> tuple[Known, list[str]]:
+            for go_on in progress_bar(self.go_on, "detection", unit="view"):
+                assert go_on.wait(WAIT)
+            return match_given(opened.opened), []
+
+        monkeypatch.setattr(OpenResult, "_known", property(look))
+        monkeypatch.setattr("mvseg.server.correction_server.STEP_SECONDS", 0.0)
 
 
 def ask(

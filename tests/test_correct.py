@@ -47,7 +47,18 @@ from mvseg.server.vanished import tell_vanished
 from mvseg.system.running import Cancelled
 from room_scene import room_cameras
 from scene_folders import write_scene
-from served_result import WAIT, Lesson, ask, save, save_text, serve, text_of, wait_for_news, wait_until_computed
+from served_result import (
+    WAIT,
+    Lesson,
+    SlowLook,
+    ask,
+    save,
+    save_text,
+    serve,
+    text_of,
+    wait_for_news,
+    wait_until_computed,
+)
 
 
 @pytest.fixture(scope="module")
@@ -313,6 +324,19 @@ def test_the_newest_edits_win(folder: Path) -> None:
     assert seen == [0, 3]
     assert corrector.problem == "stop"
     (folder / "corrections.json").unlink()
+
+
+def test_what_takes_long_is_told_step_by_step(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    look, told, state = SlowLook(monkeypatch), ["", "detection: view 1 of 2", "detection: view 2 of 2"], {"number": 0}
+    with serve(folder) as server:
+        for step, go_on in zip(told[1:], look.go_on, strict=True):
+            while (state := wait_for_news(server, state))["doing"] != step:
+                assert state["doing"] in told
+            assert (state["isComputing"], state["update"]) == (True, None)
+            go_on.set()
+        state = wait_until_computed(server)
+    assert state["doing"] == ""
+    assert state["update"]
 
 
 def test_a_second_process_is_told(folder: Path) -> None:

@@ -14,7 +14,7 @@ from mvseg.runs.one_scene import run_one_scene
 from mvseg.server.local_server import CorrectionServer
 from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from scene_folders import write_scene
-from served_result import Lesson, serve, text_of
+from served_result import Lesson, SlowLook, serve, text_of
 
 pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
 
@@ -154,6 +154,19 @@ def test_a_file_that_another_program_has_changed_is_offered(
     tab.wait_for("What you see follows from all edits.")
     assert len(tab.rows()) == 2
     tab.page.close()
+
+
+def test_the_page_says_what_is_computed(
+    browser: sync_api.Browser, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    look = SlowLook(monkeypatch)
+    with serve(folder) as server:
+        tab = Tab(browser, server)
+        for view, go_on in enumerate(look.go_on, start=1):
+            tab.wait_for(f"Computing: detection: view {view} of 2")
+            go_on.set()
+        tab.wait_for("What you see follows from all edits.")
+        tab.page.close()
 
 
 def test_a_detector_learns_while_a_person_edits(

@@ -17,11 +17,12 @@ from typing import Any, Generic, Protocol, TypeVar
 from mvseg.corrections.file import Corrections, load_corrections, name_edits, parse_corrections, write_corrections
 from mvseg.errors import InputError
 from mvseg.server.local_server import Refused
-from mvseg.system.running import Cancelled
+from mvseg.system.running import Cancelled, running
 
 CORRECTIONS_FILE = "corrections.json"
 WAIT_SECONDS = 20.0  # that a page's question for news stays open
 LOOK_SECONDS = 1.0  # until it looks again whether another program has changed the edits
+STEP_SECONDS = 1.0  # between two words of what is computed
 LEARN_SECONDS, LEARN_SECONDS_PER_PHOTO = 90, 6  # that learning takes on two cores, which the page says before
 CHANGED = "corrections.json was changed by another program since this page was loaded."
 
@@ -100,6 +101,7 @@ class Corrector(Generic[Kind]):
         self.wanted, self.computed = 1, 0
         self.number, self.updated = 0, 0  # of all news, and of the newest result among them
         self.learning, self.is_cancelled = "", False  # what is done of it, "" for nothing
+        self.doing, self.said_at = "", 0.0  # what is computed, "" for nothing, and when that was said last
         self.problem, self.outcomes = self.notice, [""] * len(self.corrections.edits)
         self.update: dict[str, Any] | None = None
         self.is_closing = False
@@ -209,6 +211,13 @@ class Corrector(Generic[Kind]):
             self.learning, self.problem = "", problem
             self._notify()
 
+    def _tell_step(self, said: str) -> None:
+        """What is computed, for the page, from time to time."""
+        if (now := time.monotonic()) - self.said_at >= STEP_SECONDS:
+            with self.news:
+                self.doing, self.said_at = said, now
+                self._notify()
+
     def _tell(self, said: str) -> None:
         with self.news:
             self.learning = said
@@ -223,9 +232,11 @@ class Corrector(Generic[Kind]):
         def is_old() -> bool:
             return self.is_closing or bool(self.learning) or self.wanted > wanted
 
+        self.said_at = time.monotonic()  # what is done at once, needs no words
         try:
-            for update in self.opened.updates(corrections, is_old):
-                self._publish(update, " ".join([self.notice, *update.messages]).strip(), wanted)
+            with running(report=self._tell_step):
+                for update in self.opened.updates(corrections, is_old):
+                    self._publish(update, " ".join([self.notice, *update.messages]).strip(), wanted)
             return
         except Cancelled:
             return
@@ -238,7 +249,7 @@ class Corrector(Generic[Kind]):
     def _publish(self, update: Update, problem: str, wanted: int) -> None:
         with self.news:
             self.update, self.outcomes = update.news, update.outcomes
-            self.problem, self.computed = problem, wanted
+            self.problem, self.computed, self.doing = problem, wanted, ""
             self._notify()
             self.updated = self.number
 
@@ -255,6 +266,7 @@ class Corrector(Generic[Kind]):
                 "number": self.number,
                 "revision": name_edits(self.corrections.edits),
                 "isComputing": self.wanted > self.computed,
+                "doing": self.doing,
                 "isChanged": self._is_changed(),
                 "problem": self.problem,
                 "outcomes": self.outcomes,

@@ -183,6 +183,10 @@ class Panel {
         ...(isLearned ? [this.button("Undo learning", null, () => server.learn("unlearn"))] : []))];
   }
 
+  showStep(doing) {
+    this.work.server.state = this.parts.state.textContent = `Computing: ${doing}\u2026`;
+  }
+
   showProgress() {
     this.progress.textContent = `${this.work.server.learning.now}\u2026`;
   }

@@ -78,7 +78,7 @@ class Server {
     }
   }
 
-  hear({ number, revision, outcomes, update, problem, isComputing, isChanged, learning }) {
+  hear({ number, revision, outcomes, update, problem, isComputing, isChanged, learning, doing }) {
     if (isChanged || !this.own.has(revision)) {
       this.isStale = true;
       const who = isChanged ? "Another program has changed corrections.json." : "Another page has changed the edits.";
@@ -88,15 +88,17 @@ class Server {
     const isFirst = this.number < 0;
     const goesOn = this.learning?.now && learning.now && !update;
     const isOld = revision !== this.base; // it was on its way while newer edits were saved
+    const isStep = !isFirst && this.isComputing && doing && !update;
     Object.assign(this, { number, outcomes, learning, isComputing: isComputing || this.unsaved || isOld });
     if (goesOn) return this.work.panel.showProgress(); // no button changes under the pointer
+    if (isStep && this.work.panel) return this.work.panel.showStep(doing);
     if (update) {
       this.isNewer ||= !isFirst;
       this.work.update(update);
     }
     const done = update || !problem ? "What you see follows from all edits." : "";
     const later = learning?.now ? "Edits are saved, and computed when the detector has learned." : "";
-    this.tell({ state: problem }, later || (isComputing ? "Computing what follows from the edits\u2026" : done));
+    this.tell({ state: problem }, later || (isComputing ? `Computing${doing ? `: ${doing}` : " what follows from the edits"}\u2026` : done));
   }
 
   // A rough outline becomes that of the leaf inside it.
