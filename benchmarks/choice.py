@@ -1,7 +1,8 @@
 """What the choice of leaves is fitted on, and what it loses: `python -m benchmarks.choice SCENE ... [--leave_out]`
 
 The scenes have photos, cameras and `truth/`; those of `MANY` photos or more are looked at a second time with every
-other photo, so that the numbers hold for plants that few photos show, too. For each: what its detector proposes, the
+other photo, so that the numbers hold for plants that few photos show, too, and `--sizes` looks at them at other sizes,
+at which the detector knows less. For each: what its detector proposes, the
 candidates, and which masks show which true leaf. The numbers of `mvseg/verification/leaf_scores.py` are fitted by
 maximum likelihood (a small ridge), in three rounds, since the features of a candidate depend on what was chosen before
 it. With `--leave_out` the plants are parted in four, and each scene is judged by numbers that were fitted on the other
@@ -25,7 +26,7 @@ from scipy.special import expit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from mvseg.detection.config import LEAST_SCORE, MORE_SCORE, SURE_SCORE
+from mvseg.detection.config import LEAST_SCORE, MORE_SCORE, SURE_SCORE, DetectConfig
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.detection.find_leaves import find_leaves
 from mvseg.errors import InputWarning
@@ -63,14 +64,15 @@ class Study:
     of_candidate: np.ndarray
 
 
-def study(folder: Path, step: int = 1) -> Study | None:
-    """A scene with every `step`-th photo; None where that leaves too few."""
+def study(folder: Path, step: int = 1, size: int | None = None) -> Study | None:
+    """A scene with every `step`-th photo, seen at a size (pixels; None: the detector's own); None where that leaves too
+    few photos."""
     scene = load_scene(folder)
     if step > 1 and len(scene.views) < MANY:
         return None
     scene = replace(scene, views=scene.views[::step], cameras=scene.cameras[list(range(0, len(scene.views), step))])
     truth = true_maps(folder, scene)
-    found = find_leaves([detect_scene(Photos(scene))], scene.cameras)
+    found = find_leaves([detect_scene(Photos(scene), DetectConfig(image_size=size))], scene.cameras)
     table, matched = found.proposals, found.matched
     candidates = gather_candidates(
         [(masks, masks.regions.labels) for masks in matched],
@@ -82,7 +84,7 @@ def study(folder: Path, step: int = 1) -> Study | None:
     leaf = true_leaves(table, truth)
     members = [~np.isnan(column) for column in candidates.matched.T]
     of_candidate = np.array([main_leaf(leaf[rows]) for rows in members])
-    name = folder.name if step == 1 else f"every {step}: {folder.name}"
+    name = "".join((f"every {step}: " * (step > 1), f"at {size}: " * (size is not None), folder.name))
     return Study(name, table, candidates, drawn, Photos(scene), truth, leaf, of_candidate)
 
 
@@ -206,9 +208,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--leave_out", action="store_true")
+    parser.add_argument("--sizes", type=int, nargs="*", default=(), help="pixels of the longer side, besides the usual")
     args = parser.parse_args()
     warnings.simplefilter("ignore", InputWarning)
-    found = [study(folder, step) for folder in args.scenes for step in (1, 2)]
+    looks = [(1, None), (2, None), *((1, size) for size in args.sizes)]
+    found = [study(folder, step, size) for folder in args.scenes for step, size in looks]
     studies = [each for each in found if each is not None]
     plants = [each.name.rpartition("-")[2] for each in studies]
     part = {plant: number % PARTS for number, plant in enumerate(sorted(set(plants)))}
