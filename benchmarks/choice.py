@@ -26,9 +26,10 @@ from scipy.special import expit
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from mvseg.detection.config import LEAST_SCORE, MORE_SCORE, SURE_SCORE, DetectConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.detection.detect_scene import detect_scene
 from mvseg.detection.find_leaves import find_leaves
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import InputWarning
 from mvseg.evaluation.panoptic import leaf_metrics
 from mvseg.formats.label_png import read_label_png
@@ -45,7 +46,7 @@ from mvseg.verification.snap_edges import snap_masks
 
 RIDGE, ROUNDS, SHOWS = 0.1, 3, 0.5  # SHOWS: IoU from which a mask shows a leaf
 MANY, PARTS = 8, 4
-SCORES = (SURE_SCORE, MORE_SCORE, LEAST_SCORE)
+SCORES = (DETECTION.sure_score, DETECTION.more_score, DETECTION.least_score)
 BINS = (0.0, 0.05, 0.2, 0.4, 0.6, 0.8, 0.9, 0.97, 1.01)
 
 

@@ -26,8 +26,8 @@ def time_choice(folder: Path, cache: Path) -> dict[str, Any]:
     import torch
 
     from mvseg.detection.cached_detections import CachedDetections
-    from mvseg.detection.config import MORE_SCORE
     from mvseg.detection.detect_scene import detect_scene
+    from mvseg.detection.numbers import DETECTION
     from mvseg.formats.photos import Photos
     from mvseg.formats.scene_folder import load_scene
     from mvseg.verification.choose import choose_leaves
@@ -35,7 +35,7 @@ def time_choice(folder: Path, cache: Path) -> dict[str, Any]:
     torch.set_num_threads(1)
     scene = load_scene(folder)
     look = detect_scene(Photos(scene), cache=CachedDetections(cache))
-    more = look.match(scene.cameras, MORE_SCORE).masks
+    more = look.match(scene.cameras, DETECTION.more_score).masks
     proposals, begun = look.proposals(scene.cameras), time.process_time()
     leaves = choose_leaves(look.sure.masks, proposals, cameras=scene.cameras, more=(more,))
     seconds, masks = time.process_time() - begun, leaves.masks

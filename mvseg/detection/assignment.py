@@ -5,14 +5,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import InputError
 from mvseg.matching.epipolar import binned_pairs, dilate, find_spans, span_histogram
 from mvseg.matching.samples import Samples, view_runs, view_samples
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-
-MAX_PIXELS = 1024  # of a proposal's mask
-LATTICE = 65_536  # pixels of an image that sample the area of a band, at most about this many
 
 
 class EpipolarAssignment(nn.Module):
@@ -39,7 +37,7 @@ class EpipolarAssignment(nn.Module):
             that similarity.
         """
         similarity = ruzicka_similarity(
-            proposals, regions, instance_ids, cameras=cameras, max_pixels=MAX_PIXELS
+            proposals, regions, instance_ids, cameras=cameras, max_pixels=DETECTION.mask_pixels
         )
         if not similarity.shape[1]:
             zeros = torch.zeros(len(proposals), device=proposals.device)
@@ -118,10 +116,10 @@ def _concatenate(first: Samples, second: Samples) -> Samples:
 
 
 def _image_lattice(size: list[int], device: torch.device) -> Samples:
-    """All pixels of an image as one region, thinned to at most about LATTICE of them."""
+    """All pixels of an image as one region, thinned to at most about `DETECTION.band_pixels` of them."""
     width, height = size
     crop = torch.ones(width * height, dtype=torch.bool, device=device)
     box = torch.tensor([[0, 0, width, height]], device=device)
     nothing = torch.zeros(1, dtype=torch.int64, device=device)
     image = Regions(view_index=nothing, boxes=box, crops=crop, num_views=1, labels=nothing)
-    return view_runs(image, LATTICE)[0][0].pixels()
+    return view_runs(image, DETECTION.band_pixels)[0][0].pixels()

@@ -9,10 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from mvseg.detection.config import MIN_IMAGE_SIZE
 from mvseg.detection.find_leaves import Found
-
-STEP = 0.5**0.5  # of the size, from one look to the next: half of the pixels
+from mvseg.detection.numbers import DETECTION
 
 
 def choose_size(see: Callable[[int], Found], first: Found) -> Found:
@@ -26,7 +24,7 @@ def choose_size(see: Callable[[int], Found], first: Found) -> Found:
         What was found where most masks are expected to be right; of equals, at the larger size.
     """
     best, size = first, float(first.looks[0].longest)
-    while (size := size * STEP) >= MIN_IMAGE_SIZE:
+    while (size := size * DETECTION.size_step) >= DETECTION.min_image_size:
         found = see(round(size))
         if found.expected_right <= best.expected_right:
             return best

@@ -5,13 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import InputError, check_choices
-
-# pixels, as in a file of weights; this module is imported for --help, and loads no torch
-MIN_IMAGE_SIZE, MAX_IMAGE_SIZE = 32, 16_384
-# Scores of proposals: those that are matched first, those that are matched for more candidates, and the whole excessive
-# set, from torchvision's threshold on. Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003 (docs/notes/detector.md).
-SURE_SCORE, MORE_SCORE, LEAST_SCORE = 0.3, 0.1, 0.05
 
 
 @dataclass(frozen=True)
@@ -40,7 +35,7 @@ class DetectConfig:
 
     weights: str = "leaf-lite"
     min_probability: float | None = None
-    min_score: float = SURE_SCORE
+    min_score: float = DETECTION.sure_score
     image_size: int | None = None
     crop: Literal["auto", "off"] = "auto"
     num_iterations: int = 1
@@ -53,8 +48,8 @@ class DetectConfig:
             raise InputError(f"detect.min_score is {self.min_score:g}, expected a number from 0 to 1")
         if self.min_probability is not None and not 0 <= self.min_probability <= 1:
             raise InputError(f"detect.min_probability is {self.min_probability:g}, expected a number from 0 to 1")
-        if self.image_size is not None and not MIN_IMAGE_SIZE <= self.image_size <= MAX_IMAGE_SIZE:
-            expected = f"at least {MIN_IMAGE_SIZE}, at most {MAX_IMAGE_SIZE}"
+        if self.image_size is not None and not DETECTION.min_image_size <= self.image_size <= DETECTION.max_image_size:
+            expected = f"at least {DETECTION.min_image_size}, at most {DETECTION.max_image_size}"
             raise InputError(f"detect.image_size is {self.image_size}, expected {expected}")
         if self.num_iterations < 0:
             raise InputError(f"detect.num_iterations is {self.num_iterations}, expected 0 or more")

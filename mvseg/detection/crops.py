@@ -10,21 +10,18 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mvseg.detection.numbers import DETECTION
 from mvseg.masks import SURE, Masks
 from mvseg.reconstruction.triangulate import triangulate
 from mvseg.scene import Cameras
 
-LEAST_VIEWS = 3  # of an instance that is part of the plant; all views where there are fewer
-MARGIN = 0.1  # of the longer side of a box, on each side: leaves that were missed
-LEAST_GAIN = 1.5  # by which a second pass must see the plant larger, for most photos
-
 
 def boxes_for_second_pass(masks: Masks, cameras: Cameras, *, longest: int) -> Tensor | None:
     """`plant_boxes`, if a detector that scales larger images down to a longer side of `longest` pixels sees the plant
-    at least `LEAST_GAIN` times as large in them, in most views; else None."""
+    at least `DETECTION.least_gain` times as large in them, in most views; else None."""
     boxes = plant_boxes(masks, cameras)
     gain = gain_of_crops(boxes, cameras.sizes, longest)
-    return boxes if float(gain.median()) >= LEAST_GAIN else None
+    return boxes if float(gain.median()) >= DETECTION.least_gain else None
 
 
 def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
@@ -48,7 +45,7 @@ def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
     for instance in masks.instance_ids[is_sure].unique().tolist():
         members = (is_sure & (masks.instance_ids == instance)).nonzero()[:, 0]
         views = regions.view_index[members]
-        if len(views) < max(2, min(LEAST_VIEWS, len(cameras))):
+        if len(views) < max(2, min(DETECTION.plant_views, len(cameras))):
             continue
         boxes = regions.boxes[members].double()
         seen = cameras[views]
@@ -71,7 +68,7 @@ def plant_boxes(masks: Masks, cameras: Cameras) -> Tensor:
         own = regions.boxes[of_plant & (regions.view_index == view)].double()
         low[view] = torch.cat((low[view][None], own[:, :2])).amin(0)
         high[view] = torch.cat((high[view][None], own[:, 2:])).amax(0)
-    margin = MARGIN * (high - low).amax(1, keepdim=True)
+    margin = DETECTION.plant_margin * (high - low).amax(1, keepdim=True)
     low, high = (low - margin).floor().clamp(min=0), torch.minimum((high + margin).ceil(), cameras.sizes.double())
     is_seen = ((high - low) >= 1).all(1, keepdim=True)  # else the plant is outside the photo
     return torch.where(is_seen, torch.cat((low, high), 1).nan_to_num(0, 0, 0), frames).long()

@@ -10,10 +10,11 @@ from torch import Tensor
 
 from mvseg._version import code_hash
 from mvseg.detection.cached_detections import CachedDetections, read_detections, write_detections
-from mvseg.detection.config import LEAST_SCORE, DetectConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import boxes_for_second_pass
 from mvseg.detection.find_leaves import Look
 from mvseg.detection.mask_rcnn import MultiViewMaskRCNN
+from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.folded_norms import fold_norms
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.formats.photos import Photos
@@ -48,7 +49,7 @@ def detect_scene(
         InputError: unknown weights, or a photo that is missing, broken or of another size than its camera says.
     """
     cameras = photos.scene.cameras
-    least = min(LEAST_SCORE, config.min_score) if config.verify else config.min_score
+    least = min(DETECTION.least_score, config.min_score) if config.verify else config.min_score
     detector = load_detector(config.weights, image_size=config.image_size, min_score=least)
     device = "cuda" if torch.cuda.is_available() else "cpu"
     model = MultiViewMaskRCNN(fold_norms(detector), num_iterations=config.num_iterations, match=match).to(device)
@@ -95,6 +96,6 @@ def describe_detector(config: DetectConfig, model: MultiViewMaskRCNN, device: st
     """Everything but the photo that detections depend on. (What the views say of them does not change them.)"""
     options = asdict(config) | {"weights": hash_files(weights_path(config.weights))}
     options |= {"num_iterations": None, "verify": None, "crop": None, "min_views": None, "min_probability": None}
-    options |= {"min_score": min(LEAST_SCORE, config.min_score) if config.verify else config.min_score}
+    options |= {"min_score": min(DETECTION.least_score, config.min_score) if config.verify else config.min_score}
     options |= {"proposals": [model.proposal_iou, model.proposals_per_view], "code": code_hash()}
     return json.dumps(options | {"torch": torch.__version__, "device": device})

@@ -10,11 +10,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.masks import Masks, Origin
 from mvseg.verification.numbers import EVIDENCE
-
-FEW = 2  # a leaf may be added as it was found if at most so many views show it
 
 
 def select_by_views(masks: Masks, detected: Masks, *, min_views: int) -> Masks:
@@ -57,7 +56,7 @@ def _count_views(masks: Masks) -> Tensor:
 
 def _few(masks: Masks, detected: Masks) -> Masks:
     """The detected masks that few views show and no verified mask covers, with ids from 1 on."""
-    detected = detected.select((_count_views(detected) <= FEW) & (detected.origin == Origin.DETECTED))
+    detected = detected.select((_count_views(detected) <= DETECTION.few_views) & (detected.origin == Origin.DETECTED))
     kept = []
     for view in range(masks.regions.num_views):
         own = (detected.view_index == view).nonzero()[:, 0]

@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING
 
 from torch import Tensor
 
-from mvseg.detection.config import MORE_SCORE, SURE_SCORE, DetectConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops
+from mvseg.detection.numbers import DETECTION
 from mvseg.detection.proposals import gather_proposals
 from mvseg.errors import InputWarning
 from mvseg.masks import Masks
@@ -103,7 +104,7 @@ class Found:
     @property
     def is_familiar(self) -> bool:
         """Whether the detector knows the species, see `mvseg.verification.unexplained.is_familiar`."""
-        return is_familiar(self.leaves.masks, sure_score=SURE_SCORE)
+        return is_familiar(self.leaves.masks, sure_score=DETECTION.sure_score)
 
     @property
     def expected_right(self) -> float:
@@ -133,7 +134,7 @@ def find_leaves(
         tables = [look.sure.masks.to("cpu")]
         if config.verify:
             with warnings.catch_warnings(action="ignore", category=InputWarning):  # said of the sure ones already
-                tables.append(look.match(cameras, min(MORE_SCORE, config.min_score)).masks)
+                tables.append(look.match(cameras, min(DETECTION.more_score, config.min_score)).masks)
         numbered = [replace(each.regions, labels=each.regions.labels + offset) for each in tables]
         matched += [replace(each, regions=regions) for each, regions in zip(tables, numbered, strict=True)]
         proposals.append(own)

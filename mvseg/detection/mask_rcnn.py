@@ -9,9 +9,10 @@ from torch import Tensor
 from torchvision.models.detection import MaskRCNN
 from torchvision.models.detection.generalized_rcnn import GeneralizedRCNN
 
-from mvseg.detection.config import SURE_SCORE, DetectConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.detection.find_leaves import Look, find_leaves
 from mvseg.detection.loop import match_proposals
+from mvseg.detection.numbers import DETECTION
 from mvseg.detection.proposals import gather_proposals
 from mvseg.detectors.run import run_heads
 from mvseg.errors import InputError, warn
@@ -21,8 +22,6 @@ from mvseg.matching.match import describe_disagreement
 from mvseg.matching.result import Matching
 from mvseg.scene import Cameras
 from mvseg.verification.snap_edges import snap_masks
-
-BRIGHTEST = 1.5  # values above it are no share of white (resampling may exceed 1 by a little)
 
 
 class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision carries no types
@@ -41,7 +40,7 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
        survivors again. Masks that resemble no map form one more group.
     4. Where match scores are probabilities (unless `match` selects "one-per-view" or "symnmf"): a box that overlaps a
        better one stays only if the other views show it to be another instance (`backed_by_views`); match what is left.
-    5. With `verify`, what is matched of the sure proposals (`SURE_SCORE`), and of many more (`MORE_SCORE`), are
+    5. With `verify`, what is matched of the sure proposals (`sure_score`), and of many more (`more_score`), are
        candidates only, and the views choose leaves and masks from the whole excessive set (`verification.choose`).
 
     Departures from the paper: the paper matches the excessive set itself at first, and estimates |k| anew each time;
@@ -148,7 +147,8 @@ class MultiViewMaskRCNN(GeneralizedRCNN):  # type: ignore[misc]  # torchvision c
         _check_cameras(cameras, sizes)
         if not self.verify:
             return _said_of(self.match_detections(detections, cameras))
-        config, posed = DetectConfig(min_score=max(SURE_SCORE, self.roi_heads.score_thresh)), cameras.to("cpu")
+        config = DetectConfig(min_score=max(DETECTION.sure_score, self.roi_heads.score_thresh))
+        posed = cameras.to("cpu")
         look = Look.of(self, detections, posed, min_score=config.min_score)
         leaves = find_leaves([look], posed, config=config).leaves
         return _said_of(look.sure).with_masks(snap_masks(leaves.masks, photos.__getitem__))
@@ -256,7 +256,7 @@ def _check_image(image: Tensor, name: str) -> None:
     if not image.is_floating_point():
         kind = str(image.dtype).removeprefix("torch.")
         raise InputError(f"{name} is {kind}, expected floats in [0, 1]: image.float() / 255")
-    if float(image.max()) > BRIGHTEST:
+    if float(image.max()) > DETECTION.brightest:
         raise InputError(f"{name} has values up to {float(image.max()):g}, expected floats in [0, 1]: image / 255")
 
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from mvseg.checks.check_scene import warn_of_contradictions
 from mvseg.config import RunConfig
 from mvseg.corrections.settle import settle
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import warn
 from mvseg.matching.split import split_merged
 from mvseg.pipeline.known import Known
@@ -89,13 +90,12 @@ def _fit_surfaces(known: Known) -> Mapping[int, LeafSurface]:
 
 def _find_missing(known: Known, result: Result) -> Missing | None:
     """Whether leaves were probably missed, where a detector found them, see `find_missing`."""
-    from mvseg.detection.config import SURE_SCORE
     from mvseg.verification.unexplained import find_missing
 
     if not known.opened.is_chosen or (known.edits and not len(result.masks)):  # a person says that there is none
         return None
     may_learn = known.opened.config.learn != "off"
-    return find_missing(result.masks, known.opened.photos, sure_score=SURE_SCORE, may_learn=may_learn)
+    return find_missing(result.masks, known.opened.photos, sure_score=DETECTION.sure_score, may_learn=may_learn)
 
 
 def _measure(result: Result, config: RunConfig, shapes: ReconstructConfig) -> Result:

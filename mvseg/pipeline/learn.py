@@ -20,8 +20,9 @@ from torch import Tensor
 from mvseg._version import code_hash
 from mvseg.corrections.file import Corrections
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.detection.config import SURE_SCORE, DetectConfig
+from mvseg.detection.config import DetectConfig
 from mvseg.detection.find_leaves import Look
+from mvseg.detection.numbers import DETECTION
 from mvseg.detectors.weights_file import encode_weights, read_weights
 from mvseg.detectors.zoo import load_detector, weights_path
 from mvseg.errors import InputError, collect_warnings, warn
@@ -95,7 +96,7 @@ def _count_rounds(known: Known) -> int:
         return 0
     if opened.config.learn != "auto":
         return opened.config.learn
-    return 0 if is_familiar(known.masks, sure_score=SURE_SCORE) else ROUNDS
+    return 0 if is_familiar(known.masks, sure_score=DETECTION.sure_score) else ROUNDS
 
 
 def _learn_once(known: Known, labels: ViewLabels, cache: CachedDetections) -> Known:

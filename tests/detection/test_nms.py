@@ -5,8 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 import torchvision
+from mvseg.detection.numbers import DETECTION
 
-from mvseg.detection.assignment import MAX_PIXELS, EpipolarAssignment, ruzicka_similarity
+from mvseg.detection.assignment import EpipolarAssignment, ruzicka_similarity
 from mvseg.detection.nms import backed_by_views, cluster_aware_nms
 from mvseg.errors import InputError
 from reference import backed_by_views_reference, cluster_aware_nms_reference, epipolar_map_reference, ruzicka_reference
@@ -45,7 +46,7 @@ def test_thinned_masks_take_the_clusters_of_whole_ones() -> None:
     """Counted by runs in place of pixels, 5 in 100 proposals of crowded plants took another one."""
     scene = ball_scene(10, 3, seed=3, radius=0.5, spread=1.3, focal=900.0, width=800, height=600)
     ids, cameras = scene.regions.labels, scene.cameras
-    assert scene.regions.areas.median() > 2 * MAX_PIXELS
+    assert scene.regions.areas.median() > 2 * DETECTION.mask_pixels
     clusters, _ = EpipolarAssignment()(scene.regions, scene.regions, ids, cameras=cameras)
     exact = ruzicka_similarity(scene.regions, scene.regions, ids, cameras=cameras).argmax(1) + 1
     assert (clusters == exact).float().mean() >= 0.98

@@ -1,0 +1,31 @@
+"""The numbers of detection: definitions, technical limits, and what was fitted to development plants.
+
+They are read for --help, too: this module loads no torch. docs/notes/detector.md says how scores and sizes were found.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class DetectionNumbers:
+    """Proposals of a detector, in all views at once."""
+
+    min_image_size: int = 32  # limit: longer side of a photo for the detector, as in a file of weights
+    max_image_size: int = 16_384  # limit: the same, at most
+    size_step: float = 0.5**0.5  # size of a look, as a share of the one before: half of the pixels
+    brightest: float = 1.5  # value of a pixel above which photos are not in shares of white; resampling may exceed 1
+    # Matching at 0.05 and 0.2, too, moves MV-PQ by 0.003.
+    sure_score: float = 0.3  # score of the proposals that are matched first, at least
+    more_score: float = 0.1  # score of those that are matched for more candidates, at least
+    least_score: float = 0.05  # score of the whole excessive set, at least: torchvision's threshold
+    mask_pixels: int = 1024  # limit: pixels of a proposal's mask that send out epipolar lines, at most
+    band_pixels: int = 65_536  # limit: pixels of an image that sample the area of a band, at most about
+    few_views: int = 2  # views of a leaf that is added as it was found, at most
+    plant_views: int = 3  # views of an instance that is part of the plant, at least; all where there are fewer
+    plant_margin: float = 0.1  # margin around the plant, as a share of its box's longer side: missed leaves
+    least_gain: float = 1.5  # size of the plant in a second pass, in that of the first, at least, in most photos
+
+
+DETECTION = DetectionNumbers()
