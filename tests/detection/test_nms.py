@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 import torchvision
-from mvseg.detection.numbers import DETECTION
 
 from mvseg.detection.assignment import EpipolarAssignment, ruzicka_similarity
 from mvseg.detection.nms import backed_by_views, cluster_aware_nms
+from mvseg.detection.numbers import DETECTION
 from mvseg.errors import InputError
 from reference import backed_by_views_reference, cluster_aware_nms_reference, epipolar_map_reference, ruzicka_reference
 from synthetic import ball_scene
