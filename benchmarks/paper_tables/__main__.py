@@ -1,7 +1,9 @@
 """`python -m benchmarks.paper_tables [--preset small|paper] [--cache DIR] ...`: run what is missing, write it up.
 
-The scenes, and one record per scene and method, are kept in the cache folder. After an interruption the same command
-goes on; with --write_only it writes up the records so far.
+The paper's tables 1 to 3 and the question of |k|, on simulated test plants and real scenes. The scenes, and one record
+per scene and method, are kept in the cache folder. After an interruption the same command goes on; with --write_only it
+writes up the records so far. After its texts in this folder were changed, the page in docs/ is written anew from its
+own records: `--preset paper --detector leaf-slim --records docs/benchmarks.json --cache NEW`.
 """
 
 from __future__ import annotations
@@ -19,6 +21,7 @@ from benchmarks.paper_tables.cells import PRESETS, list_cells
 from benchmarks.paper_tables.experiments import TABLES, Plan, run_real, run_simulated
 from benchmarks.paper_tables.methods import METHODS
 from benchmarks.paper_tables.shapes import SHAPES
+from benchmarks.paper_tables.write_up import unpack_records, write_up
 from mvseg.system.worker_pool import run_all
 
 
@@ -38,12 +41,13 @@ def main(argv: Sequence[str] | None = None) -> None:
         detector=args.detector,
         real=tuple(args.real),
     )
-    if not args.write_only:
+    if args.records:
+        plan = unpack_records(args.records, plan)
+    elif not args.write_only:
         torch.set_num_threads(1)
         run_scenes(partial(run_simulated, plan=plan), list_cells(PRESETS[plan.preset]), args.num_workers)
         if "2" in plan.tables:
             run_scenes(partial(run_real, plan=plan), plan.real, args.num_workers)
-    from benchmarks.paper_tables.write_up import write_up
 
     default = Path("docs") if plan.preset == "paper" else plan.cache / "docs"
     print(write_up(plan, args.out or default))
@@ -59,7 +63,8 @@ def run_scenes(work: Callable[[Any], None], scenes: Sequence[Any], num_workers: 
 def build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.paper_tables",
-        description="The paper's tables 1 to 3 and the question of |k|, on simulated test plants and real scenes.",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--preset", choices=list(PRESETS), default="small", help="small: 4 scenes, minutes; paper: 48")
     parser.add_argument("--cache", type=Path, default=Path("results/paper_tables"), help="for scenes and records")
@@ -71,6 +76,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--detector", help="also match the masks of this detector: a shipped one's name, or a file")
     parser.add_argument("--real", "--basil", nargs="+", type=Path, default=[], help="real scene folders for table 2")
     parser.add_argument("--out", type=Path, help="folder for benchmarks.md and its plots (docs; small: CACHE/docs)")
+    parser.add_argument("--records", type=Path, help="run nothing, write up this benchmarks.json; --cache must be new")
     parser.add_argument("--write_only", action="store_true", help="run nothing, write up the records so far")
     return parser
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 from benchmarks.paper_tables.cells import PRESETS, SEED, Record, list_cells, read_record
@@ -29,16 +31,20 @@ NOTES = Path(__file__).with_name("notes.md")
 
 
 def write_up(plan: Plan, out: Path) -> str:
-    """Write `benchmarks.md`, `benchmarks.json` and the plots into a folder.
+    """Write `benchmarks.md`, `benchmarks.json` and the plots into a folder; returns the content of `benchmarks.md`."""
+    out.mkdir(parents=True, exist_ok=True)
+    text = write_page(plan, {path.stem: path.name for path in plot_all(plan, out)})
+    write_text_whole(out / "benchmarks.md", text)
+    write_text_whole(out / "benchmarks.json", describe_records(plan))
+    return text
+
+
+def write_page(plan: Plan, plots: Mapping[str, str]) -> str:
+    """The content of `benchmarks.md`, with these plots, {name: file}.
 
     The text between the tables is written by hand. The template holds for any run; the notes are about the records of
     the preset "paper", and only that preset gets them.
-
-    Returns:
-        The content of `benchmarks.md`.
     """
-    out.mkdir(parents=True, exist_ok=True)
-    plots = {path.stem: path.name for path in plot_all(plan, out)}
     notes = read_notes(NOTES) if plan.preset == "paper" else {}
     base = f"python -m benchmarks.paper_tables --preset {plan.preset}"
     detector = f" --detector {plan.detector}" if plan.detector else ""
@@ -61,19 +67,17 @@ def write_up(plan: Plan, out: Path) -> str:
     if read_records(plan.records / "numbers" / "true", list_cells(PRESETS[plan.preset])):
         parts += ["## The number of leaves: given, and found", f"`{base} --tables k`", table_numbers(plan)]
         parts.append(notes.get("numbers", ""))
-    text = "\n\n".join(part for part in parts if part) + "\n"
-    write_text_whole(out / "benchmarks.md", text)
-    real = " --real FOLDER ..." if plan.real else ""
-    write_text_whole(out / "benchmarks.json", describe_records(plan, f"{base}{detector}{real}"))
-    return text
+    return "\n\n".join(part for part in parts if part) + "\n"
 
 
-def picture(plots: dict[str, str], name: str) -> str:
+def picture(plots: Mapping[str, str], name: str) -> str:
     return f"![{name}]({plots[name]})" if name in plots else ""
 
 
-def describe_records(plan: Plan, command: str) -> str:
-    """All records as JSON, one line per scene, numbers to five digits."""
+def describe_records(plan: Plan) -> str:
+    """All records as JSON, one line per scene, numbers to five digits; `unpack_records` reads it."""
+    options = (f" --detector {plan.detector}" if plan.detector else "") + (" --real FOLDER ..." if plan.real else "")
+    command = f"python -m benchmarks.paper_tables --preset {plan.preset}{options}"
     specs = list_cells(PRESETS[plan.preset])
     shapes = [read_shapes(plan, [shape]) for shape in SHAPES]  # one at a time: each with all scenes that it has
     groups = {f"table 3, {name}": records for of_shape in shapes for name, records in of_shape.items()}
@@ -90,6 +94,26 @@ def describe_records(plan: Plan, command: str) -> str:
     for name, records in groups.items():
         parts.append(f"{json.dumps(name)}: [\n" + ",\n".join(shorten(record) for record in records) + "\n]")
     return "{\n" + ",\n".join(parts) + "\n}\n"
+
+
+def unpack_records(file: Path, plan: Plan) -> Plan:
+    """Put the records of a `benchmarks.json` into the cache of a plan, which is empty; returns it with the real scenes
+    of the file."""
+    real: list[Path] = []
+    for name, records in json.loads(file.read_text(encoding="utf-8")).items():
+        table, _, of = name.partition(", ")
+        kind, _, method = of.partition(", ")
+        folders = {"table 1": plan.match_records(kind) / slug(method), "table 3": plan.records / "shapes" / slug(of)}
+        folders["number of leaves"] = plan.records / "numbers" / slug(of)
+        real += [Path(of)] if table == "table 2" else []
+        for record in records if of else ():
+            if table == "table 2":
+                path = real_record(plan, Path(of), record["method"])
+            else:
+                path = folders[table] / f"{record['scene'].replace('/', '_')}.json"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(json.dumps(record), encoding="utf-8")
+    return replace(plan, real=tuple(real))
 
 
 def shorten(record: Record) -> str:
