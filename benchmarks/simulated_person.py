@@ -85,7 +85,7 @@ def choose_repairs(
 
 
 class Look:
-    """What a person sees who holds a result against the truth; with `ids_only`, masks are taken as they are.
+    """What a person sees who holds a result against the truth.
 
     Attributes:
         leaf: (D,) the leaf that each mask shows; 0 = none, 65535 = not judged.
@@ -97,9 +97,7 @@ class Look:
         second: (D,) the second leaf that a mask shows and no other mask does; 0 = none.
     """
 
-    def __init__(
-        self, masks: Masks, truth: Sequence[Labels], scene: Scene, doubts: Sequence[Doubt], *, ids_only: bool = False
-    ) -> None:
+    def __init__(self, masks: Masks, truth: Sequence[Labels], scene: Scene, doubts: Sequence[Doubt]) -> None:
         self.masks, self.truth, self.scene = masks, truth, scene
         count = 1 + max(int(labels[labels != IGNORE_LABEL].max(initial=0)) for labels in truth)
         self.visible = np.stack([np.bincount(labels.ravel(), minlength=IGNORE_LABEL + 1)[:count] for labels in truth])
@@ -114,9 +112,8 @@ class Look:
         self.ids, self.views = masks.instance_ids.numpy(), masks.view_index.numpy()
         self.area = self.shares.sum(1)  # without pixels that the truth ignores
         self._find_homes()
-        self.ids_only, self.second = ids_only, np.zeros(len(masks), np.int64)
-        if not ids_only:
-            self._find_merged()
+        self.second = np.zeros(len(masks), np.int64)
+        self._find_merged()
         self.doubt_of_row = {each.region: each.doubt for each in reversed(doubts) if each.region >= 0}
         self.doubts = doubts
         self.doubt_of_gap = {(each.view, each.instance): each.doubt for each in doubts if each.kind in GAPS}
@@ -242,11 +239,7 @@ GAPS = ("missing", "covered")
 
 def list_repairs(look: Look) -> list[Repair]:
     """All that is wrong and worth the while, with the edits that say so."""
-    found = [*_join_and_reject(look), *_move(look)]
-    if look.ids_only:
-        found = [each for each in found if isinstance(each.edits[0], Link)]
-    else:
-        found += [*_cut(look), *_draw(look)]
+    found = [*_join_and_reject(look), *_move(look), *_cut(look), *_draw(look)]
     return [each for each in found if each.gain >= LEAST_REPAIR]
 
 
