@@ -894,6 +894,26 @@ def test_masks_that_show_no_true_leaf_are_counted(
     assert "3 of 12 masks show no true leaf" in capsys.readouterr().err
 
 
+def test_two_annotators_are_compared(plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A result with another one, and label images with label images."""
+    out, other = tmp_path / "out", tmp_path / "other"
+    assert main(["match", str(plant), "--out", str(out), "--quiet"]) == 0
+    shutil.copytree(plant / "truth", other)
+    for path in other.iterdir():
+        labels = read_label_png(path, WIDTH, HEIGHT)
+        write_label_png(path, np.where(labels == 1, 0, labels))
+    assert main(["eval", str(out / "plant"), "--truth", str(out / "plant")]) == 0
+    content = json.loads((out / "plant" / "metrics.json").read_text())
+    assert (content["kappa"], content["mv_pq"]) == (1, 1)
+    assert (content["iou_1_1"], content["iou_2_2"], content["iou_3_3"], content["missed"]) == (1, 1, 1, [])
+    capsys.readouterr()
+    assert main(["eval", str(other), "--truth", str(plant / "truth")]) == 0
+    said = capsys.readouterr().out.splitlines()
+    assert "missed             1" in said
+    assert "kappa              1.0000" in said
+    assert not (other / "metrics.json").exists()
+
+
 def test_eval_takes_the_folder_that_match_wrote(
     plant: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

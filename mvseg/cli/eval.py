@@ -1,4 +1,4 @@
-"""Compare the ids of a result with true labels."""
+"""Compare the ids of a result with true labels, or two annotators with each other."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from mvseg.errors import InputError
 
 def add_options(parser: ArgumentParser) -> None:
     """The options of the verb."""
-    parser.add_argument("result", type=Path, help="result folder, or the --out of mvseg match")
-    parser.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids")
+    parser.add_argument("result", type=Path, help="result folder, the --out of mvseg match, or label PNGs")
+    parser.add_argument("--truth", type=Path, required=True, help="folder of label PNGs with the true ids, or a result")
 
 
 def run(args: Namespace) -> int:
     """Run the verb; returns the exit code."""
+    from mvseg.evaluation.agreement import compare_annotators
     from mvseg.evaluation.id_metrics import matching_metrics
     from mvseg.evaluation.panoptic import leaf_metrics
     from mvseg.evaluation.truth import shown_instances
@@ -39,11 +40,17 @@ def run(args: Namespace) -> int:
     metrics: dict[str, Any] = dataclasses.asdict(matching_metrics(ids[is_scored], true[is_scored]))
     metrics |= {"no_instance": int((true == 0).sum()), "ignored": int((true == IGNORE_LABEL).sum())}
     metrics |= dataclasses.asdict(leaf_metrics(regions, ids, truth))
+    agreement = compare_annotators(regions, ids, truth)
+    metrics |= {"kappa": agreement.kappa, "alone": agreement.alone, "missed": agreement.missed}
+    metrics |= {f"iou_{each.leaf}_{each.true}": each.iou for each in agreement.shared}
     if metrics["no_instance"]:
         message = f"{metrics['no_instance']} of {len(ids)} masks show no true leaf: left out of the scores of the ids"
         print(f"mvseg: warning: {message}", file=sys.stderr)
     for name, value in metrics.items():
-        print(f"{name:18} {value:.4f}" if isinstance(value, float) else f"{name:18} {value}")
+        shown = ",".join(map(str, value)) or "none" if isinstance(value, tuple) else value
+        print(f"{name:18} {shown:.4f}" if isinstance(shown, float) else f"{name:18} {shown}")
+    if not (result / "instances.json").is_file():  # labels of somebody
+        return 0
     try:
         write_text_whole(result / "metrics.json", json.dumps(metrics, indent=1) + "\n")
     except OSError as error:

@@ -70,6 +70,27 @@ class Found:
         return int((self.true_segment >= 0).sum())
 
 
+@dataclass(frozen=True)
+class Judged:
+    """D masks of P instances against all true ones.
+
+    Attributes:
+        ids: (P,) int64, of each instance; -1 for a mask that is matched to nothing, which is one of its own.
+        instance: (D,) int64, the index of each mask's instance.
+        labels: of the true instances, ascending.
+        leaf_of_mask: the label of each true mask.
+        masks: each mask against the true masks.
+        leaves: each instance, in all views, against the true instances.
+    """
+
+    ids: np.ndarray
+    instance: np.ndarray
+    labels: tuple[int, ...]
+    leaf_of_mask: tuple[int, ...]
+    masks: Found
+    leaves: Found
+
+
 def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> LeafMetrics:
     """Judge masks with ids by true label maps.
 
@@ -82,21 +103,9 @@ def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndar
     Raises:
         InputError: another number of ids than of regions, or of maps than of views.
     """
-    if len(instance_ids) != len(regions) or len(truth) != regions.num_views:
-        raise InputError(
-            f"{len(instance_ids)} ids and {len(truth)} true label maps, "
-            f"expected {len(regions)} and {regions.num_views}, as many as regions and views"
-        )
-    ids = np.unique(separate_unmatched(instance_ids.cpu().numpy()), return_inverse=True)[1]
-    shown = [[label for label in np.unique(labels).tolist() if label not in (0, IGNORE_LABEL)] for labels in truth]
-    true_masks = [(view, label) for view, of_view in enumerate(shown) for label in of_view]
-    mask_number = {key: number for number, key in enumerate(true_masks)}
-    leaf_number = {label: number for number, label in enumerate(sorted({label for _, label in true_masks}))}
-    by_mask = [{label: mask_number[view, label] for label in of_view} for view, of_view in enumerate(shown)]
-    by_leaf = [{label: leaf_number[label] for label in of_view} for of_view in shown]
-    masks = find_segments(regions, np.arange(len(regions)), truth, numbers=by_mask)
-    leaves = find_segments(regions, ids, truth, numbers=by_leaf)
-    right, estimated, true = count_shared_pairs(masks, ids, np.array([label for _, label in true_masks], np.int64))
+    judged = find_all(regions, instance_ids, truth)
+    masks, leaves = judged.masks, judged.leaves
+    right, estimated, true = count_shared_pairs(masks, judged.instance, np.array(judged.leaf_of_mask, np.int64))
     num_false, num_missed = int(leaves.is_false.sum()), leaves.num_true - leaves.num_right
     return LeafMetrics(
         mask_precision=share(masks.num_right, masks.num_right + int(masks.is_false.sum())),
@@ -108,6 +117,31 @@ def leaf_metrics(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndar
         num_right=leaves.num_right,
         num_false=num_false,
         num_missed=num_missed,
+    )
+
+
+def find_all(regions: Regions, instance_ids: Tensor, truth: Sequence[np.ndarray]) -> Judged:
+    """What each mask, and each instance, finds; see `leaf_metrics` for the arguments and what is raised."""
+    if len(instance_ids) != len(regions) or len(truth) != regions.num_views:
+        raise InputError(
+            f"{len(instance_ids)} ids and {len(truth)} true label maps, "
+            f"expected {len(regions)} and {regions.num_views}, as many as regions and views"
+        )
+    numbers = instance_ids.cpu().numpy()
+    ids, instance = np.unique(separate_unmatched(numbers), return_inverse=True)
+    shown = [[label for label in np.unique(labels).tolist() if label not in (0, IGNORE_LABEL)] for labels in truth]
+    true_masks = [(view, label) for view, of_view in enumerate(shown) for label in of_view]
+    mask_number = {key: number for number, key in enumerate(true_masks)}
+    leaf_number = {label: number for number, label in enumerate(sorted({label for _, label in true_masks}))}
+    by_mask = [{label: mask_number[view, label] for label in of_view} for view, of_view in enumerate(shown)]
+    by_leaf = [{label: leaf_number[label] for label in of_view} for of_view in shown]
+    return Judged(
+        ids=np.where(np.isin(ids, numbers), ids, -1),
+        instance=instance,
+        labels=tuple(leaf_number),
+        leaf_of_mask=tuple(label for _, label in true_masks),
+        masks=find_segments(regions, np.arange(len(regions)), truth, numbers=by_mask),
+        leaves=find_segments(regions, instance, truth, numbers=by_leaf),
     )
 
 

@@ -25,12 +25,12 @@ from mvseg.errors import InputError, faults_of
 from mvseg.formats.coco import Rle, decode_crop, decode_rle
 from mvseg.formats.image_file import file_name_problem
 from mvseg.formats.json_file import Int64, Items, Matrix3, Pixels, Vector3, read_json
-from mvseg.formats.label_png import read_label_png
+from mvseg.formats.label_png import read_label_png, read_labels
 from mvseg.formats.lens import undistort
 from mvseg.masks import Masks, MergedMask, Origin
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.poses.refine_poses import RefinedPoses
-from mvseg.regions import Regions, stack_regions
+from mvseg.regions import Regions, regions_from_label_maps, stack_regions
 from mvseg.results.earlier import RUN_FILE
 from mvseg.results.folder import CORRECTED
 from mvseg.results.photo_masks import regions_in_photos
@@ -195,8 +195,9 @@ def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]
     """The masks and ids of a result, and the true labels of its views.
 
     Args:
-        folder: a result folder.
-        truth: a folder of label PNGs, one per view, the same number for the same instance in every view.
+        folder: a result folder, or one of label PNGs, too.
+        truth: a folder of label PNGs, one per view, the same number for the same instance in every view; or another
+            result, whose `labels` these are.
 
     Returns:
         D regions in the frames of the photos, whose `labels` are the ids of instances.json (-1 = matched to nothing),
@@ -205,9 +206,15 @@ def read_instances(folder: Path, truth: Path) -> tuple[Regions, list[np.ndarray]
     Raises:
         InputError: the result or the truth is missing or broken.
     """
-    result = load_result(folder)
+    truth = truth / "labels" if (truth / "instances.json").is_file() else truth
     if not truth.is_dir():
         raise InputError(f"{truth}: no such folder of true labels")
+    labels = sorted(folder.glob("*.png"))
+    if labels and not (folder / "instances.json").is_file():
+        maps = [read_labels(path) for path in labels]
+        truths = [read_label_png(truth / path.name, *each.shape[::-1]) for path, each in zip(labels, maps, strict=True)]
+        return regions_from_label_maps(maps), truths
+    result = load_result(folder)
     sizes = result.scene.cameras.sizes.tolist()
     views = zip(result.scene.views, sizes, strict=True)
     return regions_in_photos(result), [read_label_png(truth / f"{view.name}.png", *size) for view, size in views]
