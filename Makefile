@@ -10,6 +10,8 @@ demo: $(VENV)/installed
 # two processes, one thread each: libraries that start more get in each other's way; each begins with one half of the
 # tests, so that what the tests of a file share is made once, as a rule
 test slow: export OMP_NUM_THREADS := 1
+# they start many processes: what is compiled once need not be compiled by each
+test slow: export PYTHONDONTWRITEBYTECODE :=
 test slow: PYTEST := $(PYTHON) -m pytest -n 2 --dist worksteal
 
 test: $(VENV)/complete

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,27 +14,42 @@ NAMES = ("chromium", "chromium-browser", "google-chrome")
 CHROMIUM = next((path for path in map(shutil.which, NAMES) if path), None)
 OPTIONS = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--no-sandbox"]
 NO_WEBGL = ["--disable-gpu", "--disable-3d-apis", "--no-sandbox"]
+BLANK = "about:blank"
 WAIT_MS = 60_000  # WebGL without a GPU, on a busy machine
 
 
 class Opened:
-    """A page that is open, and what it asked for or complained of."""
+    """A page that is open, and what it asked for or complained of.
+
+    The pages of a browser are shown by one tab, one after another: in a tab of its own, each takes twice as long.
+    """
 
     def __init__(self, browser: sync_api.Browser, file: Path, size: tuple[int, int], *, has_space: bool = True) -> None:
-        self.context = browser.new_context(viewport={"width": size[0], "height": size[1]}, offline=True)
-        self.context.set_default_timeout(WAIT_MS)
+        if browser.contexts and browser.contexts[0].pages[0].url != BLANK:  # a test has failed and left it
+            browser.contexts[0].close()
+        self.context = browser.contexts[0] if browser.contexts else browser.new_context(offline=True)
+        self.page = self.context.pages[0] if self.context.pages else self.context.new_page()
+        self.page.set_default_timeout(WAIT_MS)
+        self.page.set_viewport_size({"width": size[0], "height": size[1]})
         self.problems: list[str] = []
-        self.page = self.context.new_page()
-        self.page.on("console", self._hear)
-        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
-        self.page.on("request", self._see)
-        self.page.on("dialog", lambda dialog: self.problems.append(dialog.message))
+        self.listeners: dict[Any, Callable[..., None]] = {
+            "console": self._hear,
+            "pageerror": lambda error: self.problems.append(str(error)),
+            "request": self._see,
+            "dialog": lambda dialog: self.problems.append(dialog.message),
+        }
+        for event, listener in self.listeners.items():
+            self.page.on(event, listener)
         self.page.goto(file.as_uri())
         if has_space:
             self.page.wait_for_function("() => Number(document.getElementById('canvas').dataset.frames) > 0")
 
     def close(self) -> None:
-        self.context.close()
+        self.page.evaluate("window.localStorage.clear()")
+        self.page.mouse.move(0, 0)
+        self.page.goto(BLANK)
+        for event, listener in self.listeners.items():
+            self.page.remove_listener(event, listener)
         assert self.problems == []
 
     def _hear(self, message: sync_api.ConsoleMessage) -> None:

@@ -91,6 +91,7 @@ def test_areas_do_not_depend_on_how_world_and_photos_are_turned() -> None:
     assert largest_change(surfaces, fit_surfaces(*as_regions(turned), cameras)) < 0.05
 
 
+@pytest.mark.slow
 @pytest.mark.shared_data
 def test_areas_of_a_real_plant_do_not_depend_on_it_either(shared_data: Path) -> None:
     folder = shared_data / "basil-0729"
