@@ -45,16 +45,25 @@ def warn(said: str | Warning) -> None:
 
 @contextmanager
 def collect_warnings() -> Iterator[list[str]]:
-    """The sentences of InputWarnings inside the block, each once, when it ends; they are not given. Other warnings
-    are."""
+    """The sentences of InputWarnings inside the block, each once, when it ends, also by an exception; they are not
+    given. Other warnings are."""
     sentences: list[str] = []
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", InputWarning)
-        yield sentences
-    ours = (str(each.message) for each in caught if issubclass(each.category, InputWarning))
-    sentences += dict.fromkeys(ours)
+        try:
+            yield sentences
+        finally:
+            ours = (str(each.message) for each in caught if issubclass(each.category, InputWarning))
+            sentences += dict.fromkeys(ours)
     for other in (each for each in caught if not issubclass(each.category, InputWarning)):
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
+
+
+def say_fault(error: OSError | MemoryError) -> str:
+    """What the system refuses, in words: a folder that cannot be made, a full disk, more memory."""
+    if isinstance(error, MemoryError):
+        return f"there is not enough memory ({str(error) or 'no more is known'})"
+    return f"{error.filename}: {error.strerror}" if error.filename else str(error)
 
 
 @contextmanager

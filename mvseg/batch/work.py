@@ -6,7 +6,6 @@ from __future__ import annotations
 import threading
 import time
 import traceback
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,7 +17,7 @@ from mvseg.batch.scene_list import BatchScene
 from mvseg.batch.status import Status, read_status, scene_state, write_status
 from mvseg.config import RunConfig
 from mvseg.detectors.weights_file import DETECTOR_FILE
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, collect_warnings, say_fault
 from mvseg.formats.scene_folder import load_scene
 from mvseg.results.earlier import RUN_FILE, Output, check_out
 from mvseg.results.run_record import load_run
@@ -53,7 +52,7 @@ def work_on_scene(out: Path, config: RunConfig, scene: BatchScene) -> Finished:
             masks = None if scene.masks is None else find_masks(scene.folder, scene.masks, scene.beside)
             config = _with_teacher(config, scene, out)
             edits = scene.corrections and find_masks(scene.folder, scene.corrections, what="corrections")
-            with warnings.catch_warnings(action="ignore", category=InputWarning):  # the run itself gives them
+            with collect_warnings():  # the run itself gives them
                 key = scene_key(load_scene(scene.folder), masks, config, corrections=edits)
             if earlier is not None and earlier.key == key and _is_done(earlier, place):
                 return Finished(earlier, is_kept=True)
@@ -109,10 +108,8 @@ def _describe_failure(error: Exception, scene: BatchScene) -> Status:
     trace = ""
     if isinstance(error, InputError):
         sentence = str(error)
-    elif isinstance(error, MemoryError):
-        sentence = f"there is not enough memory ({str(error) or 'no more is known'})"
-    elif isinstance(error, OSError):
-        sentence = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+    elif isinstance(error, OSError | MemoryError):
+        sentence = say_fault(error)
     else:
         trace = "".join(traceback.format_exception(error))
         last = traceback.extract_tb(error.__traceback__)[-1]

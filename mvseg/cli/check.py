@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import json
 import sys
-import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
@@ -17,7 +16,7 @@ import numpy as np
 from jsonargparse import ArgumentParser, Namespace
 
 from mvseg.cli.options import add_shared
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, collect_warnings
 
 if TYPE_CHECKING:
     from mvseg.checks.check_scene import Check
@@ -114,13 +113,12 @@ def _findings(where: str, found: list[Finding]) -> Iterator[None]:
     """Take what a reader warns of as findings."""
     from mvseg.checks.finding import Finding
 
-    with warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", InputWarning)
-        try:
+    said: list[str] = []
+    try:
+        with collect_warnings() as said:
             yield
-        finally:
-            said = [str(each.message) for each in caught if issubclass(each.category, InputWarning)]
-            found += [Finding(where=where, what=what, level="warning") for what in said]
+    finally:
+        found += [Finding(where=where, what=what, level="warning") for what in said]
 
 
 def _print_table(check: Check) -> None:

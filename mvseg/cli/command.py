@@ -18,7 +18,7 @@ from mvseg.cli import batch, check, correct, infer, match, models, pose, simulat
 from mvseg.cli import eval as evaluate
 from mvseg.cli.complain import complain
 from mvseg.cli.options import join_up
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, InputWarning, say_fault
 from mvseg.system.running import running
 from mvseg.system.sigterm import Terminated, stopped_by_sigterm
 
@@ -86,10 +86,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except BrokenPipeError:  # `mvseg eval ... | head`: the reader has seen enough
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 0
-    except OSError as error:  # a full disk, a folder that cannot be made
-        return complain(error)
-    except MemoryError as error:
-        return complain(InputError(f"there is not enough memory ({str(error) or 'no more is known'})"))
+    except (OSError, MemoryError) as error:
+        return complain(InputError(say_fault(error)))
     except Terminated:
         print("mvseg: stopped by SIGTERM", file=sys.stderr)
         return TERMINATED

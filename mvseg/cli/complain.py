@@ -7,8 +7,6 @@ import sys
 from collections.abc import Sequence
 from difflib import get_close_matches
 
-from mvseg.errors import InputError
-
 BAD_INPUT = 2
 
 
@@ -29,8 +27,6 @@ def complain(error: Exception, arguments: Sequence[str] = (), *, known: Sequence
         arguments: of the command line; an option among them is named as it stands there.
         known: verbs or options, one of which was perhaps meant by a name that nothing has.
     """
-    if isinstance(error, OSError) and error.filename:
-        error = InputError(f"{error.filename}: {error.strerror}")
     sentence = _suggest(_as_typed(" ".join(str(error).split()), arguments), known)
     print(f"mvseg: error: {sentence}", file=sys.stderr)
     return BAD_INPUT

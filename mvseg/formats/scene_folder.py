@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Collection
 from pathlib import Path
 
 import numpy as np
 
-from mvseg.errors import InputError, InputWarning, check_arguments, warn
+from mvseg.errors import InputError, check_arguments, collect_warnings, warn
 from mvseg.formats.bop import read_bop
 from mvseg.formats.coco import Crowd, read_coco
 from mvseg.formats.colmap import find_colmap_model, read_colmap
@@ -81,7 +80,7 @@ def _find_others(folder: Path) -> tuple[str, Path] | None:
 
 def is_scene_folder(folder: Path) -> bool:
     """Whether a folder holds cameras of any kind that `load_scene` reads; they need not be sound."""
-    with warnings.catch_warnings(action="ignore", category=InputWarning):  # of several models
+    with collect_warnings():  # of several models
         has_model = find_colmap_model(folder) is not None
     return has_model or (folder / "cameras.json").is_file() or _find_others(folder) is not None
 

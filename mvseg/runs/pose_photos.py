@@ -5,7 +5,6 @@ from __future__ import annotations
 import sys
 import tempfile
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import Any
 import pycolmap
 
 from mvseg._version import made_by
-from mvseg.errors import InputError, InputWarning, warn
+from mvseg.errors import InputError, collect_warnings, warn
 from mvseg.formats.find_views import list_some
 from mvseg.formats.opencv_yaml import read_calibration
 from mvseg.formats.positions import read_positions
@@ -67,18 +66,18 @@ def pose_photos(
     if known.positions is not None:
         read_positions(known.positions)  # to find mistakes in it before the minutes that follow
     start, run = time.perf_counter(), dict[str, Any](made_by())
-    with warnings.catch_warnings(record=True) as caught, replace_result(out, run, output) as folder:
-        warnings.simplefilter("always", InputWarning)
-        files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, folder / IMAGES)
-        structure = find_structure(folder / IMAGES, files, config=config, calibration=calibration, work=folder)
-        lengths = focal_lengths(structure.model, is_given=calibration is not None)
-        for sentence in least_sure(lengths).doubts(mend=MEND):
-            warn(sentence)
-        placement = place(write_structure(structure, folder), known)
-        scene = move_structure(structure, placement.similarity, folder)
-        scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
-        write_cameras(scene, folder)
-        messages = list(dict.fromkeys(str(each.message) for each in caught))
+    with replace_result(out, run, output) as folder:
+        with collect_warnings() as messages:
+            images = folder / IMAGES
+            files = _copy_frames(photos, folder, config=config) if is_clip else copy_photos(source, names, images)
+            structure = find_structure(images, files, config=config, calibration=calibration, work=folder)
+            lengths = focal_lengths(structure.model, is_given=calibration is not None)
+            for sentence in least_sure(lengths).doubts(mend=MEND):
+                warn(sentence)
+            placement = place(write_structure(structure, folder), known)
+            scene = move_structure(structure, placement.similarity, folder)
+            scene = place_scene(replace(scene, unit=placement.unit, up=placement.up), up=up)
+            write_cameras(scene, folder)
         run |= describe_poses(structure, placement, files=files, lengths=lengths)
         run |= {"config": {"photos": str(photos), **asdict(config), "known": asdict(known), "up": up}}
         run |= {"up": scene.up, "warnings": messages, "seconds": round(time.perf_counter() - start, 1)}

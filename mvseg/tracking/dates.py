@@ -5,7 +5,6 @@ from __future__ import annotations
 import datetime
 import math
 import re
-import warnings
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -16,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.errors import InputError, InputWarning
+from mvseg.errors import InputError, collect_warnings
 from mvseg.reconstruction.shapes import best_shape
 from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, cell_normals
 from mvseg.reconstruction.voxels import VoxelGrid
@@ -119,7 +118,7 @@ def read_date(folder: Path, time: str | float, *, pictures: int = 0) -> PlantOnD
         InputError: there is no result, it has no surfaces (`mvseg match` measures none), or its files are broken.
     """
     folder = find_result(folder)
-    with warnings.catch_warnings(action="ignore", category=InputWarning):  # of cameras, which nobody needs here
+    with collect_warnings():  # of cameras, which nobody needs here
         result = load_result(folder)
     if result.traits is None:
         raise InputError(f"{folder}: has ids but no surfaces, run mvseg infer or mvseg batch with these masks first")
