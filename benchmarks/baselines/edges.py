@@ -6,6 +6,11 @@ import torch
 from torch import Tensor
 
 from mvseg.matching.affinity import Affinity
+from mvseg.matching.config import MatchConfig
+from mvseg.matching.match import matching_of_ids
+from mvseg.matching.result import Matching
+from mvseg.matching.symnmf import cluster_weights
+from mvseg.regions import Regions
 
 
 def edge_graph(pairs: Tensor, num_regions: int) -> Affinity:
@@ -18,3 +23,16 @@ def edge_graph(pairs: Tensor, num_regions: int) -> Affinity:
     """
     edges = pairs.sort(1).values.unique(dim=0)
     return Affinity(edges, torch.ones(len(edges), device=pairs.device), num_regions)
+
+
+def match_graph(affinity: Affinity, regions: Regions, config: MatchConfig, *, method: str) -> Matching:
+    """Cluster any graph of the regions with SymNMF, |k| by Eq. 7.
+
+    Args:
+        affinity: the graph of D regions.
+        regions: whose numbers per view set the default range for the number of instances.
+        config: num_instances, search_range, num_restarts and seed are used; the rest concerns the epipolar weights.
+        method: the `MatchReport.method` of the result.
+    """
+    clustering = cluster_weights(affinity.to_dense(), regions.num_per_view, config)
+    return matching_of_ids(clustering.instance_ids, regions, affinity, method=method)

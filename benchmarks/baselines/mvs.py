@@ -6,11 +6,11 @@ import torch
 from torch import Tensor
 
 from benchmarks.baselines.dense_points import DensePoints
-from benchmarks.baselines.edges import edge_graph
+from benchmarks.baselines.edges import edge_graph, match_graph
 from mvseg.errors import InputError
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match import check_views, match_graph
+from mvseg.matching.match import check_views
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions
 from mvseg.scene import Cameras, Scene

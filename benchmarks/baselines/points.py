@@ -5,10 +5,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from benchmarks.baselines.edges import edge_graph
+from benchmarks.baselines.edges import edge_graph, match_graph
 from mvseg.matching.affinity import Affinity
 from mvseg.matching.config import MatchConfig
-from mvseg.matching.match import check_views, match_graph
+from mvseg.matching.match import check_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.matching.result import Matching
 from mvseg.regions import Regions

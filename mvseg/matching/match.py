@@ -140,19 +140,6 @@ def _factorise(regions: Regions, graph: ViewGraph, _: Clusters | None, *, config
     return graph.part(Clusters.of(clustering.instance_ids.cpu().numpy()[graph.node]))
 
 
-def match_graph(affinity: Affinity, regions: Regions, config: MatchConfig, *, method: str) -> Matching:
-    """Cluster any graph of the regions with SymNMF, |k| by Eq. 7.
-
-    Args:
-        affinity: the graph of D regions.
-        regions: whose numbers per view set the default range for the number of instances.
-        config: num_instances, search_range, num_restarts and seed are used; the rest concerns the epipolar weights.
-        method: the `MatchReport.method` of the result.
-    """
-    clustering = cluster_weights(affinity.to_dense(), regions.num_per_view, config)
-    return matching_of_ids(clustering.instance_ids, regions, affinity, method=method)
-
-
 def matching_of_ids(instance_ids: Tensor, regions: Regions, graph: Affinity, *, method: str) -> Matching:
     """The matching for ids in [1, K] or -1 from a graph; the scores are mean weights within clusters."""
     masks = Masks.of(regions, instance_ids, mean_affinity(graph, instance_ids, regions))

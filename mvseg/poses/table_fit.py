@@ -29,7 +29,6 @@ Ints = NDArray[np.int64]
 
 HALF = 0.5  # OpenCV's pixels start at -0.5
 NUM_LENS = 7  # numbers of a lens: f in widths of the photo; cx and cy from its middle, in widths; k1, k2, p1, p2
-NUM_CAMERA = NUM_LENS + 6  # and its pose
 # How far lenses of phones, cameras and webcams are from a pinhole with its axis in the middle: standard deviations of
 # the numbers of a lens but f. Most of what a flat board leaves open is the principal point's: at twice that, f is half
 # as sure; a third of the others changes its deviation by less than a twentieth.

@@ -107,10 +107,6 @@ class ClusterScores:
         found = _look_up(self._coverages, keys, lambda new: self._cover(clusters, np.array(new)))
         return np.stack(found) if found else np.zeros((0, len(clusters.ids)), np.float32)
 
-    def covered_clusters(self) -> list[Ints]:
-        """The members of every cluster whose coverages were asked for: all that a search has seen."""
-        return [np.frombuffer(key, np.int64) for key in self._coverages]
-
     def own(self, clusters: Clusters) -> Floats:
         """(D,) score of each region in its own cluster, its own view left out."""
         members = clusters.members

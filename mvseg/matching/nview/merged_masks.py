@@ -13,8 +13,6 @@ from mvseg.matching.nview.cluster_scores import ClusterScores
 from mvseg.matching.partition import Clusters
 from mvseg.regions import Regions
 
-Ints = NDArray[np.int64]
-
 
 def find_merged(scores: ClusterScores, clusters: Clusters, regions: Regions) -> tuple[MergedMask, ...]:
     """Masks that cover two instances: two clusters explain disjoint parts of them.
