@@ -16,14 +16,14 @@ from mvseg.scene import Cameras, Scene
 
 Floats = NDArray[np.float64]
 
-DEPTHS = np.geomspace(0.02, 500, 80)  # of candidate points, in the median distance of two cameras
-GRID = (0.25, 0.5, 0.75)  # of the photo's width and height: the rays with the candidate points
-MOST_SOURCES, POINTS_AT_ONCE = 32, 4096  # cameras whose rays have candidate points; bounds the memory
+DEPTHS = np.geomspace(0.02, 500, 80)  # depths of candidate points, in the median distance of two cameras
+GRID = (0.25, 0.5, 0.75)  # places of the rays with the candidate points, as shares of the photo's width and height
+MOST_SOURCES, POINTS_AT_ONCE = 32, 4096  # cameras with such rays, at most; points at once, which bounds the memory
 ALL, MOST = 0.9, 0.6  # share of the cameras that look at one point: with right poses; without doubt about them
-WIDER = 4  # times the angle between the cameras, from which another interpretation of the poses is better
-FIELD_OF_VIEW = (2.0, 140.0)  # degrees, of the photo's diagonal, that lenses without distortion have
-OFF_CENTER = 0.2  # of width and height; a principal point farther off belongs to another photo
-SQUARE = 1.2  # quotient of the focal lengths
+WIDER = 4  # factor of the angle between cameras from which another reading of the poses is the better one
+FIELD_OF_VIEW = (2.0, 140.0)  # least and largest field of view of lenses without distortion, degrees, diagonal
+OFF_CENTER = 0.2  # distance of the principal point from the middle, as a share of the side, from which it is wrong
+SQUARE = 1.2  # quotient of the focal lengths along x and y, at most
 FAR = 8.0  # distance of a camera from the middle of the others, in their median distance
 UNITS = {1000: "millimetres and metres", 100: "centimetres and metres", 10: "millimetres and centimetres"}
 GAP, ALIKE = 3.0, 2.0  # quotients of lengths of t between which two units may lie; of distances of cameras in one unit

@@ -24,19 +24,19 @@ from mvseg.verification.numbers import CHOICE, EVIDENCE
 
 Bools = NDArray[np.bool_]
 
-DIGITS = 6  # of what an answer changes: what differs less is a tie, on every processor
-LEAST_DOUBT = 0.3  # what is surer is not asked
-MOST_DOUBTS = 200  # of which a page asks a few, and the others where a person clicks
+DIGITS = 6  # digits of what an answer changes: smaller differences are ties, on every processor
+LEAST_DOUBT = 0.3  # doubt from which a question is asked
+MOST_DOUBTS = 200  # questions of a page, at most: it asks a few itself, and the others where a person clicks
 OPEN = 0.5  # unhidden fraction of a surface of which a view should show a mask, at least; see `EVIDENCE.open_pixels`
-EMPTY = 0.6  # of that part, outside all masks: the mask is missing
-SIMILAR = 0.4  # IoU of that part with a mask of another leaf, that may be it
-SMOOTH = 1.5  # pixels that a proposed outline may be off
-LEAST_CHANCE = 0.1  # of a candidate that was not chosen, to be a leaf, from which it is asked about
-MISSING, COVERED, LONE = 0.8, 0.9, 0.6  # doubt of what cannot be told from scores, at most
+EMPTY = 0.6  # share of that part outside of all masks from which the mask is missing
+SIMILAR = 0.4  # IoU of that part with a mask of another leaf from which the mask may be the missing one
+SMOOTH = 1.5  # pixels by which a proposed outline may be off
+LEAST_CHANCE = 0.1  # chance of being a leaf from which a candidate that was not chosen is asked about
+MISSING, COVERED, LONE = 0.8, 0.9, 0.6  # largest doubts of what scores do not tell
 UNMASKED = 0.8  # doubt of a place that has the colour of leaves, and no mask
-HALF = 0.5  # of a mask, that such a place beside it has at least: the mask may show half a leaf
+HALF = 0.5  # size of such a place beside a mask, as a share of the mask, from which this may show half a leaf
 LEAST_HALVES = 3  # photos from which that is asked: one mask may as well touch another leaf
-MOST_PLACES = 12  # that one question shows
+MOST_PLACES = 12  # places that one question shows, at most
 
 Kind = Literal["place", "half", "match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
 FIRST = ("place", "half")  # what nothing but an outline mends, and all photos follow

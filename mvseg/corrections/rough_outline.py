@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from mvseg.errors import InputError
 
-LONGEST = 480  # pixels of the part that is segmented
-AROUND = 0.35  # of the rough outline's size, that is segmented beside it
-ROUNDS = 5
-LEAST = 0.05  # of the rough outline's pixels, that the leaf must have
-TOLERANCE = 1.0  # pixels of the part, of the outline
+LONGEST = 480  # pixels of the longer side of the part that is segmented
+AROUND = 0.35  # margin around the rough outline that is segmented, too, as a share of its size
+ROUNDS = 5  # of GrabCut
+LEAST = 0.05  # size of the leaf, as a share of the rough outline's pixels, at least
+TOLERANCE = 1.0  # pixels of the part by which the outline may be off
 
 Points = NDArray[np.float64]
 

@@ -70,7 +70,7 @@ def match_regions(
 def _match(
     regions: Regions, cameras: Cameras, config: MatchConfig, *, residual_px: int | None, links: Links
 ) -> Matching:
-    links.components(len(regions))
+    links.components(len(regions))  # raises where links contradict each other, before anything takes time
     if residual_px is not None and residual_px not in NVIEW.dilations:
         raise InputError(f"residual_px is {residual_px}, expected one of {', '.join(map(str, NVIEW.dilations))}")
     cameras = cameras.to(regions.device)

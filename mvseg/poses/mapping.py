@@ -21,8 +21,8 @@ from mvseg.poses.pairs import Pair, choose_pairs, pairs_with
 from mvseg.poses.photo_files import PhotoFile, calibrated_size
 from mvseg.system.running import progress_bar
 
-FEW_FEATURES = 300  # of a photo, below which it has too little texture
-ENOUGH = 0.9  # of the photos: with fewer, all is done again with more features; at 1, one blurred photo costs minutes
+FEW_FEATURES = 300  # number of features below which a photo has too little texture
+ENOUGH = 0.9  # share of the photos below which all is done again with more features; at 1, a blurred one costs minutes
 PHOTOS = "photos"  # folder of the photos that COLMAP sees
 NEXT_STEPS = (
     "more photos with more overlap (every 5 to 10 degrees), sharper and brighter ones, a textured background or table "

@@ -164,8 +164,9 @@ def _is_seen_around(matched: Masks, cameras: Cameras) -> bool:
 def _without(proposals: Masks, gone: Masks | None) -> Bools:
     """(R,) bool: the proposals that are not masks which a person took away, by `EVIDENCE.fits`."""
     stays = np.ones(len(proposals), bool)
-    for row in range(0 if gone is None else len(gone)):
-        assert gone is not None
+    if gone is None:
+        return stays
+    for row in range(len(gone)):
         mask = gone.regions.placed(row)
         for other in (proposals.view_index == gone.view_index[row]).nonzero()[:, 0].tolist():
             stays[other] &= proposals.regions.placed(other).iou(mask) <= EVIDENCE.fits

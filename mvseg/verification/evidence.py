@@ -65,8 +65,8 @@ class Evidence:
 
     Attributes:
         visible: (D, K) IoU with the part that nothing nearer hides.
-        claimed: (D, K) the same, where of the hidden part that counts as visible which the mask itself shows: photos
-            know better what lies in front.
+        claimed: (D, K) the same, but hidden pixels that the mask shows count as visible: photos know better what
+            lies in front.
         inside: (D, K) share of the mask that lies in the part that nothing nearer hides.
         within: (D, K) share of the mask that lies in the surface as if nothing hid that.
         share: (V, K) of what the view shows of the surface, that nothing hides; 0 where it shows nothing.

@@ -7,13 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, PatchSize, measure_patch, patch_grid, patch_prior
+from mvseg.reconstruction.surface.leaf_patch import (
+    FIT_GRID,
+    MIDRIB,
+    Floats,
+    PatchSize,
+    measure_patch,
+    patch_grid,
+    patch_prior,
+)
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack, places_of_views
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
-# A patch is drawn at so many rows and columns; at the second where it is still far from the masks.
-FIT_GRID, FAR_GRID = (36, 9), (20, 5)
+FAR_GRID = (20, 5)  # rows and columns of a patch that is still far from the masks; otherwise `FIT_GRID`
 # Steps from a rough start, in two halves, and from a start that is nearly right (technical limits).
 FIRST_HALF, SECOND_HALF, NUM_STEPS = range(5), range(5, 10), 7
 FAR_REACH, NEAR_REACH = 14.0, 6.0  # a sample looks for an edge within so many pixels, at first and in the end

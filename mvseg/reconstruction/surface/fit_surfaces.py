@@ -17,7 +17,6 @@ from mvseg.reconstruction.spread_views import spread_directions, spread_views
 from mvseg.reconstruction.surface.fit_patch import (
     FAR_GRID,
     FIRST_HALF,
-    FIT_GRID,
     SECOND_HALF,
     PatchFit,
     approach_patch,
@@ -25,7 +24,7 @@ from mvseg.reconstruction.surface.fit_patch import (
 )
 from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
-from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_patch import FIT_GRID, MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, cell_normals, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks

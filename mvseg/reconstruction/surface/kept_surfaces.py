@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Any
+from collections.abc import Mapping
+from functools import partial
+from types import MappingProxyType
 
 from torch import Tensor
 
-from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.fit_surfaces import MOST_VIEWS, fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import now_running
 
 
-def fit_kept(regions: Regions, instance_ids: Tensor, cameras: Cameras, **how: Any) -> dict[int, LeafSurface]:
+def fit_kept(
+    regions: Regions,
+    instance_ids: Tensor,
+    cameras: Cameras,
+    *,
+    starts: Mapping[int, LeafSurface] = MappingProxyType({}),
+    most_views: int = MOST_VIEWS,
+    is_rough: bool = False,
+) -> dict[int, LeafSurface]:
     """As `fit_surfaces`; where the run keeps what it computed, see `running`, only the instances that it has not fitted
     yet to the same masks, with the same cameras and options. (A surface also depends a little on what may hide it: it
     is that of the first time.)
@@ -24,21 +34,24 @@ def fit_kept(regions: Regions, instance_ids: Tensor, cameras: Cameras, **how: An
         regions: D regions.
         instance_ids: (D,) int64, from 1 on; -1 = no instance.
         cameras: V cameras.
-        how: options of `fit_surfaces`. `starts` say where a fit begins, not what it finds.
+        starts, most_views, is_rough: see `fit_surfaces`; `starts` say where a fit begins, not what it finds.
 
     Returns:
         {instance id: surface} for every instance.
     """
+    fit = partial(
+        fit_surfaces, regions, instance_ids, cameras, starts=starts, most_views=most_views, is_rough=is_rough
+    )
     kept = now_running().kept
     if kept is None:
-        return fit_surfaces(regions, instance_ids, cameras, **how)
-    fitted_as = json.dumps([_digest(cameras.px_from_world), {k: how[k] for k in sorted(how) if k != "starts"}])
+        return fit()
+    fitted_as = json.dumps([_digest(cameras.px_from_world), most_views, is_rough])
     ids = instance_ids[instance_ids > 0].unique().tolist()
     names = {each: f"{fitted_as} {name_instance(regions, instance_ids == each)}" for each in ids}
     known = {each: kept[name] for each, name in names.items() if name in kept}
     if ids and len(known) == len(ids):
         return known
-    surfaces = fit_surfaces(regions, instance_ids, cameras, known=known, **how)
+    surfaces = fit(known=known)
     kept.update({names[each]: surface for each, surface in surfaces.items()})
     return surfaces
 

@@ -22,6 +22,7 @@ Ints = NDArray[np.int64]
 COUNTS = (7, 12, 4, 3)  # m, Q, R, S have so many coefficients (a definition); fewer for Q cannot follow lobes
 NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
+FIT_GRID = (36, 9)  # rows and columns of the points at which a patch is fitted, and measured for that (a definition)
 
 # The prior: each of these is expected to be none, with this standard deviation in leaf lengths (BEND, SWAY, SPEED) or
 # half-widths.
@@ -131,8 +132,8 @@ class PatchSize:
 
 def measure_patch(coefficients: Floats) -> PatchSize:
     """Length and largest half-width of a patch, world units."""
-    points = patch_grid(36, 9).points(coefficients)
-    length = np.linalg.norm(np.diff(points[:, 4], axis=0), axis=1).sum()
+    points = patch_grid(*FIT_GRID).points(coefficients)
+    length = np.linalg.norm(np.diff(points[:, FIT_GRID[1] // 2], axis=0), axis=1).sum()
     width = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(1).max()
     return PatchSize(length=float(length), half_width=float(width / 2))
 
