@@ -18,6 +18,7 @@ from mvseg.formats.label_png import read_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.regions import Regions
 from mvseg.scene import Scene
+from mvseg.system import worker_pool
 
 ROOT = Path(__file__).parent.parent
 if "OMP_NUM_THREADS" not in os.environ:
@@ -35,6 +36,14 @@ def one_parser() -> Iterator[None]:
     """The parser of the command line is built once: that takes longer than most commands of the tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(command, "build_parser", cache(command.build_parser))
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def one_worker() -> Iterator[None]:
+    """Commands fit surfaces in the process of the test: another one would load all libraries for some leaves."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(worker_pool, "default_workers", lambda: 1)
         yield
 
 

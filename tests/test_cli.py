@@ -33,7 +33,6 @@ from mvseg.formats.label_png import read_label_png, write_label_png
 from mvseg.formats.scene_folder import load_masks, load_scene
 from mvseg.matching.match import match_masks
 from mvseg.matching.result import Matching
-from mvseg.system.worker_pool import default_workers
 from scene_folders import HEIGHT, WIDTH, K, arc_pose, cut_file, edit_rig, rig_content, write_image, write_scene
 
 ROOT = Path(__file__).parent.parent
@@ -1149,11 +1148,12 @@ def test_merged_masks_are_cut_when_asked_for(tmp_path: Path, capsys: pytest.Capt
     assert np.mean(labels[true == 10] == second) > 0.8
 
 
-@pytest.mark.parametrize(("given", "expected"), [(["--num_workers", "3"], 3), ([], default_workers())])
+@pytest.mark.parametrize(("given", "expected"), [(["--num_workers", "3"], 3), ([], 4)])
 def test_infer_fits_in_so_many_processes(
     given: list[str], expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[int] = []
+    monkeypatch.setattr("mvseg.system.worker_pool.default_workers", lambda: 4)
     monkeypatch.setattr("mvseg.runs.one_scene.run_one_scene", lambda *_, num_workers, **__: asked.append(num_workers))
     assert main(["infer", str(tmp_path), *given]) == 0
     assert asked == [expected]

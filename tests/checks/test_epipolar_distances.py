@@ -165,6 +165,7 @@ def test_epipolar_distances_are_pixels(demo_scene: Scene) -> None:
     np.testing.assert_allclose(epipolar_distances(moved, F), 6 / np.sqrt(2), rtol=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.shared_data
 def test_real_photos_accuse_wrong_focal_lengths_only(shared_data: Path) -> None:
     scene = load_scene(shared_data / "basil-0729")

@@ -344,6 +344,7 @@ def test_folders_that_hold_nothing(tmp_path: Path) -> None:
 # --- real plants
 
 
+@pytest.mark.slow
 @pytest.mark.shared_data
 def test_real_rosettes_are_sound_and_the_same_from_coco(shared_data: Path, tmp_path: Path) -> None:
     folder = shared_data / "rosettes-cvppp-a1"
