@@ -112,6 +112,13 @@ def test_imports_go_one_way() -> None:
     assert {module: rooms for module, rooms in forbidden.items() if rooms} == {}
 
 
+def test_every_module_is_imported_by_another() -> None:
+    """But for those of verbs, which `cli.command` imports by their short names."""
+    imported = {name for source in MODULES.values() for name in re.findall(r"(?:from|import) (mvseg[\w.]+)", source)}
+    doors = {module for module in MODULES if module.endswith("__init__") or room_of(module) == "cli"}
+    assert MODULES.keys() - doors - imported == set()
+
+
 @pytest.mark.parametrize(
     ("line", "room"),
     [
