@@ -4,9 +4,9 @@ Tables and results of real plants are those of `benchmarks/tracking.py results`;
 of few leaves and of 12 to 30. Of two dates at most three apart, a pose is right where more than half of the leaves that
 it pairs are the same. Prints, each of greatest likelihood,
 
-- `TEMPER` of `mvseg/tracking/align.py`, by the poses of two dates alone: that a right one is taken among all;
-- `GUESS` of the same file, by the poses of all dates placed together; beside them 60 pairs of dates of different plants
-  of each kind, where no pose is right: they are rare, but must be noticed;
+- `ALIGN.temper` of `mvseg/tracking/numbers.py`, by the poses of two dates alone: that a right one is taken among all;
+- `GUESS` of `mvseg/tracking/align.py`, by the poses of all dates placed together; beside them 60 pairs of dates of
+  different plants of each kind, where no pose is right: they are rare, but must be noticed;
 - `CALIBRATION` of `mvseg/tracking/associate.py`, by links, with the chances of poses as they are in the code.
 """
 
@@ -28,9 +28,10 @@ from benchmarks.tracking import read_places, see_series
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import Alignment, Habit, Poses, judge, link_gain, list_poses, refine
 from mvseg.tracking.associate import link_leaves
-from mvseg.tracking.compare import MOST_GAP, compare_dates
+from mvseg.tracking.compare import compare_dates
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.leaves import Leaves, Pair, leaves_of
+from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.place_dates import place_dates
 
 NUM_OTHER, RIDGE, EPS = 60, 0.01, 1e-6
@@ -52,7 +53,7 @@ def look(seen: Seen) -> Looked:
     pairs = {
         (earlier, later): Pair.of(leaves[earlier], leaves[later], days=abs(times[later] - times[earlier]) or 2.0,
                                   knows_up=knows_up)
-        for later in range(len(leaves)) for earlier in range(max(0, later - MOST_GAP), later)
+        for later in range(len(leaves)) for earlier in range(max(0, later - LINKING.most_gap), later)
     }  # fmt: skip
     return {place: list_poses(pair) for place, pair in pairs.items() if pair.fewer}
 
@@ -146,7 +147,7 @@ def main() -> None:
     groups += [[see_series(spec) for spec in specs] for specs in (small_specs(), draw_specs(4, seed=3))]
     dated: list[list[list[Dated]]] = [[list(zip(*each, strict=True)) for each in group] for group in groups]
     plants = [(seen, look(seen)) for group in dated for seen in map(see, group)]
-    print("TEMPER =", round(fit_temper(plants), 2), flush=True)
+    print("temper =", round(fit_temper(plants), 2), flush=True)
     rng, others = np.random.default_rng(0), []
     for group in [group for group in dated if len(group) > 1] * NUM_OTHER:
         one, other = (group[index] for index in rng.choice(len(group), 2, replace=False))

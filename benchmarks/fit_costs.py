@@ -29,10 +29,10 @@ from benchmarks.tracking import Labels, labels_of, measure, read_places, see_ser
 from mvseg.simulation.families import FAMILIES
 from mvseg.simulation.series import SeriesSpec, draw_specs
 from mvseg.tracking.align import _fit
-from mvseg.tracking.compare import MOST_GAP
 from mvseg.tracking.dates import PlantOnDate
 from mvseg.tracking.fitted_costs import LINKS, POSES, Differences, Scales, costs_of, fitted_costs
 from mvseg.tracking.leaves import Pair, leaves_of
+from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.track import track_leaves
 
 SMALL, RIDGE = 16, 3e-3
@@ -58,7 +58,7 @@ def known_pairs(dates: list[PlantOnDate], truth: Labels) -> list[Known]:
     true = [np.array(ids, int)[each.index] for ids, each in zip(truth, leaves, strict=True)]
     knows_up, found = all(date.knows_up for date in dates), []
     for later in range(len(dates)):
-        for earlier in range(max(0, later - MOST_GAP), later):
+        for earlier in range(max(0, later - LINKING.most_gap), later):
             one, other = (np.flatnonzero(true[date] > 0) for date in (earlier, later))
             ids = true[earlier][one], true[later][other]
             days = dates[later].time - dates[earlier].time

@@ -1,6 +1,6 @@
 """What does a third more or less of a room's numbers change? `python benchmarks/thirds.py --cache DIR [--room NAME]`
 
-Numbers are those of a room's `numbers.py`, or at the head of its modules; one at a time is divided and
+Numbers are those of a room's `numbers.py`; one at a time is divided and
 multiplied by 1.33, whole numbers change by 1 at least. The scenes are development plants.
 
 Of matching, with degraded masks: a line says of each scene how many ids of "nview" and of "one-per-view" change, by how
@@ -17,18 +17,14 @@ true but for one scene, where they are those of "nview".
 from __future__ import annotations
 
 import argparse
-import ast
-import importlib
-import inspect
-import pkgutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
-from types import FunctionType, ModuleType
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -39,8 +35,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 
 import mvseg.matching.numbers
-import mvseg.reconstruction
-import mvseg.reconstruction.shapes
+import mvseg.reconstruction.numbers
 import mvseg.verification.numbers
 from benchmarks.corrections import Case, detect_case, render
 from benchmarks.drawn_leaves import draw_from, open_views
@@ -94,23 +89,12 @@ def scaled(value: Any, factor: float) -> Any:
     return value * factor
 
 
-def list_numbers(package: ModuleType) -> Iterator[tuple[ModuleType, str]]:
-    """The numbers at the head of the modules of a package."""
-    for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}."):
-        module = importlib.import_module(found.name)
-        for statement in parse(module).body:
-            for target in statement.targets if isinstance(statement, ast.Assign) else ():
-                for name in target.elts if isinstance(target, ast.Tuple) else [target]:
-                    if isinstance(name, ast.Name) and is_number(getattr(module, name.id)):
-                        yield module, name.id
-
-
 def is_number(value: Any) -> bool:
     """Whether it is a number, or several."""
     return all(map(is_number, value)) if isinstance(value, tuple) else isinstance(value, int | float)
 
 
-def list_fields(numbers: ModuleType) -> Iterator[tuple[str, Any, str]]:
+def list_numbers(numbers: ModuleType) -> Iterator[tuple[str, Any, str]]:
     """(name of a group, group, name of a number) of a room's `numbers.py`."""
     for key, group in vars(numbers).items():
         if is_dataclass(group) and not isinstance(group, type):
@@ -124,86 +108,20 @@ def changed(group: Any, **values: Any) -> Iterator[None]:
     try:
         for name, value in values.items():
             object.__setattr__(group, name, value)  # frozen for everybody else
+        forget()
         yield
     finally:
         for name, value in before.items():
             object.__setattr__(group, name, value)
+        forget()
 
 
-@contextmanager
-def changed_head(module: ModuleType, name: str, value: Any) -> Iterator[None]:
-    """A number with another value: wherever it was imported, in defaults, and in the numbers that are computed from it.
-
-    What functions remember is forgotten.
-    """
-    before = getattr(module, name)
-    holders = [each for key, each in sys.modules.items() if key.startswith("mvseg.") and vars(each).get(name) is before]
-    functions = [each for holder in holders for each in list_defaults(holder, name)]
-    kept = [(function, function.__defaults__, function.__kwdefaults__) for function, _ in functions]
-    with ExitStack() as derived:
-        try:
-            for holder in holders:
-                setattr(holder, name, value)
-            for function, node in functions:
-                set_defaults(function, node.args)
-            for other, again in list_derived(module, name):
-                derived.enter_context(changed_head(module, other, again))
-            forget(holders)
-            yield
-        finally:
-            for holder in holders:
-                setattr(holder, name, before)
-            for function, positional, named in kept:
-                function.__defaults__, function.__kwdefaults__ = positional, named
-            forget(holders)
-
-
-def list_defaults(module: ModuleType, name: str) -> Iterator[tuple[FunctionType, ast.FunctionDef]]:
-    """Functions and methods of a module whose defaults name a number."""
-    body = parse(module).body
-    classes = [each for each in body if isinstance(each, ast.ClassDef)]
-    for owner, statements in [(module, body), *((vars(module)[each.name], each.body) for each in classes)]:
-        for node in statements:
-            if isinstance(node, ast.FunctionDef):
-                function = inspect.unwrap(getattr(vars(owner)[node.name], "__func__", vars(owner)[node.name]))
-                defaults = [each for each in (*node.args.defaults, *node.args.kw_defaults) if each is not None]
-                if isinstance(function, FunctionType) and any(names(each, name) for each in defaults):
-                    yield function, node
-
-
-def set_defaults(function: FunctionType, args: ast.arguments) -> None:
-    function.__defaults__ = tuple(evaluate(each, function.__globals__) for each in args.defaults)
-    pairs = zip(args.kwonlyargs, args.kw_defaults, strict=True)
-    function.__kwdefaults__ = {k.arg: evaluate(v, function.__globals__) for k, v in pairs if v is not None}
-
-
-def list_derived(module: ModuleType, name: str) -> Iterator[tuple[str, Any]]:
-    """What else the head of a module computes from a number, and its value now."""
-    for statement in parse(module).body:
-        if isinstance(statement, ast.Assign) and names(statement.value, name):
-            (target,), value = statement.targets, evaluate(statement.value, vars(module))
-            pairs = zip(target.elts, value, strict=True) if isinstance(target, ast.Tuple) else [(target, value)]
-            for each, part in pairs:
-                if isinstance(each, ast.Name):
-                    yield each.id, part
-
-
-def forget(modules: list[ModuleType]) -> None:
+def forget() -> None:
+    """What functions remember was made with the numbers as they were."""
+    modules = [module for name, module in sys.modules.items() if name.startswith("mvseg.")]
     for each in [each for module in modules for each in vars(module).values()]:
         if hasattr(each, "cache_clear"):
             each.cache_clear()
-
-
-def parse(module: ModuleType) -> ast.Module:
-    return ast.parse(Path(str(module.__file__)).read_text(encoding="utf-8"))
-
-
-def names(expression: ast.expr, name: str) -> bool:
-    return any(isinstance(each, ast.Name) and each.id == name for each in ast.walk(expression))
-
-
-def evaluate(expression: ast.expr, where: dict[str, Any]) -> Any:
-    return eval(compile(ast.Expression(expression), "default", "eval"), where)
 
 
 def match_all(scenes: list[LabelledScene]) -> list[tuple[np.ndarray, ...]]:
@@ -234,22 +152,11 @@ def spec_of(num_views: int, num_leaves: int, plant: int = 0) -> SceneSpec:
     return next(spec for spec in specs if (spec.num_views, spec.num_leaves, plant_index(spec)) == wanted)
 
 
-def try_numbers(package: ModuleType, only: list[str] | None, compare: Callable[[], str]) -> None:
-    """Print what each number of a package changes, by what `compare` says while it is another."""
-    for module, name in list_numbers(package):
-        for factor in (1 / FACTOR, FACTOR) if only is None or name in only else ():
-            try:
-                with changed_head(module, name, scaled(getattr(module, name), factor)):
-                    said = compare()
-            except (ArithmeticError, LookupError, ValueError, RuntimeError) as error:
-                said = f"cannot be: {error}"
-            print(f"{module.__name__.rpartition('.')[2]} {name} x {factor:.2f}: {said}", flush=True)
-
-
-def try_fields(numbers: ModuleType, only: list[str] | None, compare: Callable[[Any], str]) -> None:
+def try_numbers(numbers: ModuleType, only: list[str] | None, compare: Callable[[Any], str]) -> None:
     """Print what each number of a `numbers.py` changes, by what `compare` says of its group while it is another."""
-    for key, group, name in list_fields(numbers):
-        for factor in (1 / FACTOR, FACTOR) if only is None or name in only else ():
+    for key, group, name in list_numbers(numbers):
+        is_tried = is_number(getattr(group, name)) and (only is None or name in only)
+        for factor in (1 / FACTOR, FACTOR) if is_tried else ():
             try:
                 with changed(group, **{name: scaled(getattr(group, name), factor)}):
                     said = compare(group)
@@ -261,7 +168,7 @@ def try_fields(numbers: ModuleType, only: list[str] | None, compare: Callable[[A
 def thirds_of_matching(args: argparse.Namespace) -> None:
     scenes = [load_maps(spec_of(*cell), args.cache) for cell in SCENES]
     before = match_all(scenes)
-    try_fields(mvseg.matching.numbers, args.numbers, lambda _: compare_matchings(before, match_all(scenes)))
+    try_numbers(mvseg.matching.numbers, args.numbers, lambda _: compare_matchings(before, match_all(scenes)))
 
 
 # --- verification
@@ -395,7 +302,7 @@ def thirds_of_verification(args: argparse.Namespace) -> None:
                 said.append(f"{trial.name} {count} masks, F1 {change[0]:+.3f}, PQ {change[1]:+.3f}")
         return " | ".join(said) or "nothing"
 
-    try_fields(mvseg.verification.numbers, args.numbers, compare)
+    try_numbers(mvseg.verification.numbers, args.numbers, compare)
 
 
 def judge(masks: Masks, trial: Trial) -> LeafMetrics:
@@ -418,7 +325,8 @@ def thirds_of_reconstruction(args: argparse.Namespace) -> None:
         fits = (each for each in specs if (each.num_views, each.num_leaves) == (num_views, num_leaves))
         scenes.append(load_maps(next(each for each in fits if family in (None, each.family)), args.cache))
     before = fit_all(scenes, args.masks)
-    try_numbers(mvseg.reconstruction, args.numbers, lambda: compare_leaves(before, fit_all(scenes, args.masks)))
+    again = partial(fit_all, scenes, args.masks)
+    try_numbers(mvseg.reconstruction.numbers, args.numbers, lambda _: compare_leaves(before, again()))
 
 
 def fit_all(scenes: list[LabelledScene], kind: str) -> np.ndarray:

@@ -3,7 +3,7 @@
     python -m benchmarks.thirds_of_tracking [TABLE RESULTS ...]
 
 TABLE and RESULTS are those of `benchmarks/tracking.py results`; beside them, simulated plants and two plants in one pot
-are tracked. Numbers are those at the head of the modules of `mvseg/tracking`; one at a time is divided and multiplied
+are tracked. Numbers are those of `mvseg/tracking/numbers.py`; one at a time is divided and multiplied
 by 1.33, whole numbers by 1 at least, and each number of several by itself. A line says of each series how many links
 come or go, by how much short and long change, and how far the probabilities of links move.
 """
@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 import torch
 
-import mvseg.tracking
-from benchmarks.thirds import FACTOR, changed_head, list_numbers, scaled
+import mvseg.tracking.numbers
+from benchmarks.thirds import FACTOR, changed, list_numbers, scaled
 from benchmarks.tracking import Labels, labels_of, measure, read_places, see_series, see_two_plants
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.dates import PlantOnDate
@@ -83,14 +83,14 @@ def main() -> None:
 
 def print_changes(every: Mapping[str, Series], numbers: list[str] | None = None) -> None:
     before = {name: track_series(series) for name, series in every.items()}
-    for module, name in list_numbers(mvseg.tracking):
-        for what, value in list_changes(getattr(module, name)) if numbers is None or name in numbers else ():
+    for key, group, name in list_numbers(mvseg.tracking.numbers):
+        for what, value in list_changes(getattr(group, name)) if numbers is None or name in numbers else ():
             try:
-                with changed_head(module, name, value):
+                with changed(group, **{name: value}):
                     said = [f"{key}: {compare_links(before[key], track_series(own))}" for key, own in every.items()]
             except (ArithmeticError, LookupError, ValueError) as error:
                 said = [f"cannot be: {error}"]
-            print(f"{module.__name__.rpartition('.')[2]} {name}{what} | " + " | ".join(said), flush=True)
+            print(f"{key}.{name}{what} | " + " | ".join(said), flush=True)
 
 
 if __name__ == "__main__":

@@ -20,8 +20,8 @@ from mvseg.system.file_hash import hash_files
 from mvseg.system.running import progress_bar
 from mvseg.tracking.config import Pots
 from mvseg.tracking.growth import measure_growth
+from mvseg.tracking.numbers import PAGE
 from mvseg.tracking.page import PAGE_FILE, write_index, write_page
-from mvseg.tracking.pictures import SIDE
 from mvseg.tracking.recorded import PlantResults, find_plant_links, record_plants
 from mvseg.tracking.tables import join_tables, write_tables
 from mvseg.tracking.track import track_leaves
@@ -135,7 +135,7 @@ def _track_plant(edits: Sequence[Edit], item: tuple[PlantResults, Path], *, pots
     """Track one plant and write its tables, and its page, into its place."""
     plant, place = item
     try:
-        dates = plant.read(pictures=SIDE if report else 0)
+        dates = plant.read(pictures=PAGE.side if report else 0)
         links, lost = find_plant_links(edits, dates)
         tracks = track_leaves(dates, links=links, pots=pots, plant=plant.plant)
     except InputError as error:

@@ -11,12 +11,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from mvseg.reconstruction.numbers import RAYS
 from mvseg.scene import Cameras
-
-SAME = np.radians(1.0)  # directions that differ by less than this crowd each other no more (a technical limit)
-# Axes meet in no point, as on a gantry, if the root mean square of their angles to the mean axis is less than this.
-PARALLEL = np.radians(2.0)
-TIE = 1e-6  # sums that differ by less than this share are equal, and the first one is taken (a technical limit)
 
 
 def spread_views(cameras: Cameras, most: int) -> Tensor:
@@ -40,7 +36,7 @@ def spread_directions(ways: NDArray[np.float64], most: int) -> NDArray[np.int64]
     """The same of directions (V, 3) from what is looked at to the cameras, unit vectors."""
     if len(ways) <= most:
         return np.arange(len(ways))
-    crowding = 1 / (((ways[:, None] - ways[None]) ** 2).sum(2) + SAME**2)
+    crowding = 1 / (((ways[:, None] - ways[None]) ** 2).sum(2) + RAYS.same**2)
     np.fill_diagonal(crowding, 0)
     return np.flatnonzero(_exchange(crowding, _drop(crowding, most)))
 
@@ -49,7 +45,7 @@ def _directions(cameras: Cameras) -> NDArray[np.float64]:
     """(V, 3) unit vectors from what the cameras look at to each of them."""
     axes, centers = cameras.R[:, 2], cameras.centers
     mean_axis, middle = axes.mean(0), centers.mean(0)
-    if 1 - mean_axis @ mean_axis < PARALLEL**2:
+    if 1 - mean_axis @ mean_axis < RAYS.parallel**2:
         target = middle + mean_axis * (centers - middle).norm(dim=1).square().mean().sqrt()
     else:
         target = cameras.nearest_point(torch.arange(len(cameras)), axes)
@@ -75,7 +71,7 @@ def _exchange(crowding: NDArray[np.float64], kept: NDArray[np.bool_]) -> NDArray
         load = crowding @ kept
         inside, outside = np.flatnonzero(kept), np.flatnonzero(~kept)
         change = load[outside] - load[inside, None] - crowding[np.ix_(inside, outside)]
-        if change.min() >= -TIE * load[inside].sum():
+        if change.min() >= -RAYS.tie * load[inside].sum():
             return kept
         goes, comes = np.unravel_index(_first_least(change.ravel()), change.shape)
         kept[inside[goes]], kept[outside[comes]] = False, True
@@ -84,4 +80,4 @@ def _exchange(crowding: NDArray[np.float64], kept: NDArray[np.bool_]) -> NDArray
 def _first_least(values: NDArray[np.float64]) -> int:
     """The index of the least value, or of the first that is nearly as small."""
     least = values.min()
-    return int(np.flatnonzero(values <= least + TIE * abs(least))[0])
+    return int(np.flatnonzero(values <= least + RAYS.tie * abs(least))[0])

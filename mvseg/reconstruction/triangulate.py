@@ -8,14 +8,12 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.reconstruction.numbers import RAYS
 from mvseg.scene import Cameras
 
 Floats = NDArray[np.float64]
 Key = TypeVar("Key", bound=Hashable)
 
-# A point is left out if it is missed by this or more in a view, in widths of the photo: a mistake, or it moved.
-MOST_ERROR = 0.003
-LEAST_ANGLE = np.radians(1.0)  # two rays make a point if the angle between them is at least this
 
 
 def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, Floats]]]) -> dict[Key, Floats]:
@@ -26,8 +24,8 @@ def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, 
         seen: {point: (view, (2,) pixels) wherever it is seen}, at most once in a view.
 
     Returns:
-        {point: (3,) world coordinates}; points seen in a single view, or not within `MOST_ERROR` in each, are left out,
-        and so are those whose rays are all nearly parallel.
+        {point: (3,) world coordinates}; points seen in a single view, or not within `RAYS.most_error` in each, are left
+        out, and so are those whose rays are all nearly parallel.
     """
     centers, sizes = cameras.centers.cpu().numpy(), cameras.sizes.cpu().numpy()
     px_from_world = cameras.px_from_world.cpu().numpy()
@@ -42,8 +40,8 @@ def triangulate_points(cameras: Cameras, seen: Mapping[Key, Sequence[tuple[int, 
         error = np.linalg.norm(image[:, :2] / image[:, 2:] - px, axis=1)
         rays = point - centers[views]
         rays /= np.linalg.norm(rays, axis=1, keepdims=True)
-        is_steady = bool((rays @ rays.T).min() < np.cos(LEAST_ANGLE))
-        if is_steady and (error < MOST_ERROR * sizes[views, 0]).all():
+        is_steady = bool((rays @ rays.T).min() < np.cos(RAYS.least_angle))
+        if is_steady and (error < RAYS.most_error * sizes[views, 0]).all():
             points[key] = point
     return points
 

@@ -13,9 +13,8 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from mvseg.reconstruction.numbers import VOXELS
 from mvseg.scene import nearest_point
-
-AT_ONCE = 2_000_000  # so many balls and masks are compared at once (a technical limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,7 +142,7 @@ def halve_cells(silhouettes: Silhouettes, threshold: float) -> Iterator[Cells]:
     cells = silhouettes.cube
     while True:
         cells = cells.divide(2)
-        radius, step = cells.size * 0.75**0.5, max(1, AT_ONCE // len(silhouettes))
+        radius, step = cells.size * 0.75**0.5, max(1, VOXELS.at_once // len(silhouettes))
         votes = [silhouettes.may_meet(part, radius).sum(0) for part in cells.centers.split(step)]
         is_left = torch.cat(votes) > threshold * len(silhouettes) + 1e-6
         cells = Cells(cells.indices[is_left], cells.corner, cells.size)

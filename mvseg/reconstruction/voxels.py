@@ -14,15 +14,11 @@ from torch import Tensor
 
 from mvseg.errors import InputError, check_arguments, warn
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.numbers import VOXELS
 from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
-
-SEARCH_CELLS = 24  # the search for the box of an instance ends at so many cells along it
-MAX_CELLS = 100_000  # or when there are so many cells (a technical limit)
-MAX_VOXELS = 200_000_000  # a grid has at most so many voxels (a technical limit)
-CRUMB = 0.02  # a piece is a crumb if it has less than this share of the voxels of the largest piece
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +65,15 @@ class VoxelGrid:
         """
         return len(self._pieces()[1])
 
-    def without_crumbs(self, least_share: float = CRUMB) -> VoxelGrid:
-        """The grid without pieces that have fewer voxels than this share of the largest one.
+    def without_crumbs(self) -> VoxelGrid:
+        """The grid without pieces that have fewer voxels than `VOXELS.crumb` of the largest one.
 
         Their votes become 0, so that they are gone from points, volume and mesh alike.
         """
         piece, sizes = self._pieces()
-        if not len(sizes) or sizes.min() >= least_share * sizes.max():
+        if not len(sizes) or sizes.min() >= VOXELS.crumb * sizes.max():
             return self
-        is_crumb = np.append(False, sizes < least_share * sizes.max())[piece]
+        is_crumb = np.append(False, sizes < VOXELS.crumb * sizes.max())[piece]
         return replace(self, votes=self.votes.masked_fill(torch.from_numpy(is_crumb).to(self.votes.device), 0))
 
     def _pieces(self) -> tuple[np.ndarray, np.ndarray]:
@@ -189,9 +185,9 @@ def back_project(
     size = config.voxel_size or float(((high - low).prod() / config.voxel_budget) ** (1 / 3))
     first, last = (low / size).floor(), (high / size).ceil()
     shape = (last - first).long().clamp(min=1)
-    if float((last - first).prod()) > MAX_VOXELS:
+    if float((last - first).prod()) > VOXELS.max_voxels:
         asked = int((last - first).prod())
-        raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {MAX_VOXELS}")
+        raise InputError(f"a voxel size of {size:g} asks for {asked} voxels, expected at most {VOXELS.max_voxels}")
     axes = [(first[a] + 0.5 + torch.arange(int(shape[a])).to(low)) * size for a in range(3)]
     full = None if config.seen_share == 0 or free is None else [free[view].to(members.device) for view in views]
     frames = None if full is None else Silhouettes(tuple(full), matrices)
@@ -252,8 +248,8 @@ def _is_in(mask: Tensor, px_from_world: Tensor, axes: list[Tensor]) -> Tensor:
 def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, Tensor] | None:
     """Corners (3,), (3,) of a box that holds every point whose share of masks exceeds the threshold.
 
-    Cells are halved until the box of those that are left is `SEARCH_CELLS` cells long and hardly shrinks any more. None
-    when no cell is left.
+    Cells are halved until the box of those that are left is `VOXELS.search_cells` cells long and hardly shrinks any
+    more. None when no cell is left.
     """
     before = torch.inf
     for cells in halve_cells(silhouettes, threshold):
@@ -261,8 +257,8 @@ def _bounding_box(silhouettes: Silhouettes, threshold: float) -> tuple[Tensor, T
             return None
         low, high = cells.box
         volume = float((high - low).prod())
-        is_fine = float((high - low).max()) >= SEARCH_CELLS * cells.size and volume >= 0.8 * before
-        if is_fine or len(cells) >= MAX_CELLS:
+        is_fine = float((high - low).max()) >= VOXELS.search_cells * cells.size and volume >= 0.8 * before
+        if is_fine or len(cells) >= VOXELS.max_cells:
             break
         before = volume
     root_low, root_high = silhouettes.cube.box

@@ -15,8 +15,8 @@ from mvseg.formats.find_views import list_some
 from mvseg.server.correction_server import CORRECTIONS_FILE, Update
 from mvseg.system.running import Cancelled
 from mvseg.tracking.growth import measure_growth
+from mvseg.tracking.numbers import PAGE
 from mvseg.tracking.page import build_page, describe_tracks
-from mvseg.tracking.pictures import LARGE_SIDE
 from mvseg.tracking.questions import Question, describe_changes, list_questions
 from mvseg.tracking.recorded import PlantResults, RecordedTracks, find_plant_links, read_recorded_tracks
 from mvseg.tracking.track import Tracks, track_leaves
@@ -52,7 +52,7 @@ class OpenTracks:
         self.folder, self.answers = folder, dict[str, Callable[[bytes], Mapping[str, Any]]]()
         self.recorded = read_recorded_tracks(folder)
         self.plant = _choose_plant(self.recorded, plant)
-        self.dates = self.plant.read(pictures=LARGE_SIDE)
+        self.dates = self.plant.read(pictures=PAGE.large_side)
         self._shown = self._track(self._links(self.read_edits()[0])[0])
 
     def read_edits(self) -> tuple[Corrections, str]:

@@ -22,17 +22,9 @@ from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, POSES, fitted_costs
 from mvseg.tracking.leaves import Pair
+from mvseg.tracking.numbers import ALIGN
 
-NUM_REFINED = 20  # poses of two dates: this many of those that look best are refined
-UPRIGHT = 2.0  # the direction of up, where a pose is fitted: it weighs as much as this many leaves
-ROUNDS = 5  # rounds of pairing leaves and fitting a pose to them: at most this many (a technical limit)
-LEAST_WEIGHT = 1.0  # a pair that a person says is one leaf, where a pose is fitted: its weight is at least this
-TIP = 0.43  # the tip of a leaf, where a pose is fitted: it weighs this much of what base and middle do, for tips sway
-TURNS = 30  # turns of a pot that leaves can tell apart: this many, of 12 degrees (a definition)
-TEMPER = 0.44  # a gain of a pose: this share counts as log odds; `python benchmarks/fit_chances.py` fits it
 GUESS = (-0.79, 0.62, 1.48)  # see `guess_chance`; `python benchmarks/fit_chances.py` fits them
-DIGITS = 6  # decimals of logarithms and probabilities: what differs in later ones is a tie (a technical limit)
-LARGE_NEW = 3.0  # large leaves that a pose lets appear from nowhere: each costs it this log odds
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +68,7 @@ class Habit:
     def world_prior(self) -> float:
         """Log of how much likelier than any other pose it is that the frames agree."""
         least = 1e-6
-        return math.log(max(self.still, least) / max((1 - self.still) / TURNS, least))
+        return math.log(max(self.still, least) / max((1 - self.still) / ALIGN.turns, least))
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,12 +89,12 @@ class Poses:
 
     def scores(self, habit: Habit) -> Floats:
         """(H,) gains, and what the habit of the pot says."""
-        return self.gains + habit.world_prior / TEMPER * self.near
+        return self.gains + habit.world_prior / ALIGN.temper * self.near
 
     def weights(self, habit: Habit) -> Floats:
         """(H,) the poses as probabilities."""
         scores = self.scores(habit)
-        weights = np.exp(TEMPER * (scores - scores.max()))
+        weights = np.exp(ALIGN.temper * (scores - scores.max()))
         return np.asarray(weights / weights.sum())
 
     def chance(self, pose: Floats, habit: Habit) -> float:
@@ -127,7 +119,7 @@ def list_poses(pair: Pair) -> Poses:
     rank = np.repeat([0, 1, 2], [1, len(looked_at) - 1, len(poses) - len(looked_at)])  # the first ones in any case
     found: list[Alignment] = [_as_it_stood(pair)]
     left = np.lexsort((-alikeness(pair, poses).sum(1), rank))
-    while len(left) and len(found) < NUM_REFINED:
+    while len(left) and len(found) < ALIGN.num_refined:
         found.append(refine(pair, poses[left[0]]))
         left = left[pose_distances(pair, poses[left[0]], poses[left]) >= 1]
     every = np.stack([each.pose for each in found])
@@ -137,7 +129,7 @@ def list_poses(pair: Pair) -> Poses:
 
 def judge(poses: Poses, habit: Habit) -> Alignment:
     """The best of the poses, and how likely it is."""
-    place = int(np.round(poses.scores(habit), DIGITS).argmax()) if habit.still < 1 else 0
+    place = int(np.round(poses.scores(habit), ALIGN.digits).argmax()) if habit.still < 1 else 0
     best, weights = poses.refined[place], poses.weights(habit)
     still = float(weights[poses.near > np.exp(-0.5)].sum()) if poses.pair.fewer else habit.still
     return replace(best, still=still, probability=poses.chance(best.pose, habit))
@@ -176,7 +168,7 @@ def large_new(pair: Pair, pairs: np.ndarray) -> float:
     if len(pairs) == pair.fewer:
         return 0.0
     is_large = pair.second.lengths >= np.median(pair.second.lengths)
-    return LARGE_NEW * float(np.delete(is_large, pairs[:, 1]).sum())
+    return ALIGN.large_new * float(np.delete(is_large, pairs[:, 1]).sum())
 
 
 def near_world(pair: Pair, poses: Floats) -> Floats:
@@ -187,12 +179,12 @@ def near_world(pair: Pair, poses: Floats) -> Floats:
 
 
 def pose_distances(pair: Pair, pose: Floats, others: Floats) -> Floats:
-    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of one of the TURNS and, for the plant's middle,
+    """(H,) how far poses (H, 4, 4) are from one (4, 4), in units of one of the turns and, for the plant's middle,
     of how far the base of a leaf moves: below 1, they are one."""
     middle = np.append(pair.first.midribs.mean((0, 1)), 1.0)
     turned = np.arccos(np.clip((np.einsum("ij,hij->h", pose[:3, :3], others[:, :3, :3]) - 1) / 2, -1, 1))
     moved = np.linalg.norm((others - pose)[:, :3] @ middle, axis=1)
-    return np.hypot(turned / (2 * np.pi / TURNS), moved / (POSES.across * pair.scale))
+    return np.hypot(turned / (2 * np.pi / ALIGN.turns), moved / (POSES.across * pair.scale))
 
 
 def draw_poses(pair: Pair) -> Floats:
@@ -251,12 +243,13 @@ def alikeness(pair: Pair, poses: Floats) -> Floats:
 def refine(pair: Pair, pose: Floats) -> Alignment:
     """From a pose (4, 4) that is nearly right: pair the leaves and fit it to the pairs, until these stay."""
     pairs = np.zeros((0, 2), int)
-    for _ in range(ROUNDS):
+    for _ in range(ALIGN.rounds):
         costs, before = fitted_costs(pair.moved(pose)), pairs
         pairs = best_pairs(costs)
         if not len(pairs) or np.array_equal(pairs, before):
             break
-        own = np.maximum(pair.said - costs, np.where(pair.said < 0, LEAST_WEIGHT, 0.0))  # as if nobody had said it
+        # as if nobody had said it
+        own = np.maximum(pair.said - costs, np.where(pair.said < 0, ALIGN.least_weight, 0.0))
         pose = _fit(pair, pairs, own[pairs[:, 0], pairs[:, 1]], start=pose[:3, :3])
     else:
         costs = fitted_costs(pair.moved(pose))
@@ -282,7 +275,7 @@ def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Fl
     other = other[:, :1] + (other - other[:, :1]) * np.clip(share, 0.5, 2)[:, None, None]  # as long as it was
     places = [0, one.shape[1] // 2, -1]
     source, target = one[:, places].reshape(-1, 3), other[:, places].reshape(-1, 3)
-    mass = (weights[:, None] * (1.0, 1.0, TIP)).ravel()
+    mass = (weights[:, None] * (1.0, 1.0, ALIGN.tip)).ravel()
     mass /= mass.sum()
     middle, aim = mass @ source, mass @ target
     source, target = source - middle, target - aim
@@ -290,7 +283,7 @@ def _fit(pair: Pair, pairs: np.ndarray, weights: Floats, *, start: Floats) -> Fl
     if pair.knows_up:
         up = [(0.0, 0.0, 1.0)]
         source, target = np.vstack([source, up]), np.vstack([target, up])
-        mass = np.append(mass, UPRIGHT / max(len(pairs), 1) * np.linalg.norm(moment))
+        mass = np.append(mass, ALIGN.upright / max(len(pairs), 1) * np.linalg.norm(moment))
     with warnings.catch_warnings(action="ignore", category=UserWarning):  # on one line, any of the best will do
         rotation = Rotation.align_vectors(target, source, mass)[0].as_matrix()
     return make_poses(rotation, aim - rotation @ middle)

@@ -16,12 +16,11 @@ from scipy.optimize import linear_sum_assignment
 from scipy.special import expit
 
 from mvseg.errors import InputError
-from mvseg.tracking.compare import MOST_ODDS, UNLINKED, Comparison, Sight
+from mvseg.tracking.compare import Comparison, Sight
 from mvseg.tracking.dates import Floats
+from mvseg.tracking.numbers import LINKING
 
-ASKED = 1e4  # gain of what a person says: above all that leaves can say (a technical limit)
 CALIBRATION = (0.33, 4.08)  # slope and offset of the log odds of links; `python benchmarks/fit_chances.py` fits them
-ROUNDS = 10  # rounds of joining anew: at most this many, two or three are enough (a technical limit)
 
 
 @dataclass(frozen=True)
@@ -57,8 +56,8 @@ def link_leaves(
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(int)
     date_of, gains = np.repeat(np.arange(len(counts)), counts), np.zeros((starts[-1], starts[-1]))
     for (a, b), of_pair in costs.items():
-        gains[starts[a] : starts[a + 1], starts[b] : starts[b + 1]] = (UNLINKED - of_pair) / (b - a)
-    asked = {(starts[a] + i, starts[b] + j): sign * ASKED for said, sign in ((same, 1), (different, -1))
+        gains[starts[a] : starts[a + 1], starts[b] : starts[b + 1]] = (LINKING.unlinked - of_pair) / (b - a)
+    asked = {(starts[a] + i, starts[b] + j): sign * LINKING.asked for said, sign in ((same, 1), (different, -1))
              for (a, i), (b, j) in said}  # fmt: skip
     for place, gain in asked.items():
         gains[place] = gain
@@ -73,7 +72,7 @@ def link_leaves(
             known = np.flatnonzero((tracks == tracks[after]) & (date_of < later))
             if len(known):
                 before, chance = known[-1], chances[tracks[after]]
-                is_asked = gains[known, after].max() >= ASKED
+                is_asked = gains[known, after].max() >= LINKING.asked
                 both = [(int(date_of[n]), int(n - starts[date_of[n]])) for n in (before, after)]
                 links.append(Association(both[0], both[1], 1.0 if is_asked else chance, is_asked=bool(is_asked)))
     return links
@@ -96,7 +95,7 @@ def pairwise_chances(compared: Comparison) -> dict[tuple[int, int], Floats]:
     other dates and what a person say; for asking about those that are not linked."""
     found = {}
     for pair, costs in compared.costs.items():
-        odds = np.exp(np.clip(UNLINKED - costs, -MOST_ODDS, MOST_ODDS))
+        odds = np.exp(np.clip(LINKING.unlinked - costs, -LINKING.most_odds, LINKING.most_odds))
         under_this = odds / (1 + odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds)
         trust = compared.trust[pair]
         found[pair] = trust * under_this + (1 - trust) * compared.otherwise.get(pair, 0.0)
@@ -113,7 +112,7 @@ def join_sights(gains: Floats, date_of: np.ndarray) -> np.ndarray:
     tracks, dates = np.arange(len(gains)), np.unique(date_of)
     for date in dates[1:]:
         tracks = _rejoin(tracks, gains, date_of == date, among=date_of <= date)
-    for _ in range(ROUNDS):
+    for _ in range(LINKING.rounds):
         before = tracks[:, None] == tracks
         for date in dates:
             for apart in (date_of > date, date_of == date):
@@ -151,7 +150,7 @@ def _probabilities(tracks: np.ndarray, gains: Floats, later: np.ndarray) -> dict
     (`CALIBRATION`).
     """
     here, there, table = _part_gains(tracks, gains, ~later, later)
-    odds, found = np.exp(np.clip(table, -MOST_ODDS, MOST_ODDS)), {}
+    odds, found = np.exp(np.clip(table, -LINKING.most_odds, LINKING.most_odds)), {}
     for track in np.intersect1d(here, there).tolist():
         row, column = np.searchsorted(here, track), np.searchsorted(there, track)
         others = odds[row].sum() + odds[:, column].sum() - 2 * odds[row, column]

@@ -9,7 +9,6 @@ import numpy as np
 
 from mvseg.system.running import kept
 from mvseg.tracking.align import (
-    DIGITS,
     Alignment,
     Habit,
     Poses,
@@ -26,14 +25,10 @@ from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import LINKS, fitted_costs
 from mvseg.tracking.leaves import Leaves, Pair
 from mvseg.tracking.motions import Motion, find_motion
+from mvseg.tracking.numbers import ALIGN, BENT, LINKING
 from mvseg.tracking.place_dates import place_dates, step_between
 
-MOST_GAP = 3  # dates from one sight to another: they are compared up to this many, so that two may hide a leaf
 Sight = tuple[int, int]  # index of the date, row of its `Leaves`
-UNLINKED = 2.0  # cost of a pair of leaves: up to this, one track is cheaper than two
-ENOUGH = 6  # leaves that are paired: from this many on they tell how a plant bent
-SAID = 20.0  # log odds of what a person says, where poses are weighed: more than any leaf's own (a definition)
-MOST_ODDS = 40.0  # log odds: cut off here, so that their exponentials are numbers (a technical limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,16 +63,16 @@ def compare_dates(
     same: Collection[tuple[Sight, Sight]] = (),
     different: Collection[tuple[Sight, Sight]] = (),
 ) -> Comparison:
-    """Dates at most MOST_GAP apart are compared.
+    """Dates at most `LINKING.most_gap` apart are compared.
 
     `place_dates` says how they stand to each other, before anything is linked. Of `same` and `different`, pairs of
     sights that a person says are one leaf, or are not, the earlier one first, the poses take note.
     """
     pairs = {
         (n, later): Pair.of(dates[n], dates[later], days=times[later] - times[n], knows_up=knows_up)
-        for later in range(len(dates)) for n in range(max(later - MOST_GAP, 0), later)
+        for later in range(len(dates)) for n in range(max(later - LINKING.most_gap, 0), later)
     }  # fmt: skip
-    for said, cost in ((same, -SAID), (different, SAID)):
+    for said, cost in ((same, -LINKING.said), (different, LINKING.said)):
         for (earlier, row), (later, column) in said:
             if (earlier, later) in pairs:
                 pairs[earlier, later].said[row, column] = cost
@@ -118,11 +113,12 @@ def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats:
     """(N, M) probability that leaves of two dates are the same if not this pose (4, 4) but another one is right; 0 if
     there is none."""
     every = np.stack([each.pose for each in looked.refined])
-    weights = np.round(looked.weights(habit), DIGITS) * (pose_distances(looked.pair, pose, every) >= 1)
+    weights = np.round(looked.weights(habit), ALIGN.digits) * (pose_distances(looked.pair, pose, every) >= 1)
     chances = np.zeros((len(looked.pair.first), len(looked.pair.second)))
     for weight, other in zip(weights / (weights.sum() or 1.0), every, strict=True):
         if weight:
-            odds = np.exp(np.clip(-fitted_costs(looked.pair.moved(other), LINKS), -MOST_ODDS, MOST_ODDS))
+            costs = fitted_costs(looked.pair.moved(other), LINKS)
+            odds = np.exp(np.clip(-costs, -LINKING.most_odds, LINKING.most_odds))
             rivals = odds.sum(0, keepdims=True) + odds.sum(1, keepdims=True) - odds
             chances += weight * odds / (1 + rivals)
     return chances
@@ -131,7 +127,7 @@ def _under_others(looked: Poses, pose: Floats, habit: Habit) -> Floats:
 def _link_costs(pair: Pair, alignment: Alignment) -> Floats:
     """(N, M) costs of leaves of two aligned dates being the same. Where few leaves are paired, they do not tell how the
     plant bent."""
-    if len(alignment.pairs) < ENOUGH:
+    if len(alignment.pairs) < BENT.enough:
         return fitted_costs(pair.moved(alignment.pose), LINKS)
     return bent_costs(pair, alignment)
 
@@ -140,7 +136,8 @@ def _parted_costs(pair: Pair, motion: Motion, costs: Floats) -> Floats:
     """The costs where the leaves of a second motion are linked with each other only, and only if it is sure."""
     rows, columns = motion.pairs.T
     parted = costs.copy()
-    parted[rows], parted[:, columns] = np.maximum(parted[rows], UNLINKED), np.maximum(parted[:, columns], UNLINKED)
+    none = LINKING.unlinked
+    parted[rows], parted[:, columns] = np.maximum(parted[rows], none), np.maximum(parted[:, columns], none)
     if motion.is_sure:
         part = pair.take(rows, columns)
         alignment = refine(part, motion.pose)

@@ -21,19 +21,15 @@ from mvseg.reconstruction.surface.leaf_surface import MESH_SHAPE, LeafSurface, c
 from mvseg.reconstruction.voxels import VoxelGrid
 from mvseg.results.read import find_result, load_result
 from mvseg.results.result import Result
+from mvseg.tracking.numbers import SIGHTS
 from mvseg.tracking.pictures import LeafPicture, picture_leaves, picture_plant
 from mvseg.traits.leaf import Measurement
 from mvseg.traits.ontology import DEFINITIONS, unit_of
 from mvseg.traits.up import level_frame
 
 Floats = NDArray[np.float64]
-MOST_DAYS = 100_000  # five digits: more are dates, or seconds
 NUMBER = re.compile(r"[+-]?(0|[1-9]\d*|(?=\.\d))(\.\d*)?([eE][+-]?\d+)?")  # 0428 and 2026_04_28 are none
-STATIONS = 9  # points of a midrib, base and tip included (a definition)
-ROWS = 12  # rows of points from base to tip, of edge, midrib and edge (a definition)
-CLOUD = 3 * ROWS  # points that stand for a leaf (a definition)
 UNITS = {"m": 1000.0, "cm": 10.0, "mm": 1.0}  # in millimetres (a definition)
-MOST_PARTS = 256  # parts of a path: at most this many (a technical limit)
 
 
 @dataclass(frozen=True)
@@ -51,10 +47,10 @@ class SeenLeaf:
 
     Attributes:
         leaf: its id in that date's result.
-        midrib: (STATIONS, 3) float64 from base to tip, evenly spread, in the date's frame: its unit, +z up where up is
+        midrib: (stations, 3) float64 from base to tip, evenly spread, in the date's frame: its unit, +z up where up is
             known; None for a leaf without a shape (seen in one view).
         normal: (3,) unit mean normal of the blade; None with the midrib.
-        points: (CLOUD, 3) points of the leaf: of a surface, rows from base to tip of edge, midrib, edge; None with the
+        points: (cloud, 3) points of the leaf: of a surface, rows from base to tip of edge, midrib, edge; None with the
             midrib.
         is_oriented: the first point of the midrib is known to be the base.
         numbers: {trait: number} of what was measured.
@@ -160,7 +156,7 @@ def read_time(time: str | float) -> float:
     if you like: then it is counted in UTC).
 
     Raises:
-        InputError: it is neither; so are 0428 and numbers of `MOST_DAYS` or more, which are no days.
+        InputError: it is neither; so are 0428 and numbers of `SIGHTS.most_days` or more, which are no days.
     """
     moment = _read_moment(str(time).strip())
     if isinstance(moment, float):
@@ -172,12 +168,12 @@ def read_time(time: str | float) -> float:
 
 def _read_moment(text: str) -> float | datetime.datetime:
     """A number of days, or a date."""
-    if NUMBER.fullmatch(text) and abs(float(text)) < MOST_DAYS:
+    if NUMBER.fullmatch(text) and abs(float(text)) < SIGHTS.most_days:
         return float(text)
     with suppress(ValueError):
         if not text.isdecimal() or len(text) == 8:  # 13 digits would be a date of the year 1711
             return datetime.datetime.fromisoformat(text)
-    expected = f"expected a number (days) or an ISO date, as in 2026-05-31; days are below {MOST_DAYS}"
+    expected = f"expected a number (days) or an ISO date, as in 2026-05-31; days are below {SIGHTS.most_days}"
     raise InputError(f"time '{text}': {expected}")
 
 
@@ -221,7 +217,7 @@ def name_apart(dates: Sequence[PlantOnDate]) -> list[PlantOnDate]:
                 folder = named[index].folder
                 longer = "" if folder is None else "/".join(folder.resolve().parts[-parts:])
                 named[index] = replace(named[index], scene=longer or named[index].scene)
-        if parts > MOST_PARTS:  # the same folder twice, or results in memory
+        if parts > SIGHTS.most_parts:  # the same folder twice, or results in memory
             break
     return named
 
@@ -260,13 +256,13 @@ def _see_leaf(
     number: int, shape: LeafSurface | VoxelGrid | None, numbers: Mapping[str, Number], frame: Floats | None
 ) -> SeenLeaf:
     vertices = np.zeros((0, 3)) if shape is None else np.asarray(shape.mesh().vertices)
-    if len(vertices) < CLOUD:
+    if len(vertices) < SIGHTS.cloud:
         return SeenLeaf(number, None, None, None, False, numbers)
     points = vertices if frame is None else vertices @ frame.T
     if isinstance(shape, LeafSurface):
         return see_surface(number, points, MESH_SHAPE[1], numbers, is_oriented=shape.is_oriented)
     midrib, normal = _midrib_of_voxels(points)
-    cloud = points[np.linspace(0, len(points) - 1, CLOUD).round().astype(int)]
+    cloud = points[np.linspace(0, len(points) - 1, SIGHTS.cloud).round().astype(int)]
     return SeenLeaf(number, midrib, normal, cloud, False, numbers)
 
 
@@ -277,14 +273,15 @@ def see_surface(
     grid = vertices[1:-1].reshape(-1, columns, 3)
     midrib = resample(np.concatenate([vertices[:1], grid[:, columns // 2], vertices[-1:]]))
     normal = cell_normals(grid).sum((0, 1))
-    cloud = grid[np.linspace(0, len(grid) - 1, ROWS).round().astype(int)][:, [0, columns // 2, -1]].reshape(-1, 3)
+    rows = np.linspace(0, len(grid) - 1, SIGHTS.rows).round().astype(int)
+    cloud = grid[rows][:, [0, columns // 2, -1]].reshape(-1, 3)
     return SeenLeaf(number, midrib, normal / max(float(np.linalg.norm(normal)), 1e-12), cloud, is_oriented, numbers)
 
 
 def resample(line: Floats) -> Floats:
-    """(STATIONS, 3) points evenly spread along a line (P, 3)."""
+    """(`SIGHTS.stations`, 3) points evenly spread along a line (P, 3)."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    at = np.linspace(0, along[-1], STATIONS)
+    at = np.linspace(0, along[-1], SIGHTS.stations)
     return np.stack([np.interp(at, along, line[:, axis]) for axis in range(3)], 1)
 
 
@@ -293,7 +290,8 @@ def _midrib_of_voxels(points: Floats) -> tuple[Floats, Floats]:
     center = points.mean(0)
     _, _, axes = np.linalg.svd(points - center, full_matrices=False)
     along = (points - center) @ axes[0]
-    bins = np.clip(np.digitize(along, np.linspace(along.min(), along.max(), STATIONS + 1)) - 1, 0, STATIONS - 1)
-    line = np.stack([points[bins == index].mean(0) for index in range(STATIONS) if (bins == index).any()])
+    edges = np.linspace(along.min(), along.max(), SIGHTS.stations + 1)
+    bins = np.clip(np.digitize(along, edges) - 1, 0, SIGHTS.stations - 1)
+    line = np.stack([points[bins == index].mean(0) for index in range(SIGHTS.stations) if (bins == index).any()])
     ends = points[[along.argmin(), along.argmax()]]
     return resample(np.concatenate([ends[:1], line[1:-1], ends[1:]])), axes[2]

@@ -15,9 +15,7 @@ import numpy as np
 
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
-
-TAIL = 3.0  # degrees of freedom of Student's t, which differences follow
-FLIPPED = 0.5  # a midrib that runs the other way on the other date: it costs this much more
+from mvseg.tracking.numbers import BENT
 
 
 @dataclass(frozen=True)
@@ -132,7 +130,7 @@ def fitted_costs(pair: Pair, scales: Scales = POSES) -> Floats:
 def costs_of(found: Differences, scales: Scales) -> Floats:
     """(N, M) costs, see `fitted_costs`."""
     as_it_runs, turned = _place_costs(found, scales)
-    costs = np.minimum(as_it_runs, turned + FLIPPED) + _size_costs(found, scales) + found.crowd - scales.parting
+    costs = np.minimum(as_it_runs, turned + BENT.flipped) + _size_costs(found, scales) + found.crowd - scales.parting
     if found.near is None or found.far is None or not scales.lines:
         return costs
     lines = 0.5 * (student_tail(found.near / scales.near, 2) + student_tail(found.far / (3 * scales.near), 1))
@@ -179,4 +177,4 @@ def _line_distances(pair: Pair) -> tuple[Floats, Floats]:
 
 def student_tail(x: Floats, dimensions: int) -> Floats:
     """Minus twice the log of Student's density in units of its peak."""
-    return (TAIL + dimensions) * np.log1p(np.square(x) / TAIL)
+    return (BENT.tail + dimensions) * np.log1p(np.square(x) / BENT.tail)

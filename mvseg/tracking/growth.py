@@ -18,12 +18,11 @@ from scipy.special import expit
 from mvseg.system.running import kept
 from mvseg.tracking.dates import Floats, Number, PlantOnDate
 from mvseg.tracking.heights import level_heights
+from mvseg.tracking.numbers import GROWTH
 from mvseg.tracking.track import Tracks
 
 TRAITS = ("area", "length", "width", "inclination", "curvature", "insertion_height", "greenness_index")
 SIZES = ("area", "length", "width")  # get a curve, too
-LEAST_SD = 0.01  # standard deviation of a size: at least this share of the size, no leaf is measured better
-LEAST_DATES = 5  # dates on which a leaf is measured: from this many on it gets a curve, which has three parameters
 NOTHING = Number(math.nan, math.nan, "")
 
 
@@ -98,7 +97,7 @@ class Growth:
 
     Attributes:
         points: all traits of all tracks on the dates on which they were measured, by track, trait and time.
-        curves: of each size with LEAST_DATES dates or more, by track and trait.
+        curves: of each size with `GROWTH.least_dates` dates or more, by track and trait.
         plant: one row per date.
     """
 
@@ -134,7 +133,7 @@ def measure_growth(tracks: Tracks) -> Growth:
             rates = slope(times[near], values[near], sds[near])
             reference = references[date] if trait == "insertion_height" else None
             points.append(GrowthPoint(track, trait, date, number, *rates, reference=reference))
-        if trait in SIZES and len(seen) >= LEAST_DATES:
+        if trait in SIZES and len(seen) >= GROWTH.least_dates:
             curves.append(fit_curve(track, trait, (times, values, sds)))
     return Growth(tuple(points), tuple(curves), tuple(_plant_rows(tracks, points)))
 
@@ -153,7 +152,7 @@ def slope(times: Floats, values: Floats, sds: Floats) -> tuple[float, float]:
 def fit_curve(track: int, trait: str, seen: tuple[Floats, Floats, Floats]) -> GrowthCurve:
     """The model with the least Akaike criterion through (times, values, sds); robust against single dates."""
     times, values, sds = seen
-    sds = np.maximum(np.where(np.isfinite(sds), sds, 0.05 * values), LEAST_SD * values)
+    sds = np.maximum(np.where(np.isfinite(sds), sds, 0.05 * values), GROWTH.least_sd * values)
     fits = [_fit(track, trait, model, (times, values, sds)) for model in CURVES]
     return min(fits, key=lambda fit: fit.criterion)
 

@@ -7,9 +7,8 @@ from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from mvseg.tracking.dates import CLOUD, STATIONS, Floats, PlantOnDate, SeenLeaf
-
-SPREAD = 0.6  # spread of bases: places are measured in this share of it where leaves are shorter than that
+from mvseg.tracking.dates import Floats, PlantOnDate, SeenLeaf
+from mvseg.tracking.numbers import BENT, SIGHTS
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,9 +17,9 @@ class Leaves:
 
     Attributes:
         index: (N,) their places in `PlantOnDate.leaves`.
-        midribs: (N, STATIONS, 3) from base to tip.
+        midribs: (N, `SIGHTS.stations`, 3) from base to tip.
         normals: (N, 3).
-        points: (N, CLOUD, 3).
+        points: (N, `SIGHTS.cloud`, 3).
         lengths: (N,).
         areas: (N,) one-sided; NaN where none is measured.
         base_sd, turn_sd: (N,) standard deviations of the base, in lengths, and of the azimuth, in radians.
@@ -80,9 +79,9 @@ def leaves_of(date: PlantOnDate) -> Leaves:
 
     return Leaves(
         index=np.array(date.shaped, int),
-        midribs=np.array([leaf.midrib for leaf in shaped]).reshape(-1, STATIONS, 3),
+        midribs=np.array([leaf.midrib for leaf in shaped]).reshape(-1, SIGHTS.stations, 3),
         normals=np.array([leaf.normal for leaf in shaped]).reshape(-1, 3),
-        points=np.array([leaf.points for leaf in shaped]).reshape(-1, CLOUD, 3),
+        points=np.array([leaf.points for leaf in shaped]).reshape(-1, SIGHTS.cloud, 3),
         lengths=np.array([leaf.length for leaf in shaped]),
         areas=np.array([leaf.numbers["area"].value if "area" in leaf.numbers else np.nan for leaf in shaped], float),
         base_sd=np.array([sd(leaf, "insertion_height") for leaf in shaped]),
@@ -119,7 +118,7 @@ class Pair:
         for leaves in (first, second):
             if len(leaves):
                 spread = np.linalg.norm(leaves.bases - np.median(leaves.bases, axis=0), axis=1)
-                found += [float(np.median(leaves.lengths)), SPREAD * float(np.sqrt(np.mean(spread**2)))]
+                found += [float(np.median(leaves.lengths)), BENT.spread * float(np.sqrt(np.mean(spread**2)))]
         nothing = np.zeros((len(first), len(second)))
         return cls(first, second, days, knows_up, scale=max(found), said=nothing if said is None else said)
 

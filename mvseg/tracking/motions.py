@@ -12,13 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvseg.system.running import kept
-from mvseg.tracking.align import NUM_REFINED, alikeness, best_pairs, draw_poses, pose_distances, refine
+from mvseg.tracking.align import alikeness, best_pairs, draw_poses, pose_distances, refine
 from mvseg.tracking.bent_costs import pair_costs
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.leaves import Pair
-
-LEAST_GAIN = 20.0  # log odds of a second motion: from this on it is believed; leaves that only grow reach about 15
-SURE_MARGIN = 7.0  # log odds of a second motion over each other one: from this on it is sure, where two turns fit
+from mvseg.tracking.numbers import ALIGN, MOTIONS
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +37,7 @@ class Motion:
 
     @property
     def is_sure(self) -> bool:
-        return self.margin >= SURE_MARGIN
+        return self.margin >= MOTIONS.sure_margin
 
 
 @kept
@@ -54,7 +52,7 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
     costs = pair_costs(pair.moved(pose))
     alone, found = _total(costs), []
     left = np.argsort(-better, kind="stable")
-    for _ in range(NUM_REFINED):
+    for _ in range(ALIGN.num_refined):
         if not len(left) or not better[left[0]]:
             break
         at, own = poses[left[0]], np.flatnonzero(alike[left[0]] > alike[0])
@@ -67,7 +65,7 @@ def find_motion(pair: Pair, pose: Floats) -> Motion | None:
             pairs = np.stack([rows[keep], columns[keep]], 1)
             found.append(Motion(refined.pose, pairs, alone - _total(np.minimum(costs, others)), margin=0.0))
     best = max(found, key=lambda motion: motion.gain, default=None)
-    if best is None or best.gain < LEAST_GAIN:
+    if best is None or best.gain < MOTIONS.least_gain:
         return None
     rivals = (motion.gain for motion in found if _contradicts(motion.pairs, best.pairs))
     return Motion(best.pose, best.pairs, best.gain, margin=best.gain - max(rivals, default=0.0))

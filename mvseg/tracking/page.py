@@ -16,12 +16,12 @@ import numpy as np
 from mvseg.results.overlay import instance_color
 from mvseg.results.report.page import ASSETS as REPORT_ASSETS
 from mvseg.results.report.page import dump_inside_script
-from mvseg.tracking.dates import ROWS, Number
+from mvseg.tracking.dates import Number
 from mvseg.tracking.growth import SIZES, Growth
+from mvseg.tracking.numbers import PAGE, SIGHTS
 from mvseg.tracking.track import Tracks
 
 PAGE_FILE = "tracks.html"
-CURVE_STEPS = 40  # points of a drawn curve (a definition)
 ASSETS = files("mvseg.tracking") / "assets"
 SERVED_SCRIPTS = ("selection.js", "numbers.js", "edits.js", "server.js")  # of the page that corrects a result
 
@@ -81,7 +81,7 @@ def describe_tracks(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         for leaf in date.leaves:
             row, shape, picture = rows[leaf.leaf], np.zeros((0, 3)), date.pictures.get(leaf.leaf)
             if leaf.points is not None and leaf.midrib is not None:
-                grid = leaf.points.reshape(ROWS, 3, 3)  # of a surface: once around it, from base to tip and back
+                grid = leaf.points.reshape(SIGHTS.rows, 3, 3)  # of a surface: once around it, from base to tip and back
                 shape = np.concatenate([grid[:, 0], grid[::-1, 2]]) if "length" in leaf.numbers else leaf.midrib
             placed = (shape @ pose[:3, :3].T + pose[:3, 3] - middle) / scale * 1000
             leaves.append(
@@ -121,7 +121,7 @@ def _describe_growth(tracks: Tracks, growth: Growth) -> dict[str, Any]:
         of_trait = numbers.setdefault(point.trait, {"unit": point.number.unit, "tracks": {}})
         row = [point.date, _round(point.number.value, 5), _round(point.number.sd, 3) or 0.0]
         of_trait["tracks"].setdefault(str(point.track), []).append(row)
-    times = np.linspace(tracks.dates[0].time, tracks.dates[-1].time, CURVE_STEPS)
+    times = np.linspace(tracks.dates[0].time, tracks.dates[-1].time, PAGE.curve_steps)
     curves: dict[str, dict[str, Any]] = {trait: {} for trait in SIZES}
     for curve in growth.curves:
         line = [[round(t, 3), _round(v, 5)] for t, v in zip(times.tolist(), curve.at(times).tolist(), strict=True)]

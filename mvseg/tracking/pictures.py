@@ -15,9 +15,8 @@ from mvseg.errors import InputError
 from mvseg.formats.image_file import encode_jpeg, read_rgb
 from mvseg.results.photo_masks import labels_in_photo
 from mvseg.results.result import Result
+from mvseg.tracking.numbers import PAGE
 
-SIDE, LARGE_SIDE, QUALITY = 72, 160, 70  # pixels and JPEG quality of a picture (a definition)
-PLANT_SIDE = 120  # pixels of the picture of a plant (a definition)
 LIT, DARK = np.uint8(200), np.uint8(24)  # greys of a mask and around it without a photo (a definition)
 
 
@@ -36,7 +35,7 @@ class LeafPicture:
     at: tuple[float, float]
 
 
-def picture_leaves(result: Result, leaves: Collection[int], *, side: int = SIDE) -> dict[int, LeafPicture]:
+def picture_leaves(result: Result, leaves: Collection[int], *, side: int = PAGE.side) -> dict[int, LeafPicture]:
     """{leaf: its picture, `side` pixels wide or high}; none of a leaf without a mask."""
     labels = [labels_in_photo(result, view) for view in range(len(result.scene.views))]
     count = max(leaves, default=0) + 1
@@ -58,7 +57,7 @@ def picture_plant(result: Result) -> bytes:
     view = int(np.argmax([mask.mean() for mask in shown]))
     if not shown[view].any():
         return b""
-    return cut_picture(_photo(result.scene.views[view].path, shown[view].shape), shown[view], side=PLANT_SIDE)
+    return cut_picture(_photo(result.scene.views[view].path, shown[view].shape), shown[view], side=PAGE.plant_side)
 
 
 def _inner_point(mask: np.ndarray) -> tuple[float, float]:
@@ -76,7 +75,7 @@ def _photo(path: Path, shape: tuple[int, ...]) -> np.ndarray | None:
     return None
 
 
-def cut_picture(photo: np.ndarray | None, mask: np.ndarray, *, side: int = SIDE) -> bytes:
+def cut_picture(photo: np.ndarray | None, mask: np.ndarray, *, side: int = PAGE.side) -> bytes:
     """A square around a mask (H, W) in its photo (H, W, 3), the rest of it dark."""
     x, y, width, height = cv2.boundingRect(mask.astype(np.uint8))
     half, row, column = max(width, height) // 2 + 4, y + height // 2, x + width // 2
@@ -84,4 +83,4 @@ def cut_picture(photo: np.ndarray | None, mask: np.ndarray, *, side: int = SIDE)
     is_leaf = mask[box][..., None].repeat(3, axis=2)
     shown = np.where(is_leaf, LIT, DARK) if photo is None else np.where(is_leaf, photo[box], photo[box] // 2)
     image = ImageOps.contain(Image.fromarray(np.ascontiguousarray(shown)), (side, side), Image.Resampling.BOX)
-    return encode_jpeg(np.asarray(image), quality=QUALITY)
+    return encode_jpeg(np.asarray(image), quality=PAGE.quality)

@@ -16,8 +16,6 @@ from scipy.special import expit
 
 from mvseg.system.running import kept
 from mvseg.tracking.align import (
-    DIGITS,
-    TEMPER,
     Alignment,
     Habit,
     Poses,
@@ -30,9 +28,8 @@ from mvseg.tracking.align import (
 from mvseg.tracking.dates import Floats
 from mvseg.tracking.fitted_costs import fitted_costs
 from mvseg.tracking.leaves import Pair
+from mvseg.tracking.numbers import ALIGN
 
-PLACES = 9  # decimals of a pose: what differs in later ones is rounding (a technical limit)
-ROUNDS = 6  # rounds of placing all dates anew: at most this many, two or three are enough (a technical limit)
 Looked = Mapping[tuple[int, int], Poses]
 Likeliness = Callable[[Floats, tuple[int, int]], float]  # of the poses (T, 4, 4) of all dates, and of two of these
 
@@ -77,7 +74,7 @@ def weigh_turns(poses: Floats, looked: Looked, likeliness: Likeliness) -> Floats
             rivals.append(sum(likeliness(moved, pair) for pair in across))
         if rivals:
             ours = sum(likeliness(poses, pair) for pair in across)
-            chances[later - 1] = expit(np.round(ours - max(rivals), DIGITS))
+            chances[later - 1] = expit(np.round(ours - max(rivals), ALIGN.digits))
     return chances
 
 
@@ -85,7 +82,7 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
     """Poses and roots, see `place_dates`, by way of the likeliest alignments."""
     weights, poses, roots = np.zeros((num_dates, num_dates)), np.zeros((num_dates, 4, 4)), np.full(num_dates, -1)
     for pair, alignment in alignments.items():
-        weights[pair] = -1 - round(alignment.probability, DIGITS)  # any falling order will do; 0 would be no way
+        weights[pair] = -1 - round(alignment.probability, ALIGN.digits)  # any falling order will do; 0 would be no way
     tree = minimum_spanning_tree(weights)
     for root in range(num_dates):
         if roots[root] < 0:
@@ -101,7 +98,7 @@ def chain_dates(num_dates: int, alignments: Mapping[tuple[int, int], Alignment])
 def _search(poses: Floats, alignments: Mapping[tuple[int, int], Alignment], likeliness: Likeliness) -> Floats:
     """One date after the other, alone or with all later ones, moves so that two dates stand as their alignment says, if
     all then agree better; the first one, too: where it is the odd one, all others would have to move."""
-    for _ in range(ROUNDS):
+    for _ in range(ALIGN.date_rounds):
         before = poses
         for date in range(len(poses)):
             for moving in (slice(date, date + 1), slice(date, None)):
@@ -124,7 +121,7 @@ def _move(
         step = poses[later] @ alignments[earlier, later].pose @ np.linalg.inv(poses[earlier])
         moved = poses.copy()
         moved[moving] = (step if is_moving[earlier] else np.linalg.inv(step)) @ moved[moving]
-        gain = round(sum(likeliness(moved, pair) for pair in apart) - now, DIGITS)
+        gain = round(sum(likeliness(moved, pair) for pair in apart) - now, ALIGN.digits)
         if gain > most:
             best, most = moved, gain
     return best
@@ -136,7 +133,7 @@ def _remembered(looked: Looked, habit: Habit) -> Likeliness:
     @cache
     def of_step(pair: tuple[int, int], step: bytes) -> float:
         of_pair, pose = looked[pair].pair, np.frombuffer(step).reshape(4, 4)
-        return TEMPER * _gain(of_pair, pose) + habit.world_prior * float(near_world(of_pair, pose[None])[0])
+        return ALIGN.temper * _gain(of_pair, pose) + habit.world_prior * float(near_world(of_pair, pose[None])[0])
 
     def likeliness(poses: Floats, pair: tuple[int, int]) -> float:
         return of_step(pair, step_between(poses, pair).tobytes())
@@ -146,7 +143,7 @@ def _remembered(looked: Looked, habit: Habit) -> Likeliness:
 
 def step_between(poses: Floats, pair: tuple[int, int]) -> Floats:
     """(4, 4) later_from_earlier; by way of whichever dates its poses (T, 4, 4) were found, it has the same digits."""
-    return np.round(np.linalg.inv(poses[pair[1]]) @ poses[pair[0]], PLACES)
+    return np.round(np.linalg.inv(poses[pair[1]]) @ poses[pair[0]], ALIGN.places)
 
 
 @kept

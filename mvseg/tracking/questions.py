@@ -10,12 +10,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mvseg.corrections.track_links import LeafLink
-from mvseg.tracking.align import TURNS
 from mvseg.tracking.dates import NUMBER
+from mvseg.tracking.numbers import ALIGN, PAGE
 from mvseg.tracking.track import Tracks
 
-MOST_QUESTIONS = 10  # a person answers so many (a definition)
-LEAST_DOUBT = 0.1  # probability that a link, or that there is none, is wrong: below this nobody is asked
 Sight = tuple[int, int]  # index of the date, id of the leaf in its result
 
 
@@ -49,7 +47,7 @@ def list_questions(tracks: Tracks, links: Sequence[LeafLink] = ()) -> list[Quest
     for each in every:
         is_new = all(each.before != other.before and each.after != other.after for other in asked)
         is_answered = frozenset(each.link(tracks, is_same=True).leaves) in said
-        if is_new and not is_answered and each.doubt >= LEAST_DOUBT and len(asked) < MOST_QUESTIONS:
+        if is_new and not is_answered and each.doubt >= PAGE.least_doubt and len(asked) < PAGE.most_questions:
             asked.append(each)
     return asked
 
@@ -91,7 +89,7 @@ def _describe_turns(now: Tracks, then: Tracks) -> Iterator[str]:
     for later in range(1, len(now.dates)):
         one, other = (np.linalg.inv(each.poses[later - 1]) @ each.poses[later] for each in (now, then))
         turn = np.degrees(Rotation.from_matrix(other[:3, :3] @ one[:3, :3].T).magnitude())
-        if turn > 360 / TURNS:
+        if turn > 360 / ALIGN.turns:
             yield f"the plant of {_name_day(now, later)} is turned by {turn:.0f} degrees"
 
 

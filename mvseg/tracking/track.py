@@ -18,11 +18,11 @@ from mvseg.tracking.compare import Comparison, Sight, compare_dates
 from mvseg.tracking.config import Pots
 from mvseg.tracking.dates import Floats, PlantOnDate, date_of, name_apart, order_dates, read_date
 from mvseg.tracking.leaves import leaves_of
+from mvseg.tracking.numbers import ALIGN
 
 if TYPE_CHECKING:
     from mvseg.results.result import Result
 
-TOLD = 0.9  # probability of an alignment: below this, a person is told
 State = Literal["born", "seen", "hidden", "gone"]
 
 
@@ -213,7 +213,7 @@ def _rows(dates: Sequence[PlantOnDate], links: Sequence[Association], roots: np.
 def _warnings(dates: Sequence[PlantOnDate], compared: Comparison) -> Iterator[str]:
     for later in range(1, len(dates)):
         chance = compared.trust[later - 1, later]
-        if chance < TOLD:
+        if chance < ALIGN.told:
             pair = f"{dates[later - 1].scene} and {dates[later].scene}"
             likely = f"{chance:.0%}" if chance >= 0.01 else "less than 1%"
             yield f"{pair}: how the pot stands is a guess, {likely} likely to be right"

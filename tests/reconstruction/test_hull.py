@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
+from mvseg.reconstruction.numbers import STACK
 from mvseg.reconstruction.surface.hull import carve_hull, look_at
 from mvseg.reconstruction.surface.leaf_patch import Floats
-from mvseg.reconstruction.surface.mask_stack import MARGIN, MaskStack, choose_pixel_size, stack_masks
+from mvseg.reconstruction.surface.mask_stack import MaskStack, choose_pixel_size, stack_masks
 
 BLADE = EllipticBlade(bend=0.9)
 NOTHING = np.zeros((SIZE, SIZE), np.int32)
@@ -73,10 +74,10 @@ def test_larger_photos_give_the_same_masks() -> None:
     assert large.pixel_size > 1
     size = large.pixel_size / 5
     assert np.sqrt(large.inside.sum((1, 2))) * size == pytest.approx(np.sqrt(small.inside.sum((1, 2))), rel=0.02)
-    assert np.abs(np.argwhere(large.inside[0]).min(0) - MARGIN).max() <= 1
+    assert np.abs(np.argwhere(large.inside[0]).min(0) - STACK.margin).max() <= 1
     point = np.array([0.1, 0.2, 0.0, 1.0])
     first, second = (masks.px_from_world @ point for masks in (small, large))
-    first, second = (px[:, :2] / px[:, 2:] - MARGIN for px in (first, second))
+    first, second = (px[:, :2] / px[:, 2:] - STACK.margin for px in (first, second))
     assert second * size == pytest.approx(first, abs=0.6)
 
 
@@ -86,9 +87,10 @@ def test_masks_are_averaged_where_they_are_made_smaller() -> None:
     masks = stack_masks([mask], [np.zeros(mask.shape, np.int32)], [0], px_from_world=np.eye(3, 4)[None])
     k = masks.pixel_size
     assert k == choose_pixel_size([int(mask.sum())], 600) > 1
-    left, top = (np.flatnonzero(mask.any(axis))[0] - k * MARGIN for axis in (0, 1))
+    left, top = (np.flatnonzero(mask.any(axis))[0] - k * STACK.margin for axis in (0, 1))
     rows, columns = masks.size
-    padded = np.pad(mask, 2 * k * MARGIN)[top + 2 * k * MARGIN :, left + 2 * k * MARGIN :][: rows * k, : columns * k]
+    around = 2 * k * STACK.margin
+    padded = np.pad(mask, around)[top + around :, left + around :][: rows * k, : columns * k]
     share = np.zeros((rows * k, columns * k))
     share[: padded.shape[0], : padded.shape[1]] = padded
     assert (masks.inside[0] == (share.reshape(rows, k, columns, k).mean((1, 3)) >= 0.5)).all()

@@ -3,7 +3,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mvseg.reconstruction.surface.mask_errors import LEAST_MASKS, learn_mask_errors, winsorised_mean
+from mvseg.reconstruction.numbers import ERRORS
+from mvseg.reconstruction.surface.mask_errors import learn_mask_errors, winsorised_mean
 
 RNG = np.random.default_rng(5)
 FLAT = [RNG.choice([-3.0, -2.0, -1.0, 1.0, 2.0, 3.0], 10) + RNG.normal(0, 0.1, 10) for _ in range(30)]
@@ -54,7 +55,7 @@ def test_density_is_symmetric_and_sums_to_one() -> None:
 
 def test_clean_masks_and_few_masks_teach_nothing() -> None:
     assert learn_mask_errors([0.02 * each for each in NORMAL]) is None
-    assert learn_mask_errors([np.arange(LEAST_MASKS - 1.0)]) is None
+    assert learn_mask_errors([np.arange(ERRORS.least_masks - 1.0)]) is None
     assert learn_mask_errors([]) is None
 
 

@@ -8,6 +8,7 @@ import pytest
 
 from benchmarks.faults import disc
 from blade_scene import SIZE, EllipticBlade, blade_masks, ring_cameras
+from mvseg.reconstruction.numbers import FIT, IMAGE, STACK
 from mvseg.reconstruction.surface.fit_patch import fit_patch, invert_normal, per_view
 from mvseg.reconstruction.surface.leaf_patch import (
     COUNTS,
@@ -19,12 +20,9 @@ from mvseg.reconstruction.surface.leaf_patch import (
     patch_grid,
     patch_prior,
 )
-from mvseg.reconstruction.surface.mask_stack import FRAME, MARGIN, MaskStack, stack_masks
+from mvseg.reconstruction.surface.mask_stack import FRAME, MaskStack, stack_masks
 from mvseg.reconstruction.surface.outline import nearest_samples, outline_distances, outline_samples, search_edges
 from mvseg.reconstruction.surface.patch_image import (
-    DRAWN_TOO_FAR,
-    NEAR_PX,
-    SUPERSAMPLED,
     cover_crops,
     crop_ious,
     draw_patch,
@@ -135,7 +133,7 @@ def test_beyond_the_frame_is_hidden() -> None:
     mask = np.zeros((SIZE, SIZE), bool)
     mask[:30, 50:90] = True
     frame = stack_masks([mask], [NOTHING], [0], px_from_world=matrices()[:1])
-    places = np.array([[70.0, -1.0], [70.0, 40.0]]) - (50 - MARGIN, 0 - MARGIN)
+    places = np.array([[70.0, -1.0], [70.0, 40.0]]) - (50 - STACK.margin, 0 - STACK.margin)
     values = frame.look_up(frame.others, np.zeros(2, int), places)
     assert values.tolist() == [FRAME, 0]
 
@@ -171,7 +169,7 @@ def test_polygons_are_too_wide_by_a_known_part_of_a_pixel() -> None:
         corners = np.array([[-width, -height], [width, -height], [width, height], [-width, height]]) / 2
         share = draw_polygons((corners @ turn.T + rng.uniform(28, 32, 2))[None], (60, 60), np.zeros(2))
         extra.append((share.sum() - width * height) / (2 * (width + height)))
-    assert np.mean(extra) == pytest.approx(DRAWN_TOO_FAR / SUPERSAMPLED, abs=0.02)
+    assert np.mean(extra) == pytest.approx(IMAGE.drawn_too_far / IMAGE.supersampled, abs=0.02)
 
 
 def bent_patch(seed: int) -> Floats:
@@ -272,10 +270,10 @@ def test_neighbour_in_front_hides_the_leaf_where_it_has_no_mask() -> None:
     hiding = hiding_pixels(masks, own, {8: above}, margin=0.05)
     assert set(np.unique(hiding[(masks.others == 0)])) == {0, 8}
     for index, mask in enumerate(blade_masks(EllipticBlade(), CAMERAS)):
-        near = cv2.dilate(mask.astype(np.uint8), np.ones((2 * NEAR_PX + 1,) * 2)) > 0
+        near = cv2.dilate(mask.astype(np.uint8), np.ones((2 * IMAGE.near_px + 1,) * 2)) > 0
         covered = draw_polygons_reference(above, index) & near
         crop = hiding[index] == 8
-        y, x = np.argwhere(mask).min(0) - MARGIN
+        y, x = np.argwhere(mask).min(0) - STACK.margin
         y, x = y + SIZE, x + SIZE
         wanted = np.pad(covered, SIZE)[y : y + crop.shape[0], x : x + crop.shape[1]] & ~masks.inside[index]
         assert (crop != wanted).mean() < 0.01
@@ -353,12 +351,12 @@ def test_a_patch_that_no_mask_is_near_is_fitted_to_nothing() -> None:
     far = ellipse()
     far[MIDRIB] += (100, 0, 0)
     assert outline_distances(stack(), GRID, far, reach=6.0, is_imaged=True).jacobian.shape == (0, 3 * NUM_COEFFICIENTS)
-    fit = fit_patch(stack(), far)
+    fit = fit_patch(stack(), far, num_steps=FIT.num_steps)
     assert np.isfinite(fit.coefficients).all()
     assert np.isnan(fit.residual_px).all()
     assert np.isnan(fit.offsets_px).all()
     assert np.isnan(fit.covariance).all()
-    assert np.isfinite(fit_patch(stack(), ellipse()).covariance).all()
+    assert np.isfinite(fit_patch(stack(), ellipse(), num_steps=FIT.num_steps).covariance).all()
 
 
 def test_the_prior_alone_has_no_inverse_on_any_processor() -> None:

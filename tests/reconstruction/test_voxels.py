@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ import torch
 
 from mvseg.errors import InputError, InputWarning
 from mvseg.reconstruction.config import ReconstructConfig
+from mvseg.reconstruction.numbers import VOXELS
 from mvseg.reconstruction.voxels import VoxelGrid, back_project, reconstruct_instances
 from mvseg.regions import Regions, regions_from_label_maps
 from mvseg.scene import Cameras
@@ -295,7 +297,7 @@ def test_pieces_are_those_of_the_mesh() -> None:
     assert empty.without_crumbs() is empty
 
 
-def test_crumbs_are_gone_from_points_volume_and_mesh() -> None:
+def test_crumbs_are_gone_from_points_volume_and_mesh(monkeypatch: pytest.MonkeyPatch) -> None:
     """A crumb has less than 2 % of the largest piece: 19 of 1000 voxels."""
     with_crumb, kept = pieces_grid(crumb=19), pieces_grid(crumb=20)
     swept = with_crumb.without_crumbs()
@@ -305,4 +307,5 @@ def test_crumbs_are_gone_from_points_volume_and_mesh() -> None:
     assert with_crumb.volume - swept.volume == pytest.approx(19 * 0.5**3)
     assert len(swept.mesh().split()) == len(with_crumb.mesh().split()) - 1
     assert torch.equal(swept.votes, pieces_grid(crumb=0).votes)
-    assert swept.without_crumbs(0.5).num_pieces == 1
+    monkeypatch.setattr("mvseg.reconstruction.voxels.VOXELS", replace(VOXELS, crumb=0.5))
+    assert swept.without_crumbs().num_pieces == 1

@@ -8,6 +8,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import ExitStack
+from dataclasses import replace
 from multiprocessing import active_children
 
 import pytest
@@ -16,6 +17,7 @@ import torch
 from batch_work import square, start_lightly
 from blade_scene import EllipticBlade, as_regions, blade_masks, ring_cameras
 from mvseg.errors import InputError, InputWarning
+from mvseg.reconstruction.numbers import SEARCH
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.system.running import running
 from mvseg.system.worker_pool import default_workers, map_in_order, run_all, start_workers
@@ -49,7 +51,7 @@ def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor)
 
 
 def test_surfaces_are_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.FEW_MASKS", 0)
+    monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.SEARCH", replace(SEARCH, few_masks=0))
     cameras = ring_cameras(4)
     regions, ids = as_regions(blade_masks(EllipticBlade(), cameras))
     here = fit_surfaces(regions, ids, cameras)[1]

@@ -10,8 +10,8 @@ from benchmarks.tracking import see_series
 from mvseg.simulation.series import draw_specs
 from mvseg.tracking.align import Alignment, Habit, judge, list_poses
 from mvseg.tracking.leaves import Pair, leaves_of
+from mvseg.tracking.numbers import ALIGN
 from mvseg.tracking.place_dates import place_dates
-from mvseg.tracking.track import TOLD
 from tests.plants_over_days import grow_blades, grown, see
 
 BLADES_OF_8 = grow_blades(8, 3)
@@ -61,7 +61,7 @@ def test_another_plant_in_the_pot_is_less_likely_than_the_same_one(seed: int) ->
     first, *later = (leaves_of(see(blades, n)[0]) for n, blades in enumerate(
         (BLADES_OF_8, grown(BLADES_OF_8, 1.05), grow_blades(8, seed))))  # fmt: skip
     same, other = (align(Pair.of(first, each, days=1, knows_up=True)).probability for each in later)
-    assert other < TOLD < 0.99 < same
+    assert other < ALIGN.told < 0.99 < same
 
 
 def test_one_leaf_in_a_pot_that_stands_still() -> None:

@@ -10,7 +10,7 @@ import pytest
 from mvseg.errors import InputError
 from mvseg.tracking.align import Alignment, make_poses
 from mvseg.tracking.associate import Association, join_sights, link_leaves
-from mvseg.tracking.compare import UNLINKED
+from mvseg.tracking.numbers import LINKING
 from mvseg.tracking.place_dates import chain_dates
 
 Costs = dict[tuple[int, int], np.ndarray]
@@ -80,7 +80,7 @@ def test_dates_around_outweigh_one_on_which_two_leaves_look_swapped() -> None:
 def test_nothing_is_linked_across_dates_that_are_not_aligned() -> None:
     assert link_leaves([2, 2], {}) == []
     assert link_leaves([0, 0], {}) == []
-    assert link_leaves([1, 1], {(0, 1): np.full((1, 1), UNLINKED + 0.1)}) == []
+    assert link_leaves([1, 1], {(0, 1): np.full((1, 1), LINKING.unlinked + 0.1)}) == []
 
 
 def test_a_person_is_obeyed() -> None:

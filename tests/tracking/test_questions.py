@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 
 from mvseg.system.running import running
-from mvseg.tracking.questions import MOST_QUESTIONS, describe_changes, list_questions
+from mvseg.tracking.numbers import PAGE
+from mvseg.tracking.questions import describe_changes, list_questions
 from mvseg.tracking.track import Tracks, track_leaves
 from tests.plants_over_days import grow_blades, opposite_leaves, see, true_tracks
 
@@ -54,6 +55,6 @@ def test_who_is_sure_asks_nothing_and_ends_are_asked_about_once() -> None:
         replace(row, track=row.track + 8 * row.date, state="born" if row.date else "seen") for row in tracks.rows
     ))  # fmt: skip
     questions = list_questions(apart)
-    assert len(questions) == 8 < MOST_QUESTIONS
+    assert len(questions) == 8 < PAGE.most_questions
     assert {each.is_linked for each in questions} == {False}
     assert len({each.before for each in questions}) == len({each.after for each in questions}) == 8

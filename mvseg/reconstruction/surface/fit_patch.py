@@ -7,44 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mvseg.reconstruction.surface.leaf_patch import (
-    FIT_GRID,
-    MIDRIB,
-    Floats,
-    PatchSize,
-    measure_patch,
-    patch_grid,
-    patch_prior,
-)
+from mvseg.reconstruction.numbers import FIT
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, PatchSize, measure_patch, patch_grid, patch_prior
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, winsorised_mean
 from mvseg.reconstruction.surface.mask_stack import MaskStack, places_of_views
 from mvseg.reconstruction.surface.outline import Distances, outline_distances
 
-FAR_GRID = (20, 5)  # rows and columns of a patch that is still far from the masks; otherwise `FIT_GRID`
-# Steps from a rough start, in two halves, and from a start that is nearly right (technical limits).
-FIRST_HALF, SECOND_HALF, NUM_STEPS = range(5), range(5, 10), 7
-FAR_REACH, NEAR_REACH = 14.0, 6.0  # a sample looks for an edge within so many pixels, at first and in the end
-# A step is damped by the first, and moves no point by more than the second, in half-widths; at first and in the end.
-FAR_STEP, NEAR_STEP = (0.05, 0.25), (0.005, 0.12)
-SAMPLE_WEIGHT = 0.35  # a sample has this weight: neighbouring samples are alike
-# A distance of so many pixels has half the weight of none, at first; of at least so many, in the end.
-FAR_SCALE_PX, LEAST_SCALE_PX = 4.0, 0.7
-SCALE_FACTOR = 4.0  # or of at least so many median distances: masks may contradict each other
-# Masks may be too large or small from this step on, and this share of what is measured is believed.
-OFFSET_FROM, OFFSET_SHARE = 6, 0.8
-CLEAN_PX = 1.0  # masks are clean if the deviation of the distances is less; beyond it fold and curl stay nearer to none
-NARROW = 0.15  # steps are limited as if half a leaf were at least so wide, as a share of its length
-NOISY_VIEW = 1.5  # a view counts less if its distances deviate by more than this times what is usual
-
-# Of the covariance; fitted (`python benchmarks/traits.py --cache DIR`, column "inside").
-# Deviations are multiplied by the first, and by more where the root mean square distance is above the second.
-FIT_FACTOR, QUIET_PX = 2.0, 0.3
-# Deviation of what all masks may be too large by: so many times the measured one, and at least so many pixels:
-# where masks are clean, little is measured.
-CENTRE_FACTOR, LEAST_CENTRE_SD = 1.5, 0.1
-# A normal matrix, scaled, is singular if its least eigenvalue is less (a technical limit). Leaves have 1e-4 and more;
-# where nothing holds a patch in its place, rounding makes 1e-15.
-LEAST_EIGENVALUE = 1e-10
+FIRST_HALF, SECOND_HALF = range(5), range(5, 10)  # steps from a rough start (a technical limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,21 +42,22 @@ def approach_patch(masks: MaskStack, start: Floats, *, steps: range) -> tuple[Fl
         steps: FIRST_HALF of the way, or the SECOND_HALF, from where the first one ends.
     """
     moved, coefficients = _to_unit_world(masks, start)
-    grid = patch_grid(*(FAR_GRID if steps == FIRST_HALF else FIT_GRID))
+    grid = patch_grid(*(FIT.far_grid if steps == FIRST_HALF else FIT.grid))
     offsets = np.zeros(len(masks))
     for step in steps:
         share = step / SECOND_HALF.stop
-        reach = FAR_REACH + (NEAR_REACH - FAR_REACH) * share
+        reach = FIT.far_reach + (FIT.near_reach - FIT.far_reach) * share
         distances = outline_distances(moved, grid, coefficients, reach=reach, is_imaged=False)
-        if step >= OFFSET_FROM:
+        if step >= FIT.offset_from:
             offsets = _believe(per_view(distances.px, distances.stack, len(masks)), None)
-        equations = _weigh(distances, offsets, scale_px=FAR_SCALE_PX + (LEAST_SCALE_PX - FAR_SCALE_PX) * share)
-        coefficients = _step(coefficients, equations, FAR_STEP)
+        scale = FIT.far_scale_px + (FIT.least_scale_px - FIT.far_scale_px) * share
+        equations = _weigh(distances, offsets, scale_px=scale)
+        coefficients = _step(coefficients, equations, FIT.far_step)
     return _from_unit_world(coefficients, start), offsets
 
 
 def fit_patch(
-    masks: MaskStack, start: Floats, *, num_steps: int = NUM_STEPS, errors: MaskErrors | None = None
+    masks: MaskStack, start: Floats, *, num_steps: int, errors: MaskErrors | None = None
 ) -> PatchFit:
     """Move a patch that is nearly right until its outlines, drawn as the masks are, are theirs.
 
@@ -102,13 +72,13 @@ def fit_patch(
     for step in range(num_steps + 1):
         drawn = offsets if errors else drawn
         distances = outline_distances(
-            moved, patch_grid(*FIT_GRID), coefficients, reach=NEAR_REACH, is_imaged=True, offsets=drawn
+            moved, patch_grid(*FIT.grid), coefficients, reach=FIT.near_reach, is_imaged=True, offsets=drawn
         )
         measured = drawn + per_view(distances.px, distances.stack, len(masks))
         offsets = _believe(measured, errors)
-        equations = _weigh(distances, offsets - drawn, scale_px=LEAST_SCALE_PX)
+        equations = _weigh(distances, offsets - drawn, scale_px=FIT.least_scale_px)
         if step < num_steps:
-            coefficients = _step(coefficients, equations, NEAR_STEP)
+            coefficients = _step(coefficients, equations, FIT.near_step)
     scale = measure_patch(start).length
     centre_sd = _centre_sd(measured, errors)
     return PatchFit(
@@ -163,8 +133,8 @@ def _covariance(coefficients: Floats, equations: _Equations, stack: NDArray, *, 
     growth = inverse @ (jacobian.T @ weight)  # by which everything changes when all masks grow by a pixel
     rms = np.sqrt((weight * px**2).sum() / max(weight.sum(), 1e-12))
     few = num_views / max(num_views - 2, 0.5)
-    shared = CENTRE_FACTOR * few * max(centre_sd, LEAST_CENTRE_SD)
-    fitted = (FIT_FACTOR * max(1.0, rms / QUIET_PX)) ** 2 * inverse
+    shared = FIT.centre_factor * few * max(centre_sd, FIT.least_centre_sd)
+    fitted = (FIT.sd_factor * max(1.0, rms / FIT.quiet_px)) ** 2 * inverse
     return fitted + between @ between.T + shared**2 * np.outer(growth, growth)
 
 
@@ -177,7 +147,7 @@ def invert_normal(matrix: Floats) -> Floats:
     scale = np.sqrt(np.maximum(np.diag(matrix), 0))
     if not np.isfinite(matrix).all() or not scale.all():
         return np.full_like(matrix, np.nan)
-    if np.linalg.eigvalsh(matrix / scale / scale[:, None])[0] < LEAST_EIGENVALUE:
+    if np.linalg.eigvalsh(matrix / scale / scale[:, None])[0] < FIT.least_eigenvalue:
         return np.full_like(matrix, np.nan)
     return np.asarray(np.linalg.inv(matrix), dtype=float)
 
@@ -186,16 +156,16 @@ def _weigh(distances: Distances, offsets: Floats, *, scale_px: float) -> _Equati
     """Robust weights, after what the masks of each view (S,) are all too large or too small by is taken off."""
     px = distances.px - offsets[distances.stack]
     spread = float(np.median(np.abs(px))) if len(px) else 0.0
-    scale = max(scale_px, SCALE_FACTOR * spread)
-    weight = SAMPLE_WEIGHT * distances.weight / (1 + (px / scale) ** 2)
+    scale = max(scale_px, FIT.scale_factor * spread)
+    weight = FIT.sample_weight * distances.weight / (1 + (px / scale) ** 2)
     weight = weight * _view_weights(px, distances.stack, len(offsets))[distances.stack]
-    noise = max(1.0, 1.48 * spread / CLEAN_PX)
+    noise = max(1.0, 1.48 * spread / FIT.clean_px)
     return _Equations(distances=distances, px=px, weight=weight, noise=noise)
 
 
 def _believe(measured: Floats, errors: MaskErrors | None) -> Floats:
     """(S,) the offset of each view's mask, from the measured ones, NaN for views that show none."""
-    share = errors.share if errors else OFFSET_SHARE
+    share = errors.share if errors else FIT.offset_share
     return np.nan_to_num(share * (measured - _centre(measured, errors)))
 
 
@@ -218,7 +188,7 @@ def _centre_sd(measured: Floats, errors: MaskErrors | None) -> float:
 def _view_weights(px: Floats, stack: np.ndarray, num_views: int) -> Floats:
     """(S,) 1, or less for views whose distances spread more than is usual in the others."""
     spreads = np.nan_to_num(per_view(np.abs(px), stack, num_views))
-    usual = NOISY_VIEW * max(float(np.median(spreads)), 0.3)
+    usual = FIT.noisy_view * max(float(np.median(spreads)), 0.3)
     return np.minimum(1.0, (usual / np.maximum(spreads, 1e-9)) ** 2)
 
 
@@ -248,8 +218,8 @@ def _step(coefficients: Floats, equations: _Equations, damping_and_cap: tuple[fl
     by_vector = np.diag(matrix).reshape(-1, 3).mean(1)  # the same along all axes, however the world is turned
     matrix[np.diag_indices_from(matrix)] += damping * np.repeat(by_vector, 3)
     step = np.linalg.solve(matrix, right).reshape(-1, 3)
-    longest = np.linalg.norm(patch_grid(*FIT_GRID).basis @ step, axis=1).max()
-    limit = cap * max(size.half_width, NARROW * size.length)
+    longest = np.linalg.norm(patch_grid(*FIT.grid).basis @ step, axis=1).max()
+    limit = cap * max(size.half_width, FIT.narrow * size.length)
     return coefficients + step * min(1.0, limit / max(longest, 1e-12))
 
 

@@ -13,18 +13,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.errors import InputError, check_arguments
+from mvseg.reconstruction.numbers import DOUBTS, FIT, SEARCH
 from mvseg.reconstruction.spread_views import spread_directions, spread_views
-from mvseg.reconstruction.surface.fit_patch import (
-    FAR_GRID,
-    FIRST_HALF,
-    SECOND_HALF,
-    PatchFit,
-    approach_patch,
-    fit_patch,
-)
+from mvseg.reconstruction.surface.fit_patch import FIRST_HALF, SECOND_HALF, PatchFit, approach_patch, fit_patch
 from mvseg.reconstruction.surface.hull import Hull, carve_hull, look_at
 from mvseg.reconstruction.surface.leaf_frame import find_axes, find_middle, find_quarters, turn_matrix, turn_pixels
-from mvseg.reconstruction.surface.leaf_patch import FIT_GRID, MIDRIB, Floats, measure_patch, patch_grid
+from mvseg.reconstruction.surface.leaf_patch import MIDRIB, Floats, measure_patch, patch_grid
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface, Quality, cell_normals, measure_sizes
 from mvseg.reconstruction.surface.mask_errors import MaskErrors, learn_mask_errors
 from mvseg.reconstruction.surface.mask_stack import MaskStack, stack_masks
@@ -43,37 +37,6 @@ from mvseg.scene import Cameras
 from mvseg.system.running import now_running, progress_bar
 from mvseg.system.worker_pool import map_in_order
 
-NUM_FIRST_STEPS = 3  # steps of the fit before the second one (a technical limit)
-GOOD_IOU = 0.93  # the second hull is not asked if the median IoU of a patch is more than this
-# Share of the IoU that is given back where masks as a whole are too large or small: faulty masks reach less.
-FORGIVEN = 0.5
-MOST_FITS = 3  # so many of the starts are fitted (a technical limit)
-AS_GOOD = 0.03  # fits are as good as the best one, the less the more they score below it, down to so much, in IoU
-# A surface e times as large scores less by this, in IoU: bulges can hide behind the outlines of a level leaf.
-AREA_COST = 0.1
-WIDE_COST = 0.1  # a patch that is wider than long scores less by this, in IoU: some would run from edge to edge
-MOST_STARTS = 3  # so many starts are tried of each hull
-HOPELESS = 0.1  # a patch goes no farther than half way if it scores less than the best by more than this
-SEARCHED_VIEWS = 12  # starts are compared in so many views of a leaf, evenly spread (a technical limit)
-# A mask is another leaf's, with a wrong id, if its share of the hull's voxels is less than this share of the median.
-WRONG_SHARE = 0.25
-BEHIND = 0.03  # a neighbour lies behind if it is farther away by more than this share of the leaf's length
-
-# A surface is doubted if its median IoU is less, or the deviation of its area more than this share of it.
-LEAST_IOU, MOST_AREA_SHARE = 0.8, 0.1
-# Or if its median IoU is more than the first, but it lacks more than the second of a single mask, as a share of the
-# median mask: a deep cup that most views look into shows in one view what it is. (Ovate leaves lack 0.02 at most.)
-CLEAN_IOU, MOST_LACKING = 0.95, 0.05
-# Or if more than the second of its area lies where fewer of the masks than the first have it: a patch fills the bays
-# of a star. (It fills 2.5 % there, 0.5 % at most of leaves, hearts and rectangles.)
-SHOWN, MOST_UNSHOWN = 0.2, 0.02
-# Or if, the first of its length before an end, it is wider than the second of its greatest width: then the midrib ends
-# in a corner. (Rectangles have 0.9 there, discs and hearts 0.4, leaves 0.3.)
-NEAR_END, BLUNT = 0.02, 0.7
-
-FEW_MASKS = 60  # fewer masks are fitted in this process: others would take longer to start (a technical limit)
-MOST_VIEWS = 20  # a fit looks at so many views of an instance at most: more add time, and next to nothing else
-
 
 @check_arguments
 def fit_surfaces(
@@ -83,7 +46,7 @@ def fit_surfaces(
     *,
     starts: Mapping[int, LeafSurface] = MappingProxyType({}),
     known: Mapping[int, LeafSurface] = MappingProxyType({}),
-    most_views: int = MOST_VIEWS,
+    most_views: int | None = None,
     is_rough: bool = False,
 ) -> dict[int, LeafSurface]:
     """Fit a surface to every instance.
@@ -98,7 +61,7 @@ def fit_surfaces(
         starts: instance id -> a surface that is nearly right; of these instances no start is looked for.
         known: instance id -> a surface that is returned as it is. The others are fitted as if it had been fitted with
             them: it hides what lies behind it, and its masks tell how all masks err.
-        most_views: at least 2.
+        most_views: at least 2; None: `SEARCH.most_views`.
         is_rough: leave out the second fit, which knows what the leaves hide of each other, and how the masks err, and
             the reasons to doubt a surface.
 
@@ -111,7 +74,7 @@ def fit_surfaces(
     """
     if instance_ids.shape != regions.view_index.shape:
         raise InputError(f"{len(instance_ids)} instance ids for {len(regions)} regions, expected as many")
-    workers = now_running().workers if len(regions) >= FEW_MASKS else None
+    workers = now_running().workers if len(regions) >= SEARCH.few_masks else None
     regions, cameras, instance_ids = regions.to("cpu"), cameras.to("cpu"), instance_ids.cpu()
     frames = _instance_frames(regions, instance_ids, cameras)
     stacks: dict[int, MaskStack] = {}
@@ -126,7 +89,8 @@ def fit_surfaces(
         if len(views) < 2:
             surfaces[instance] = LeafSurface.none(views, "seen in one view only")
             continue
-        kept = known[instance].views if instance in known else views[spread_views(cameras[views], most_views)]
+        most = most_views or SEARCH.most_views
+        kept = known[instance].views if instance in known else views[spread_views(cameras[views], most)]
         members = members.select(torch.isin(members.view_index, kept))
         stacks[instance] = _stack(members, cameras, frames, instance=instance)
         if instance in known:
@@ -149,7 +113,7 @@ def fit_surfaces(
     if not is_rough:
         offsets = [fit.offsets_px[np.isfinite(fit.offsets_px)] for fit in fits.values()]
         errors = learn_mask_errors([each for each in offsets if len(each) > 1])
-        points = {instance: patch_grid(*FIT_GRID).points(fit.coefficients) for instance, fit in fits.items()}
+        points = {instance: patch_grid(*FIT.grid).points(fit.coefficients) for instance, fit in fits.items()}
         asked = [(instance, stacks[instance], fits[instance]) for instance in unknown]
         refitted = map_in_order(partial(_fit_again, points, errors), asked, workers)
         for instance, (masks, better) in zip(unknown, refitted, strict=True):
@@ -179,7 +143,7 @@ def _fit_first(asked: tuple[MaskStack, Floats | None], *, is_rough: bool) -> tup
     """
     masks, start = asked
     masks, starts = (masks, [start]) if start is not None else _find_starts(masks)
-    fits = [fit_patch(masks, each, num_steps=NUM_FIRST_STEPS) for each in starts]
+    fits = [fit_patch(masks, each, num_steps=SEARCH.first_steps) for each in starts]
     if len(fits) < 2:
         return masks, fits[0] if fits else None
     areas = np.array([measure_sizes(fit.coefficients)[0] for fit in fits])
@@ -187,7 +151,7 @@ def _fit_first(asked: tuple[MaskStack, Floats | None], *, is_rough: bool) -> tup
         [_fine_rank(masks, fit, np.median if is_rough else np.mean) - _area_cost(fit.coefficients) for fit in fits]
     )
     best = int(scores.argmax())
-    weights = np.maximum(0, 1 - (scores[best] - scores) / AS_GOOD)
+    weights = np.maximum(0, 1 - (scores[best] - scores) / SEARCH.as_good)
     spread = float(np.sqrt(weights @ (areas / areas[best] - 1) ** 2 / weights.sum()))
     return masks, replace(fits[best], spread=spread)
 
@@ -214,14 +178,14 @@ def _find_starts(masks: MaskStack) -> tuple[MaskStack, list[Floats]]:
         if not found.is_good:
             found = _try_starts(few, _likely_starts(few, replace(hull, voxels=hull.voxels[keep])), found)
     order = sorted(range(len(found.patches)), key=lambda index: -found.scores[index])
-    return masks.turn_world(axes.T), [found.patches[index] @ axes for index in order[:MOST_FITS]]
+    return masks.turn_world(axes.T), [found.patches[index] @ axes for index in order[:SEARCH.most_fits]]
 
 
 def _few_views(masks: MaskStack, middle: Floats) -> MaskStack:
-    """At most SEARCHED_VIEWS of the views, evenly spread around the middle of the leaf."""
+    """At most `SEARCH.searched_views` of the views, evenly spread around the middle of the leaf."""
     matrices, shifts = masks.px_from_world[:, :, :3], masks.px_from_world[:, :, 3:]
     ways = -np.linalg.solve(matrices, shifts)[..., 0] - middle
-    chosen = spread_directions(ways / np.linalg.norm(ways, axis=1, keepdims=True), SEARCHED_VIEWS)
+    chosen = spread_directions(ways / np.linalg.norm(ways, axis=1, keepdims=True), SEARCH.searched_views)
     return masks.select(np.isin(np.arange(len(masks)), chosen))
 
 
@@ -242,11 +206,11 @@ def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found
     most = max([found.half_way, *scores])
     patches, ends, is_good = list(found.patches), list(found.scores), found.is_good
     for score, half in zip(scores, halves, strict=True):
-        if score > most - HOPELESS:
+        if score > most - SEARCH.hopeless:
             patch, offsets = approach_patch(masks, half, steps=SECOND_HALF)
             rank = _rank(masks, patch, offsets)
             explained = max(0.0, rank - _rank(masks, patch))
-            is_good |= rank + FORGIVEN * explained > GOOD_IOU
+            is_good |= rank + SEARCH.forgiven * explained > SEARCH.good_iou
             patches.append(patch)
             ends.append(rank - _area_cost(patch))
     return _Found(tuple(patches), tuple(ends), is_good, most)
@@ -254,14 +218,14 @@ def _try_starts(masks: MaskStack, starts: list[Floats], found: _Found) -> _Found
 
 def _area_cost(coefficients: Floats) -> float:
     """What is taken off the rank of a patch before it is compared with others."""
-    return AREA_COST * float(np.log(measure_sizes(coefficients)[0]))
+    return SEARCH.area_cost * float(np.log(measure_sizes(coefficients)[0]))
 
 
 def _likely_starts(masks: MaskStack, hull: Hull) -> list[Floats]:
     """How well a start explains the masks, before any fit, tells how likely it is."""
     starts = start_in(hull)
     ranks = [_rank(masks, start) for start in starts]
-    return [starts[index] for index in sorted(range(len(ranks)), key=lambda index: -ranks[index])[:MOST_STARTS]]
+    return [starts[index] for index in sorted(range(len(ranks)), key=lambda index: -ranks[index])[:SEARCH.most_starts]]
 
 
 def start_in(hull: Hull) -> list[Floats]:
@@ -276,21 +240,22 @@ def start_in(hull: Hull) -> list[Floats]:
 
 def _rank(masks: MaskStack, coefficients: Floats, offsets: Floats | None = None) -> float:
     """Median IoU over the views, coarsely; less for a patch that is wider than long."""
-    covered = cover_crops(masks, project_points(masks.px_from_world, patch_grid(*FAR_GRID).points(coefficients))) > 0
+    points = patch_grid(*FIT.far_grid).points(coefficients)
+    covered = cover_crops(masks, project_points(masks.px_from_world, points)) > 0
     return float(np.median(crop_ious(masks, covered, offsets=offsets))) - _wide_cost(coefficients)
 
 
 def _fine_rank(masks: MaskStack, fit: PatchFit, average: Callable[[Floats], np.floating]) -> float:
     """The same, finely; with the mean IoU for its average: of fits that are nearly as good, medians pick one by
     chance."""
-    points = patch_grid(*FIT_GRID).points(fit.coefficients)
+    points = patch_grid(*FIT.grid).points(fit.coefficients)
     ious = view_ious(masks, points, offsets=np.nan_to_num(fit.offsets_px))
     return float(average(ious)) - _wide_cost(fit.coefficients)
 
 
 def _wide_cost(coefficients: Floats) -> float:
     size = measure_patch(coefficients)
-    return WIDE_COST if 2 * size.half_width > size.length else 0.0
+    return SEARCH.wide_cost if 2 * size.half_width > size.length else 0.0
 
 
 def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
@@ -300,7 +265,7 @@ def find_wrong_masks(masks: MaskStack, points: Floats) -> NDArray[np.bool_]:
     """
     inside, free = look_at(masks, points)
     shares = inside.sum(1) / np.maximum((inside | free).sum(1), 1)
-    is_wrong = shares < WRONG_SHARE * np.median(shares)
+    is_wrong = shares < SEARCH.wrong_share * np.median(shares)
     return is_wrong if (~is_wrong).sum() >= 3 else np.zeros(len(masks), bool)
 
 
@@ -331,19 +296,19 @@ def _fit_again(
     """A leaf fitted to what is its rim, now that all leaves (`points` of their grids) and the errors of the masks are
     known."""
     instance, masks, fit = asked
-    margin = BEHIND * measure_patch(fit.coefficients).length
+    margin = SEARCH.behind * measure_patch(fit.coefficients).length
     others = {other: grid for other, grid in points.items() if other != instance}
     hiding = hiding_pixels(masks, points[instance], others, margin=margin)
     masks = replace(masks, others=hiding)
-    return masks, replace(fit_patch(masks, fit.coefficients, errors=errors), spread=fit.spread)
+    return masks, replace(fit_patch(masks, fit.coefficients, num_steps=FIT.num_steps, errors=errors), spread=fit.spread)
 
 
 def _surface(masks: MaskStack, fit: PatchFit, *, is_judged: bool) -> LeafSurface:
     if not np.isfinite(fit.covariance).all():
         return LeafSurface.none(torch.from_numpy(masks.views), "its masks do not tell its shape")
-    points = patch_grid(*FIT_GRID).points(fit.coefficients)
+    points = patch_grid(*FIT.grid).points(fit.coefficients)
     offsets = np.nan_to_num(fit.offsets_px)
-    drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, blur_px=0.0) >= 0.5
+    drawn = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, is_blurred=False) >= 0.5
     iou, inside = crop_ious(masks, drawn), masks.inside.sum((1, 2))
     lacking = float(((masks.inside & ~drawn).sum((1, 2)) / np.median(inside)).max())
     surface = LeafSurface(
@@ -372,14 +337,14 @@ def _judge_shape(masks: MaskStack, points: Floats) -> list[str]:
     is_open = (masks.look_up(masks.others, stack, px) == 0).reshape(len(masks), -1)
     is_inside = masks.look_up(masks.inside, stack, px).reshape(len(masks), -1)
     shown = (is_inside & is_open).sum(0) / np.maximum(is_open.sum(0), 1)
-    unshown = float(areas[shown < SHOWN].sum() / areas.sum())
-    if unshown > MOST_UNSHOWN:
+    unshown = float(areas[shown < DOUBTS.shown].sum() / areas.sum())
+    if unshown > DOUBTS.most_unshown:
         reasons.append(f"{100 * unshown:.0f} % of the surface is in hardly any mask: the leaf has lobes or holes")
     along = np.linalg.norm(np.diff(points[:, points.shape[1] // 2], axis=0), axis=-1).cumsum()
     widths = np.linalg.norm(np.diff(points, axis=1), axis=-1).sum(-1)
     places = np.append(0, along) / along[-1]
-    ends = np.interp((NEAR_END, 1 - NEAR_END), places, widths) / widths.max()
-    if ends.max() > BLUNT:
+    ends = np.interp((DOUBTS.near_end, 1 - DOUBTS.near_end), places, widths) / widths.max()
+    if ends.max() > DOUBTS.blunt:
         reasons.append("one end is blunt: where the midrib ends, and so the length, is a guess")
     return reasons
 
@@ -392,11 +357,11 @@ def _judge(surface: LeafSurface, lacking: float) -> list[str]:
     if len(surface.views) == 2:
         reasons.append("seen in two views only")
     iou = float(surface.iou.median())
-    if iou < LEAST_IOU:
+    if iou < DOUBTS.least_iou:
         reasons.append(f"the surface explains its masks badly (median IoU {iou:.2f})")
-    if iou > CLEAN_IOU and lacking > MOST_LACKING:
+    if iou > DOUBTS.clean_iou and lacking > DOUBTS.most_lacking:
         reasons.append(f"one view shows more than its surface, by {100 * lacking:.0f} % of a mask")
     share = surface.deviations[0] / surface.area
-    if share > MOST_AREA_SHARE:
+    if share > DOUBTS.most_area_share:
         reasons.append(f"its area is uncertain by {100 * share:.0f} %")
     return reasons

@@ -8,16 +8,11 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.reconstruction.numbers import HULL
 from mvseg.reconstruction.surface.leaf_patch import Floats, Ints
 from mvseg.reconstruction.surface.mask_stack import MaskStack
 from mvseg.reconstruction.surface.patch_image import project_points
 from mvseg.reconstruction.visual_hull import Silhouettes, halve_cells
-
-SHOWN_SHARE = 0.5  # a voxel is occupied if it is in more than this share of the masks
-SEEN_SHARE = 0.8  # no view looks past a voxel if more than this share of those that nothing hides it from show it
-CELL_PX = 6.0  # the search ends when the side of a cell is less than this in the photos
-MOST_CELLS = 10_000  # or when there are so many cells (a technical limit)
-NUM_VOXELS = 20_000  # about so many voxels are looked at in these cells (a technical limit)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,16 +43,16 @@ def carve_hull(masks: MaskStack) -> Hull:
     Masks of nearly parallel views may share an unbounded space: see `halve_cells`.
     """
     silhouettes = Silhouettes(tuple(torch.from_numpy(masks.inside)), torch.from_numpy(masks.px_from_world))
-    enough = CELL_PX * float((silhouettes.distances / silhouettes.focal).quantile(0.5))
-    for cells in halve_cells(silhouettes, SHOWN_SHARE):
-        if not 0 < len(cells) < MOST_CELLS or cells.size <= enough:
+    enough = HULL.cell_px * float((silhouettes.distances / silhouettes.focal).quantile(0.5))
+    for cells in halve_cells(silhouettes, HULL.shown_share):
+        if not 0 < len(cells) < HULL.most_cells or cells.size <= enough:
             break
-    cells = cells.divide(max(1, round((NUM_VOXELS / max(len(cells), 1)) ** (1 / 3))))
+    cells = cells.divide(max(1, round((HULL.num_voxels / max(len(cells), 1)) ** (1 / 3))))
     voxels, corner, size = cells.indices.numpy(), cells.corner.numpy(), cells.size
     inside, free = look_at(masks, corner + size * (voxels + 0.5))
     votes = inside.sum(0)
-    is_shown = votes > SHOWN_SHARE * len(masks)
-    is_seen = votes > SEEN_SHARE * (votes + free.sum(0)) + 1e-6
+    is_shown = votes > HULL.shown_share * len(masks)
+    is_seen = votes > HULL.seen_share * (votes + free.sum(0)) + 1e-6
     return Hull(voxels=voxels[is_shown], is_seen=is_seen[is_shown], corner=corner, size=size)
 
 

@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 from torch import Tensor
 
-from mvseg.reconstruction.surface.fit_surfaces import MOST_VIEWS, fit_surfaces
+from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
@@ -23,7 +23,7 @@ def fit_kept(
     cameras: Cameras,
     *,
     starts: Mapping[int, LeafSurface] = MappingProxyType({}),
-    most_views: int = MOST_VIEWS,
+    most_views: int | None = None,
     is_rough: bool = False,
 ) -> dict[int, LeafSurface]:
     """As `fit_surfaces`; where the run keeps what it computed, see `running`, only the instances that it has not fitted

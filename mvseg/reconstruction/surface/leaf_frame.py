@@ -11,11 +11,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from mvseg.reconstruction.numbers import STARTS
 from mvseg.reconstruction.surface.leaf_patch import Floats, Ints
 from mvseg.scene import nearest_point
-
-TIE = 1e-6  # lengths that differ by less than this are equal, and the first one is taken (a technical limit)
-FLAT = 1e-3  # cameras lie in one plane with the leaf if no direction leaves it by more than this
 
 
 def find_middle(px_from_world: Floats, px: Floats) -> Floats:
@@ -53,8 +51,8 @@ def find_axes(px_from_world: Floats, middle: Floats, areas: Ints) -> Floats:
 def _farthest(vectors: Floats) -> Floats | None:
     """The first of the longest vectors (S, 3), as a unit vector; None where all are short."""
     lengths = np.linalg.norm(vectors, axis=1)
-    index = int((lengths >= lengths.max() - TIE).argmax())
-    return vectors[index] / lengths[index] if lengths[index] > FLAT else None
+    index = int((lengths >= lengths.max() - STARTS.tie).argmax())
+    return vectors[index] / lengths[index] if lengths[index] > STARTS.flat else None
 
 
 def find_quarters(px_from_world: Floats, middle: Floats, axes: Floats) -> Ints:
@@ -68,7 +66,7 @@ def find_quarters(px_from_world: Floats, middle: Floats, axes: Floats) -> Ints:
     # (S, 2, 3) the axes, as photos show them.
     shown = matrix[:, :2] - cam[:, :2, None] / cam[:, 2:, None] * matrix[:, 2:]
     lengths = np.linalg.norm(shown, axis=1)
-    longest = (lengths >= lengths.max(1, keepdims=True) * (1 - TIE)).argmax(1)
+    longest = (lengths >= lengths.max(1, keepdims=True) * (1 - STARTS.tie)).argmax(1)
     x, y = shown[np.arange(len(shown)), :, longest].T * np.sign(cam[:, 2])
     is_level = np.abs(x) >= np.abs(y)
     cosine, sine = np.where(is_level, np.sign(x), 0), np.where(is_level, 0, np.sign(y))

@@ -16,25 +16,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
+from mvseg.reconstruction.numbers import FIT, PRIOR
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 COUNTS = (7, 12, 4, 3)  # m, Q, R, S have so many coefficients (a definition); fewer for Q cannot follow lobes
 NUM_COEFFICIENTS = sum(COUNTS)
 MIDRIB, SIDE, FOLD, CURL = (slice(sum(COUNTS[:part]), sum(COUNTS[: part + 1])) for part in range(len(COUNTS)))
-FIT_GRID = (36, 9)  # rows and columns of the points at which a patch is fitted, and measured for that (a definition)
 
-# The prior: each of these is expected to be none, with this standard deviation in leaf lengths (BEND, SWAY, SPEED) or
-# half-widths.
-BEND_SD = 0.06  # third differences of m
-SWAY_SD = 0.1  # times length / width: turns of the midrib within the blade, from each piece to the next
-SPEED_SD = 0.05  # differences of the speed along a piece of the midrib from one length in all
-SIDE_SD = 1.0  # second differences of Q
-NORMAL_SD = 0.35  # R and S along the normal
-FOLD_STEP_SD = 0.2  # differences of R
-SHEAR_SD = 0.15  # Q along the midrib, and R and S within the blade
-NUM_PIECES = 10  # the midrib has so many pieces, for SWAY and SPEED
-FRAMES = (*COUNTS[1:], NUM_PIECES + 1)  # the prior needs directions at so many places, evenly spaced along the leaf
 
 
 def place_stations(num_rows: int) -> Floats:
@@ -132,8 +122,8 @@ class PatchSize:
 
 def measure_patch(coefficients: Floats) -> PatchSize:
     """Length and largest half-width of a patch, world units."""
-    points = patch_grid(*FIT_GRID).points(coefficients)
-    length = np.linalg.norm(np.diff(points[:, FIT_GRID[1] // 2], axis=0), axis=1).sum()
+    points = patch_grid(*FIT.grid).points(coefficients)
+    length = np.linalg.norm(np.diff(points[:, FIT.grid[1] // 2], axis=0), axis=1).sum()
     width = np.linalg.norm(np.diff(points, axis=1), axis=2).sum(1).max()
     return PatchSize(length=float(length), half_width=float(width / 2))
 
@@ -156,17 +146,18 @@ def patch_prior(coefficients: Floats, size: PatchSize, *, noise: float) -> tuple
     bend, side, fold = _difference_rows()
     *frames, pieces = _frames(coefficients)
     tangents = _unit(_speed_rows() @ coefficients)
-    equations = [bend / (BEND_SD * length), side / (SIDE_SD * half), fold * (noise / (FOLD_STEP_SD * half))]
-    shear, upright = noise / (SHEAR_SD * half), noise / (NORMAL_SD * half)
+    equations = [bend / (PRIOR.bend_sd * length), side / (PRIOR.side_sd * half)]
+    equations += [fold * (noise / (PRIOR.fold_step_sd * half))]
+    shear, upright = noise / (PRIOR.shear_sd * half), noise / (PRIOR.normal_sd * half)
     directions = [frames[0][0] * shear]
     for along, across, normal in frames[1:]:
         directions += [along * shear, across * shear, normal * upright]
     # The outline of a round blade does not tell where its midrib runs, which would wind and come out too long. That of
     # a narrow one does.
-    directions += [pieces[1][1:-1] * (2 * half / (SWAY_SD * length**2)), tangents / (SPEED_SD * length)]
+    directions += [pieces[1][1:-1] * (2 * half / (PRIOR.sway_sd * length**2)), tangents / (PRIOR.speed_sd * length)]
     equations.append(_along(_directed_rows(), np.concatenate(directions)))
     target = np.zeros(sum(map(len, equations)))
-    target[-len(tangents) :] = 1 / SPEED_SD
+    target[-len(tangents) :] = 1 / PRIOR.speed_sd
     return np.concatenate(equations), target
 
 
@@ -196,12 +187,17 @@ def _differences(part: slice, order: int) -> Floats:
 @cache
 def _speed_rows() -> Floats:
     """(10, 26) rows that give dm/du on ten pieces of the midrib."""
-    u = np.linspace(0, 1, NUM_PIECES + 1)
-    return np.diff(patch_basis(u, np.zeros_like(u)), axis=0) * NUM_PIECES
+    u = np.linspace(0, 1, PRIOR.num_pieces + 1)
+    return np.diff(patch_basis(u, np.zeros_like(u)), axis=0) * PRIOR.num_pieces
+
+
+def _frame_counts() -> tuple[int, ...]:
+    """How many directions the prior needs, evenly spaced along the leaf: for Q, R, S, and for the ends of pieces."""
+    return *COUNTS[1:], PRIOR.num_pieces + 1
 
 
 def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
-    """Directions along, across and normal to the blade, (count, 3) each, at the places of each count of `FRAMES`."""
+    """Directions along, across and normal to the blade, (count, 3) each, at the places of each of `_frame_counts`."""
     ahead, sideways = _frame_rows()
     along = _unit(ahead @ coefficients)
     side = sideways @ coefficients[SIDE]
@@ -210,14 +206,14 @@ def _frames(coefficients: Floats) -> list[tuple[Floats, Floats, Floats]]:
     across = _unit(side - (side * along).sum(1, keepdims=True) * along)
     (ax, ay, az), (bx, by, bz) = along.T, across.T
     normal = np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], 1)  # np.cross is slow on few
-    ends = np.cumsum(FRAMES)[:-1]
+    ends = np.cumsum(_frame_counts())[:-1]
     return list(zip(*(np.split(each, ends) for each in (along, across, normal)), strict=True))
 
 
 @cache
 def _frame_rows() -> tuple[Floats, Floats]:
-    """(sum of `FRAMES`, 26) rows of directions along the midrib, and (same, 12) of the side vectors."""
-    middle = np.clip(np.concatenate([np.linspace(0, 1, count) for count in FRAMES]), 0.02, 0.98)
+    """(sum of `_frame_counts`, 26) rows of directions along the midrib, and (same, 12) of the side vectors."""
+    middle = np.clip(np.concatenate([np.linspace(0, 1, count) for count in _frame_counts()]), 0.02, 0.98)
     zeros = np.zeros_like(middle)
     ahead = patch_basis(middle + 0.02, zeros) - patch_basis(middle - 0.02, zeros)
     return ahead, spline_basis(middle, COUNTS[1])

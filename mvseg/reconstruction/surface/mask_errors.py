@@ -14,14 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter1d
 
+from mvseg.reconstruction.numbers import ERRORS
 from mvseg.reconstruction.surface.leaf_patch import Floats
-
-ROUNDS = 4  # times that the offsets and their density are found in turn (a technical limit)
-LEAST_MASKS = 20  # errors are learnt from at least so many masks
-LEAST_SPREAD_PX = 0.3  # masks are clean if their sizes differ by less
-MEASURED_PX = 0.2  # the measured offset of one mask has this standard deviation
-STEP_PX = 0.05  # a density is given at steps of this (a technical limit)
-FLOOR = 1e-3  # a density is at least this, per pixel: any mask may be wrong in another way
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +24,7 @@ class MaskErrors:
 
     Attributes:
         sd_px: their standard deviation.
-        density: (2 G + 1,) per pixel, at -G ... G steps of STEP_PX.
+        density: (2 G + 1,) per pixel, at -G ... G steps of `ERRORS.step_px`.
     """
 
     sd_px: float
@@ -39,22 +33,22 @@ class MaskErrors:
     @property
     def share(self) -> float:
         """How much of a measured offset is to be believed: all of it where masks differ by more than is measured."""
-        return self.sd_px**2 / (self.sd_px**2 + MEASURED_PX**2)
+        return self.sd_px**2 / (self.sd_px**2 + ERRORS.measured_px**2)
 
     def centre(self, offsets: Floats) -> tuple[float, float]:
         """Where offset 0 lies among the offsets (S,) of one leaf, in pixels, and its standard deviation.
 
         Mean and deviation of the posterior over all places between the smallest and the largest offset.
         """
-        places = np.arange(offsets.min(), offsets.max() + STEP_PX, STEP_PX)
+        places = np.arange(offsets.min(), offsets.max() + ERRORS.step_px, ERRORS.step_px)
         middle = len(self.density) // 2
-        cells = np.round((offsets - places[:, None]) / STEP_PX).astype(int) + middle
+        cells = np.round((offsets - places[:, None]) / ERRORS.step_px).astype(int) + middle
         density = self.density[np.clip(cells, 0, 2 * middle)]
-        evidence = np.log(density + FLOOR).sum(1)
+        evidence = np.log(density + ERRORS.floor).sum(1)
         weight = np.exp(evidence - evidence.max())
         weight /= weight.sum()
         mean = float(weight @ places)
-        return mean, float(np.sqrt(weight @ (places - mean) ** 2 + STEP_PX**2))
+        return mean, float(np.sqrt(weight @ (places - mean) ** 2 + ERRORS.step_px**2))
 
 
 def learn_mask_errors(offsets: Sequence[Floats]) -> MaskErrors | None:
@@ -66,13 +60,13 @@ def learn_mask_errors(offsets: Sequence[Floats]) -> MaskErrors | None:
     Returns:
         None where there are too few masks, or where they differ so little that they are clean.
     """
-    if sum(map(len, offsets)) < LEAST_MASKS:
+    if sum(map(len, offsets)) < ERRORS.least_masks:
         return None
     centres = [winsorised_mean(each) for each in offsets]
     errors = _spread(offsets, centres)
-    if errors.sd_px < LEAST_SPREAD_PX:
+    if errors.sd_px < ERRORS.least_spread_px:
         return None
-    for _ in range(ROUNDS):
+    for _ in range(ERRORS.rounds):
         centres = [errors.centre(each)[0] for each in offsets]
         errors = _spread(offsets, centres)
     return errors
@@ -92,9 +86,10 @@ def _spread(offsets: Sequence[Floats], centres: Sequence[float]) -> MaskErrors:
     away = [(each - centre) * by for each, centre, by in zip(offsets, centres, widen, strict=True)]
     sample = np.abs(np.concatenate(away))
     spread = float(np.sqrt((sample**2).mean()))
-    bandwidth = max(0.5 * spread * (2 * len(sample)) ** -0.2, MEASURED_PX / 2)
-    half = int(np.ceil((sample.max() + 4 * bandwidth) / STEP_PX))
-    counts = np.bincount(np.round(sample / STEP_PX).astype(int), minlength=half + 1) / (2 * len(sample) * STEP_PX)
-    both = np.concatenate([counts[:0:-1], counts])
+    bandwidth = max(0.5 * spread * (2 * len(sample)) ** -0.2, ERRORS.measured_px / 2)
+    half = int(np.ceil((sample.max() + 4 * bandwidth) / ERRORS.step_px))
+    counts = np.bincount(np.round(sample / ERRORS.step_px).astype(int), minlength=half + 1)
+    density = counts / (2 * len(sample) * ERRORS.step_px)
+    both = np.concatenate([density[:0:-1], density])
     both[half] *= 2
-    return MaskErrors(sd_px=spread, density=gaussian_filter1d(both, bandwidth / STEP_PX, mode="constant"))
+    return MaskErrors(sd_px=spread, density=gaussian_filter1d(both, bandwidth / ERRORS.step_px, mode="constant"))

@@ -1,6 +1,6 @@
 """The masks of one leaf, ready for its fit: blurred, with samples of their edges, and with what may hide the leaf.
 
-Large masks are made smaller first: outlines need no more than LARGE_PX pixels across a leaf, and photos of any
+Large masks are made smaller first: outlines need no more than `STACK.large_px` pixels across a leaf, and photos of any
 size cost the same. Positions are in pixels of these crops, each from its own top-left corner.
 """
 
@@ -15,13 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.measure import find_contours
 
+from mvseg.reconstruction.numbers import STACK
 from mvseg.reconstruction.surface.leaf_patch import Floats
 
-BLUR_PX = 0.8  # masks are blurred by a Gaussian of this, so that their edges are smooth functions of the position
-MARGIN = 24  # a crop has so many pixels around its mask (a technical limit)
-LARGE_PX = 60.0  # masks are made smaller by the whole number nearest to the root of their median area over this
-LONG_PX = 400  # or by more, so that no side is longer than this (a technical limit)
-EDGE_SAMPLES = 40  # the edge of a mask has about so many samples (a technical limit)
 FRAME = -1  # what lies outside the image has this label (a definition)
 Labels = NDArray[np.int32]
 
@@ -153,17 +149,17 @@ def stack_masks(
     places = [(np.flatnonzero(mask.any(0))[[0, -1]], np.flatnonzero(mask.any(1))[[0, -1]]) for mask in masks]
     sides = np.array([(rows[1] - rows[0] + 1, columns[1] - columns[0] + 1) for columns, rows in places])
     scale = choose_pixel_size([int(mask.sum()) for mask in masks], int(sides.max()))
-    rows, columns = (-(-side // scale) + 2 * MARGIN for side in sides.max(0).tolist())
+    rows, columns = (-(-side // scale) + 2 * STACK.margin for side in sides.max(0).tolist())
     shape = (len(masks), rows, columns)
     blurred, inside, hiding = np.zeros(shape, np.float32), np.zeros(shape, bool), np.zeros(shape, np.int32)
     px_from_world = np.array(px_from_world, dtype=float)
     for index, (mask, (left, top), (across, down)) in enumerate(zip(masks, mask_corners, places, strict=True)):
-        x, y = int(across[0]) - scale * MARGIN, int(down[0]) - scale * MARGIN
+        x, y = int(across[0]) - scale * STACK.margin, int(down[0]) - scale * STACK.margin
         around = _cut(others[index], (x + left, y + top), (columns * scale, rows * scale), beyond=FRAME)
         around = around[scale // 2 :: scale, scale // 2 :: scale]
         own_part = _cut(mask, (x, y), (columns * scale, rows * scale), beyond=0).astype(np.float32)
         share = cv2.resize(own_part, (columns, rows), interpolation=cv2.INTER_AREA)
-        cv2.GaussianBlur(share, (0, 0), BLUR_PX, dst=blurred[index])
+        cv2.GaussianBlur(share, (0, 0), STACK.blur_px, dst=blurred[index])
         inside[index] = share >= 0.5
         hiding[index] = np.where(inside[index] | (around == own), 0, around)
         matrix = px_from_world[index]
@@ -195,7 +191,7 @@ def places_of_views(stack: NDArray, num_views: int) -> NDArray[np.int64]:
 
 def choose_pixel_size(num_pixels: Sequence[int], longest: int) -> int:
     """At least 1, for masks of (S,) pixels the longest side of which is `longest`."""
-    return max(1, round(float(np.sqrt(np.median(num_pixels))) / LARGE_PX), -(-longest // LONG_PX))
+    return max(1, round(float(np.sqrt(np.median(num_pixels))) / STACK.large_px), -(-longest // STACK.long_px))
 
 
 def _cut(frame: NDArray, corner: tuple[int, int], size: tuple[int, int], *, beyond: int) -> NDArray:
@@ -213,7 +209,7 @@ def _edge_samples(blurred: NDArray) -> tuple[Floats, Floats]:
     total = sum(len(line) for line in lines)
     px, normals = [np.zeros((0, 2))], [np.zeros((0, 2))]
     for line in lines:
-        count = max(4, round(EDGE_SAMPLES * len(line) / total))
+        count = max(4, round(STACK.edge_samples * len(line) / total))
         pick = np.linspace(0, len(line) - 1, count, endpoint=False).astype(int)
         tangent = line[(pick + 3) % (len(line) - 1)] - line[(pick - 3) % (len(line) - 1)]
         tangent /= np.maximum(np.linalg.norm(tangent, axis=1, keepdims=True), 1e-9)

@@ -12,14 +12,10 @@ from itertools import pairwise
 import numpy as np
 import torch
 
+from mvseg.reconstruction.numbers import STEM
 from mvseg.reconstruction.surface.leaf_patch import COUNTS, NUM_COEFFICIENTS, SIDE, Floats
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.scene import Cameras
-
-LEAST_LEAVES = 4  # the stem is looked for if so many leaves are there
-# An end is surely the base if it is nearer to the stem than the other by more than this share of the length.
-CLEAR = 0.25
-ROUNDS = 5  # of fitting the stem to the bases (a technical limit)
 
 
 def turn_matrix() -> Floats:
@@ -43,13 +39,13 @@ def orient_surfaces(surfaces: dict[int, LeafSurface], cameras: Cameras) -> dict[
     there = {instance: surface for instance, surface in surfaces.items() if surface.exists}
     oriented = dict(surfaces)
     ends = np.array([surface.midrib[[0, -1]].numpy() for surface in there.values()]).reshape(-1, 2, 3)
-    to_stem = stem_distances(ends) if len(there) >= LEAST_LEAVES else None
+    to_stem = stem_distances(ends) if len(there) >= STEM.least_leaves else None
     for index, (instance, surface) in enumerate(there.items()):
         if to_stem is not None:
             first, last = to_stem[index]
             if last < first:
                 surface = _transform(surface, turn_matrix())
-            surface = replace(surface, is_oriented=bool(abs(first - last) > CLEAR * surface.length))
+            surface = replace(surface, is_oriented=bool(abs(first - last) > STEM.clear * surface.length))
         towards = cameras.centers[surface.views].mean(0).cpu() - surface.midrib.mean(0)
         oriented[instance] = _transform(surface, mirror_matrix()) if towards @ surface.normal < 0 else surface
     return oriented
@@ -63,7 +59,7 @@ def stem_distances(ends: Floats) -> Floats:
     """
     point = np.median(ends.reshape(-1, 3), axis=0)
     distances = np.linalg.norm(ends - point, axis=2)
-    for _ in range(ROUNDS):
+    for _ in range(STEM.rounds):
         bases = ends[np.arange(len(ends)), distances.argmin(1)]
         point = np.median(bases, axis=0)
         weight = 1 / (1 + (distances.min(1) / np.median(distances.min(1)).clip(1e-12)) ** 2)

@@ -14,28 +14,16 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.reconstruction.numbers import IMAGE, OUTLINE
 from mvseg.reconstruction.surface.leaf_patch import Floats, PatchGrid
 from mvseg.reconstruction.surface.mask_stack import MaskStack, places_of_views
 from mvseg.reconstruction.surface.patch_image import (
-    DRAWN_TOO_FAR,
-    SUPERSAMPLED,
     Projection,
     cover_crops,
     draw_patch,
     grid_orientations,
     project_points,
 )
-
-BEYOND_PX = (1.0, 2.0)  # another instance begins beyond an edge if it is seen so far outside of it
-# A sample lies on the outline if the patch does not cover the pixel so far outside of it: filled quads are half a pixel
-# too wide.
-OUTSIDE_PX = 1.6
-REVERSE_WEIGHT = 0.5  # samples of the masks' edges have this weight, those of the patch 1
-PULL_FROM_PX = 4.0  # an edge pulls at its nearest sample if it is farther than this outside the patch
-SIMILAR = 0.5  # two samples match if the cosine between their normals is at least this
-# An edge is looked for at so many steps of a pixel to either side first: most edges are there (a technical limit).
-NEAR_STEPS = 3
-MOST_SHIFT_PX = 5.0  # outline of a patch and edge of its image may be apart by at most this
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +58,7 @@ def outline_samples(
     Also (S, H, W) uint8, above 0 where the patch covers a pixel of `masks`.
     """
     samples = _concatenate(_rim_samples(grid, projection), _fold_samples(grid, projection))
-    outside = samples.px + OUTSIDE_PX * samples.normals
+    outside = samples.px + OUTLINE.outside_px * samples.normals
     covered = cover_crops(masks, projection)
     return samples.select(masks.look_up(covered, samples.stack, outside) == 0), covered
 
@@ -215,8 +203,9 @@ def outline_distances(
     shift = np.zeros(len(to_edge))
     if is_imaged:
         drawn = draw_patch(masks, projection, offsets=offsets)
-        most = MOST_SHIFT_PX + float(np.abs(offsets).max(initial=0))
-        shift = search_edges(masks, samples, drawn, reach=most, offsets=offsets)[0] - DRAWN_TOO_FAR / SUPERSAMPLED
+        most = OUTLINE.most_shift_px + float(np.abs(offsets).max(initial=0))
+        shift = search_edges(masks, samples, drawn, reach=most, offsets=offsets)[0]
+        shift = shift - IMAGE.drawn_too_far / IMAGE.supersampled
     counts = np.isfinite(to_edge) & np.isfinite(shift) & ~(hidden & (to_edge < shift))
     own, edge, toward = nearest_samples(masks, samples, covered, reach=reach)
     back = ((masks.edge_px[edge] - samples.px[own]) * toward).sum(1) - shift[own]
@@ -233,7 +222,7 @@ def outline_distances(
         px=np.concatenate([(to_edge - shift)[counts], back]),
         place=both.place,
         gradient=_gradients(masks.px_from_world[both.stack], both, normals),
-        weight=np.concatenate([np.ones(len(forth.px)), np.full(len(reverse.px), REVERSE_WEIGHT)]),
+        weight=np.concatenate([np.ones(len(forth.px)), np.full(len(reverse.px), OUTLINE.reverse_weight)]),
         grid=grid,
     )
 
@@ -254,7 +243,7 @@ def search_edges(
     """
     steps = np.linspace(-reach, reach, 2 * int(np.ceil(reach)) + 1)
     middle = len(steps) // 2
-    near = steps[max(middle - NEAR_STEPS, 0) : middle + NEAR_STEPS + 1]
+    near = steps[max(middle - OUTLINE.near_steps, 0) : middle + OUTLINE.near_steps + 1]
     distance = _nearest_edges(masks, samples, blurred, steps=near)
     missed = np.flatnonzero(np.isinf(distance))  # a nearer edge is not to be had farther away
     distance[missed] = _nearest_edges(masks, samples.select(missed), blurred, steps=steps)
@@ -290,7 +279,7 @@ def _is_hidden(
     """
     hidden = np.zeros(len(edge), bool)
     gap = np.maximum(0, -offsets)[stack]
-    for step in BEYOND_PX:
+    for step in OUTLINE.beyond_px:
         hidden |= masks.look_up(masks.others, stack, edge + (step + gap)[:, None] * normals) != 0
     return hidden
 
@@ -315,8 +304,8 @@ def nearest_samples(
     is_outside = _take(masks.look_up(covered, masks.edge_stack, masks.edge_px) == 0, edge)
     normals = _take(masks.edge_normals, edge)
     nearest_square = np.take_along_axis(square, straight[:, :, None], 2)[:, :, 0]
-    pulls = is_outside & (nearest_square > PULL_FROM_PX**2) & np.isfinite(nearest_square)
-    is_other = normals @ _take(samples.normals, own).transpose(0, 2, 1) < SIMILAR
+    pulls = is_outside & (nearest_square > OUTLINE.pull_from_px**2) & np.isfinite(nearest_square)
+    is_other = normals @ _take(samples.normals, own).transpose(0, 2, 1) < OUTLINE.similar
     np.copyto(square, np.inf, where=is_other)
     nearest = np.where(pulls, straight, square.argmin(2))
     found = pulls | (np.take_along_axis(square, nearest[:, :, None], 2)[:, :, 0] < (2 * reach) ** 2)

@@ -11,15 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from mvseg.reconstruction.numbers import IMAGE, STACK
 from mvseg.reconstruction.surface.leaf_patch import Floats
-from mvseg.reconstruction.surface.mask_stack import BLUR_PX, MaskStack
-
-SUPERSAMPLED = 3  # a pixel is drawn as so many small ones along each side (a technical limit)
-DRAWN_TOO_FAR = 0.48  # OpenCV draws polygons so many small pixels too wide on every side (measured: test_outline.py)
-SUB_PIXEL_BITS = 4  # corners of OpenCV's polygons are whole numbers of 1 / 2^4 pixels (a technical limit)
-LEAST_GROWTH_PX = 0.15  # a patch is drawn with an offset if that is at least this: less is not worth the time
-DRAWN_BESIDE = 4  # the blurred image of a patch reaches so many pixels beyond it
-NEAR_PX = 6  # what lies in front of a leaf matters so far around it
+from mvseg.reconstruction.surface.mask_stack import MaskStack
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +50,7 @@ def view_ious(masks: MaskStack, points: Floats, *, offsets: Floats | None = None
 
     With `offsets` (S,), pixels, the patch is drawn as much too large or small as the mask of each view is.
     """
-    shares = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, blur_px=0.0)
+    shares = draw_patch(masks, project_points(masks.px_from_world, points), offsets=offsets, is_blurred=False)
     return crop_ious(masks, shares >= 0.5)
 
 
@@ -73,26 +67,26 @@ def crop_ious(masks: MaskStack, covered: NDArray[np.bool_], *, offsets: Floats |
 
 
 def draw_patch(
-    masks: MaskStack, projection: Projection, *, offsets: Floats | None = None, blur_px: float = BLUR_PX
+    masks: MaskStack, projection: Projection, *, offsets: Floats | None = None, is_blurred: bool = True
 ) -> NDArray[np.float32]:
-    """(S, H, W) the projected grid as a blurred mask, like `MaskStack.blurred`; sharp with a blur of 0.
+    """(S, H, W) the projected grid as a blurred mask, like `MaskStack.blurred`, or sharp.
 
     With `offsets` (S,), pixels, it is grown or shrunk as the mask of each view seems to be.
     """
     drawn = np.zeros((len(masks), *masks.size), np.float32)
-    beside = DRAWN_BESIDE if offsets is None else DRAWN_BESIDE + int(np.ceil(np.abs(offsets).max(initial=0)))
+    beside = IMAGE.drawn_beside + (0 if offsets is None else int(np.ceil(np.abs(offsets).max(initial=0))))
     low = np.clip(np.floor(projection.px.min((1, 2))) - beside, 0, masks.size[::-1]).astype(int)
     high = np.clip(np.ceil(projection.px.max((1, 2))) + beside, 0, masks.size[::-1]).astype(int)
-    canvases = [np.zeros((height, width), np.uint8) for width, height in (SUPERSAMPLED * (high - low)).tolist()]
-    fill_grids(canvases, SUPERSAMPLED * (projection.px - low[:, None, None]))
+    canvases = [np.zeros((height, width), np.uint8) for width, height in (IMAGE.supersampled * (high - low)).tolist()]
+    fill_grids(canvases, IMAGE.supersampled * (projection.px - low[:, None, None]))
     for index, canvas in enumerate(canvases):
         if not canvas.size:
             continue
-        if offsets is not None and abs(offsets[index]) > LEAST_GROWTH_PX:
-            canvas = grow(canvas, SUPERSAMPLED * float(offsets[index]))
+        if offsets is not None and abs(offsets[index]) > IMAGE.least_growth_px:
+            canvas = grow(canvas, IMAGE.supersampled * float(offsets[index]))
         (left, top), (right, bottom) = low[index], high[index]
         share = _shares(canvas, (right - left, bottom - top))
-        drawn[index, top:bottom, left:right] = cv2.GaussianBlur(share, (0, 0), blur_px) if blur_px else share
+        drawn[index, top:bottom, left:right] = cv2.GaussianBlur(share, (0, 0), STACK.blur_px) if is_blurred else share
     return drawn
 
 
@@ -118,15 +112,15 @@ def fill_grids(canvases: Iterable[NDArray[np.uint8]], px: Floats) -> None:
     corners = corners.reshape(len(px), -1, 2)
     for canvas, grid, rim, rare, folds in zip(canvases, corners, rims, is_rare, is_rare.any(1), strict=True):
         if canvas.size:
-            cv2.fillPoly(canvas, [rim], 255, shift=SUB_PIXEL_BITS)
+            cv2.fillPoly(canvas, [rim], 255, shift=IMAGE.sub_pixel_bits)
         if canvas.size and folds:
-            cv2.fillPoly(canvas, list(grid[quads[rare]]), 255, shift=SUB_PIXEL_BITS)
+            cv2.fillPoly(canvas, list(grid[quads[rare]]), 255, shift=IMAGE.sub_pixel_bits)
 
 
 def _fixed(px: Floats) -> NDArray[np.int32]:
     """Positions as OpenCV's polygons have them: whole numbers of small parts of a pixel, from its centre on."""
-    most = 1 << (SUB_PIXEL_BITS + 13)
-    return np.clip(np.round((px - 0.5) * (1 << SUB_PIXEL_BITS)), -most, most).astype(np.int32)
+    most = 1 << (IMAGE.sub_pixel_bits + 13)
+    return np.clip(np.round((px - 0.5) * (1 << IMAGE.sub_pixel_bits)), -most, most).astype(np.int32)
 
 
 def grid_orientations(px: Floats) -> Floats:
@@ -152,15 +146,15 @@ def _quad_places(rows: int, columns: int) -> NDArray[np.int64]:
 def draw_polygons(polygons: Floats, size: tuple[int, int], corner: Floats) -> NDArray[np.float32]:
     """(height, width) share of each pixel that quads (T, 4, 2) cover.
 
-    Drawn several times as large. OpenCV's polygons include their border: they are DRAWN_TOO_FAR small pixels too wide
-    on every side.
+    Drawn several times as large. OpenCV's polygons include their border: they are `IMAGE.drawn_too_far` small pixels
+    too wide on every side.
     """
-    canvas = np.zeros((size[1] * SUPERSAMPLED, size[0] * SUPERSAMPLED), np.uint8)
+    canvas = np.zeros((size[1] * IMAGE.supersampled, size[0] * IMAGE.supersampled), np.uint8)
     first, second = polygons[:, 2] - polygons[:, 0], polygons[:, 3] - polygons[:, 1]
     is_front = first[:, 0] * second[:, 1] - first[:, 1] * second[:, 0] > 0
-    local = _fixed((polygons - corner) * SUPERSAMPLED)
+    local = _fixed((polygons - corner) * IMAGE.supersampled)
     for side in (local[is_front], local[~is_front]):  # where two of one side meet, their edge counts twice: as inside
-        cv2.fillPoly(canvas, list(side), 255, shift=SUB_PIXEL_BITS)
+        cv2.fillPoly(canvas, list(side), 255, shift=IMAGE.sub_pixel_bits)
     return _shares(canvas, size)
 
 
@@ -187,7 +181,7 @@ def hiding_pixels(masks: MaskStack, points: Floats, others: dict[int, Floats], *
     leaves = (masks.inside | (cover_crops(masks, projection) > 0)).astype(np.uint8)
     size = masks.size[::-1]
     for index, crop in enumerate(hiding):
-        near = cv2.dilate(leaves[index], np.ones((2 * NEAR_PX + 1,) * 2, np.uint8)) > 0
+        near = cv2.dilate(leaves[index], np.ones((2 * IMAGE.near_px + 1,) * 2, np.uint8)) > 0
         near &= ~masks.inside[index]
         own = cKDTree(projection.px[index].reshape(-1, 2))
         own_depth = projection.depth[index].ravel()
@@ -195,8 +189,8 @@ def hiding_pixels(masks: MaskStack, points: Floats, others: dict[int, Floats], *
             px, depth = image.px[index].reshape(-1, 2), image.depth[index].ravel()
             if (px.max(0) < 0).any() or (px.min(0) > size).any():
                 continue
-            canvas = np.zeros((size[1] * SUPERSAMPLED, size[0] * SUPERSAMPLED), np.uint8)
-            fill_grids([canvas], image.px[index : index + 1] * SUPERSAMPLED)
+            canvas = np.zeros((size[1] * IMAGE.supersampled, size[0] * IMAGE.supersampled), np.uint8)
+            fill_grids([canvas], image.px[index : index + 1] * IMAGE.supersampled)
             drawn = _shares(canvas, size) >= 0.5
             shows = crop == other
             row, column = np.nonzero(near & (shows | drawn & (crop == 0)))

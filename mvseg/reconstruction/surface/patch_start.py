@@ -9,6 +9,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from mvseg.reconstruction.numbers import STARTS
 from mvseg.reconstruction.surface.leaf_patch import (
     COUNTS,
     CURL,
@@ -20,18 +21,6 @@ from mvseg.reconstruction.surface.leaf_patch import (
     measure_patch,
     spline_basis,
 )
-
-MOST_POINTS = 1000  # so many voxels are used at most, which is enough for nine windows (a technical limit)
-NUM_WINDOWS = 9  # the midrib of a start goes through the middles of so many windows along the leaf
-NEIGHBOURS = 8  # a voxel is joined to so many others where the way along a leaf is looked for
-# A leaf may be so bent that its axis is a curve if the ratio of its two largest deviations is at least this.
-ELONGATED = 2.0
-BENT = 1.35  # or if the way along it is so many times the straight one: graphs make detours of a tenth
-TURNS_DEG = (0.0, 90.0, 45.0, 135.0)  # starts have their side at these angles about the midrib
-# A start is at least so wide, as a share of its length, and so long, as a share of the cloud's deviation: masks of a
-# pixel have flat hulls, or hulls of a few voxels.
-THINNEST = 0.01
-TIE = 1e-6  # distances on a lattice are equal if they differ by less than this share, by rounding
 
 
 def start_patches(points: Floats) -> list[Floats]:
@@ -56,10 +45,10 @@ def start_patches(points: Floats) -> list[Floats]:
     if spreads[1] <= 1e-9 * spreads[0] or spreads[0] == 0:
         return []
     straight, along = centred @ axes[0], _geodesic_places(points)
-    is_bent = spreads[0] > ELONGATED * spreads[1] or along.max() > BENT * np.ptp(straight)
+    is_bent = spreads[0] > STARTS.elongated * spreads[1] or along.max() > STARTS.bent * np.ptp(straight)
     first = _patches_along(points, along if is_bent else straight, axes[1])
     starts = first + _patches_along(points, centred @ axes[1], axes[0])
-    shortest = THINNEST * spreads[0] / np.sqrt(len(points))
+    shortest = STARTS.thinnest * spreads[0] / np.sqrt(len(points))
     return [start for start in starts if measure_patch(start).length > shortest]
 
 
@@ -77,7 +66,7 @@ def _patches_along(points: Floats, place: Floats, side: Floats) -> list[Floats]:
 
 def _thin(points: Floats) -> Floats:
     """Every so many points, in their order: deterministic, and even for the lattice order of voxels."""
-    step = max(1, int(np.ceil(len(points) / MOST_POINTS)))
+    step = max(1, int(np.ceil(len(points) / STARTS.most_points)))
     return points[::step]
 
 
@@ -87,8 +76,8 @@ def _geodesic_places(points: Floats) -> Floats:
     Loose pieces are joined by the straight distance to the nearest point of the largest piece.
     """
     tree = cKDTree(points)
-    reach = tree.query(points, k=min(NEIGHBOURS + 1, len(points)))[0][:, -1]
-    near = tree.query_ball_point(points, reach * (1 + TIE))  # of voxels that are equally near, all
+    reach = tree.query(points, k=min(STARTS.neighbours + 1, len(points)))[0][:, -1]
+    near = tree.query_ball_point(points, reach * (1 + STARTS.tie))  # of voxels that are equally near, all
     rows, columns = np.repeat(np.arange(len(points)), [len(each) for each in near]), np.concatenate(near).astype(int)
     distance = np.maximum(np.linalg.norm(points[rows] - points[columns], axis=1), 1e-12)
     graph = csr_matrix((distance, (rows, columns)), (len(points), len(points)))
@@ -106,24 +95,24 @@ def _geodesic_places(points: Floats) -> Floats:
 
 def _first_largest(values: Floats) -> int:
     """Place of the first of the largest values (P,), of those that tie."""
-    return int((values >= values.max() * (1 - TIE)).argmax())
+    return int((values >= values.max() * (1 - STARTS.tie)).argmax())
 
 
 def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
     """Centroids (9, 3) of overlapping windows along t in [0, 1], and half-width vectors (4, 9, 3) in all directions."""
-    centres = (np.arange(NUM_WINDOWS) + 0.5) / NUM_WINDOWS
-    weights = np.clip(1 - np.abs(t - centres[:, None]) * NUM_WINDOWS, 0, None)
+    centres = (np.arange(STARTS.num_windows) + 0.5) / STARTS.num_windows
+    weights = np.clip(1 - np.abs(t - centres[:, None]) * STARTS.num_windows, 0, None)
     for index in np.flatnonzero((weights > 0).sum(1) < 4):  # a gap in the cloud: the nearest points
         weights[index] = 0
         weights[index, np.argsort(np.abs(t - centres[index]), kind="stable")[:8]] = 1
     middles = weights @ points / weights.sum(1, keepdims=True)
     along = np.gradient(middles, axis=0)
     along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
-    turns = np.radians(TURNS_DEG)[:, None]
-    thinnest = THINNEST / 2 * float(np.linalg.norm(np.diff(middles, axis=0), axis=1).sum())
-    directions, sides = np.zeros((NUM_WINDOWS, 3)), np.zeros((len(turns), NUM_WINDOWS, 3))
+    turns = np.radians(STARTS.turns_deg)[:, None]
+    thinnest = STARTS.thinnest / 2 * float(np.linalg.norm(np.diff(middles, axis=0), axis=1).sum())
+    directions, sides = np.zeros((STARTS.num_windows, 3)), np.zeros((len(turns), STARTS.num_windows, 3))
     for index in np.argsort(np.abs(centres - 0.5), kind="stable"):
-        near = np.abs(t - centres[index]) < 0.75 / NUM_WINDOWS
+        near = np.abs(t - centres[index]) < 0.75 / STARTS.num_windows
         flat = points[near] - middles[index] if near.sum() >= 4 else points - middles[index]
         flat = flat - (flat @ along[index])[:, None] * along[index]
         widest = np.linalg.eigh(flat.T @ flat)[1][:, 2]
@@ -139,7 +128,7 @@ def _windows(points: Floats, t: Floats, side: Floats) -> tuple[Floats, Floats]:
 
 def _coefficients(middles: Floats, sides: Floats) -> Floats:
     """Splines through the windows; the ends of the midrib are pushed out by half a window to the ends of the cloud."""
-    centres = (np.arange(NUM_WINDOWS) + 0.5) / NUM_WINDOWS
+    centres = (np.arange(STARTS.num_windows) + 0.5) / STARTS.num_windows
     first = middles[0] + 0.5 * (middles[0] - middles[1])
     last = middles[-1] + 0.5 * (middles[-1] - middles[-2])
     u = np.concatenate([[0.0], centres, [1.0]])
