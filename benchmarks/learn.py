@@ -2,7 +2,8 @@
 
 For each scene a table: as it is; after one, two, three rounds (each from the labels of the last, whatever E says),
 and after one round in which a person has outlined six leaves in two photos each, the largest ones that are not right;
-his masks do not count in the figures. E, the expected number of right masks, stands beside what the truth says, where
+his masks do not count in the figures. With --next, what the weights of each round find on the next plant, as they are.
+E, the expected number of right masks, stands beside what the truth says, where
 the scene has a folder `truth`. `stays` marks what `mvseg infer --learn 3` would keep: E grows by `GROWTH`.
 Weights and detections are kept in --cache.
 """
@@ -14,6 +15,7 @@ import sys
 import time
 import warnings
 from pathlib import Path
+from tempfile import NamedTemporaryFile
 from typing import Any
 
 import numpy as np
@@ -72,12 +74,26 @@ def show(name: str, known: Known, truth: list[Labels] | None, *, stays: str, beg
     print("| " + " | ".join(str(row.get(column, "")) for column in HEAD) + " |", flush=True)
 
 
+def see_next(folder: Path, weights: bytes | None, name: str, *, cache: CachedDetections) -> None:
+    """A row of another plant, seen with learned weights; None: with the shipped ones."""
+    with NamedTemporaryFile(suffix=".safetensors") as file:
+        file.write(weights or b"")
+        file.flush()
+        detect = DetectConfig() if weights is None else DetectConfig(weights=file.name)
+        begun = time.process_time()
+        opened = open_scene(folder, None, RunConfig(reconstruct=None, learn="off", detect=detect))
+        known = find_in_photos(opened, cache=cache)
+    truth = true_maps(folder, opened.scene) if (folder / "truth").is_dir() else None
+    show(name, known, truth, stays="", begun=begun)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="+")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--person", action=argparse.BooleanOptionalAction, default=True)
     parser.add_argument("--image_size", type=int, default=None)
+    parser.add_argument("--next", type=Path, help="folder of another plant of the same species")
     parser.add_argument("--cache", type=Path, default=Path("results/learn"))
     args = parser.parse_args()
     torch.set_num_threads(1)
@@ -92,12 +108,16 @@ def main() -> None:
         print(f"\n**{folder.resolve().name}**: {len(opened.scene.views)} photos, seen at {known.looks[0].longest} px\n")
         print("| " + " | ".join(HEAD) + " |\n|" + "---|" * len(HEAD))
         show("as it is", known, truth, stays="", begun=begun)
+        if args.next is not None:
+            see_next(args.next, None, "the next plant", cache=cache)
         stays = True
         for number in range(1, args.rounds + 1):
             begun, before = time.process_time(), known
             known = learn(known, cache=cache, rounds=1)
             stays = stays and known.expected_right >= GROWTH * before.expected_right
             show(f"round {number}", known, truth, stays="yes" if stays else "no", begun=begun)
+            if args.next is not None:
+                see_next(args.next, known.learned.weights, f"the next plant, weights of round {number}", cache=cache)
         if args.person and truth is not None:
             begun, corrections = time.process_time(), outline_some(first, truth)
             known = learn(first, cache=cache, corrections=corrections, rounds=1)

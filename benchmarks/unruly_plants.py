@@ -3,7 +3,8 @@
 Blades are curled and wavy, plants wild (`make_wild`), leaves move from photo to photo as in a draught, and the poses
 that the scene states are wrong by about 1.5 px. Four plants with truth, to judge on them what is chosen for real
 plants; and, with SKINS, a folder of leaves that were cut out, twelve more that look like other species (`dress`), and
-four of these seen from so near that leaves fill the photos, as somebody with a phone does.
+four of these seen from so near that leaves fill the photos, as somebody with a phone does; and the next plants of two
+of these species, on which to see what learned weights bring.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ DRESSED = (
 CLOSE = (
     ("ovate", 20, 14, 181), ("lanceolate", 18, 14, 182), ("rosette", 16, 12, 186), ("lobed", 12, 12, 187),
 )  # fmt: skip
+NEXT = {"lobed-187": ("lobed", 14, 12, 188), "lanceolate-182": ("lanceolate", 16, 12, 183)}  # from as near
 ZOOM = 2.2  # of these, over the focal length that fills the photo with the plant
 SIZE = 800
 CURL, WAVE = 0.7, 0.035  # radians from midrib to edge; of a leaf's length
@@ -90,8 +92,10 @@ def write_unruly(
     seed: int,
     skins: tuple[Floats, ...] = (),
     zoom: float = 1.0,
+    worn: int | None = None,
 ) -> None:
-    """A scene as `mvseg simulate` writes it, without leaf meshes: no one shape is the truth of all photos."""
+    """A scene as `mvseg simulate` writes it, without leaf meshes: no one shape is the truth of all photos. It looks as
+    the plant of seed `worn` does, if that is given."""
     plant, rng = make_unruly(grow_plant(family, num_leaves, seed), seed), np.random.default_rng([seed, 4])
     cameras = arc_cameras(
         num_views, plant, span_deg=360, start_deg=seed, elevations_deg=(15.0, 45.0, 30.0), width=SIZE, height=SIZE
@@ -105,7 +109,8 @@ def write_unruly(
     for view, name in enumerate(names):
         stage = build_stage(sway(plant, rng), seed=seed)
         if skins:
-            stage = replace(stage, look=dress(stage.look, skins, np.random.default_rng([seed, 5])))
+            look = stage.look if worn is None else build_stage(plant, seed=worn).look
+            stage = replace(stage, look=dress(look, skins, np.random.default_rng([worn or seed, 5])))
         shot = render_stage(stage, cameras, view)
         truth = drop_small(shot.ids, 30)
         write_jpeg(folder / "images" / f"{name}.jpg", shot.rgb)
@@ -125,6 +130,9 @@ def main() -> None:
         for family, num_leaves, num_views, seed in plants if skins or plants is PLANTS else ():
             folder = out / f"{family}-{seed}"
             write_unruly(folder, family, num_leaves, num_views=num_views, seed=seed, skins=worn, zoom=zoom)
+    for name, (family, num_leaves, num_views, seed) in NEXT.items() if skins else ():
+        worn_by, folder = int(name.rpartition("-")[2]), out / f"{family}-{seed}"
+        write_unruly(folder, family, num_leaves, num_views=num_views, seed=seed, skins=skins, zoom=ZOOM, worn=worn_by)
 
 
 if __name__ == "__main__":
