@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -13,7 +12,7 @@ from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops
 from mvseg.detection.numbers import DETECTION
 from mvseg.detection.proposals import gather_proposals
-from mvseg.errors import InputWarning
+from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
 from mvseg.matching.result import Matching, MatchReport
 from mvseg.matching.split import split_merged
@@ -133,7 +132,7 @@ def find_leaves(
         own = look.proposals(cameras)
         tables = [look.sure.masks.to("cpu")]
         if config.verify:
-            with warnings.catch_warnings(action="ignore", category=InputWarning):  # said of the sure ones already
+            with collect_warnings():  # said of the sure ones already
                 tables.append(look.match(cameras, min(DETECTION.more_score, config.min_score)).masks)
         numbered = [replace(each.regions, labels=each.regions.labels + offset) for each in tables]
         matched += [replace(each, regions=regions) for each, regions in zip(tables, numbered, strict=True)]

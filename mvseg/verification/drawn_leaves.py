@@ -7,7 +7,6 @@ is fitted to those parts as well, and then says what each view shows of the leaf
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
@@ -19,7 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.crop import Crop
-from mvseg.errors import InputWarning
+from mvseg.errors import collect_warnings
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.config import ReconstructConfig
@@ -173,8 +172,7 @@ def _with_hiding(masks: Masks, leaf: int, cameras: Cameras) -> Regions:
 def _shown_points(allowed: Regions, cameras: Cameras, colored: Mapping[int, Frame]) -> dict[int, Frame]:
     """{view: (H, W) bool} where the points come to lie that all regions `allowed` hold, and nearly all other views:
     these show leaf colour there."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)  # masks whose common part is unbounded are cut off
+    with collect_warnings():  # masks whose common part is unbounded are cut off
         hull = back_project(allowed, cameras, config=HULL)
     if hull is None or not len(hull.points):
         return {}

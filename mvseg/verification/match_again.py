@@ -7,14 +7,13 @@ find each other.
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
 import torch
 from scipy.special import logit
 
-from mvseg.errors import InputWarning
+from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
 from mvseg.matching.config import MatchConfig
 from mvseg.matching.links import Links
@@ -44,8 +43,7 @@ def match_again(masks: Masks, leaf: Ints, *, odds: Floats, cameras: Cameras, con
     for least in AGAIN.freed:
         is_free = (leaf < 0) | (odds < logit(least))
         if (is_free & (leaf >= 0)).any():
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore", InputWarning)  # the first matching has said it
+            with collect_warnings():  # the first matching has said it
                 again = match_masks(masks, cameras, config, links=_links(leaf, is_free))
             ids = again.masks.instance_ids
             is_old = torch.isin(ids, ids[torch.from_numpy(~is_free)])

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
-
 import torch
 
-from mvseg.errors import InputWarning
+from mvseg.errors import collect_warnings
 from mvseg.masks import Masks
 from mvseg.reconstruction.surface.kept_surfaces import fit_kept
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
@@ -17,8 +15,7 @@ from mvseg.verification.numbers import ROUGH
 def fit_roughly(masks: Masks, cameras: Cameras) -> dict[int, LeafSurface]:
     """{instance id: surface} to verify masks with. It does not warn: what still holds after the correction is said
     then."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", InputWarning)
+    with collect_warnings():
         return fit_kept(masks.regions, masks.instance_ids, cameras, most_views=ROUGH.views, is_rough=True)
 
 
