@@ -2,7 +2,8 @@
 
 Two outlines leave a surface's tilt open. The other views close it: what has the colour of leaves there, and is in no
 mask of another leaf, is the leaf itself wherever the points that both outlines allow come to lie in it. The surface
-is fitted to those parts as well, and then says what each view shows of the leaf. Not in the paper.
+is fitted to those parts as well, and then says what each view shows of the leaf. Half masks of the leaf, which no
+person drew, go: they would make it half a surface. Not in the paper.
 """
 
 from __future__ import annotations
@@ -23,10 +24,12 @@ from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
 from mvseg.reconstruction.config import ReconstructConfig
 from mvseg.reconstruction.surface.fit_surfaces import fit_surfaces
+from mvseg.reconstruction.surface.kept_surfaces import name_fit
 from mvseg.reconstruction.surface.leaf_surface import LeafSurface
 from mvseg.reconstruction.voxels import back_project
 from mvseg.regions import Regions, stack_regions
 from mvseg.scene import Cameras
+from mvseg.system.running import now_running
 from mvseg.verification.leaf_color import colors_of_leaves, has_leaf_color
 from mvseg.verification.numbers import DRAWN, EVIDENCE, ROUGH
 from mvseg.verification.rough_surfaces import median_parallax
@@ -48,7 +51,8 @@ def follow_drawn(
 
     That is where at least `DRAWN.least_visible` of the leaf's surface, and `EVIDENCE.open_pixels`, lie in no mask of
     another leaf, and `DRAWN.least_colored` of it have the colour of leaves. There, a mask that was matched to nothing
-    and agrees with it (`EVIDENCE.fits`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`.
+    and agrees with it (`EVIDENCE.fits`) becomes the leaf's; otherwise, that part does, with `Origin.OTHER_VIEWS`. With
+    photos, it takes the place of half masks of the leaf, see `_drop_halves`.
 
     Args:
         masks: D masks, matched; those that a person drew have `Origin.CORRECTED`.
@@ -57,20 +61,24 @@ def follow_drawn(
         colors: of leaves, where they are known already; None: those of the masks, see `colors_of_leaves`.
 
     Returns:
-        The D masks on the CPU in their order, and the new ones after them. And {instance id: surface} of the leaves
-        that were looked for; none of those that are not credible, which get no masks.
+        The D masks on the CPU in their order, without half masks, and the new ones after them. And {instance id:
+        surface} of the leaves that were looked for; none of those that are not credible, which get no masks.
     """
     masks, cameras = masks.to("cpu"), cameras.to("cpu")
     drawn = masks.instance_ids[(masks.origin == Origin.CORRECTED) & (masks.instance_ids > 0)].unique().tolist()
-    others = {leaf: _views_without(masks, leaf) for leaf in drawn}
-    if not any(others.values()) or median_parallax(masks, cameras) < ROUGH.least_parallax:
+    followed = [leaf for leaf in drawn if _is_followed(masks, leaf)]
+    if not followed or median_parallax(masks, cameras) < ROUGH.least_parallax:
         return masks, {}
     colored = [np.ones((height, width), bool) for width, height in cameras.sizes.tolist()]
     if photos is not None:
         colors = colors_of_leaves(masks, photos) if colors is None else colors
         colored = [has_leaf_color(photos(view), colors) for view in range(len(cameras))]
     surfaces: dict[int, LeafSurface] = {}
-    for leaf in (leaf for leaf in drawn if others[leaf]):
+    for leaf in followed:
+        if photos is not None:
+            masks = _drop_halves(masks, leaf, colored, cameras=cameras)
+        if not _views_without(masks, leaf):
+            continue
         surface = _fit(masks, leaf, colored if photos is not None else None, cameras=cameras)
         if surface.is_credible:
             surfaces[leaf] = surface
@@ -78,9 +86,54 @@ def follow_drawn(
     return masks, surfaces
 
 
+def _is_followed(masks: Masks, leaf: int) -> bool:
+    """Whether a leaf has masks in several views, and none, or others than a person's, in others."""
+    is_own = masks.instance_ids == leaf
+    return bool(_views_without(masks, leaf)) or bool((is_own & ~masks.is_corrected & ~masks.is_linked).any())
+
+
 def _views_without(masks: Masks, leaf: int) -> list[int]:
     shown = set(masks.view_index[masks.instance_ids == leaf].tolist())
     return [view for view in range(masks.regions.num_views) if view not in shown] if len(shown) > 1 else []
+
+
+def _maybe_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cameras) -> Tensor:
+    """(D,) bool: which masks of a leaf may show half of it: those that no person drew, confirmed or linked, and where
+    enough more has the colour of leaves and is in no mask of another leaf. None where a person drew the leaf in one
+    view only. (Without such masks, no surface need be fitted.)"""
+    is_own = masks.instance_ids == leaf
+    maybe = is_own & ~masks.is_corrected & ~masks.is_linked
+    if len(masks.view_index[is_own & (masks.origin == Origin.CORRECTED)].unique()) < 2:
+        return maybe & False
+    for row in maybe.nonzero()[:, 0].tolist():
+        view, mask = int(masks.view_index[row]), masks.regions.placed(row)
+        (x1, y1, x2, y2), (width, height) = mask.box, cameras.sizes[view].tolist()
+        reach = max(x2 - x1, y2 - y1)  # on each side as much as there is
+        near = slice(max(y1 - reach, 0), min(y2 + reach, height)), slice(max(x1 - reach, 0), min(x2 + reach, width))
+        free = colored[view][near] & ~_others(masks, leaf, view, cameras).numpy()[near]
+        maybe[row] = int(free.sum()) >= DRAWN.least_colored / DRAWN.half * mask.area
+    return maybe
+
+
+def _drop_halves(masks: Masks, leaf: int, colored: list[Frame], *, cameras: Cameras) -> Masks:
+    """The masks without those that show half a leaf: the surface that follows from what was drawn alone holds them, and
+    the view shows more than twice as much of it openly, all in the colour of leaves."""
+    maybe = _maybe_halves(masks, leaf, colored, cameras=cameras)
+    if not maybe.any():
+        return masks
+    certain = (masks.instance_ids == leaf) & (masks.is_corrected | masks.is_linked)
+    free = (masks.instance_ids == leaf) & ~certain
+    alone = replace(masks, instance_ids=masks.instance_ids.where(~free, -1))
+    surface = _fit(alone, leaf, colored, cameras=cameras)
+    if not surface.is_credible:
+        return masks
+    shown = _find_open(alone, leaf, surface, cameras=cameras, colored=colored)
+    stays = torch.ones(len(masks), dtype=torch.bool)
+    for row in maybe.nonzero()[:, 0].tolist():
+        if (found := shown.get(int(masks.view_index[row]))) is not None:
+            mask, (visible, _) = masks.regions.placed(row), found
+            stays[row] = not EVIDENCE.fits * mask.area <= mask.intersect(visible).area < DRAWN.half * visible.area
+    return masks.select(stays)
 
 
 def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Cameras) -> LeafSurface:
@@ -96,37 +149,47 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
         starts = {} if start is None else {leaf: start}
         return fit_surfaces(more, ids, cameras, starts=starts)[leaf]
 
-    if colored is None:
+    others = _views_without(masks, leaf)
+    if colored is None or not others:
         return fit({}, None)
+    around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in others})
+    left = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in around}
+    parts = _find_parts(left, around)
+    kept, name = now_running().kept, name_fit(_with_parts(own, parts), cameras, how="drawn")
+    if kept is not None and name in kept:  # what else hides it, may have changed, as in `fit_kept`
+        found: LeafSurface = kept[name]
+        return found
     best = None
-    left = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in _views_without(masks, leaf)}
-    around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in left})
     for _ in range(DRAWN.rounds):
-        found = {view: _largest_part(left[view] & around[view]) for view in left if view in around}
-        parts = {view: Crop.of(part) for view, part in found.items() if int(part.sum()) >= EVIDENCE.open_pixels}
         if not parts:
             break
         best = fit(parts, best)
         if not best.exists:
             break
-        around = _around(best, cameras, left)
+        parts = _find_parts(left, _around(best, cameras, left))
     is_own = None if best is None else torch.isin(best.views, own.view_index)
     if best is None or is_own is None or float(best.iou[is_own].min()) < EVIDENCE.fits:  # the outlines are certain
-        return fit({}, None)
+        best = fit({}, None)
+    if kept is not None:
+        kept[name] = best
     return best
+
+
+def _find_parts(left: Mapping[int, Frame], around: Mapping[int, Frame]) -> dict[int, Crop]:
+    """{view: what may be a leaf's there}: the largest part of what is left around its place."""
+    found = {}
+    for view in left:
+        place = Crop.of(left[view] & around[view]) if (left[view] & around[view]).any() else None
+        part = None if place is None else _largest_part(np.pad(place.pixels.numpy(), 1))[1:-1, 1:-1]
+        if place is not None and part is not None and int(part.sum()) >= EVIDENCE.open_pixels:
+            found[view] = replace(place, pixels=torch.from_numpy(part.copy())).tighten()
+    return found
 
 
 def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, colored: list[Frame]) -> Masks:
     """The masks with those that the other views show of a leaf."""
-    places = surface.project_parts(cameras)
     ids, parts = masks.instance_ids.clone(), {}
-    for view in _views_without(masks, leaf):
-        whole = places[view]
-        visible = replace(whole, pixels=whole.pixels & ~whole.cut(_others(masks, leaf, view, cameras)))
-        leaf_colored = replace(visible, pixels=visible.pixels & whole.cut(torch.from_numpy(colored[view])))
-        is_open = visible.area >= max(EVIDENCE.open_pixels, DRAWN.least_visible * whole.area)
-        if not is_open or leaf_colored.area < DRAWN.least_colored * visible.area:
-            continue
+    for view, (visible, leaf_colored) in _find_open(masks, leaf, surface, cameras=cameras, colored=colored).items():
         free = ((masks.view_index == view) & (ids < 0) & ~masks.is_corrected).nonzero()[:, 0].tolist()
         fits = {row: masks.regions.placed(row).iou(visible) for row in free}
         best = max(fits, key=lambda row: fits[row], default=-1)
@@ -146,6 +209,22 @@ def _show(masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, co
         origin=torch.where(is_new, int(Origin.OTHER_VIEWS), more.origin),
         is_linked=more.is_linked & ~is_new,
     )
+
+
+def _find_open(
+    masks: Masks, leaf: int, surface: LeafSurface, *, cameras: Cameras, colored: list[Frame]
+) -> dict[int, tuple[Crop, Crop]]:
+    """{view: the unhidden part of a leaf's surface, and what of it has the colour of leaves}, of the views without a
+    mask of the leaf that show it openly."""
+    places, found = surface.project_parts(cameras), {}
+    for view in _views_without(masks, leaf):
+        whole = places[view]
+        visible = replace(whole, pixels=whole.pixels & ~whole.cut(_others(masks, leaf, view, cameras)))
+        leaf_colored = replace(visible, pixels=visible.pixels & whole.cut(torch.from_numpy(colored[view])))
+        is_open = visible.area >= max(EVIDENCE.open_pixels, DRAWN.least_visible * whole.area)
+        if is_open and leaf_colored.area >= DRAWN.least_colored * visible.area:
+            found[view] = visible, leaf_colored
+    return found
 
 
 def _others(masks: Masks, leaf: int, view: int, cameras: Cameras) -> Tensor:

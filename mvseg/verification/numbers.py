@@ -73,6 +73,7 @@ class DrawnNumbers:
 
     least_visible: float = 0.3  # unhidden fraction of a surface that a view sees openly, at least; see `open_pixels`
     least_colored: float = 0.8  # fraction of the unhidden part that has the colour of leaves, at least
+    half: float = 0.5  # definition: a mask shows half a leaf if it covers less of what its view shows of the surface
     rounds: int = 2  # fits: the second one is to what is found where the surface of the first one is
     beside_px: int = 2  # pixels between leaf colour and where a view may show a leaf, at most
     most_against: float = 0.15  # fraction of views with another colour at a point of a leaf, at most: stakes hide it

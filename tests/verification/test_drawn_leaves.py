@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from blade_scene import as_regions
+from known_leaves import flat_leaf
 from matched import matched
 from mvseg.demo import demo_scene
 from mvseg.formats.photos import Photos
@@ -18,7 +19,7 @@ from mvseg.masks import Masks, Origin
 from mvseg.regions import Regions
 from mvseg.scene import Scene
 from mvseg.verification.drawn_leaves import follow_drawn
-from three_leaves import CAMERAS, true_maps
+from three_leaves import CAMERAS, LEAVES, true_maps
 
 
 @pytest.fixture(scope="module")
@@ -134,3 +135,28 @@ def test_a_view_must_show_enough_of_it(how: dict[str, float], is_shown: bool) ->
     views = follow_painted(4, **how)
     assert (4 in views) == is_shown
     assert {1, 5} <= {*views}
+
+
+@pytest.mark.parametrize(("share", "goes"), [(0.35, True), (0.65, False)])
+def test_half_masks_of_a_drawn_leaf_go(share: float, goes: bool) -> None:
+    """Leaf 3 was drawn in two photos. In the others a detector has found a part of it, from one edge on: less than half
+    goes, and each photo shows the whole leaf, but for one in which others hide it; a larger part stays."""
+    half_width = 0.3 * share
+    part = flat_leaf(length=0.8, half_width=half_width, at=(0.4, -1.2 + half_width, -0.2))
+    whole, parts = true_maps(), true_maps({**LEAVES, 3: part})
+    regions, ids = as_regions([whole[view] if view in (0, 3) else parts[view] for view in range(6)])
+    given = matched(regions, ids).masks
+    is_drawn = (ids == 3) & torch.isin(regions.view_index, torch.tensor([0, 3]))
+    given = replace(given, origin=torch.where(is_drawn, int(Origin.CORRECTED), int(Origin.GIVEN)))
+    photos = [np.where(labels[..., None] > 0, GREEN, BROWN).astype(np.uint8) for labels in whole]
+    after, _ = follow_drawn(given, cameras=CAMERAS, photos=photos.__getitem__)
+    is_leaf = after.instance_ids == 3
+    is_other = (given.instance_ids != 3).nonzero()[:, 0]
+    assert sorted(after.view_index[is_leaf].tolist()) == list(range(6))
+    is_new = is_leaf & (after.origin == Origin.OTHER_VIEWS)
+    assert after.view_index[is_new].tolist() == ([1, 4, 5] if goes else [])
+    for one, other in zip((~is_leaf).nonzero()[:, 0].tolist(), is_other.tolist(), strict=True):
+        assert torch.equal(after.regions.crop(one), given.regions.crop(other))
+    for view in after.view_index[is_new].tolist():
+        shown, true = mask_of(after.regions, is_leaf, view, whole[view].shape[::-1]), whole[view] == 3
+        assert (shown & true).sum() > 0.85 * (shown | true).sum()

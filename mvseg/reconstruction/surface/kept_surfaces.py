@@ -45,15 +45,20 @@ def fit_kept(
     kept = now_running().kept
     if kept is None:
         return fit()
-    fitted_as = json.dumps([_digest(cameras.px_from_world), most_views, is_rough])
     ids = instance_ids[instance_ids > 0].unique().tolist()
-    names = {each: f"{fitted_as} {name_instance(regions, instance_ids == each)}" for each in ids}
+    how = f"{most_views} {is_rough}"
+    names = {each: name_fit(regions.select(instance_ids == each), cameras, how=how) for each in ids}
     known = {each: kept[name] for each, name in names.items() if name in kept}
     if ids and len(known) == len(ids):
         return known
     surfaces = fit(known=known)
     kept.update({names[each]: surface for each, surface in surfaces.items()})
     return surfaces
+
+
+def name_fit(regions: Regions, cameras: Cameras, *, how: str) -> str:
+    """A name of a surface that is fitted to these masks, with these cameras, in the way that `how` says."""
+    return json.dumps([_digest(cameras.px_from_world), how, sorted(name_each(regions))])
 
 
 def name_instance(regions: Regions, is_member: Tensor) -> str:
