@@ -163,7 +163,7 @@ class _Reported(tqdm):  # type: ignore[misc]  # it has no types
 
     def __init__(self, items: Iterable[Any] | None, name: str, total: int | None, **how: Any) -> None:
         super().__init__(items, name, total, **how)
-        self.words, self.count = (name, how["unit"]), total or len(items or ())  # type: ignore[arg-type]
+        self.words = name, how["unit"]
 
     def __iter__(self) -> Iterator[Any]:
         now, (name, unit) = now_running(), self.words
@@ -171,7 +171,7 @@ class _Reported(tqdm):  # type: ignore[misc]  # it has no types
             if now.is_cancelled():
                 raise Cancelled
             if now.report is not None:
-                now.report(f"{name}: {unit} {number} of {self.count}")
+                now.report(f"{name}: {unit} {number} of {self.total}")
             yield item
 
 

@@ -69,3 +69,12 @@ def test_on_a_terminal_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> Non
     assert "pictures: view 0 of 3, ? left" in terminal.getvalue()
     assert "\n" not in terminal.getvalue()
     assert terminal.getvalue().endswith(" \r")
+
+
+def test_steps_are_reported_also_where_there_are_none_or_they_cannot_be_counted() -> None:
+    said: list[str] = []
+    with running(report=said.append):
+        assert list(progress_bar(iter(()), "surfaces", 0, unit="instance")) == []
+        assert list(progress_bar(iter("ab"), "surfaces", 2, unit="instance")) == ["a", "b"]
+        assert list(progress_bar(range(1), "views", unit="view")) == [0]
+    assert said == ["surfaces: instance 1 of 2", "surfaces: instance 2 of 2", "views: view 1 of 1"]
