@@ -155,7 +155,7 @@ def _fit(masks: Masks, leaf: int, colored: list[Frame] | None, *, cameras: Camer
     around = _shown_points(_with_hiding(masks, leaf, cameras), cameras, {view: colored[view] for view in others})
     left = {view: colored[view] & ~_others(masks, leaf, view, cameras).numpy() for view in around}
     parts = _find_parts(left, around)
-    kept, name = now_running().kept, name_fit(_with_parts(own, parts), cameras, how="drawn")
+    kept, name = now_running().kept, name_fit(_with_parts(own, parts), cameras, how=f"{DRAWN} {EVIDENCE}")
     if kept is not None and name in kept:  # what else hides it, may have changed, as in `fit_kept`
         found: LeafSurface = kept[name]
         return found
