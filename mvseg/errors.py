@@ -59,6 +59,18 @@ def collect_warnings() -> Iterator[list[str]]:
         warnings.warn_explicit(other.message, other.category, other.filename, other.lineno)
 
 
+@contextmanager
+def note_warnings() -> Iterator[list[str]]:
+    """As `collect_warnings`, and they are given when the block ends, also by an exception."""
+    sentences: list[str] = []
+    try:
+        with collect_warnings() as sentences:
+            yield sentences
+    finally:
+        for sentence in sentences:
+            warn(sentence)
+
+
 def say_fault(error: OSError | MemoryError) -> str:
     """What the system refuses, in words: a folder that cannot be made, a full disk, more memory."""
     if isinstance(error, MemoryError):

@@ -33,6 +33,7 @@ from mvseg.detection.cached_detections import CachedDetections
 from mvseg.detection.config import DetectConfig
 from mvseg.detection.crops import crop_cameras, place_crops, plant_boxes
 from mvseg.detection.detect_scene import detect_scene
+from mvseg.errors import warn
 from mvseg.formats.image_file import read_rgb, write_png
 from mvseg.formats.photos import Photos, read_photo
 from mvseg.masks import Masks, MergedMask
@@ -350,3 +351,13 @@ def test_a_small_plant_is_looked_at_again_as_if_its_photos_had_been_cut(tmp_path
     assert torch.equal(again.regions.boxes, placed.regions.boxes)
     assert torch.equal(again.regions.crops, placed.regions.crops)
     assert int(again.instance_ids.max()) >= 10  # of 12 leaves
+
+
+def test_warnings_before_an_error_are_given(plant: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(_: object) -> None:
+        warn("view 3 is dark")
+        raise InputError("view 4 is missing")
+
+    monkeypatch.setattr("mvseg.pipeline.run_scene.match_given", fail)
+    with pytest.warns(InputWarning, match="view 3 is dark"), pytest.raises(InputError, match="view 4 is missing"):
+        run_scene(plant, plant / "masks", IDS_ONLY)

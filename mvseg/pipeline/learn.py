@@ -39,7 +39,7 @@ from mvseg.verification.unexplained import is_familiar
 
 ROUNDS = 3  # where nobody says how many; most plants gain nothing from the third one (docs/detector.md)
 # Growth of E from which new weights stay. Scores rise with learning by themselves, and E with them: it grew by up to
-# 1.17 where masks became worse; where the detector finds a species for the first time, by 1.3 and more
+# 1.17 where masks became worse; where the detector finds a species for the first time, by 1.27 and more
 # (docs/detector.md).
 GROWTH = 1.2
 

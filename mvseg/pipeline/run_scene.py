@@ -14,7 +14,7 @@ from mvseg.config import RunConfig
 from mvseg.corrections.file import Corrections, load_corrections
 from mvseg.corrections.same_scene import check_made_for
 from mvseg.detection.cached_detections import CachedDetections
-from mvseg.errors import collect_warnings, warn
+from mvseg.errors import note_warnings
 from mvseg.pipeline.apply_edits import apply_edits
 from mvseg.pipeline.before_edits import pack_known
 from mvseg.pipeline.finish import finish
@@ -57,7 +57,7 @@ def run_scene(
         opened = open_scene(folder, masks, config, corrections=corrections)
         if corrections is not None and not force_corrections:
             check_made_for(corrections, opened.photos)
-        with collect_warnings() as said:
+        with note_warnings() as said:
             if opened.given is not None:
                 known = match_given(opened)
             else:
@@ -68,8 +68,6 @@ def run_scene(
                 known = find_in_photos(opened, cache=kept)
                 known = learn(known, cache=kept, corrections=corrections)
                 kept.delete_others()
-        for sentence in said:
-            warn(sentence)
         result = finish(apply_edits(known, corrections))
         before = pack_known(known, said)
     return replace(result, corrections=corrections, before_edits=before, seconds=now.seconds)
