@@ -15,7 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.corrections.doubtful import Doubt
+from mvseg.corrections.edited_mask import side_of
 from mvseg.corrections.file import Confirm, Edit, Link, Outline, Reject, Split
+from mvseg.crop import Crop
 from mvseg.evaluation.panoptic import RIGHT_IOU
 from mvseg.evaluation.truth import region_crops, shown_instances
 from mvseg.formats.lens import photo_from_pinhole, pinhole_from_photo
@@ -174,6 +176,15 @@ class Look:
         (xy,) = self._to_photo(view, np.array([[x1 + x - 0.5, y1 + y - 0.5]]))
         return (self.scene.views[view].name, float(xy[0]), float(xy[1]))
 
+    def cut_off(self, row: int, line: NDArray[np.float64], second: int) -> float:
+        """Pixels of the mask's second leaf on its side of a line, less those of others that go with them."""
+        x1, y1, x2, y2 = (int(each) for each in self.masks.regions.boxes[row])
+        crop = Crop((x1, y1, x2, y2), self.masks.regions.crop(row))
+        is_left, shown = side_of(line, crop).numpy(), crop.pixels.numpy()
+        is_second = self.truth[int(self.views[row])][y1:y2, x1:x2] == second
+        sides = (shown & is_left, shown & ~is_left)
+        return float(max(int((side & is_second).sum()) - int((side & ~is_second).sum()) for side in sides))
+
     def outline(self, leaf: int, view: int) -> Outline:
         """The largest visible piece of a leaf, drawn by hand."""
         shown = (self.truth[view] == leaf).astype(np.uint8)
@@ -304,7 +315,9 @@ def _cut(look: Look) -> list[Repair]:
         view, leaf, second = int(look.views[row]), int(look.leaf[row]), int(look.second[row])
         name, x, y = look.place(row)
         line = cut_line(look.truth[view], leaf, second)
-        pixels = float(look.shares[row, second])
+        pixels = look.cut_off(row, line, second)
+        if pixels <= 0:
+            continue
         gain = look.worth(second, pixels / look.size[second]) + pixels / look.size[leaf]
         edit = Split(view=name, at=(x, y), line=tuple((float(a), float(b)) for a, b in look._to_photo(view, line)))
         found.append(

@@ -152,6 +152,7 @@ def apply(corrections: Corrections, masks: Masks, scene: Scene) -> Corrected:
     for outlines in work.words.values():
         alive = [(number, mask) for number, mask in outlines if mask in work.masks]
         work.links += [(number, True, alive[0][1], mask) for number, mask in alive[1:]]
+    _clear_outlines(work.masks)
     order = sorted(work.masks, key=lambda mask: mask.view)
     place = {mask: n for n, mask in enumerate(order)}
     links = _agreeing_links(work, place)
@@ -279,6 +280,15 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
         work.words.setdefault(edit.leaf, []).append((number, made))
 
 
+def _clear_outlines(masks: Sequence[EditedMask]) -> None:
+    """A pixel shows one leaf: what lies in an outline is taken from every mask drawn before it."""
+    for n, drawn in enumerate(masks):
+        for mask in masks[:n] if drawn.origin == Origin.CORRECTED else []:
+            both = mask.crop.intersect(drawn.crop) if mask.view == drawn.view else None
+            if both is not None and 0 < both.area < mask.crop.area:
+                mask.crop = Crop(mask.crop.box, mask.crop.pixels & ~both.pixels).tighten()
+
+
 def _split(work: _Work, number: int, edit: Split) -> None:
     mask = _kept_mask_at(work, number, (edit.view, *edit.at))
     line = _to_pinhole(work.scene, mask.view, edit.line)
@@ -371,12 +381,12 @@ def _contradict(work: _Work, number: int, edits: Sequence[int]) -> None:
 
 
 def _mask_at(work: _Work, place: Place) -> EditedMask:
-    """The smallest mask at a place, as it would be drawn on top."""
+    """The mask at a place: what a person outlined there, or else the smallest one, as it would be drawn on top."""
     here = _masks_at(work, place, work.masks)
     if not here:
         name, x, y = place
         raise _Lost(f"there is no mask at ({x:g}, {y:g}) in view {name}")
-    return min(here, key=lambda mask: (work.is_rejected(mask), mask.crop.area))
+    return min(here, key=lambda mask: (work.is_rejected(mask), mask.origin != Origin.CORRECTED, mask.crop.area))
 
 
 def _kept_mask_at(work: _Work, number: int, place: Place) -> EditedMask:

@@ -66,12 +66,20 @@ def test_no_edits_leave_the_masks() -> None:
 
 
 def test_an_outline_replaces_what_it_covers_by_more_than_half() -> None:
-    corrected = correct(square(9, 9, 35, 21))  # all of the left mask, half of the right one
-    assert corrected.masks.regions.boxes[corrected.masks.view_index == 0].tolist() == [[*RIGHT], [9, 9, 35, 21]]
+    corrected = correct(square(9, 9, 35, 21))  # all of the left mask, half of the right one, which loses that half
+    boxes = corrected.masks.regions.boxes[corrected.masks.view_index == 0].tolist()
+    assert boxes == [[35, *RIGHT[1:]], [9, 9, 35, 21]]
     assert corrected.masks.origin.tolist() == [Origin.DETECTED, Origin.CORRECTED, Origin.DETECTED, Origin.DETECTED]
     assert corrected.masks.detection_scores[1].isnan()
     more = correct(square(9, 9, 36, 21))
     assert more.masks.regions.boxes[more.masks.view_index == 0].tolist() == [[9, 9, 36, 21]]
+
+
+def test_a_click_on_an_outline_is_about_it_even_where_a_smaller_mask_lies_under_it() -> None:
+    drawn = square(18, 8, 58, 38)  # a tenth of the left mask, all of the right one
+    corrected = correct(drawn, at("reject", 19, 12), masks=MASKS)
+    assert fates(corrected) == ["contradicted by edit 2", "applied"]
+    assert corrected.masks.regions.boxes[corrected.masks.view_index == 0].tolist() == [[10, 10, 20, 20]]
 
 
 def test_a_point_belongs_to_the_pixel_that_it_lies_in() -> None:
