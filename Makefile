@@ -17,7 +17,7 @@ test slow: PYTEST := $(PYTHON) -m pytest -n 2 --dist worksteal
 test: $(VENV)/complete
 	$(PYTEST)
 
-# whole commands, killed workers, notebooks: about three minutes
+# whole commands, pages in a browser, killed workers, notebooks
 slow: $(VENV)/complete
 	$(PYTEST) -m slow
 

@@ -172,14 +172,10 @@ def test_from_python(demo_scene: Scene, demo_regions: Regions) -> None:
         check_scene(few, demo_regions)
 
 
+@pytest.mark.slow
 @pytest.mark.shared_data
 @pytest.mark.parametrize(
-    ("plant", "masks"),
-    [
-        ("basil-0729", "masks"),
-        pytest.param("maize-plant1", "silhouettes", marks=pytest.mark.slow),
-        pytest.param("fern-llff", None, marks=pytest.mark.slow),
-    ],
+    ("plant", "masks"), [("basil-0729", "masks"), ("maize-plant1", "silhouettes"), ("fern-llff", None)]
 )
 def test_real_plants_have_no_error(plant: str, masks: str | None, shared_data: Path) -> None:
     scene = load_scene(shared_data / plant)

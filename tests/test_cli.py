@@ -815,6 +815,7 @@ def test_another_scenes_result_is_replaced_only_when_asked_for(
     assert json.loads((place / "run.json").read_text())["config"]["scene"] == str(other)
 
 
+@pytest.mark.slow
 def test_a_second_run_does_not_take_the_detections_of_the_first(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -434,6 +434,7 @@ sys.exit(main())
 """
 
 
+@pytest.mark.slow
 def test_a_process_keeps_what_was_saved_and_ends_on_ctrl_c_with_one_sentence(
     folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -462,6 +463,7 @@ def test_a_process_keeps_what_was_saved_and_ends_on_ctrl_c_with_one_sentence(
     saved.unlink()
 
 
+@pytest.mark.slow
 def test_the_whole_result_keeps_the_options_and_the_edits(tmp_path: Path) -> None:
     scene, out = write_scene(tmp_path / "my balls"), tmp_path / "my result"
     config = RunConfig(reconstruct=None, scale=0.1, unit="cm", split_merged=True)

@@ -12,7 +12,7 @@ from mvseg.server.open_tracks import OpenTracks
 from report_browser import CHROMIUM, NO_WEBGL, WAIT_MS, sync_api
 from served_result import serve, write_two_ways
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")]
 PLACE = """([date, leaf]) => {
   const canvas = document.querySelectorAll("#dates canvas")[date], box = canvas.getBoundingClientRect();
   const { shape } = data.leaves.find((one) => one.date === date && one.leaf === leaf);

@@ -373,6 +373,7 @@ def test_shipped_scene_is_small() -> None:
         assert sum(file.stat().st_size for file in (PACKAGE / name).rglob("*") if file.is_file()) <= most
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "write"), [("demo_plant", write_demo_plant), ("demo_plant_later", write_demo_plant_later)]
 )

@@ -110,7 +110,8 @@ def earlier(runs: Runs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out" / "plant"
 
 
-@pytest.mark.parametrize("verb", ["infer", pytest.param("detect", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("verb", ["infer", "detect"])
 def test_a_result_is_old_or_new(verb: str, runs: Runs, earlier: Path, tmp_path: Path) -> None:
     """"detect" is `mvseg infer` without masks, whose detections are kept until it is done."""
     plant, out = write_scene(tmp_path / "plant", 3 if verb == "infer" else 2), tmp_path / "out"

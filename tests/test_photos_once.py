@@ -45,7 +45,10 @@ def reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Reads:
     return Reads(write_scene(tmp_path / "plant"), monkeypatch)
 
 
-@pytest.mark.parametrize("given", [["--masks", "masks"], ["--detect.min_score", "0.05"]])
+DETECTED = pytest.param(["--detect.min_score", "0.05"], marks=pytest.mark.slow)
+
+
+@pytest.mark.parametrize("given", [["--masks", "masks"], DETECTED])
 def test_infer_decodes_and_hashes_each_photo_once(given: list[str], tmp_path: Path, reads: Reads) -> None:
     coarse = ["--reconstruct.shape", "voxels", "--reconstruct.voxel_budget", "500"]
     out = ["--out", str(tmp_path / "out"), "--quiet"]

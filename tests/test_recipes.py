@@ -41,6 +41,7 @@ def test_example_files_are_what_the_script_makes(tmp_path: Path) -> None:
             assert numbers == pytest.approx(expected, abs=1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("command", COMMANDS)
 def test_commands_of_the_recipes_run(
     command: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -67,6 +67,7 @@ def test_leaves_of_a_basil_go_on_over_six_days(shared_data: Path, tmp_path: Path
     assert all(is_right for chance, is_right in links if chance > 0.9)
 
 
+@pytest.mark.slow
 def test_maize_is_one_plant_of_its_height(shared_data: Path) -> None:
     folder = shared_data / "maize-plant1"
     scene = load_scene(folder)

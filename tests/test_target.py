@@ -129,6 +129,7 @@ def test_masks_end_where_half_of_the_light_is_ink(
 # --- the chain
 
 
+@pytest.mark.slow
 def test_a_page_printed_at_97_percent_is_noticed(
     photos: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

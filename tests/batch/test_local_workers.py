@@ -33,6 +33,7 @@ def light(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvseg.system.worker_pool._start_worker", start_lightly)
 
 
+@pytest.mark.slow
 def test_every_item_has_its_answer_and_workers_are_used_again() -> None:
     """With workers as they are; those of the other tests load no libraries."""
     environment = dict(os.environ)

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import pytest
+
 from mvseg.poses.focal_length import FocalLength, focal_lengths, least_sure
 from room_scene import FOCAL
 
 
+@pytest.mark.slow
 def test_the_focal_length_of_a_room_is_as_sure_as_it_says(room) -> None:
     (found,) = focal_lengths(room.structure.model, is_given=False)
     assert found.deviation is not None

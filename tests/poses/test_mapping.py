@@ -67,6 +67,7 @@ def test_a_moved_world_shows_the_same_photos(room, tmp_path: Path) -> None:
     assert np.abs(read_photo(rig, 0).astype(int) - read_photo(scene, 0)).max() <= 1  # the same lens
 
 
+@pytest.mark.slow
 def test_a_calibrated_camera_stays_and_a_photo_without_texture_is_left_out(room, tmp_path: Path) -> None:
     source, names = list_photos(room.folder / IMAGES)
     files = copy_photos(source, names[:4], tmp_path)
@@ -85,6 +86,7 @@ def test_one_quick_mapping_where_it_succeeds(room) -> None:
     assert room.steps == ("find_features", "match_features 21", "_map")
 
 
+@pytest.mark.slow
 def test_photos_that_chosen_pairs_leave_out_are_compared_with_all(room, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = watch_stages(monkeypatch)
     monkeypatch.setattr(mapping, "choose_pairs", lambda names, how, alike: [(0, 1), (0, 2), (1, 2), (4, 5)])
@@ -95,6 +97,7 @@ def test_photos_that_chosen_pairs_leave_out_are_compared_with_all(room, monkeypa
     assert len(find_structure(room.folder / IMAGES, room.files, config=asked).registered) == 3
 
 
+@pytest.mark.slow
 def test_too_few_matches_ask_for_more_features(room, monkeypatch: pytest.MonkeyPatch) -> None:
     steps = watch_stages(monkeypatch)
     monkeypatch.setattr(features, "QUICK_MOST", 12)

@@ -50,6 +50,7 @@ def test_warnings_and_errors_are_those_of_the_work(workers: ProcessPoolExecutor)
     assert next(map_in_order(square, [3], workers))[0] == 9  # the workers are still there
 
 
+@pytest.mark.slow
 def test_surfaces_are_the_same_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mvseg.reconstruction.surface.fit_surfaces.SEARCH", replace(SEARCH, few_masks=0))
     cameras = ring_cameras(4)

@@ -71,6 +71,7 @@ def test_plants_are_shown_in_one_frame_where_they_are_aligned() -> None:
     assert max(np.abs(shape).max() for shape in shapes) <= 1000
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
 def test_the_page_in_a_browser(tmp_path: Path) -> None:
     tracks = many_dates(6, 4)
@@ -101,6 +102,7 @@ def test_the_page_in_a_browser(tmp_path: Path) -> None:
         browser.close()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
 def test_growth_at_a_glance_on_a_phone(tmp_path: Path) -> None:
     """Leaf 3 is new on the second date, leaf 1 gone."""

@@ -13,7 +13,7 @@ from mvseg.results.result import Instances, Result
 from report_browser import CHROMIUM, OPTIONS, WAIT_MS, Opened, sync_api
 from report_pages import HOSTILE, rename_hostile, write_page
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")]
 
 
 @pytest.fixture(scope="module")

@@ -23,7 +23,7 @@ from mvseg.verification.choose import LeftOut
 from report_browser import CHROMIUM, NO_WEBGL, Opened, sync_api
 from report_pages import HOSTILE, RUN, draw_pictures, rename_hostile, write_page
 
-pytestmark = pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(CHROMIUM is None, reason="no browser is installed (chromium)")]
 
 
 @pytest.fixture(scope="module")
