@@ -173,7 +173,7 @@ def test_warnings_are_given_by_one_function() -> None:
 
 
 # Rooms whose numbers stand in their `numbers.py`, and modules of them that still have theirs.
-NUMBERED = {"detection", "matching", "reconstruction", "tracking", "verification"}
+NUMBERED = {"corrections", "detection", "matching", "reconstruction", "tracking", "verification"}
 BESIDE = {"mvseg.verification.leaf_scores", "mvseg.reconstruction.surface.leaf_surface"}
 
 

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from mvseg.corrections.edited_mask import EditedMask, as_table, hang_together, side_of
 from mvseg.corrections.file import Confirm, Corrections, Edit, Link, Outline, Place, Point, Reject, Split, TrackLink
+from mvseg.corrections.numbers import EDITS
 from mvseg.crop import Crop
 from mvseg.errors import InputError
 from mvseg.formats.coco import decode_segmentation
@@ -29,8 +30,6 @@ from mvseg.regions import Regions
 from mvseg.scene import Scene
 
 APPLIED, NOTHING, CONTRADICTED, PASSED = "applied", "points at nothing", "contradicted by edit {}", "not of a scene"
-COVERED = 0.5  # of a mask, from which an outline replaces it
-MOST_COVERED = 3  # masks that an outline replaces without a word: two stems in front of a leaf make three pieces
 
 
 @dataclass(frozen=True)
@@ -267,12 +266,12 @@ def _outline(work: _Work, number: int, edit: Outline) -> None:
     crop = Crop.of(frame)
     covered = []
     for mask in [each for each in work.masks if each.view == view and not work.is_rejected(each)]:
-        if mask.crop.intersect(crop).area > COVERED * mask.crop.area:
+        if mask.crop.intersect(crop).area > EDITS.covered * mask.crop.area:
             covered.append(mask)
     row = max(covered, key=lambda mask: mask.crop.area).row if covered else -1
     for mask in covered:
         _remove(work, number, mask)
-    if len(covered) > MOST_COVERED:
+    if len(covered) > EDITS.most_covered:
         work.fates[number] = Fate(number, edit.op, APPLIED, f"it replaces {len(covered)} masks")
     made = EditedMask(view, crop, row, int(Origin.CORRECTED), [number])
     work.masks.append(made)

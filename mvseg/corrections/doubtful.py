@@ -13,6 +13,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.ndimage import find_objects
 
+from mvseg.corrections.numbers import DOUBTS
 from mvseg.corrections.unmasked import Unmasked, find_unmasked
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks, Origin
@@ -24,19 +25,6 @@ from mvseg.verification.numbers import CHOICE, EVIDENCE
 
 Bools = NDArray[np.bool_]
 
-DIGITS = 6  # digits of what an answer changes: smaller differences are ties, on every processor
-LEAST_DOUBT = 0.3  # doubt from which a question is asked
-MOST_DOUBTS = 200  # questions of a page, at most: it asks a few itself, and the others where a person clicks
-OPEN = 0.5  # unhidden fraction of a surface of which a view should show a mask, at least; see `EVIDENCE.open_pixels`
-EMPTY = 0.6  # share of that part outside of all masks from which the mask is missing
-SIMILAR = 0.4  # IoU of that part with a mask of another leaf from which the mask may be the missing one
-SMOOTH = 1.5  # pixels by which a proposed outline may be off
-LEAST_CHANCE = 0.1  # chance of being a leaf from which a candidate that was not chosen is asked about
-MISSING, COVERED, LONE = 0.8, 0.9, 0.6  # largest doubts of what scores do not tell
-UNMASKED = 0.8  # doubt of a place that has the colour of leaves, and no mask
-HALF = 0.5  # size of such a place beside a mask, as a share of the mask, from which this may show half a leaf
-LEAST_HALVES = 3  # photos from which that is asked: one mask may as well touch another leaf
-MOST_PLACES = 12  # places that one question shows, at most
 
 Kind = Literal["place", "half", "match", "unmatched", "few", "surface", "covered", "missing", "leaf"]
 FIRST = ("place", "half")  # what nothing but an outline mends, and all photos follow
@@ -80,7 +68,7 @@ class Doubt:
     @property
     def change(self) -> float:
         """How many usual masks an answer is expected to change."""
-        return round(self.doubt * self.size * max(1, self.found, len(self.outlines)), DIGITS)
+        return round(self.doubt * self.size * max(1, self.found, len(self.outlines)), DOUBTS.digits)
 
 
 def list_doubts(
@@ -91,7 +79,7 @@ def list_doubts(
     left: Sequence[LeftOut] = (),
     photos: ReadPhoto | None = None,
 ) -> list[Doubt]:
-    """What a person should look at, at most `MOST_DOUBTS`: first places without masks and half masks, then what an
+    """What a person should look at, at most `DOUBTS.most`: first places without masks and half masks, then what an
     answer is expected to change most (`Doubt.change`); masks that a person made or confirmed are not asked about, and
     every other mask once.
 
@@ -117,20 +105,20 @@ def list_doubts(
     found += _doubt_surfaces(masks, known) + _doubt_rare(masks, should)
     usual, areas = _usual_area(masks), masks.regions.areas.tolist()
     if photos is not None:
-        found += _doubt_unmasked(masks, find_unmasked(masks, photos, least_area=HALF * usual), usual=usual)
+        found += _doubt_unmasked(masks, find_unmasked(masks, photos, least_area=DOUBTS.half * usual), usual=usual)
     found = [replace(each, size=min(1.0, areas[each.region] / usual)) if each.region >= 0 else each for each in found]
     is_corrected = (masks.origin >= int(Origin.CORRECTED)).tolist()
     asked: set[tuple[int, ...]] = set()
     queue = _doubt_left(left, free, usual=usual)
     for each in sorted(found, key=lambda one: (*_order(one), one.view, one.instance, one.region)):
         name = (each.region,) if each.region >= 0 else (-1, each.view, each.instance)
-        if each.doubt >= LEAST_DOUBT and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
+        if each.doubt >= DOUBTS.least and name not in asked and not (each.region >= 0 and is_corrected[each.region]):
             asked.add(name)
             queue.append(each)
     queue.sort(key=_order)
     return [
         each if each.instance < 0 else replace(each, other=best_mask(masks, each.instance, but=each.view))
-        for each in queue[:MOST_DOUBTS]
+        for each in queue[: DOUBTS.most]
     ]
 
 
@@ -145,7 +133,7 @@ def best_mask(masks: Masks, instance: int, *, but: int) -> int:
     if not len(rows):
         return -1
     scores = masks.match_scores[rows]
-    return int(rows[torch.where(scores >= scores.max() - 0.1, masks.regions.areas[rows], -1).argmax()])
+    return int(rows[torch.where(scores >= scores.max() - DOUBTS.as_good, masks.regions.areas[rows], -1).argmax()])
 
 
 def _doubt_matches(masks: Masks) -> list[Doubt]:
@@ -157,7 +145,7 @@ def _doubt_matches(masks: Masks) -> list[Doubt]:
         if ids[row] > 0:
             found.append(Doubt("match", 1 - score, views[row], ids[row], region=row))
         elif areas[row] > 0:
-            doubt = LONE * min(1.0, float(areas[row]) / usual)
+            doubt = DOUBTS.lone * min(1.0, float(areas[row]) / usual)
             found.append(Doubt("unmatched", doubt, views[row], -1, region=row))
     return found
 
@@ -174,24 +162,24 @@ def _doubt_unmasked(masks: Masks, parts: Sequence[Unmasked], *, usual: float) ->
     ids, areas, drawn = masks.instance_ids.tolist(), masks.regions.areas.tolist(), masks.is_corrected.tolist()
     places, halves = [], defaultdict[int, dict[int, Unmasked]](dict)
     for part in sorted(parts, key=lambda one: (-one.area, one.view)):
-        if part.row >= 0 and ids[part.row] > 0 and not drawn[part.row] and part.area >= HALF * areas[part.row]:
+        if part.row >= 0 and ids[part.row] > 0 and not drawn[part.row] and part.area >= DOUBTS.half * areas[part.row]:
             halves[ids[part.row]].setdefault(part.view, part)
         if part.area >= usual:
             places.append(part)
     found = []
     for instance, views in sorted(halves.items()):
-        if len(views) < LEAST_HALVES:
+        if len(views) < DOUBTS.least_halves:
             continue
         places = [part for part in places if part.row < 0 or ids[part.row] != instance]
         largest = max(views.values(), key=lambda one: one.area)
         outlines = tuple((part.view, part.outline) for part in views.values())
         found.append(
-            Doubt("half", UNMASKED, largest.view, instance, region=largest.row, found=len(views),
+            Doubt("half", DOUBTS.unmasked, largest.view, instance, region=largest.row, found=len(views),
                   expected=len(set(masks.view_index[masks.instance_ids == instance].tolist())), outlines=outlines)
         )  # fmt: skip
     if places:
-        outlines = tuple((part.view, part.outline) for part in places[:MOST_PLACES])
-        found.append(Doubt("place", UNMASKED, outlines[0][0], -1, outlines=outlines))
+        outlines = tuple((part.view, part.outline) for part in places[: DOUBTS.most_places])
+        found.append(Doubt("place", DOUBTS.unmasked, outlines[0][0], -1, outlines=outlines))
     return found
 
 
@@ -210,7 +198,7 @@ def _doubt_left(left: Sequence[LeftOut], free: Sequence[Sequence[int]], *, usual
     as `_usual_area` says."""
     found = []
     for each, rows in zip(left, free, strict=True):
-        if each.chance < LEAST_CHANCE or len(rows) < CHOICE.least_views:
+        if each.chance < DOUBTS.least_chance or len(rows) < CHOICE.least_views:
             continue
         regions = each.masks.regions
         areas = regions.areas[rows].double()
@@ -239,20 +227,20 @@ def _doubt_view(
         if box is None:
             continue
         mask, share = painted[box] == instance, float(evidence.share[view, instance])
-        if share < OPEN or mask.sum() < EVIDENCE.open_pixels:
+        if share < DOUBTS.open or mask.sum() < EVIDENCE.open_pixels:
             continue
         should[instance, view] = True
         if instance in here:
             continue
         empty = float((mask & ~taken[box]).sum() / mask.sum())
         nearest = max(members, key=lambda row: evidence.visible[row, instance], default=-1)
-        if nearest >= 0 and evidence.visible[nearest, instance] >= SIMILAR:
-            doubt = COVERED * min(1.0, float(evidence.visible[nearest, instance]) / 0.8)
+        if nearest >= 0 and evidence.visible[nearest, instance] >= DOUBTS.similar:
+            doubt = DOUBTS.covered * min(1.0, float(evidence.visible[nearest, instance]) / DOUBTS.surely)
             found.append(Doubt("covered", doubt, view, instance, region=nearest))
-        elif empty >= EMPTY:
+        elif empty >= DOUBTS.empty:
             outlines = ((view, _outline(mask, (box[1].start, box[0].start))),)
             size = min(1.0, float(mask.sum()) / _usual_area(masks))
-            found.append(Doubt("missing", MISSING * empty * share, view, instance, outlines=outlines, size=size))
+            found.append(Doubt("missing", DOUBTS.missing * empty * share, view, instance, outlines=outlines, size=size))
     return found
 
 
@@ -260,7 +248,7 @@ def _outline(crop: Bools, corner: Sequence[int]) -> NDArray[np.float64]:
     """(P, 2) the largest component of a mask (h, w), cut out at a corner x, y, as a polygon; pixels."""
     lines, _ = cv2.findContours(crop.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     longest = max(lines, key=cv2.contourArea)
-    points = cv2.approxPolyDP(longest, SMOOTH, True)[:, 0]
+    points = cv2.approxPolyDP(longest, DOUBTS.smooth_px, True)[:, 0]
     return np.asarray(points + np.array(corner) + 0.5, dtype=np.float64)
 
 

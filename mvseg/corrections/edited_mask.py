@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from mvseg.corrections.numbers import EDITS
 from mvseg.crop import Crop
 from mvseg.masks import Masks, Origin
 from mvseg.regions import stack_regions
-
-FINE = 4  # bits of a pixel's fraction, along a cut
-TOUCHES_PX = 2  # between masks of one leaf in one photo
 
 
 @dataclass(eq=False)
@@ -43,7 +41,7 @@ def side_of(line: NDArray[np.float64], crop: Crop) -> Tensor:
     aside = np.array([-along[1], along[0]]) / max(float(np.hypot(*along)), 1e-9) * far
     polygon = np.concatenate((line, [line[-1] + aside, line[0] + aside])) - 0.5  # from pixel corners to centres
     side = np.zeros((height, width), np.uint8)
-    cv2.fillPoly(side, [np.round(polygon * 2**FINE).astype(np.int32)], 1, shift=FINE)
+    cv2.fillPoly(side, [np.round(polygon * 2**EDITS.fine).astype(np.int32)], 1, shift=EDITS.fine)
     return torch.from_numpy(side > 0)
 
 
@@ -56,8 +54,9 @@ def hang_together(masks: Sequence[EditedMask]) -> bool:
 def touch(one: Crop, other: Crop) -> bool:
     """Do two masks of one view touch, or nearly?"""
     x1, y1, x2, y2 = one.union(other).box
-    around = (x1 - TOUCHES_PX, y1 - TOUCHES_PX, x2 + TOUCHES_PX, y2 + TOUCHES_PX)
-    kernel = np.ones((2 * TOUCHES_PX + 1, 2 * TOUCHES_PX + 1), np.uint8)
+    gap = EDITS.touches_px
+    around = (x1 - gap, y1 - gap, x2 + gap, y2 + gap)
+    kernel = np.ones((2 * gap + 1, 2 * gap + 1), np.uint8)
     near = cv2.dilate(one.within(around).pixels.numpy().astype(np.uint8), kernel)
     return bool((near & other.within(around).pixels.numpy()).any())
 

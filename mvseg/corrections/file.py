@@ -16,15 +16,12 @@ from typing import Annotated, Any, ClassVar, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic.types import StrictBool
 
+from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 from mvseg.formats.json_file import Items, Pixels, load_json
 from mvseg.system.atomic import write_text_whole
 
 FORMAT = "mvseg-corrections/1"
-MOST_BYTES = 64 * 2**20
-MOST_EDITS = 10_000
-MOST_POINTS = 10_000  # of an outline or a line
-MOST_PLACES = 100  # of a link: each is held against each other
 
 Text = Annotated[str, Field(max_length=1000)]
 Pixel = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-1e6, le=1e6)]
@@ -48,7 +45,7 @@ class Outline(_Edit):
 
     op: Literal["outline"] = "outline"
     view: Text
-    polygon: Annotated[tuple[Point, ...], Field(min_length=3, max_length=MOST_POINTS)]
+    polygon: Annotated[tuple[Point, ...], Field(min_length=3, max_length=EDITS.most_points)]
     leaf: Text | None = None
 
 
@@ -76,21 +73,21 @@ class Split(_Edit):
     op: Literal["split"] = "split"
     view: Text
     at: Point
-    line: Annotated[tuple[Point, ...], Field(min_length=2, max_length=MOST_POINTS)]
+    line: Annotated[tuple[Point, ...], Field(min_length=2, max_length=EDITS.most_points)]
 
 
 class Link(_Edit):
     """The masks at these places show one leaf (`same`), or different ones each (`different`)."""
 
     op: Literal["same", "different"]
-    at: Annotated[tuple[Place, ...], Field(min_length=2, max_length=MOST_PLACES)]
+    at: Annotated[tuple[Place, ...], Field(min_length=2, max_length=EDITS.most_places)]
 
 
 class TrackLink(_Edit):
     """The same of leaves on different dates: for `mvseg track`; a single scene passes it over."""
 
     op: Literal["same_track", "different_track"]
-    at: Annotated[tuple[DatedPlace, ...], Field(min_length=2, max_length=MOST_POINTS)]
+    at: Annotated[tuple[DatedPlace, ...], Field(min_length=2, max_length=EDITS.most_points)]
 
 
 Edit = Annotated[Outline | Reject | Confirm | Split | Link | TrackLink, Field(discriminator="op")]
@@ -108,8 +105,8 @@ class PhotoMark(BaseModel):
 class _File(BaseModel):
     model_config: ClassVar[ConfigDict] = ConfigDict(extra="forbid")
     format: Literal["mvseg-corrections/1"]
-    photos: Annotated[dict[Text, PhotoMark], Field(max_length=MOST_EDITS)] = {}
-    edits: Annotated[Items[Edit], Field(max_length=MOST_EDITS)]
+    photos: Annotated[dict[Text, PhotoMark], Field(max_length=EDITS.most_edits)] = {}
+    edits: Annotated[Items[Edit], Field(max_length=EDITS.most_edits)]
 
 
 @dataclass(frozen=True)
@@ -134,7 +131,7 @@ def load_corrections(path: Path | str) -> Corrections:
         InputError: the file is missing, too large or not JSON; see `parse_corrections`.
     """
     path = Path(path)
-    return parse_corrections(load_json(path, most=MOST_BYTES), source=path)
+    return parse_corrections(load_json(path, most=EDITS.most_bytes), source=path)
 
 
 def parse_corrections(data: Any, source: Path | None = None) -> Corrections:

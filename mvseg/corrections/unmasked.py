@@ -9,18 +9,13 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mvseg.corrections.numbers import UNMASKED
 from mvseg.formats.photos import ReadPhoto
 from mvseg.masks import Masks
 from mvseg.verification.leaf_color import ColorCounts, count_colors, has_leaf_color, leaf_colors
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
-
-MOST_PX = 600  # of a photo that is looked at: a limit of time
-OPENING = 5  # pixels of these: what is thinner is a stem, or the seam beside a mask
-COMPACT = 0.25  # of a part's area, the square of its largest width: stems have less, and leaves of more than 5 to 1
-BESIDE = 3  # pixels of these between a mask and what it leaves out of its leaf
-MOST_SHARE = 0.2  # of a photo: what is larger is no leaf, but the ground
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +63,7 @@ def find_unmasked(masks: Masks, photos: ReadPhoto, *, least_area: float) -> list
 def _thin(masks: Masks, photo: NDArray[np.uint8], view: int) -> tuple[NDArray[np.uint8], Ints, int]:
     """Every `step`-th pixel of a view: the photo, and the row of the mask there, -1 for none."""
     height, width = photo.shape[:2]
-    step = -(-max(width, height) // MOST_PX)
+    step = -(-max(width, height) // UNMASKED.most_px)
     rows = np.full((height, width), -1)
     for row in (masks.view_index == view).nonzero()[:, 0].tolist():
         crop = masks.regions.placed(row)
@@ -77,18 +72,19 @@ def _thin(masks: Masks, photo: NDArray[np.uint8], view: int) -> tuple[NDArray[np
 
 
 def _parts(is_free: Bools, rows: Ints, *, view: int, step: int) -> Iterator[Unmasked]:
-    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((OPENING, OPENING), np.uint8))
+    opened = cv2.morphologyEx(is_free.astype(np.uint8), cv2.MORPH_OPEN, np.ones((UNMASKED.opening,) * 2, np.uint8))
     count, labels, stats, _ = cv2.connectedComponentsWithStats(opened, connectivity=4)
-    height, width = rows.shape
+    (height, width), beside = rows.shape, UNMASKED.beside
     for label in range(1, count):
         left, top, wide, high, area = stats[label].tolist()
-        if not (left > 0 and top > 0 and left + wide < width and top + high < height) or area > MOST_SHARE * rows.size:
+        is_inside = left > 0 and top > 0 and left + wide < width and top + high < height
+        if not is_inside or area > UNMASKED.most_share * rows.size:
             continue
-        box = np.s_[max(top - BESIDE, 0) : top + high + BESIDE, max(left - BESIDE, 0) : left + wide + BESIDE]
+        box = np.s_[max(top - beside, 0) : top + high + beside, max(left - beside, 0) : left + wide + beside]
         part = (labels[box] == label).astype(np.uint8)
-        if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < COMPACT * area:
+        if (2 * cv2.distanceTransform(np.pad(part, 1), cv2.DIST_L2, 3).max()) ** 2 < UNMASKED.compact * area:
             continue
-        touched = rows[box][cv2.dilate(part, np.ones((2 * BESIDE + 1,) * 2, np.uint8)) > 0]
+        touched = rows[box][cv2.dilate(part, np.ones((2 * beside + 1,) * 2, np.uint8)) > 0]
         found, numbers = np.unique(touched[touched >= 0], return_counts=True)
         lines, _ = cv2.findContours(part, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
         outline = cv2.approxPolyDP(max(lines, key=cv2.contourArea), 1.0, True)[:, 0]

@@ -17,7 +17,7 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qs, urlsplit
 
-from mvseg.corrections.file import MOST_BYTES
+from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 
 if TYPE_CHECKING:
@@ -129,8 +129,10 @@ class _Handler(BaseHTTPRequestHandler):
         length = self.headers.get("Content-Length", "")
         if not (length.isascii() and length.isdigit() and len(length) < 16):
             raise Refused(HTTPStatus.LENGTH_REQUIRED, "The request does not say how long it is.")
-        if int(length) > MOST_BYTES:
-            raise Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"More than {MOST_BYTES // 2**20} MiB are not read.")
+        if int(length) > EDITS.most_bytes:
+            raise Refused(
+                HTTPStatus.REQUEST_ENTITY_TOO_LARGE, f"More than {EDITS.most_bytes // 2**20} MiB are not read."
+            )
         return self.rfile.read(int(length))
 
     def _json(self, content: Mapping[str, Any], status: HTTPStatus = HTTPStatus.OK) -> None:

@@ -11,7 +11,8 @@ import torch
 
 from blade_scene import as_regions
 from known_leaves import make_surface
-from mvseg.corrections.doubtful import LEAST_DOUBT, Doubt, best_mask, list_doubts
+from mvseg.corrections.doubtful import Doubt, best_mask, list_doubts
+from mvseg.corrections.numbers import DOUBTS
 from mvseg.masks import Masks, Origin
 from mvseg.verification.choose import LeftOut
 from three_leaves import CAMERAS, LEAVES, true_maps
@@ -48,7 +49,7 @@ def test_nothing_is_asked_of_a_result_without_faults() -> None:
 def test_low_scores_come_first_the_lowest_before_the_others() -> None:
     masks = masks_of(TRUE)
     rows = [row_of(masks, view=view, leaf=leaf) for view, leaf in ((1, 2), (4, 3), (0, 1))]
-    masks.match_scores[rows] = torch.tensor([0.5, 0.1, 1 - LEAST_DOUBT + 0.01])
+    masks.match_scores[rows] = torch.tensor([0.5, 0.1, 1 - DOUBTS.least + 0.01])
     found = doubts(masks)
     assert [(each.kind, each.view, each.instance, each.region) for each in found] == [
         ("match", 4, 3, rows[1]), ("match", 1, 2, rows[0])

@@ -10,7 +10,6 @@ import pytest
 
 from mvseg.corrections.file import (
     FORMAT,
-    MOST_EDITS,
     Confirm,
     Corrections,
     Link,
@@ -22,6 +21,7 @@ from mvseg.corrections.file import (
     parse_corrections,
     write_corrections,
 )
+from mvseg.corrections.numbers import EDITS
 from mvseg.errors import InputError
 
 REJECT = {"op": "reject", "view": "003", "at": [1, 2]}
@@ -71,7 +71,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
         (content({"op": "outline", "view": "3", "polygon": [[0, 0], [1, 1]]}), "polygon: .*at least 3"),
         (content({"op": "outline", "view": "3", "polygon": [[0, 0]] * 10_001}), "polygon: .*at most 10000"),
         (content({"op": "same", "at": [["3", 1, 2]]}), "at: .*at least 2"),
-        (content(*[REJECT] * (MOST_EDITS + 1)), "edits: .*at most 10000"),
+        (content(*[REJECT] * (EDITS.most_edits + 1)), "edits: .*at most 10000"),
     ],
 )
 def test_faults_are_one_sentence(data: Any, message: str) -> None:
