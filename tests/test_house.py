@@ -173,8 +173,8 @@ def test_warnings_are_given_by_one_function() -> None:
 
 
 # Rooms whose numbers stand in their `numbers.py`, and modules of them that still have theirs.
-NUMBERED = {"corrections", "detection", "matching", "reconstruction", "tracking", "verification"}
-BESIDE = {"mvseg.verification.leaf_scores", "mvseg.reconstruction.surface.leaf_surface"}
+NUMBERED = {"checks", "corrections", "detection", "matching", "reconstruction", "tracking", "verification"}
+BESIDE = {"mvseg.checks.camera_plan", "mvseg.verification.leaf_scores", "mvseg.reconstruction.surface.leaf_surface"}
 
 
 def numbers_at_the_head(source: str) -> set[str]:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.checks.finding import Finding, Rule, list_findings
+from mvseg.checks.numbers import CAMERAS
 from mvseg.formats.find_views import name_views
 from mvseg.matching.pencil import is_coincident
 from mvseg.scene import Cameras, Scene
@@ -18,16 +19,7 @@ Floats = NDArray[np.float64]
 
 DEPTHS = np.geomspace(0.02, 500, 80)  # depths of candidate points, in the median distance of two cameras
 GRID = (0.25, 0.5, 0.75)  # places of the rays with the candidate points, as shares of the photo's width and height
-MOST_SOURCES, POINTS_AT_ONCE = 32, 4096  # cameras with such rays, at most; points at once, which bounds the memory
-ALL, MOST = 0.9, 0.6  # share of the cameras that look at one point: with right poses; without doubt about them
-WIDER = 4  # factor of the angle between cameras from which another reading of the poses is the better one
-FIELD_OF_VIEW = (2.0, 140.0)  # least and largest field of view of lenses without distortion, degrees, diagonal
-OFF_CENTER = 0.2  # distance of the principal point from the middle, as a share of the side, from which it is wrong
-SQUARE = 1.2  # quotient of the focal lengths along x and y, at most
-FAR = 8.0  # distance of a camera from the middle of the others, in their median distance
 UNITS = {1000: "millimetres and metres", 100: "centimetres and metres", 10: "millimetres and centimetres"}
-GAP, ALIKE = 3.0, 2.0  # quotients of lengths of t between which two units may lie; of distances of cameras in one unit
-NARROW, WIDE = 2.0, 75.0  # degrees between the rays of neighbouring views: no depth below, no common leaves above
 FLIP = np.diag([1.0, -1.0, -1.0])  # from cameras that look along -z with +y up (OpenGL, Blender)
 
 
@@ -58,9 +50,9 @@ def find_coverage(cameras: Cameras) -> Coverage:
     px = grid[None] * torch.nn.functional.pad(sizes, (0, 1), value=1.0)[:, None]
     rays = torch.nn.functional.normalize(px @ cameras.world_from_px.mT, dim=2)
     depths = torch.from_numpy(DEPTHS * scale).to(centers)
-    some = torch.linspace(0, len(cameras) - 1, min(len(cameras), MOST_SOURCES)).long()
+    some = torch.linspace(0, len(cameras) - 1, min(len(cameras), CAMERAS.most_sources)).long()
     points = (centers[some, None, None] + rays[some, :, None] * depths[:, None]).reshape(-1, 3)
-    looks = [_look(cameras, part) for part in points.split(POINTS_AT_ONCE)]
+    looks = [_look(cameras, part) for part in points.split(CAMERAS.points_at_once)]
     # the most views, and then the middle of the photos
     best = points[int(torch.cat([sees.sum(0).double() - off.mean(0) / 2 for sees, off in looks]).argmax())]
     sees = _look(cameras, best[None])[0][:, 0]
@@ -106,7 +98,7 @@ def _place_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]
     centers = cameras.centers.numpy()
     distance = np.linalg.norm(centers - np.median(centers, 0), axis=1)
     usual = float(np.median(distance))
-    far = tuple(np.flatnonzero(distance > FAR * usual).tolist()) if len(names) > 3 and usual > 0 else ()
+    far = tuple(np.flatnonzero(distance > CAMERAS.far * usual).tolist()) if len(names) > 3 and usual > 0 else ()
     what = (
         f"{{}}: {distance.max() / max(usual, 1e-300):.0f} times as far out as the other cameras; is t in another unit?"
     )
@@ -118,34 +110,34 @@ def _baseline_findings(cameras: Cameras, coverage: Coverage, names: tuple[str, .
     what = "{} have the same position as other cameras, which gives no depth: move the camera"
     findings = list_findings("cameras", [("warning", twins, what)], names)
     spread = _widest_angle(cameras, coverage)
-    if coverage.sees.sum() > 1 and spread < NARROW:
+    if coverage.sees.sum() > 1 and spread < CAMERAS.narrow:
         what = f"the views differ by {spread:.1f} degrees at most: depth is uncertain; photograph from more sides"
         findings.append(Finding(where="cameras", what=what, level="warning"))
     angle = np.nan_to_num(coverage.angle)
     facts = f"the next view is {angle.max():.0f} degrees away and shows few of the same leaves"
-    lonely: Rule = ("warning", np.flatnonzero(angle > WIDE).tolist(), f"{{}}: {facts}; add photos between")
+    lonely: Rule = ("warning", np.flatnonzero(angle > CAMERAS.wide).tolist(), f"{{}}: {facts}; add photos between")
     return findings + list_findings("cameras", [lonely], names)
 
 
 def _lens_findings(cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
     K, sizes = cameras.K.numpy(), cameras.sizes.numpy().astype(float)
     focal, center = K[:, [0, 1], [0, 1]], K[:, :2, 2]
-    view_deg = field_of_view(cameras)
+    view_deg, (least, most) = field_of_view(cameras), CAMERAS.field_of_view
     found = (
         (
-            (view_deg < FIELD_OF_VIEW[0]) | (view_deg > FIELD_OF_VIEW[1]),
-            f"a field of view of {{:.0f}} degrees, expected {FIELD_OF_VIEW[0]:.0f} to {FIELD_OF_VIEW[1]:.0f}: is K in "
+            (view_deg < least) | (view_deg > most),
+            f"a field of view of {{:.0f}} degrees, expected {least:.0f} to {most:.0f}: is K in "
             "pixels, of photos of this size?",
             view_deg,
         ),
         (
-            (np.abs(center / sizes - 0.5) > OFF_CENTER).any(1),
+            (np.abs(center / sizes - 0.5) > CAMERAS.off_center).any(1),
             "a principal point {:.0%} of the photo's size beside its middle: is K that of photos of another size, or "
             "before they were cropped?",
             np.abs(center / sizes - 0.5).max(1),
         ),
         (
-            focal.max(1) > SQUARE * focal.min(1),
+            focal.max(1) > CAMERAS.square * focal.min(1),
             "focal lengths of x and y that differ by a factor of {:.2f}: was the photo scaled in one direction only?",
             focal.max(1) / focal.min(1),
         ),
@@ -184,22 +176,22 @@ def _mixed_units(cameras: Cameras, coverage: Coverage, names: tuple[str, ...]) -
     order = lengths.argsort()
     ordered = lengths[order].clamp(min=1e-300)
     share = coverage.sees.mean()
-    for place in ((ordered[1:] > GAP * ordered[:-1]).nonzero()[:, 0] + 1).tolist():
+    for place in ((ordered[1:] > CAMERAS.gap * ordered[:-1]).nonzero()[:, 0] + 1).tolist():
         is_short = torch.zeros(len(cameras), dtype=torch.bool)
         is_short[order[:place]] = True
-        if share >= ALL and _distance_ratio(cameras, coverage, is_short) < GAP:
+        if share >= CAMERAS.all and _distance_ratio(cameras, coverage, is_short) < CAMERAS.gap:
             continue
         for factor, units in UNITS.items():
             scaled = replace(cameras, t=torch.where(is_short[:, None], factor * cameras.t, cameras.t))
             found = find_coverage(scaled)
-            if found.sees.mean() < ALL or _distance_ratio(scaled, found, is_short) > ALIKE:
+            if found.sees.mean() < CAMERAS.all or _distance_ratio(scaled, found, is_short) > CAMERAS.alike:
                 continue
             few, length = (is_short, "short") if 2 * place <= len(cameras) else (~is_short, "long")
             views = tuple(few.nonzero()[:, 0].tolist())
             facts = f"t is some {factor} times as {length} as in the other {len(cameras) - len(views)}"
             step = f"is t in another unit ({units})? In one, {found.sees.sum()} of {len(cameras)} look at one point"
             what = f"{name_views(views, names)}: {facts}; {step}"
-            is_sure = factor > min(UNITS) or share < ALL
+            is_sure = factor > min(UNITS) or share < CAMERAS.all
             return Finding(where="cameras", what=what, level="error" if is_sure else "warning", views=views)
     return None
 
@@ -238,11 +230,11 @@ def _other_reading(cameras: Cameras, coverage: Coverage) -> str | None:
             found = find_coverage(reading)
             best = max(best, (int(found.sees.sum()), round(_widest_angle(reading, found), 3), what))
     num, angle, what = best
-    if num < ALL * len(cameras):
+    if num < CAMERAS.all * len(cameras):
         return None
-    if given[0] < MOST * len(cameras):
+    if given[0] < CAMERAS.most * len(cameras):
         return f"the cameras do not look at one place; {what}, and {num} of {len(cameras)} would"
-    if given[1] * WIDER < angle:
+    if given[1] * CAMERAS.wider < angle:
         facts = f"the cameras look from directions that differ by {given[1]:.0f} degrees only"
         return f"{facts}; {what}, and they differ by {angle:.0f}"
     return None

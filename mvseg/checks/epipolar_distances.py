@@ -15,20 +15,15 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from mvseg.checks.finding import Finding, Rule, list_findings
-from mvseg.checks.groups import NAMED, NEXT_STEP
+from mvseg.checks.groups import NEXT_STEP
+from mvseg.checks.numbers import AGREEMENT, FEATURES
 from mvseg.checks.photo_matches import PhotoMatches
 from mvseg.formats.find_views import name_views
 from mvseg.scene import Cameras
 
 Floats = NDArray[np.float64]
 
-OFFSET = 1.5  # units; features that miss by less fit the cameras
-CONTRADICTS, AGREES = 0.3, 0.6  # share of the features of one fundamental matrix that fit the cameras', below and above
-FEWEST_PAIRS = 3  # needed to judge a focal length
 FACTORS = np.exp(np.linspace(-1, 1, 101))  # of the focal length, in steps of 2 %; the middle one is 1
-LEAST_ERROR = 0.05  # of the focal length's logarithm
-BETTER = 0.5  # of the epipolar distance, with another focal length
-MOST = 0.7  # share of the pairs for which it is better, and fits
 
 ONE_STEP = "it has the pose of another photo, or was moved; correct it or leave it out"
 QUESTION = "do R and t map world points to the camera, and does each camera belong to its photo?"
@@ -67,15 +62,16 @@ def focal_factor(matches: Sequence[PhotoMatches], cameras: Cameras) -> float:
     Another focal length is certain if it halves the median epipolar distance, brings it below what fits in 70 % of
     the pairs, differs by 5 % or more, and is not at the end of the tested range (0.37 to 2.7).
     """
-    if len(matches) < FEWEST_PAIRS:
+    if len(matches) < FEATURES.fewest_pairs:
         return 1.0
     cost = np.array([[_median_distance(pair, cameras, factor) for pair in matches] for factor in FACTORS])
     best, given = int(np.median(cost, axis=1).argmin()), len(FACTORS) // 2
     is_inside = 0 < best < len(FACTORS) - 1
-    is_far = abs(np.log(FACTORS[best])) > LEAST_ERROR
-    is_better = np.median(cost[best]) < BETTER * np.median(cost[given]) and np.mean(cost[best] < cost[given]) >= MOST
-    fits = np.mean(cost[best] < OFFSET) >= MOST
-    return float(FACTORS[best]) if is_inside and is_far and is_better and fits else 1.0
+    is_far = abs(np.log(FACTORS[best])) > FEATURES.least_error
+    is_better = np.median(cost[best]) < FEATURES.better * np.median(cost[given])
+    shares = np.mean(cost[best] < cost[given]), np.mean(cost[best] < FEATURES.offset)
+    is_certain = is_inside and is_far and is_better and min(shares) >= FEATURES.most
+    return float(FACTORS[best]) if is_certain else 1.0
 
 
 def scale_focal(cameras: Cameras, factor: float) -> Cameras:
@@ -118,17 +114,17 @@ def _pose_rules(significant: Sequence[PhotoMatches], cameras: Cameras, names: tu
     """The pairs of views that contradict their cameras, as one rule; one pair among others may be a mistake."""
     shares = []  # of the features that fit one fundamental matrix: those that fit that of the cameras
     for pair in significant:
-        fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < OFFSET * pair.unit_px
+        fits = epipolar_distances(pair.xy, fundamental(pair.views, cameras)) < FEATURES.offset * pair.unit_px
         shares.append(float(fits.sum() / pair.is_rigid.sum()))
-    wrong = [pair for pair, share in zip(significant, shares, strict=True) if share < CONTRADICTS]
+    wrong = [pair for pair, share in zip(significant, shares, strict=True) if share < FEATURES.contradicts]
     if not wrong or (len(wrong) == 1 and len(significant) > 1):
         return []
-    agreeing = [pair.views for pair, share in zip(significant, shares, strict=True) if share > AGREES]
+    agreeing = [pair.views for pair, share in zip(significant, shares, strict=True) if share > FEATURES.agrees]
     facts = f"in {len(wrong)} of {len(significant)} pairs of photos they miss by {_median_px(wrong, cameras):.0f} px"
     few, many = _sides(agreeing, [pair.views for pair in wrong], len(names))
     if not few:
         return [("error", None, f"features of the photos contradict the cameras ({facts}): {QUESTION}")]
-    between = " and those of ".join(name_views(side, names, shown=NAMED) for side in (few, many))
+    between = " and those of ".join(name_views(side, names, shown=AGREEMENT.named) for side in (few, many))
     step = ONE_STEP if len(few) == 1 else NEXT_STEP
     return [("error", few, f"features of the photos do not fit both the cameras of {between} ({facts}): {step}")]
 

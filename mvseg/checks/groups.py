@@ -12,15 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.checks.finding import Finding, Level, list_findings
-from mvseg.checks.poses import OFFSET, PoseAgreement, is_sure, view_agreement
+from mvseg.checks.numbers import AGREEMENT
+from mvseg.checks.poses import PoseAgreement, is_sure, view_agreement
 from mvseg.formats.find_views import name_views
 
 Floats = NDArray[np.float64]
 
-CHANCE = 0.06  # share of the masks that fit where poses and masks have nothing to do with each other
-APART = 0.5  # of the share that fits within the groups: in one world, more fit between them, see docs/check.md
-SMALLEST = 2  # views of a group; one alone is for `view_agreement`
-NAMED = 12  # views of a group that a sentence names
 NEXT_STEP = "were they calibrated separately, with two scales or axes? Calibrate them together, or use one group"
 
 
@@ -54,7 +51,7 @@ def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding
     within = np.concatenate([_upper(pairs.fitting, group) for group in members])
     between = np.concatenate([_block(pairs.fitting, one, other) for one, other in combinations(members, 2)])
     facts = f"{np.nanmean(between):.0%} of the masks fit instead of {np.nanmean(within):.0%}"
-    each = " and ".join(f"within {name_views(group, names, shown=NAMED)}" for group in groups)
+    each = " and ".join(f"within {name_views(group, names, shown=AGREEMENT.named)}" for group in groups)
     level: Level = "error" if is_sure(pairs) else "warning"
     what = f"masks and poses agree {each}, but not between these groups ({facts}): {NEXT_STEP}"
     return list_findings("poses", [(level, sorted(view for group in groups[1:] for view in group), what)], names)
@@ -62,19 +59,19 @@ def group_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding
 
 def _split(pairs: PoseAgreement, members: NDArray[np.int64]) -> list[NDArray[np.int64]] | None:
     """Two groups of the members that contradict each other; None where they are of one world."""
-    if len(members) < 2 * SMALLEST:
+    if len(members) < 2 * AGREEMENT.smallest:
         return None
     order = members[_order(pairs, members)]
-    cuts = [(order[:cut], order[cut:]) for cut in range(SMALLEST, len(order) - SMALLEST + 1)]
+    cuts = [(order[:cut], order[cut:]) for cut in range(AGREEMENT.smallest, len(order) - AGREEMENT.smallest + 1)]
     found = [(_contrast(pairs, *cut), cut) for cut in cuts]
     contrast, (one, other) = min(found, key=lambda each: each[0])
-    return [np.sort(one), np.sort(other)] if contrast < APART and _is_off(pairs, one, other) else None
+    return [np.sort(one), np.sort(other)] if contrast < AGREEMENT.apart and _is_off(pairs, one, other) else None
 
 
 def _order(pairs: PoseAgreement, members: NDArray[np.int64]) -> NDArray[np.int64]:
     """The members so that those that agree stand together: by the second eigenvector of the graph's Laplacian (the
     Fiedler vector of the normalized cut, Shi and Malik 2000)."""
-    weight = np.nan_to_num(pairs.fitting[np.ix_(members, members)]).clip(CHANCE / 10)
+    weight = np.nan_to_num(pairs.fitting[np.ix_(members, members)]).clip(AGREEMENT.chance / 10)
     np.fill_diagonal(weight, 0)
     root = np.sqrt(weight.sum(1))
     second = np.linalg.eigh(np.eye(len(members)) - weight / np.outer(root, root))[1][:, 1]
@@ -87,7 +84,8 @@ def _contrast(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.in
     within = np.concatenate((_upper(pairs.fitting, one), _upper(pairs.fitting, other)))
     if np.isnan(between).all() or np.isnan(within).all():
         return 1.0
-    return max(float(np.nanmean(between)) - CHANCE, 0.0) / max(float(np.nanmean(within)) - CHANCE, CHANCE)
+    chance = AGREEMENT.chance
+    return max(float(np.nanmean(between)) - chance, 0.0) / max(float(np.nanmean(within)) - chance, chance)
 
 
 def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int64]) -> bool:
@@ -95,7 +93,7 @@ def _is_off(pairs: PoseAgreement, one: NDArray[np.int64], other: NDArray[np.int6
     two worlds itself."""
     of_groups = [_upper(pairs.offset, one), _upper(pairs.offset, other)]
     within = [np.nanmedian(offsets) for offsets in of_groups if not np.isnan(offsets).all()]
-    return bool(np.nanmedian(_block(pairs.offset, one, other)) >= OFFSET > min(within))
+    return bool(np.nanmedian(_block(pairs.offset, one, other)) >= AGREEMENT.offset > min(within))
 
 
 def _block(values: Floats, one: NDArray[np.int64], other: NDArray[np.int64]) -> Floats:

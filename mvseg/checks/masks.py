@@ -6,15 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.checks.finding import Finding, Rule, list_findings
+from mvseg.checks.numbers import IMAGES
 from mvseg.formats.masks.faults import mask_faults
 from mvseg.matching.tangency import touches_border, without_small_components
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-
-TINY_PX = 30  # pixels; smaller masks carry no information
-MANY = 0.25  # share of the masks
-FEW = 0.34  # of the median number of masks per view
-BEYOND = 0.1  # of the photo's longer side: how far small components reach beyond the rest of their mask
 
 
 def mask_findings(regions: Regions, cameras: Cameras, names: tuple[str, ...]) -> list[Finding]:
@@ -31,7 +27,7 @@ def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
     if len(counts) - len(empty) < 2:  # an error, see `mask_faults`
         return []
     usual = float(np.median(counts[counts > 0]))
-    few = np.flatnonzero((counts > 0) & (counts < FEW * usual)).tolist()
+    few = np.flatnonzero((counts > 0) & (counts < IMAGES.few * usual)).tolist()
     facts = f"there are {counts[counts > 0].min()} masks in {{}} where {usual:.0f} are usual"
     return [
         ("warning", empty, "there are no masks in {}: is the plant hidden there, or a file missing?"),
@@ -42,13 +38,13 @@ def _count_rules(counts: NDArray[np.int64]) -> list[Rule]:
 def _size_rules(regions: Regions, cameras: Cameras) -> list[Rule]:
     rules: list[Rule] = []
     areas = regions.areas.numpy()
-    tiny = areas < TINY_PX
-    if tiny.mean() > MANY:
-        sizes = f"fewer than {TINY_PX} pixels (median {np.median(areas):.0f})"
+    tiny = areas < IMAGES.tiny_px
+    if tiny.mean() > IMAGES.many:
+        sizes = f"fewer than {IMAGES.tiny_px} pixels (median {np.median(areas):.0f})"
         what = f"{tiny.sum()} of {len(regions)} masks have {sizes}: remove small components, or segment larger photos"
         rules.append(("warning", None, what))
     cut = touches_border(regions, cameras).numpy()
-    if cut.mean() > MANY:
+    if cut.mean() > IMAGES.many:
         what = f"{cut.sum()} of {len(regions)} masks touch the border of their photo, and cut leaves come out small: "
         rules.append(("warning", None, f"{what}step back, or add photos"))
     return rules
@@ -62,6 +58,6 @@ def _small_component_rule(regions: Regions, cameras: Cameras) -> Rule:
         view, crop = int(regions.view_index[index]), regions.crop(index).numpy()
         kept = without_small_components(crop).astype(bool)
         reach = max(crop.shape[axis] - np.ptp(np.flatnonzero(kept.any(1 - axis))) - 1 for axis in (0, 1))
-        if reach > BEYOND * longest[view]:
+        if reach > IMAGES.beyond * longest[view]:
             views.add(view)
     return "warning", sorted(views), "masks of {} have stray pixels far from the rest of them: remove small components"

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mvseg.checks.cameras import find_coverage
+from mvseg.checks.numbers import FEATURES
 from mvseg.errors import InputError
 from mvseg.formats.photos import ReadPhoto
 from mvseg.matching.pencil import is_coincident
@@ -17,15 +18,6 @@ from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
 
 Floats = NDArray[np.float64]
-
-SIDE, MOST_FEATURES = 800, 1500  # pixels of the longer side; per photo
-CONTRAST = 0.013  # of SIFT; leaves have less than OpenCV's default of 0.04
-BEST_ANGLE, WIDEST_ANGLE = 15.0, 60.0  # degrees between two views: fewer features are the same above, less depth below
-PARTNERS = 4  # of each view: wrong cameras are wrong about what is near, too
-MOST_VIEWS, SOURCES = 24, 8  # of more views, the partners of some are looked for
-STILL = 3.0  # units: features that have moved by less belong to what stands still, as the wall behind a turntable
-TOLERANCE = 1.0  # units, of a fundamental matrix
-FEWEST, LEAST_SHARE = 20, 0.5  # features that fit one fundamental matrix; 40 that have nothing in common give 13
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +41,7 @@ class PhotoMatches:
     @property
     def is_significant(self) -> bool:
         """Whether enough features fit one fundamental matrix to rule out chance."""
-        return bool(self.is_rigid.sum() >= max(FEWEST, LEAST_SHARE * len(self.is_rigid)))
+        return bool(self.is_rigid.sum() >= max(FEATURES.fewest, FEATURES.least_share * len(self.is_rigid)))
 
 
 def match_photos(read: ReadPhoto, cameras: Cameras) -> list[PhotoMatches]:
@@ -82,27 +74,29 @@ def neighbours(cameras: Cameras) -> list[tuple[int, int]]:
     toward /= np.linalg.norm(toward, axis=1, keepdims=True).clip(min=1e-300)
     angle = np.degrees(np.arccos(np.clip(toward @ toward.T, -1, 1)))
     angle[is_coincident(cameras).numpy()] = np.inf  # a view is at its own place, too
-    sources = np.arange(num) if num <= MOST_VIEWS else np.linspace(0, num - 1, SOURCES).round().astype(int)
+    number = num if num <= FEATURES.most_views else FEATURES.sources
+    sources = np.linspace(0, num - 1, number).round().astype(int)
     pairs = set()
     for view in sources.tolist():
-        nearest = np.argsort(np.abs(angle[view] - BEST_ANGLE), kind="stable")[:PARTNERS].tolist()
-        pairs |= {(min(view, other), max(view, other)) for other in nearest if angle[view, other] <= WIDEST_ANGLE}
+        nearest = np.argsort(np.abs(angle[view] - FEATURES.best_angle), kind="stable")[: FEATURES.partners].tolist()
+        near = [other for other in nearest if angle[view, other] <= FEATURES.widest_angle]
+        pairs |= {(min(view, other), max(view, other)) for other in near}
     return sorted(pairs)
 
 
 def find_features(photo: NDArray[np.uint8]) -> Sift:
     """Features of a photo (H, W, 3)."""
-    return find_sift(photo, image_size=SIDE, most=MOST_FEATURES, contrast=CONTRAST)
+    return find_sift(photo, image_size=FEATURES.side, most=FEATURES.most_features, contrast=FEATURES.contrast)
 
 
 def match_pair(views: tuple[int, int], first: Sift, second: Sift, *, unit_px: float) -> PhotoMatches:
     """The features that views i and j share, see `Cameras.unit_px`."""
     index = match_descriptors(first.descriptors, second.descriptors, back_ratio=1.0)
     xy = np.stack((first.px[index[:, 0]], second.px[index[:, 1]])).astype(np.float64)
-    has_moved = np.linalg.norm(xy[0] - xy[1], axis=1) > STILL * unit_px
+    has_moved = np.linalg.norm(xy[0] - xy[1], axis=1) > FEATURES.still * unit_px
     xy = xy[:, has_moved]
     is_rigid = np.zeros(xy.shape[1], bool)
-    if len(is_rigid) >= FEWEST:
-        kept = cv2.findFundamentalMat(xy[0], xy[1], cv2.USAC_MAGSAC, TOLERANCE * unit_px, 0.999, 5000)[1]
+    if len(is_rigid) >= FEATURES.fewest:
+        kept = cv2.findFundamentalMat(xy[0], xy[1], cv2.USAC_MAGSAC, FEATURES.tolerance * unit_px, 0.999, 5000)[1]
         is_rigid = is_rigid if kept is None else kept[:, 0] > 0
     return PhotoMatches(views, xy, is_rigid, int((~has_moved).sum()), unit_px)

@@ -9,19 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from mvseg.checks.finding import Finding, Rule, list_findings
+from mvseg.checks.numbers import IMAGES
 from mvseg.errors import InputError
 from mvseg.formats.image_file import is_turned, read_exposure, read_image_size, read_rgb
 from mvseg.formats.photo_content import PhotoContent, measure_content
 from mvseg.formats.photos import Photos, describe_folder, photo_bits
 from mvseg.scene import Scene
 from mvseg.system.running import progress_bar
-
-# Standard deviation of a photo of nothing: grey levels, or a share of its level where it is dark (photos of something
-# have a fifth), but no less than rounding makes.
-BLANK, BLANK_SHARE, ROUNDING = 4.0, 0.03, 1.0
-DARK = 30  # grey level that 99 % of the pixels stay below
-STOPS = 1 / 3  # exposures that differ by more are noted: the least step of a camera's dials
-BURNT = 0.7  # a photo is overexposed if more than this share of its pixels is white
 
 NOTHING = PhotoContent(contrast=0.0, level=0.0, burnt=0.0, grey=False)
 
@@ -49,7 +43,7 @@ class PhotoFacts:
     @property
     def is_blank(self) -> bool:
         """Whether it has one colour all over. A dark photo of a plant has little contrast, too."""
-        return self.content.contrast < max(ROUNDING, min(BLANK, BLANK_SHARE * self.content.level))
+        return self.content.contrast < max(IMAGES.rounding, min(IMAGES.blank, IMAGES.blank_share * self.content.level))
 
 
 def read_photo_facts(photos: Photos) -> list[PhotoFacts]:
@@ -101,8 +95,8 @@ def _content_rules(facts: list[PhotoFacts]) -> list[Rule]:
     whole = [view for view, each in enumerate(facts) if each.size is not None]
     blank = [view for view in whole if facts[view].is_blank]
     shown = [view for view in whole if view not in blank]
-    dark = [view for view in shown if facts[view].content.level < DARK]
-    burnt = [view for view in shown if facts[view].content.burnt > BURNT]
+    dark = [view for view in shown if facts[view].content.level < IMAGES.dark]
+    burnt = [view for view in shown if facts[view].content.burnt > IMAGES.burnt]
     grey = [view for view in shown if facts[view].content.grey]
     few = "detectors will find few leaves there"
     same: dict[str, list[int]] = defaultdict(list)
@@ -124,7 +118,7 @@ def _exposure_rules(facts: list[PhotoFacts]) -> list[Rule]:
     if np.isfinite(exposures).sum() < 2:
         return []
     apart = np.abs(exposures - np.nanmedian(exposures))
-    others = np.flatnonzero(apart > STOPS).tolist()  # NaN is no more than anything
+    others = np.flatnonzero(apart > IMAGES.stops).tolist()  # NaN is no more than anything
     what = f"by EXIF, the exposures of {{}} are up to {np.nanmax(apart):.1f} stops from the usual one"
     return [("note", others, f"{what}: leaf colours differ as much; fix exposure and white balance")]
 

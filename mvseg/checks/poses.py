@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from mvseg.checks.finding import Finding, Level, Rule, list_findings
+from mvseg.checks.numbers import AGREEMENT
 from mvseg.matching.numbers import TANGENCY
 from mvseg.matching.pencil import Pencil, epipolar_pencil, is_coincident
 from mvseg.matching.tangency import hull_corners, touches_border
@@ -26,17 +27,6 @@ from mvseg.scene import Cameras
 from mvseg.system.running import progress_bar
 
 Floats = NDArray[np.float64]
-
-NUM_MOVES = 16  # of a view's masks, to see what chance does
-MOST_PARTNERS = 20  # views that each view is compared with
-MOST_OFFSET = 40  # units, tried in both directions
-SHARPNESS = 2.0  # units, of the vote for an offset
-# Chosen on 96 development scenes (48 simulated plants with true and with degraded masks) with eight faults in each: no
-# sound view was off, see docs/check.md.
-CHANCE, OFFSET = 0.22, 1.5  # fitting share, units
-MOST_AGREE = 0.3  # quantile of the offsets over the other views: noise alone puts some of them at 0
-FEW_MASKS = 10  # of two views, in the median: one faulty mask is too large a share of fewer
-FEW_VIEWS = 4  # with fewer, no view is outvoted
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,7 +113,7 @@ def view_agreement(pairs: PoseAgreement) -> ViewAgreement:
     kept, off = list(range(num_views)), []
     while len(kept) > 1:
         fitting, offset = _against(pairs, kept)
-        is_off = [view for view in kept if fitting[view] < CHANCE and offset[view] >= OFFSET]
+        is_off = [view for view in kept if fitting[view] < AGREEMENT.off and offset[view] >= AGREEMENT.offset]
         if not is_off:
             break
         worst = min(is_off, key=lambda view: (fitting[view], -offset[view]))
@@ -158,8 +148,8 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
         facts = f"{view.fitting[index]:.0%} of its masks fit, epipolar lines miss by {view.offset_px[index]:.0f} px"
         step = "it has the pose or the masks of another photo, or was moved; correct it or leave it out"
         rules.append((level, (index,), f"{{}} agrees with none of the others ({facts} or more): {step}"))
-    missed = np.flatnonzero(view.offset_px >= OFFSET * pairs.unit_px).tolist() if len(names) >= FEW_VIEWS else []
-    missing = [index for index in missed if index not in view.off]
+    missed = np.flatnonzero(view.offset_px >= AGREEMENT.offset * pairs.unit_px).tolist()
+    missing = [index for index in missed if index not in view.off] if len(names) >= AGREEMENT.few_views else []
     most = view.offset_px[missing].max(initial=0)
     step = "refine the poses, with --refine_poses true or COLMAP's bundle adjustment"
     rules.append(("warning", missing, f"epipolar lines of {{}} miss by up to {most:.0f} px: {step}"))
@@ -168,8 +158,8 @@ def pose_findings(pairs: PoseAgreement, names: tuple[str, ...]) -> list[Finding]
 
 def is_sure(pairs: PoseAgreement) -> bool:
     """Whether views and masks are enough for an error; there must be masks to compare."""
-    enough = np.median(pairs.num_masks[pairs.num_masks > 0]) >= FEW_MASKS
-    return bool(enough and len(pairs.fitting) >= FEW_VIEWS)
+    enough = np.median(pairs.num_masks[pairs.num_masks > 0]) >= AGREEMENT.few_masks
+    return bool(enough and len(pairs.fitting) >= AGREEMENT.few_views)
 
 
 def _against(pairs: PoseAgreement, kept: list[int]) -> tuple[Floats, Floats]:
@@ -179,13 +169,13 @@ def _against(pairs: PoseAgreement, kept: list[int]) -> tuple[Floats, Floats]:
         others = [other for other in kept if other != view and pairs.num_masks[view, other]]
         if others:
             fitting[view] = np.average(pairs.fitting[view, others], weights=pairs.num_masks[view, others])
-            offset[view] = np.quantile(pairs.offset[view, others], MOST_AGREE)
+            offset[view] = np.quantile(pairs.offset[view, others], AGREEMENT.most_agree)
     return fitting, offset
 
 
 def _chosen_pairs(num_views: int) -> list[tuple[int, int]]:
     """Neighbours, far views, and some between. A step of the list reaches one view on either side."""
-    steps = np.linspace(1, num_views - 1, min(num_views - 1, MOST_PARTNERS)).round().astype(int)
+    steps = np.linspace(1, num_views - 1, min(num_views - 1, AGREEMENT.most_partners)).round().astype(int)
     return [(i, i + step) for step in dict.fromkeys(steps.tolist()) for i in range(num_views - step)]
 
 
@@ -216,7 +206,7 @@ def _beats_chance(first: _Spans, second: _Spans) -> tuple[Tensor, Tensor]:
     middle = second.ends.mean(1)
     reach = torch.maximum(middle.max() - middle.min(), (second.ends[:, 1] - second.ends[:, 0]).mean())
     low = (middle.max() + middle.min() - reach) / 2
-    steps = torch.arange(NUM_MOVES + 1).double()[:, None] / (NUM_MOVES + 1)
+    steps = torch.arange(AGREEMENT.num_moves + 1).double()[:, None] / (AGREEMENT.num_moves + 1)
     moves = low + (middle - low + steps * reach) % reach.clamp(min=1e-12) - middle
     moves[0] = 0
     residuals = _residuals(first, second, moves)
@@ -226,9 +216,9 @@ def _beats_chance(first: _Spans, second: _Spans) -> tuple[Tensor, Tensor]:
 
 def _offset(first: _Spans, second: _Spans, unit_px: float) -> float:
     """The move, in units and without sign, at which most masks of two views begin and end together."""
-    units = torch.arange(-MOST_OFFSET, MOST_OFFSET + 1).double()
+    units = torch.arange(-AGREEMENT.most_offset, AGREEMENT.most_offset + 1).double()
     apart = (first.ends[:, None] - second.ends) / torch.hypot(first.pitch[:, None], second.pitch) / unit_px
     residuals = (apart - units[:, None, None, None]).abs().amax(3)
-    votes = sum(torch.exp(-((residuals.amin(axis) / SHARPNESS) ** 2)).sum(1) for axis in (1, 2))
+    votes = sum(torch.exp(-((residuals.amin(axis) / AGREEMENT.sharpness) ** 2)).sum(1) for axis in (1, 2))
     assert isinstance(votes, Tensor)
     return float(units[votes == votes.max()].abs().min())

@@ -10,15 +10,11 @@ from numpy.typing import NDArray
 from scipy import ndimage
 from skimage.filters import threshold_otsu
 
+from mvseg.checks.numbers import IMAGES
+
 Floats = NDArray[np.float64]
 
-GAMMA = 2.2  # of photos, roughly; blur mixes light, so the middle of an edge is where light is halfway
 LUMA = np.array([0.299, 0.587, 0.114])  # brightness as JPEG has it
-SMOOTH = 4.0  # pixels over which light hardly changes, unlike ink and paper at an edge
-SHIFT = 4  # fractional bits of OpenCV's polygons
-# Of a mask with the shape where it should be. Shapes in small drawn photos have 0.93 and more, noise in those of a grey
-# print up to 0.72: a third less would take that, too, a third more would leave out every shape.
-LEAST_IOU = 0.75
 
 
 def cut_shapes(photo: NDArray[np.uint8], places: Mapping[int, tuple[Floats, Floats]]) -> NDArray[np.uint16]:
@@ -43,7 +39,7 @@ def cut_shapes(photo: NDArray[np.uint8], places: Mapping[int, tuple[Floats, Floa
         part = photo[y1:y2, x1:x2]
         mask = _cut(part, _fill(cell - (x1, y1), part.shape[:2]))
         shape = _fill(outline - (x1, y1), part.shape[:2])
-        if (mask & shape).sum() >= LEAST_IOU * (mask | shape).sum():
+        if (mask & shape).sum() >= IMAGES.least_iou * (mask | shape).sum():
             labels[y1:y2, x1:x2][mask] = label
     return labels
 
@@ -54,15 +50,15 @@ def _cut(part: NDArray[np.uint8], is_cell: NDArray[np.bool_]) -> NDArray[np.bool
     Each pixel is a mixture of paper and ink, in some light. The edge is where both have half, by brightness: JPEG blurs
     colours, which makes shapes larger, but not brightness.
     """
-    light = ((part + 1.0) / 256) ** GAMMA
+    light = ((part + 1.0) / 256) ** IMAGES.gamma
     lack = 1 - 2 * light[..., 1] / (light[..., 0] + light[..., 2])  # of green, in any light and shade: magenta
     is_ink = lack > threshold_otsu(lack[is_cell])
     if not (is_ink & is_cell).any():  # grey all over
         return is_ink & is_cell
     colors = np.stack([np.median(light[is_cell & where], 0) for where in (~is_ink, is_ink)])
-    strength = cv2.GaussianBlur((light @ np.linalg.pinv(colors)).sum(2), (0, 0), SMOOTH).clip(0)
-    half = colors.mean(0) ** (1 / GAMMA) @ LUMA
-    pieces, count = ndimage.label((part / 255 @ LUMA < half * strength ** (1 / GAMMA)) & is_cell)
+    strength = cv2.GaussianBlur((light @ np.linalg.pinv(colors)).sum(2), (0, 0), IMAGES.smooth_px).clip(0)
+    half = colors.mean(0) ** (1 / IMAGES.gamma) @ LUMA
+    pieces, count = ndimage.label((part / 255 @ LUMA < half * strength ** (1 / IMAGES.gamma)) & is_cell)
     sizes = np.bincount(pieces.ravel(), minlength=count + 1)
     sizes[0] = 0
     return np.asarray(ndimage.binary_fill_holes(pieces == sizes.argmax()))
@@ -71,5 +67,5 @@ def _cut(part: NDArray[np.uint8], is_cell: NDArray[np.bool_]) -> NDArray[np.bool
 def _fill(polygon: Floats, size: tuple[int, int]) -> NDArray[np.bool_]:
     """(h, w) bool: a polygon in pixels, about."""
     filled = np.zeros(size, np.uint8)
-    corners = np.round((polygon - 0.5) * (1 << SHIFT)).astype(np.int32)
-    return np.asarray(cv2.fillPoly(filled, [corners], 1, shift=SHIFT), bool)
+    corners = np.round((polygon - 0.5) * (1 << IMAGES.shift)).astype(np.int32)
+    return np.asarray(cv2.fillPoly(filled, [corners], 1, shift=IMAGES.shift), bool)

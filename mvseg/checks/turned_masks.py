@@ -8,13 +8,10 @@ import numpy as np
 import torch
 
 from mvseg.checks.finding import Finding
+from mvseg.checks.numbers import AGREEMENT
 from mvseg.checks.poses import PoseAgreement, is_sure, pairwise_agreement, view_agreement
 from mvseg.regions import Regions
 from mvseg.scene import Cameras
-
-# Of the masks, in the median view. On 65 real plants and dates with sound masks it is 0.47 and more, but for 0.28 on a
-# basil of 30 leaves that hide each other; where the masks of a simulated plant are turned, it is 0.29 and 0.26.
-LOW = 0.4
 
 
 def low_fit_findings(regions: Regions, cameras: Cameras, agreement: PoseAgreement) -> list[Finding]:
@@ -23,11 +20,11 @@ def low_fit_findings(regions: Regions, cameras: Cameras, agreement: PoseAgreemen
     if not agreement.num_masks.any() or not is_sure(agreement):
         return []
     share = np.nanmedian(view_agreement(agreement).fitting)
-    if share >= LOW:
+    if share >= AGREEMENT.low:
         return []
     turned = pairwise_agreement(turn_by_180(regions, cameras), cameras)
     other = np.nanmedian(view_agreement(turned).fitting) if turned.num_masks.any() else 0.0
-    if other > 2 * share:
+    if other > AGREEMENT.turned * share:
         facts = f"{share:.0%} of the masks fit those of other views, {other:.0%} if they are turned by 180 degrees"
         step = "they must be of the photos as stored, not as EXIF turns them"
         return [Finding(where="masks", what=f"{facts}: {step}", level="error")]
